@@ -1,0 +1,85 @@
+"""The state of a fit on disk: enough to continue after a kill at any moment, and to export when it is done."""
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from panoless.config import FitConfig
+from panoless.surfels import Surfels
+from shinypartial.errors import InputError
+from shinypartial.files import read_json, whole_file, write_json
+
+CHECKPOINT = "checkpoint.pt"
+DESCRIPTION = "fit.json"
+
+
+@dataclass
+class FitState:
+    """What changes during a fit. `iteration` counts finished steps; `environment` is as the optimizer holds it.
+
+    `final_environment` (radiance) and `evidence` are set when the fit is complete.
+    """
+
+    surfels: Surfels
+    environment: Tensor
+    iteration: int
+    optimizer: dict[str, Any]
+    gradient_sum: Tensor
+    gradient_count: Tensor
+    evidence: Tensor
+    center: list[float]
+    radius: float
+    final_environment: Tensor | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+    curves: dict[str, list[float]] = field(default_factory=dict)
+    peak_memory_bytes: int = 0
+
+
+def save_state(folder: Path, state: FitState) -> None:
+    """Write the checkpoint whole or not at all."""
+    content = {**vars(state), "surfels": {name: value.detach() for name, value in state.surfels.named().items()}}
+    content["environment"] = state.environment.detach()
+    with whole_file(folder / CHECKPOINT) as temporary:
+        torch.save(content, temporary)
+
+
+def load_state(folder: Path) -> FitState | None:
+    """Read the checkpoint, or None when there is none yet; InputError when it is damaged."""
+    path = folder / CHECKPOINT
+    if not path.exists():
+        return None
+    try:
+        content = torch.load(path, weights_only=True)
+        return FitState(**{**content, "surfels": Surfels(**content["surfels"])})
+    except Exception as error:
+        raise InputError(
+            expected=f"a checkpoint of this version at {path}",
+            found=f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}",
+            remedy="Delete that run folder and fit again.",
+        ) from None
+
+
+def claim_run(folder: Path, dataset: Path, dataset_hash: str, config: FitConfig) -> None:
+    """Make `folder` the run of this dataset and configuration; InputError when it belongs to another."""
+    description = json.loads(json.dumps({"dataset_hash": dataset_hash, "config": asdict(config)}))
+    path = folder / DESCRIPTION
+    if path.exists():
+        found = read_json(path, "the description of a run")
+        if any(found.get(key) != value for key, value in description.items()):
+            raise InputError(
+                expected=f"a run folder that is new or belongs to the same dataset and configuration, at {folder}",
+                found="a run of another dataset or configuration",
+                remedy="Choose another --output, or delete that folder.",
+            )
+        return
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(
+            expected=f"a new or empty run folder at {folder}",
+            found="files that are not a run",
+            remedy="Choose another --output.",
+        )
+    write_json(path, {"dataset": str(dataset.resolve()), **description})

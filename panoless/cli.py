@@ -1,0 +1,114 @@
+"""The `panoless` command: fit a dataset, export a finished fit."""
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from panoless.config import PRESETS, FitConfig
+from shinypartial.errors import EXIT_BAD_INPUT, InputError, run_command
+
+RUNS = Path("runs")
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Fit a dataset: surfels, an environment map and a visibility map; then export the prediction."""
+
+    dataset: Annotated[Path | None, tyro.conf.Positional] = None
+    """Dataset folder, also a plain NeRF-synthetic one; without it the newest below ./datasets."""
+    preset: Literal[tuple(PRESETS)] = "default"  # type: ignore[valid-type]
+    """Starting values of the configuration."""
+    output: Path | None = None
+    """Prediction folder; default predictions/DATASET-PRESET. The run folder has the same name below ./runs."""
+    config: FitConfig = field(default_factory=FitConfig)
+
+    def run(self) -> None:
+        """Load, fit, export and say what to do next."""
+        from panoless.export import export_prediction
+        from panoless.fit import fit
+        from shinypartial.dataset.read import newest_dataset, open_dataset
+        from shinypartial.prediction import claim_prediction
+
+        root = self.dataset
+        if root is None:
+            root = newest_dataset()
+            print(f"No dataset named; taking the newest one: {root}")
+        dataset = open_dataset(root)
+        name = f"{dataset.name}-{self.config.preset}"
+        prediction = self.output or Path("predictions") / name
+        claim_prediction(prediction)
+        state = fit(dataset, self.config, RUNS / prediction.name)
+        export_prediction(dataset, state, self.config, prediction)
+        print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write the prediction folder and the PLY of a finished run again."""
+
+    run_folder: Annotated[Path | None, tyro.conf.Positional] = None
+    """Run folder; without it the newest below ./runs."""
+    output: Path | None = None
+    """Prediction folder; default predictions/RUN."""
+
+    def run(self) -> None:
+        """Read the checkpoint and export it."""
+        from panoless.checkpoint import CHECKPOINT, DESCRIPTION, load_state
+        from panoless.config import config_from_dict
+        from panoless.export import export_prediction
+        from shinypartial.dataset.read import open_dataset
+        from shinypartial.files import newest_folder, read_json
+        from shinypartial.prediction import claim_prediction
+
+        folder = self.run_folder or newest_folder(RUNS, DESCRIPTION, "a run", "Make one: `panoless fit`.")
+        description = read_json(folder / DESCRIPTION, "the description of a run")
+        config = config_from_dict(description["config"])
+        state = load_state(folder)
+        if state is None or state.final_environment is None:
+            raise InputError(
+                expected=f"a finished run in {folder}",
+                found=f"no {CHECKPOINT}" if state is None else f"{state.iteration} of {config.iterations} iterations",
+                remedy="Run the same `panoless fit` command again: it continues where it stopped.",
+            )
+        prediction = self.output or Path("predictions") / folder.resolve().name
+        claim_prediction(prediction)
+        export_prediction(open_dataset(Path(description["dataset"])), state, config, prediction)
+        print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
+
+
+def _preset_of(arguments: list[str]) -> str:
+    """The preset chose the defaults of all other options, so it is read before the command line is derived."""
+    for index, argument in enumerate(arguments):
+        name, _, value = argument.partition("=")
+        if name == "--preset":
+            value = value or (arguments[index + 1] if index + 1 < len(arguments) else "")
+            return value if value in PRESETS else "default"
+    return "default"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns 0, 2 for bad input or usage, 130 when interrupted."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    preset = _preset_of(arguments)
+    fit_default = Fit(preset=preset, config=PRESETS[preset])
+    kinds = (
+        Annotated[Fit, tyro.conf.subcommand("fit", default=fit_default)]
+        | Annotated[Export, tyro.conf.subcommand("export")]
+    )
+    try:
+        command: Fit | Export = tyro.cli(
+            kinds,  # type: ignore[arg-type]
+            args=arguments,
+            prog="panoless",
+            description="The environment that a shiny object reflects, from photographs of one side of it.",
+        )
+    except SystemExit as stop:
+        return EXIT_BAD_INPUT if stop.code else 0
+    return run_command(command.run)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,188 @@
+"""Configuration of a fit: frozen dataclasses whose docstrings are the help texts. Presets are data.
+
+Durations are shares of `iterations`, so every schedule scales with the length of the fit.
+"""
+
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any, Literal
+
+
+@dataclass(frozen=True)
+class SurfelConfig:
+    """The set of surfels and how it starts."""
+
+    initial: Literal["hull", "random"] = "hull"
+    """`hull`: on the visual hull of the masks; `random`: uniformly in the normalized cube, as the paper's code does."""
+    count: int = 6000
+    """Number of surfels at the start."""
+    curved: bool = True
+    """Give every surfel a linear normal field (three numbers of a shape operator) instead of one normal."""
+    hull_resolution: int = 96
+    """Voxels along the longest side of the hull."""
+    hull_votes: float = 0.96
+    """Share of the views whose mask must keep a voxel."""
+
+
+@dataclass(frozen=True)
+class EnvironmentConfig:
+    """The learnable cubemap."""
+
+    resolution: int = 128
+    """Texels along a face side during the optimization."""
+    activation: Literal["clamp", "sigmoid"] = "clamp"
+    """`sigmoid`: Eq. 7 of the paper, started at random logits; `clamp`: radiance itself, kept in [0, 1]."""
+    warmup: float = 0.06
+    """Share of the iterations in which only the environment learns, before the geometry moves."""
+    solve: bool = True
+    """Start and end with the closed-form robust least-squares map instead of what gradient descent left."""
+    solve_resolution: int = 128
+    """Texels along a face side of the closed-form map that is exported."""
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Terms of the objective (paper Eqs. 9–14)."""
+
+    photometric: Literal["masked", "paper"] = "masked"
+    """`paper`: Eq. 9 over the whole image; `masked`: mean √(‖e‖² + ε²) over pixels that lie wholly on the object."""
+    lambda_ssim: float = 0.2
+    """Weight of D-SSIM in Eq. 9; read by `paper`."""
+    lambda_normal_consistency: float = 0.05
+    """Weight of the depth–normal term, Eq. 12."""
+    lambda_silhouette: float = 1.0
+    """Weight of the binary cross-entropy between alpha and mask, Eq. 13."""
+    silhouette_until: float = 1.0
+    """Share of the iterations in which the silhouette term acts (the paper's 3000 of 45000)."""
+    lambda_distortion: float = 0.0
+    """Weight of the depth distortion of the surfel paper (Huang et al. 2024, Eq. 13)."""
+    depth_blend: float = 0.5
+    """λ_d of Eq. 3: 0 takes the expected depth, 1 the median depth."""
+    roughness_weighted: bool = False
+    """Scale the specular term by a learned (1 − ρ)², the ablation of the paper's Table 3."""
+    random_background: bool = False
+    """Composite over a new random color at each step instead of black."""
+
+
+@dataclass(frozen=True)
+class DensityConfig:
+    """Adaptive density control (Kerbl et al. 2023; Huang et al. 2024) and normal propagation (Ye et al. 2024)."""
+
+    enabled: bool = False
+    """Clone, split, prune and reset."""
+    start: float = 500 / 45000
+    """Share of the iterations after which it begins."""
+    stop: float = 12000 / 45000
+    """Share of the iterations after which it ends."""
+    every: float = 100 / 45000
+    """Share of the iterations between two rounds."""
+    gradient_threshold: float = 2e-4
+    """Mean screen-space gradient (per half image width) above which a surfel is cloned or split."""
+    dense_share: float = 0.01
+    """Surfels larger than this share of the scene's radius are split, smaller ones cloned."""
+    prune_opacity: float = 0.1
+    """Surfels below this opacity are removed."""
+    reset_every: float = 3000 / 45000
+    """Share of the iterations between two opacity resets."""
+    propagate_every: float = 1000 / 45000
+    """Share of the iterations between two rounds of normal propagation; 0 turns it off."""
+    max_surfels: int = 100_000
+    """Growth stops at this number."""
+
+
+@dataclass(frozen=True)
+class RateConfig:
+    """Learning rates of Adam, in the normalized frame; all drop once, because a late drop beats a decay here."""
+
+    means: float = 1e-4
+    quats: float = 2e-3
+    log_scales: float = 3e-3
+    opacity_logits: float = 2e-2
+    albedo: float = 2.5e-3
+    curvatures: float = 3e-2
+    roughness_logits: float = 1e-2
+    environment: float = 3e-2
+    drop_at: float = 0.7
+    """Share of the iterations after which every rate is multiplied by `drop_factor`."""
+    drop_factor: float = 0.3
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Everything that determines a fit, saved beside its result."""
+
+    preset: str = "default"
+    """Name of the preset that the values started from."""
+    iterations: int = 2400
+    """Number of optimization steps (one view each)."""
+    seed: int = 0
+    """Seed of the initial surfels and of the order of views."""
+    albedo: bool = False
+    """Learn a diffuse term A (Eq. 8); a perfect mirror has none."""
+    alpha_applied: Literal["once", "paper"] = "once"
+    """`paper`: (A + L)·α as Eq. 10 is written, though A is blended already; `once`: A + L·α."""
+    crop_margin_px: int = 12
+    """Work on the mask's bounding box with this margin; −1 works on whole images."""
+    visibility: Literal["final", "online"] = "final"
+    """`online`: accumulated at each iteration as in the paper; `final`: one pass with the converged geometry."""
+    visibility_alpha: float = 0.5
+    """τ: only pixels with alpha above it count as observations."""
+    surfels: SurfelConfig = field(default_factory=SurfelConfig)
+    environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    density: DensityConfig = field(default_factory=DensityConfig)
+    rates: RateConfig = field(default_factory=RateConfig)
+
+
+_PAPER = FitConfig(
+    preset="paper",
+    iterations=45_000,
+    albedo=True,
+    alpha_applied="paper",
+    crop_margin_px=-1,
+    visibility="online",
+    surfels=SurfelConfig(initial="random", count=100_000, curved=False),
+    environment=EnvironmentConfig(activation="sigmoid", warmup=0.0, solve=False),
+    loss=LossConfig(
+        photometric="paper",
+        lambda_normal_consistency=0.5,
+        silhouette_until=3000 / 45000,
+        random_background=True,
+    ),
+    density=DensityConfig(enabled=True, max_surfels=200_000),
+    rates=RateConfig(
+        means=1.6e-4,
+        quats=1e-3,
+        log_scales=5e-3,
+        opacity_logits=5e-2,
+        albedo=2.5e-3,
+        environment=2e-2,
+        drop_at=1.0,
+    ),
+)
+
+PRESETS: dict[str, FitConfig] = {
+    "default": FitConfig(),
+    "paper": _PAPER,
+    "paper-rho-weighted": replace(
+        _PAPER, preset="paper-rho-weighted", loss=replace(_PAPER.loss, roughness_weighted=True)
+    ),
+    "paper-no-silhouette": replace(
+        _PAPER, preset="paper-no-silhouette", loss=replace(_PAPER.loss, lambda_silhouette=0.0)
+    ),
+    "paper-no-normal": replace(
+        _PAPER, preset="paper-no-normal", loss=replace(_PAPER.loss, lambda_normal_consistency=0.0)
+    ),
+}
+
+
+def config_from_dict(content: dict[str, Any]) -> FitConfig:
+    """The configuration that `dataclasses.asdict` was taken from."""
+    return _rebuild(FitConfig(), content)
+
+
+def _rebuild(default: Any, content: dict[str, Any]) -> Any:
+    values = {}
+    for item in fields(default):
+        value = getattr(default, item.name)
+        values[item.name] = _rebuild(value, content[item.name]) if is_dataclass(value) else content[item.name]
+    return type(default)(**values)

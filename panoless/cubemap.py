@@ -1,0 +1,132 @@
+"""The environment as a cubemap: lookup with its activation, the closed-form robust map, and the fill of gaps."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from panoless.config import EnvironmentConfig
+from panoless.kernels.cubemap import cubemap_directions, sample_cubemap, scatter_cubemap
+
+INITIAL_LOGIT = 5.0
+ROBUST_SCALES = (None, 0.15, 0.15, 0.08)
+CONJUGATE_GRADIENT_STEPS = 6
+CONFIDENT_WEIGHT = 1.0
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Observations of the environment: unit world directions and the linear radiance seen along them."""
+
+    directions: Float[Tensor, "P 3"]
+    radiance: Float[Tensor, "P 3"]
+
+
+def initial_environment(config: EnvironmentConfig, generator: torch.Generator) -> Float[Tensor, "6 3 L L"]:
+    """Gray radiance for `clamp`; logits uniform in ±5 for `sigmoid`."""
+    shape = (6, 3, config.resolution, config.resolution)
+    if config.activation == "sigmoid":
+        return (torch.rand(shape, generator=generator) * 2 - 1) * INITIAL_LOGIT
+    return torch.full(shape, 0.5)
+
+
+def look_up(
+    environment: Float[Tensor, "6 3 L L"], directions: Float[Tensor, "P 3"], activation: str
+) -> Float[Tensor, "P 3"]:
+    """Specular radiance: σ(E(ω)) for `sigmoid` (Eq. 7), E(ω) for `clamp`; bilinear and seamless."""
+    value = sample_cubemap(environment, directions)
+    return torch.sigmoid(value) if activation == "sigmoid" else value
+
+
+def solve_environment(rays: Sequence[Rays], resolution: int) -> Float[Tensor, "6 3 L L"]:
+    """Robust least squares of the map for fixed geometry: min_E Σ w ‖E(ω) − c‖², gaps filled smoothly.
+
+    Rounds of iteratively re-weighted least squares with Geman–McClure weights w = 1/(1 + ‖e‖²/s²)², so that pixels
+    which see the object itself or a wrong normal lose their vote. Each round starts from the weighted splat
+    Eᵀ(w c)/Eᵀ(w) and sharpens it by conjugate gradients on the normal equations.
+    """
+    weights = [torch.ones(len(batch.directions)) for batch in rays]
+    environment = torch.zeros(6, 3, resolution, resolution)
+    for scale in ROBUST_SCALES:
+        if scale is not None:
+            for batch, weight in zip(rays, weights, strict=True):
+                error = (sample_cubemap(environment, batch.directions) - batch.radiance).square().sum(1)
+                weight.copy_((1 + error / scale**2) ** -2)
+        total = _normal_product(torch.ones(6, 1, resolution, resolution), rays, weights)
+        right_side = _right_side(rays, weights, resolution)
+        splat = fill_unobserved(right_side / total.clamp(min=1e-9), total[:, 0])
+        environment = _sharpen(splat, right_side, total, rays, weights)
+    return environment.clamp(0, 1)
+
+
+def _right_side(rays: Sequence[Rays], weights: Sequence[Tensor], resolution: int) -> Float[Tensor, "6 3 L L"]:
+    result = torch.zeros(6, 3, resolution, resolution)
+    for batch, weight in zip(rays, weights, strict=True):
+        result += scatter_cubemap(batch.radiance * weight[:, None], batch.directions, resolution)
+    return result
+
+
+def _normal_product(
+    environment: Float[Tensor, "6 C L L"], rays: Sequence[Rays], weights: Sequence[Tensor]
+) -> Float[Tensor, "6 C L L"]:
+    """EᵀWE applied to a map: look up, weigh, scatter."""
+    result = torch.zeros_like(environment)
+    for batch, weight in zip(rays, weights, strict=True):
+        seen = sample_cubemap(environment, batch.directions) * weight[:, None]
+        result += scatter_cubemap(seen, batch.directions, environment.shape[-1])
+    return result
+
+
+def _sharpen(
+    start: Float[Tensor, "6 3 L L"],
+    right_side: Float[Tensor, "6 3 L L"],
+    total: Float[Tensor, "6 1 L L"],
+    rays: Sequence[Rays],
+    weights: Sequence[Tensor],
+) -> Float[Tensor, "6 3 L L"]:
+    """A few preconditioned conjugate-gradient steps; a unit-weight pull to the start keeps thin texels stable."""
+    precondition = 1 / (total + CONFIDENT_WEIGHT)
+    result = start.clone()
+    residual = right_side - _normal_product(start, rays, weights)
+    scaled = precondition * residual
+    direction = scaled.clone()
+    energy = (residual * scaled).sum()
+    for _ in range(CONJUGATE_GRADIENT_STEPS):
+        product = _normal_product(direction, rays, weights) + CONFIDENT_WEIGHT * direction
+        step = energy / (direction * product).sum().clamp(min=1e-12)
+        result += step * direction
+        residual -= step * product
+        scaled = precondition * residual
+        new_energy = (residual * scaled).sum()
+        direction = scaled + (new_energy / energy.clamp(min=1e-12)) * direction
+        energy = new_energy
+    return result
+
+
+def fill_unobserved(values: Float[Tensor, "6 C L L"], weight: Float[Tensor, "6 L L"]) -> Float[Tensor, "6 C L L"]:
+    """Push–pull (Gortler et al. 1996): average what is known to coarser levels, interpolate it back into gaps.
+
+    A texel whose weight is at least one keeps its value; below that it is blended with the coarser level.
+    """
+    confidence = weight.clamp(max=1)[:, None]
+    pyramid = [(values * confidence, confidence)]
+    while pyramid[-1][0].shape[-1] > 1:
+        color, known = (4 * avg_pool2d(level, 2, ceil_mode=True, count_include_pad=False) for level in pyramid[-1])
+        scale = 1 / known.clamp(min=1)
+        pyramid.append((color * scale, known * scale))
+    color, known = pyramid[-1]
+    everywhere = color.sum(0, keepdim=True) / known.sum(0, keepdim=True).clamp(min=1e-9)
+    filled = color + (1 - known) * everywhere
+    for color, known in reversed(pyramid[:-1]):
+        filled = color + (1 - known) * resample(filled, color.shape[-1])
+    return filled
+
+
+def resample(environment: Float[Tensor, "6 C L L"], resolution: int) -> Float[Tensor, "6 C M M"]:
+    """The map at the texel centers of another resolution, bilinear and seamless."""
+    directions = cubemap_directions(resolution).to(environment.dtype).reshape(-1, 3)
+    sampled = sample_cubemap(environment, directions)
+    return sampled.view(6, resolution, resolution, -1).permute(0, 3, 1, 2).contiguous()

@@ -1,0 +1,222 @@
+"""A finished fit → the prediction folder that the evaluator reads, pictures of the decomposition, and a PLY."""
+
+import os
+import platform
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from panoless import __version__
+from panoless.checkpoint import FitState
+from panoless.config import FitConfig
+from panoless.cubemap import look_up
+from panoless.fit import normalization_of
+from panoless.kernels.rasterize import RasterCamera
+from panoless.shading import ALPHA_FLOOR, compose, reflection_directions_world, surface_buffers
+from panoless.surfels import Surfels, rotation_matrices
+from panoless.views import Normalization, raster_camera, unit_rays_camera
+from panoless.visibility import visibility_from_evidence
+from shinypartial.color import to_display
+from shinypartial.dataset.schema import Dataset, View
+from shinypartial.files import whole_file
+from shinypartial.images import write_png
+from shinypartial.prediction import (
+    PredictionInfo,
+    dataset_hash,
+    write_environment_map,
+    write_info,
+    write_test_view,
+    write_visibility,
+)
+from shinypartial.progress import Progress
+from shinypartial.sphere import latlong_directions
+
+PLY_NAME = "surfels.ply"
+PICTURES = "pictures"
+SUPERSAMPLING = 2
+SH_DEGREE_0 = 0.28209479177387814
+
+
+@dataclass(frozen=True)
+class Decomposition:
+    """What a view is made of. Radiance and albedo are linear and premultiplied; normals are unit, world frame.
+
+    `depth` is camera z-depth in scene units; depth and normals are zero where alpha is below 0.001.
+    """
+
+    radiance: Float[Tensor, "3 H W"]
+    albedo: Float[Tensor, "3 H W"]
+    specular: Float[Tensor, "3 H W"]
+    alpha: Float[Tensor, "H W"]
+    normals_world: Float[Tensor, "3 H W"]
+    depth: Float[Tensor, "H W"]
+
+
+def render(
+    surfels: Surfels,
+    environment: Float[Tensor, "6 3 L L"],
+    camera: RasterCamera,
+    normalization: Normalization,
+    config: FitConfig,
+) -> Decomposition:
+    """Render one camera with the final environment (radiance, not logits)."""
+    with torch.no_grad():
+        buffers = surface_buffers(surfels, camera, curved=config.surfels.curved, depth_blend=config.loss.depth_blend)
+        rotation = camera.world_to_camera[:3, :3].T
+        pixels = torch.nonzero(buffers.alpha.flatten() > ALPHA_FLOOR)[:, 0]
+        normals_camera = buffers.raster_normals_camera.flatten(1)[:, pixels]
+        rays = unit_rays_camera(camera).flatten(1)[:, pixels]
+        directions = reflection_directions_world(normals_camera, rays, rotation)
+        specular = torch.zeros_like(buffers.albedo)
+        specular.flatten(1)[:, pixels] = look_up(environment, directions, "clamp").T
+        normals = torch.zeros_like(buffers.albedo)
+        normals.flatten(1)[:, pixels] = rotation @ normalize(normals_camera, dim=0, eps=1e-8)
+        return Decomposition(
+            radiance=compose(buffers.albedo, specular, buffers.alpha, config.alpha_applied),
+            albedo=buffers.albedo,
+            specular=specular,
+            alpha=buffers.alpha,
+            normals_world=normals,
+            depth=buffers.surface_depth * normalization.radius * (buffers.alpha > ALPHA_FLOOR),
+        )
+
+
+def export_prediction(dataset: Dataset, state: FitState, config: FitConfig, folder: Path) -> None:
+    """Write environment, visibility, test views, pictures, PLY and, last, prediction.json."""
+    if state.final_environment is None:
+        raise ValueError("only a finished fit can be exported")
+    environment = state.final_environment
+    visibility = visibility_from_evidence(state.evidence)
+    height = 2 * environment.shape[-1]
+    write_environment_map(folder, cube_to_latlong(environment, height))
+    write_visibility(folder, cube_to_latlong(visibility[:, None], height)[..., 0].clip(0, 1))
+    write_ply(folder / PLY_NAME, state.surfels, normalization_of(state))
+    _write_test_views(dataset, state, config, folder)
+    info = PredictionInfo(
+        method=f"panoless {__version__} ({config.preset})",
+        dataset=str(dataset.root.resolve()),
+        dataset_hash=dataset_hash(dataset),
+        config=asdict(config),
+        seconds={name: round(value, 3) for name, value in state.seconds.items()},
+        hardware={
+            "processor": _processor_name(),
+            "cores": os.cpu_count(),
+            "threads": torch.get_num_threads(),
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+        },
+        parameter_counts=_parameter_counts(state, config),
+        peak_memory_bytes=state.peak_memory_bytes,
+        curves=state.curves,
+    )
+    write_info(folder, info)
+
+
+def _write_test_views(dataset: Dataset, state: FitState, config: FitConfig, folder: Path) -> None:
+    normalization = normalization_of(state)
+    environment = state.final_environment
+    assert environment is not None
+    progress = Progress("exporting test views", len(dataset.test))
+    for index, frame in enumerate(dataset.test):
+        distance = np.linalg.norm(frame.camera.position_world - normalization.center) / normalization.radius
+        camera = raster_camera(frame.camera, normalization, 0.1 * float(distance))
+        parts = render(state.surfels, environment, camera, normalization, config)
+        view = View(
+            radiance=parts.radiance.permute(1, 2, 0).numpy(),
+            alpha=parts.alpha.numpy(),
+            normals_world=parts.normals_world.permute(1, 2, 0).numpy(),
+            depth=parts.depth.numpy(),
+            high_dynamic_range=True,
+        )
+        write_test_view(folder, frame, view)
+        if index == len(dataset.test) // 2:
+            _write_pictures(folder / PICTURES, parts)
+        progress.advance()
+
+
+def _write_pictures(folder: Path, parts: Decomposition) -> None:
+    """The decomposition of one test view: render, specular, albedo, normals, depth and alpha."""
+
+    def image(tensor: Tensor) -> np.ndarray:
+        return tensor.permute(1, 2, 0).contiguous().numpy()
+
+    covered = parts.alpha > 0.5
+    depth = parts.depth[covered]
+    near, far = (float(depth.min()), float(depth.max())) if len(depth) else (0.0, 1.0)
+    nearness = torch.where(covered, 1 - 0.9 * (parts.depth - near) / max(far - near, 1e-9), torch.zeros(()))
+    pictures = {
+        "1-render": to_display(image(parts.radiance)),
+        "2-specular": to_display(image(parts.specular * parts.alpha)),
+        "3-albedo": to_display(image(parts.albedo)),
+        "4-normals": np.rint((image(parts.normals_world) + 1) / 2 * 255 * image(covered[None].float())).astype(
+            np.uint8
+        ),
+        "5-depth-near-is-bright": np.rint(nearness.clamp(0, 1).numpy() * 255).astype(np.uint8),
+        "6-alpha": np.rint(parts.alpha.clamp(0, 1).numpy() * 255).astype(np.uint8),
+    }
+    for name, picture in pictures.items():
+        write_png(folder / f"{name}.png", picture)
+
+
+def cube_to_latlong(cube: Float[Tensor, "6 C L L"], height: int) -> Float[np.ndarray, "H 2H C"]:
+    """Area-averaged lat-long map of a cubemap: seamless lookups at 2×2 points a texel."""
+    fine = latlong_directions(height * SUPERSAMPLING).reshape(-1, 3)
+    values = look_up(cube, torch.from_numpy(fine).to(torch.float32), "clamp").numpy()
+    blocks = values.reshape(height, SUPERSAMPLING, 2 * height, SUPERSAMPLING, -1)
+    return blocks.mean((1, 3))
+
+
+def write_ply(path: Path, surfels: Surfels, normalization: Normalization) -> None:
+    """Write surfels in world units as binary PLY with the property names that Gaussian-splat viewers read.
+
+    Colors are degree-0 spherical harmonics of the albedo; curvature_a, _b, _c are the shape operator.
+    """
+    world = surfels.detached()
+    normals = rotation_matrices(world.quats)[:, :, 2]
+    columns = {
+        **_columns("xyz", world.means * normalization.radius + torch.from_numpy(normalization.center).float()),
+        **_columns(("nx", "ny", "nz"), normals),
+        **_columns(("f_dc_0", "f_dc_1", "f_dc_2"), (world.albedo - 0.5) / SH_DEGREE_0),
+        "opacity": world.opacity_logits.numpy(),
+        **_columns(("scale_0", "scale_1"), world.log_scales + float(np.log(normalization.radius))),
+        **_columns(("rot_0", "rot_1", "rot_2", "rot_3"), normalize(world.quats, dim=1)),
+        **_columns(("curvature_a", "curvature_b", "curvature_c"), world.curvatures / normalization.radius),
+    }
+    table = np.zeros(world.count, dtype=[(name, "<f4") for name in columns])
+    for name, column in columns.items():
+        table[name] = column
+    properties = "".join(f"property float {name}\n" for name in columns)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {world.count}\n{properties}end_header\n"
+    with whole_file(path) as temporary:
+        temporary.write_bytes(header.encode("ascii") + table.tobytes())
+
+
+def _columns(names: str | tuple[str, ...], matrix: Tensor) -> dict[str, np.ndarray]:
+    return {name: matrix[:, index].numpy() for index, name in enumerate(names)}
+
+
+def _parameter_counts(state: FitState, config: FitConfig) -> dict[str, int]:
+    """Numbers that the fit may choose, by what they belong to."""
+    per_surfel = 3 + 4 + 2 + 1
+    per_surfel += 3 * config.albedo + 3 * config.surfels.curved + config.loss.roughness_weighted
+    assert state.final_environment is not None
+    return {
+        "surfels": state.surfels.count,
+        "surfel parameters": per_surfel * state.surfels.count,
+        "environment parameters": state.final_environment.numel(),
+    }
+
+
+def _processor_name() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

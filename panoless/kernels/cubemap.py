@@ -1,0 +1,111 @@
+"""Cubemap lookup on the whole sphere, without seams, and what belongs to it.
+
+Faces are ordered (+X, −X, +Y, −Y, +Z, −Z) and oriented as OpenGL 4.6 table 8.19, in unswizzled world axes. A cubemap is
+stored as (face, channel, row, column): column i lies at s = 2(i + ½)/L − 1, row j at t = 2(j + ½)/L − 1.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from panoless.kernels.backend import Backend, choose_backend
+from panoless.kernels.reference import cubemap as reference
+
+
+def sample_cubemap(
+    cubemap: Float[Tensor, "6 C L L"], directions: Float[Tensor, "P 3"], *, backend: Backend = "auto"
+) -> Float[Tensor, "P C"]:
+    """Look up a cubemap in the given directions, bilinearly and continuously across edges and corners.
+
+    value = Σ_k w_k(s, t)·texel_k over the four texel centers around (s, t) = (s_c, t_c)/|m|, the central projection of
+    the direction to its dominant face (ties: x before y before z; table 8.19). A texel beyond the border of a face is
+    the texel straight across the edge; beyond a corner it is the mean of the three texels that meet there, so that
+    the value at the corner itself is that mean as well.
+
+    Directions are in world axes and need not be unit. A direction that is zero (every component below 1e-30) or not
+    finite looks nowhere: its value is zero and so are its gradients.
+
+    Gradients: to `cubemap`, which is `scatter_cubemap` of the cotangent (its summation order depends on the number of
+    threads only), and to `directions`, exact within a texel cell; on the lines between cells, where the derivative
+    jumps, one side's. The CPU kernel can be differentiated once.
+
+    Raises ValueError for wrong shapes, mixed dtypes or devices, or a backend that can't take these tensors.
+    Source: OpenGL 4.6 core profile, section 8.13; seams as in ARB_seamless_cube_map.
+    """
+    _check_cubemap(cubemap)
+    _check_directions(directions)
+    if choose_backend(backend, cubemap=cubemap, directions=directions) == "reference":
+        return reference.sample_cubemap(cubemap, directions)
+    from panoless.kernels.cpu.cubemap import SampleCubemap
+
+    return SampleCubemap.apply(cubemap, directions)
+
+
+@torch.no_grad()
+def scatter_cubemap(
+    values: Float[Tensor, "P C"],
+    directions: Float[Tensor, "P 3"],
+    resolution: int,
+    *,
+    backend: Backend = "auto",
+) -> Float[Tensor, "6 C L L"]:
+    """Add values to the texels that `sample_cubemap` would read, with the same weights: its adjoint.
+
+    ⟨sample_cubemap(E, d), w⟩ = ⟨E, scatter_cubemap(w, d, L)⟩ for every cubemap E of `resolution` L; so scattering ones
+    gives the total weight that a set of rays puts on each texel. Directions as in `sample_cubemap`; those that look
+    nowhere add nothing. The result carries no gradient.
+
+    Raises ValueError for wrong shapes, mixed dtypes or devices, or a backend that can't take these tensors.
+    """
+    _check_directions(directions)
+    _check_resolution(resolution)
+    if values.ndim != 2 or len(values) != len(directions):
+        raise ValueError(
+            f"expected values (P, C), one row for each of the {len(directions)} directions; "
+            f"found {tuple(values.shape)}."
+        )
+    if choose_backend(backend, values=values, directions=directions) == "reference":
+        return reference.scatter_cubemap(values, directions, resolution)
+    from panoless.kernels.cpu.cubemap import scatter_cubemap as scatter
+
+    return scatter(values, directions, resolution)
+
+
+def cubemap_directions(
+    resolution: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+) -> Float[Tensor, "6 L L 3"]:
+    """Unit world directions of all texel centers, as (face, row, column).
+
+    d ∝ m + s·e_s + t·e_t with the outward axis m and the directions e_s, e_t of growing s and t of each face.
+    Raises ValueError if `resolution` is not positive.
+    """
+    _check_resolution(resolution)
+    return reference.cubemap_directions(resolution, dtype, torch.device(device))
+
+
+def cubemap_solid_angles(
+    resolution: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+) -> Float[Tensor, "L L"]:
+    """Solid angle (sr) of every texel of a face; the same for all six, whose sum is 4π.
+
+    Ω = F(s₁, t₁) − F(s₀, t₁) − F(s₁, t₀) + F(s₀, t₀), with F(s, t) = atan2(s·t, √(s² + t² + 1)) at the texel's corners.
+    Computed in float64 and rounded to `dtype`. Raises ValueError if `resolution` is not positive.
+    """
+    _check_resolution(resolution)
+    return reference.cubemap_solid_angles(resolution, dtype, torch.device(device))
+
+
+def _check_cubemap(cubemap: Tensor) -> None:
+    shape = tuple(cubemap.shape)
+    if len(shape) != 4 or shape[0] != 6 or shape[2] != shape[3] or shape[2] < 1:
+        raise ValueError(f"expected a cubemap (6, C, L, L) of square faces; found {shape}.")
+
+
+def _check_directions(directions: Tensor) -> None:
+    if directions.ndim != 2 or directions.shape[1] != 3:
+        raise ValueError(f"expected directions (P, 3); found {tuple(directions.shape)}. Flatten image axes first.")
+
+
+def _check_resolution(resolution: int) -> None:
+    if resolution < 1:
+        raise ValueError(f"expected at least one texel along a face; found a resolution of {resolution}.")

@@ -1,0 +1,82 @@
+"""Adam over named parameters whose surfel rows can be edited during the fit."""
+
+from dataclasses import asdict
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from panoless.config import RateConfig
+from panoless.surfels import Surfels
+
+BETAS = (0.9, 0.99)
+EPSILON = 1e-12
+MOMENTS = ("exp_avg", "exp_avg_sq")
+ENVIRONMENT = "environment"
+
+
+class SurfelOptimizer:
+    """One parameter group a name, so that every quantity has its own rate."""
+
+    def __init__(self, surfels: Surfels, environment: Tensor, rates: RateConfig) -> None:
+        """Make leaves of all tensors; rates are looked up by the parameters' names."""
+        base = {"opacity_logits": rates.opacity_logits, **asdict(rates)}
+        named = {**surfels.named(), ENVIRONMENT: environment}
+        groups: list[dict[str, Any]] = [
+            {"params": [value.detach().clone().requires_grad_()], "lr": base[name], "name": name, "base": base[name]}
+            for name, value in named.items()
+        ]
+        self._adam = torch.optim.Adam(groups, betas=BETAS, eps=EPSILON, fused=True)
+
+    def _groups(self) -> dict[str, dict[str, Any]]:
+        return {group["name"]: group for group in self._adam.param_groups}
+
+    @property
+    def surfels(self) -> Surfels:
+        """The surfel parameters, leaves of the graph."""
+        return Surfels(**{name: group["params"][0] for name, group in self._groups().items() if name != ENVIRONMENT})
+
+    @property
+    def environment(self) -> Tensor:
+        """The environment parameters, a leaf of the graph."""
+        return self._groups()[ENVIRONMENT]["params"][0]
+
+    def step(self, factor: float, *, geometry: bool, frozen: frozenset[str]) -> None:
+        """One step with every rate times `factor`; without `geometry` only the environment moves."""
+        for name, group in self._groups().items():
+            group["lr"] = group["base"] * factor
+            if name in frozen or (name != ENVIRONMENT and not geometry):
+                group["params"][0].grad = None
+        self._adam.step()
+        self._adam.zero_grad(set_to_none=True)
+
+    def replace_environment(self, environment: Tensor) -> None:
+        """Set the environment's values and forget its moments."""
+        self._replace(ENVIRONMENT, environment, None)
+
+    def edit_surfels(self, surfels: Surfels, source: Tensor, keep_moments: Tensor) -> None:
+        """Take `surfels`; row i inherits the moments of old row `source[i]` where `keep_moments[i]`, else zeros."""
+        for name, value in surfels.named().items():
+            state = self._adam.state.get(self._groups()[name]["params"][0], {})
+            moments = {
+                key: state[key][source] * keep_moments.view(-1, *[1] * (value.dim() - 1)).to(value.dtype)
+                for key in MOMENTS
+                if key in state
+            }
+            self._replace(name, value, {"step": state["step"], **moments} if moments else None)
+
+    def _replace(self, name: str, value: Tensor, state: dict[str, Tensor] | None) -> None:
+        group = self._groups()[name]
+        self._adam.state.pop(group["params"][0], None)
+        leaf = value.detach().clone().requires_grad_()
+        group["params"] = [leaf]
+        if state:
+            self._adam.state[leaf] = state
+
+    def state_dict(self) -> dict[str, Any]:
+        """Moments and step counts, for a checkpoint."""
+        return self._adam.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` gave."""
+        self._adam.load_state_dict(state)

@@ -1,0 +1,51 @@
+"""When things happen during a fit: the only place that turns shares of the iterations into iteration numbers."""
+
+from dataclasses import dataclass
+
+from panoless.config import FitConfig
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Answers, for an iteration in [0, iterations), what acts in it."""
+
+    config: FitConfig
+
+    def _iteration(self, share: float) -> int:
+        return round(share * self.config.iterations)
+
+    def _due(self, iteration: int, share: float) -> bool:
+        period = max(self._iteration(share), 1)
+        return share > 0 and iteration > 0 and iteration % period == 0
+
+    def geometry_moves(self, iteration: int) -> bool:
+        """False while only the environment is warmed up."""
+        return iteration >= self._iteration(self.config.environment.warmup)
+
+    def rate_factor(self, iteration: int) -> float:
+        """1, and the drop factor after the drop."""
+        rates = self.config.rates
+        return rates.drop_factor if iteration >= self._iteration(rates.drop_at) else 1.0
+
+    def lambda_silhouette(self, iteration: int) -> float:
+        """The weight of Eq. 13, zero when its time is over ([t < 3000] in Eq. 14)."""
+        loss = self.config.loss
+        return loss.lambda_silhouette if iteration < self._iteration(loss.silhouette_until) else 0.0
+
+    def _density_active(self, iteration: int) -> bool:
+        density = self.config.density
+        begun = iteration >= self._iteration(density.start)
+        return density.enabled and begun and iteration < self._iteration(density.stop)
+
+    def density_round(self, iteration: int) -> bool:
+        """Whether surfels are cloned, split and pruned after this iteration."""
+        return self._density_active(iteration) and self._due(iteration, self.config.density.every)
+
+    def opacity_reset(self, iteration: int) -> bool:
+        """Whether opacities are reset after this iteration."""
+        return self._density_active(iteration) and self._due(iteration, self.config.density.reset_every)
+
+    def propagation(self, iteration: int) -> bool:
+        """Whether normals are propagated after this iteration; an opacity reset has precedence."""
+        due = self._density_active(iteration) and self._due(iteration, self.config.density.propagate_every)
+        return due and not self.opacity_reset(iteration)

@@ -1,0 +1,175 @@
+"""Dataset folder → training views: cropped tensors with cameras in a normalized frame."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from panoless.kernels.rasterize import RasterCamera
+from shinypartial.camera import Camera
+from shinypartial.conventions import PIXEL_CENTER, SOLID_ALPHA
+from shinypartial.dataset.read import read_view
+from shinypartial.dataset.schema import Dataset, Frame
+from shinypartial.errors import InputError
+from shinypartial.progress import Progress
+
+
+@dataclass(frozen=True)
+class Normalization:
+    """x_normalized = (x_world − center)/radius, so that the object lies in the unit ball."""
+
+    center: Float[np.ndarray, "3"]
+    radius: float
+
+
+@dataclass(frozen=True)
+class TrainView:
+    """One cropped training view. Radiance is linear, premultiplied, clipped to [0, 1]; rays are unit, camera frame."""
+
+    camera: RasterCamera
+    radiance: Float[Tensor, "3 H W"]
+    mask: Float[Tensor, "H W"]
+    rays_camera: Float[Tensor, "3 H W"]
+    solid: Float[Tensor, "P"] | Tensor
+    """Flat indices of the pixels that lie wholly on the object."""
+
+    @property
+    def camera_to_world_rotation(self) -> Float[Tensor, "3 3"]:
+        """Rotates camera directions into the world: R of the pose."""
+        return self.camera.world_to_camera[:3, :3].T
+
+
+@dataclass(frozen=True)
+class Views:
+    """All training views of a dataset and the frame they live in."""
+
+    train: tuple[TrainView, ...]
+    normalization: Normalization
+    near: float
+    """Near plane in normalized units: a tenth of the smallest camera distance."""
+
+
+def load_views(dataset: Dataset, crop_margin_px: int) -> Views:
+    """Read the training split; raises InputError for unreadable images and for masks that are all empty."""
+    progress = Progress("reading views", len(dataset.train))
+    loaded: list[tuple[Frame, np.ndarray, np.ndarray]] = []
+    for frame in dataset.train:
+        view = read_view(frame)
+        if not (view.alpha >= 0.5).any():
+            raise InputError(
+                expected=f"the object in {frame.name}: some mask pixel of at least one half",
+                found="an empty mask",
+                remedy="Correct the mask, or remove the frame from transforms_train.json.",
+            )
+        loaded.append((frame, np.clip(view.radiance, 0, 1), np.clip(view.alpha, 0, 1)))
+        progress.advance()
+    normalization = estimate_normalization([(frame.camera, alpha) for frame, _, alpha in loaded])
+    distances = [
+        np.linalg.norm(frame.camera.position_world - normalization.center) / normalization.radius
+        for frame, _, _ in loaded
+    ]
+    near = 0.1 * float(min(distances))
+    views = tuple(
+        _make_view(frame.camera, radiance, alpha, normalization, near, crop_margin_px)
+        for frame, radiance, alpha in loaded
+    )
+    return Views(views, normalization, near)
+
+
+def raster_camera(camera: Camera, normalization: Normalization, near: float) -> RasterCamera:
+    """Camera of the rasterizer in the normalized frame."""
+    pose = camera.camera_to_world.copy()
+    pose[:3, 3] = (pose[:3, 3] - normalization.center) / normalization.radius
+    world_to_camera = torch.from_numpy(np.linalg.inv(pose)).to(torch.float32)
+    return RasterCamera(
+        world_to_camera, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, near, 500 * near
+    )
+
+
+def unit_rays_camera(camera: RasterCamera) -> Float[Tensor, "3 H W"]:
+    """Unit ray directions in the camera frame through pixel centers."""
+    x = (torch.arange(camera.width) + PIXEL_CENTER - camera.cx) / camera.fx
+    y = (torch.arange(camera.height) + PIXEL_CENTER - camera.cy) / camera.fy
+    grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
+    rays = torch.stack([grid_x, grid_y, torch.ones_like(grid_x)])
+    return torch.nn.functional.normalize(rays, dim=0)
+
+
+def _make_view(
+    camera: Camera,
+    radiance: Float[np.ndarray, "H W 3"],
+    alpha: Float[np.ndarray, "H W"],
+    normalization: Normalization,
+    near: float,
+    crop_margin_px: int,
+) -> TrainView:
+    if crop_margin_px >= 0:
+        rows, columns = np.nonzero(alpha > 0)
+        top, left = max(rows.min() - crop_margin_px, 0), max(columns.min() - crop_margin_px, 0)
+        bottom = min(rows.max() + 1 + crop_margin_px, camera.height)
+        right = min(columns.max() + 1 + crop_margin_px, camera.width)
+        radiance, alpha = radiance[top:bottom, left:right], alpha[top:bottom, left:right]
+        camera = Camera(
+            camera.camera_to_world,
+            camera.fx,
+            camera.fy,
+            camera.cx - left,
+            camera.cy - top,
+            int(right - left),
+            int(bottom - top),
+        )
+    raster = raster_camera(camera, normalization, near)
+    mask = torch.from_numpy(np.ascontiguousarray(alpha, dtype=np.float32))
+    return TrainView(
+        camera=raster,
+        radiance=torch.from_numpy(np.ascontiguousarray(radiance.transpose(2, 0, 1), dtype=np.float32)),
+        mask=mask,
+        rays_camera=unit_rays_camera(raster),
+        solid=torch.nonzero(mask.flatten() > SOLID_ALPHA)[:, 0],
+    )
+
+
+def estimate_normalization(masks: list[tuple[Camera, Float[np.ndarray, "H W"]]]) -> Normalization:
+    """Center and radius of the object from where the masks lie in the views.
+
+    The center is the point nearest, in least squares, to the rays through the masks' centers; the radius is the
+    median over views of (largest distance of a mask pixel from the projected center) · depth / focal length, with
+    a tenth to spare. Raises InputError when all cameras look along one line, which leaves the depth open.
+    """
+    normal_matrix, right_side = np.zeros((3, 3)), np.zeros(3)
+    for camera, alpha in masks:
+        rows, columns = np.nonzero(alpha >= 0.5)
+        x = (columns.min() + columns.max() + 1) / 2
+        y = (rows.min() + rows.max() + 1) / 2
+        ray = camera.camera_to_world[:3, :3] @ np.array([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0])
+        ray /= np.linalg.norm(ray)
+        across = np.eye(3) - np.outer(ray, ray)
+        normal_matrix += across
+        right_side += across @ camera.position_world
+    if np.linalg.eigvalsh(normal_matrix)[0] < 1e-4 * len(masks):
+        raise InputError(
+            expected="cameras that see the object from different directions",
+            found="views along a single line",
+            remedy="Add views from the sides; an arc of at least 30° is best.",
+        )
+    center = np.linalg.solve(normal_matrix, right_side)
+    radii = [_mask_radius(camera, alpha, center) for camera, alpha in masks]
+    return Normalization(center, 1.1 * float(np.median(radii)))
+
+
+def _mask_radius(camera: Camera, alpha: Float[np.ndarray, "H W"], center: Float[np.ndarray, "3"]) -> float:
+    rows, columns = np.nonzero(alpha >= 0.5)
+    in_camera = camera.camera_to_world[:3, :3].T @ (center - camera.position_world)
+    if in_camera[2] <= 0:
+        raise InputError(
+            expected="cameras that look at one object",
+            found="an object center behind one of the cameras",
+            remedy="Check the axes of transform_matrix: OpenGL, the camera looks along −z.",
+        )
+    x = in_camera[0] / in_camera[2] * camera.fx + camera.cx
+    y = in_camera[1] / in_camera[2] * camera.fy + camera.cy
+    across = np.hypot((columns + 0.5 - x) / camera.fx, (rows + 0.5 - y) / camera.fy).max()
+    return float(np.linalg.norm(in_camera) * math.sin(math.atan(across)))

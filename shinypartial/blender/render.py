@@ -1,0 +1,102 @@
+"""Render views of an assembled scene and hand back their passes as arrays."""
+
+import contextlib
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from shinypartial.blender.assemble import DEPTH_PASS, assemble
+from shinypartial.blender.runtime import import_blender, quiet
+from shinypartial.camera import Camera, opencv_to_opengl
+from shinypartial.errors import InputError
+from shinypartial.scene import SceneSpec
+
+
+@dataclass(frozen=True)
+class RenderedView:
+    """What Blender knows about one view, averaged over the area of each pixel.
+
+    `radiance` is linear and premultiplied by `alpha`; `normals_world` are unit vectors that face the camera where
+    alpha > 0 and zero elsewhere; `depth` is z along the optical axis in scene units, zero where alpha is zero.
+    """
+
+    radiance: Float[np.ndarray, "H W 3"]
+    alpha: Float[np.ndarray, "H W"]
+    normals_world: Float[np.ndarray, "H W 3"]
+    depth: Float[np.ndarray, "H W"]
+
+
+@dataclass(frozen=True)
+class Renderer:
+    """An assembled scene; Blender holds one at a time in a process."""
+
+    bpy: Any
+    scratch: Path
+    device: str
+    blender_version: str
+
+    def render(self, camera: Camera) -> RenderedView:
+        """Render one view from a camera with the recipe's lens and resolution."""
+        scene, path = self.bpy.context.scene, self.scratch / "view.exr"
+        scene.camera.matrix_world = opencv_to_opengl(camera.camera_to_world).T.tolist()
+        scene.render.filepath = str(path)
+        try:
+            with quiet():
+                self.bpy.ops.render.render(write_still=True)
+        except RuntimeError as error:
+            raise InputError(
+                expected=f"Blender to render a view and to write it to {self.scratch}",
+                found=" ".join(str(error).split()),
+                remedy="Free space there or set TMPDIR to another folder, then run the same command again.",
+            ) from None
+        return _from_passes(_read_passes(path))
+
+
+@contextlib.contextmanager
+def open_renderer(spec: SceneSpec) -> Iterator[Renderer]:
+    """Assemble the scene; its passes go through a temporary folder that is removed at the end."""
+    bpy = import_blender()
+    with tempfile.TemporaryDirectory(prefix="shinypartial-") as scratch:
+        with quiet():
+            device = assemble(bpy, spec)
+        yield Renderer(bpy, Path(scratch), device, bpy.app.version_string)
+
+
+def _read_passes(path: Path) -> dict[str, Float[np.ndarray, "H W"]]:
+    """Every channel of every part, by the name that follows the view layer's."""
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            return {
+                name.partition(".")[2]: channel.pixels.astype(np.float32)
+                for part in file.parts
+                for name, channel in part.channels.items()
+            }
+    except Exception as error:
+        raise InputError(
+            expected=f"Blender's passes in {path}",
+            found=f"a file that can't be read ({str(error).strip()})",
+            remedy="Free space there or set TMPDIR to another folder, then run the same command again.",
+        ) from None
+
+
+def _from_passes(passes: dict[str, Float[np.ndarray, "H W"]]) -> RenderedView:
+    """Normals and depth are averages over the pixel, zero where it misses: divide by alpha, or renormalize."""
+    alpha = np.clip(passes["Combined.A"], 0, 1)
+    inside = alpha > 0
+    radiance = np.stack([passes[f"Combined.{name}"] for name in "RGB"], -1)
+    normals = np.stack([passes[f"Normal.{name}"] for name in "XYZ"], -1)
+    length = np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), np.finfo(np.float32).tiny)
+    depth = passes[f"{DEPTH_PASS}.X"] / np.where(inside, alpha, 1)
+    return RenderedView(
+        np.where(inside[..., None], radiance, 0),
+        alpha,
+        np.where(inside[..., None], normals / length, 0),
+        np.where(inside, depth, 0),
+    )

@@ -1,0 +1,102 @@
+"""Getting at Blender: a clear refusal where it can't run, a quiet terminal, the fastest device."""
+
+import contextlib
+import ctypes
+import importlib
+import importlib.util
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from shinypartial.errors import InputError
+
+PYTHON_OF_BPY = (3, 11)
+INSTALL = "pip install 'panoless[blender]'"
+GPU_KINDS = ("OPTIX", "CUDA", "HIP", "METAL", "ONEAPI")
+
+
+def check_blender() -> None:
+    """Raise InputError unless this Python can import bpy; imports nothing."""
+    version = sys.version_info[:2]
+    if importlib.util.find_spec("bpy") is None:
+        if version != PYTHON_OF_BPY:
+            raise InputError(
+                expected=f"Python {PYTHON_OF_BPY[0]}.{PYTHON_OF_BPY[1]} to render with Blender as a module",
+                found=f"Python {version[0]}.{version[1]}, for which there is no such module",
+                remedy=f"Make an environment with Python 3.11 and run: {INSTALL}",
+            )
+        raise InputError(
+            expected="Blender as a Python module (bpy) to render with",
+            found="no module named bpy",
+            remedy=f"Install it: {INSTALL}",
+        )
+
+
+def import_blender() -> Any:
+    """The module bpy; raises InputError where it is missing or can't be loaded."""
+    check_blender()
+    try:
+        with quiet():
+            return importlib.import_module("bpy")
+    except ImportError as error:
+        raise InputError(
+            expected="Blender as a Python module (bpy) that loads",
+            found=str(error),
+            remedy=f"Install what it names, or install bpy again: {INSTALL}",
+        ) from None
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[BinaryIO]:
+    """Send everything that is written to the terminal, by C code too, to a temporary file that is yielded."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as log:
+        saved = {stream: os.dup(stream) for stream in (1, 2)}
+        try:
+            for stream in saved:
+                os.dup2(log.fileno(), stream)
+            yield log
+        finally:
+            _flush_c_streams()
+            for stream, copy in saved.items():
+                os.dup2(copy, stream)
+                os.close(copy)
+
+
+def _flush_c_streams() -> None:
+    """What C code has printed but not yet written would appear after the terminal is back."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    if os.name == "posix":
+        ctypes.CDLL(None).fflush(None)
+
+
+def choose_device(bpy: Any) -> str:
+    """Enable every GPU of the first kind that Cycles finds and return that kind, or CPU."""
+    bpy.context.scene.cycles.device = "CPU"
+    preferences = bpy.context.preferences.addons["cycles"].preferences
+    for kind in GPU_KINDS:
+        try:
+            preferences.compute_device_type = kind
+        except TypeError:  # This build of Blender doesn't know the kind.
+            continue
+        preferences.get_devices()
+        found = [device for device in preferences.devices if device.type == kind]
+        for device in preferences.devices:
+            device.use = device in found
+        if found:
+            bpy.context.scene.cycles.device = "GPU"
+            return kind
+    preferences.compute_device_type = "NONE"
+    return "CPU"
+
+
+def studio_light(name: str) -> Path:
+    """The file of one of Blender's environment maps."""
+    check_blender()
+    bpy = import_blender()
+    return Path(bpy.utils.resource_path("LOCAL")) / "datafiles" / "studiolights" / "world" / f"{name}.exr"

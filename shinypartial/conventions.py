@@ -1,0 +1,31 @@
+"""The constitution: frames, axes, face order and pixel centres that every room imports.
+
+World: right-handed, +Z up, scene units. Camera in memory: OpenCV axes (+x right, +y down, +z forward).
+Camera in `transforms.json`: OpenGL/Blender axes (+x right, +y up, −z forward). Pixel (0, 0) spans [0, 1]², so its
+centre lies at 0.5. Rays point from the camera to the surface. Lat-long maps have shape (H, 2H, 3), row 0 looks
+along +Z and the image center along +X. Cubemap faces follow FACES with the orientation of OpenGL 4.6 table 8.19.
+"""
+
+import numpy as np
+
+FACES = ("px", "nx", "py", "ny", "pz", "nz")
+PIXEL_CENTER = 0.5
+
+#: Multiplies the columns of a camera-to-world matrix: OpenGL axes ⇄ OpenCV axes (its own inverse).
+OPENGL_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+#: For each face, the world-axis coefficients of (sc, tc, ma): direction = ma + s·sc + t·tc (OpenGL 4.6, table 8.19).
+FACE_AXES = np.array(
+    [
+        [[0, 0, -1], [0, -1, 0], [1, 0, 0]],
+        [[0, 0, 1], [0, -1, 0], [-1, 0, 0]],
+        [[1, 0, 0], [0, 0, 1], [0, 1, 0]],
+        [[1, 0, 0], [0, 0, -1], [0, -1, 0]],
+        [[1, 0, 0], [0, -1, 0], [0, 0, 1]],
+        [[-1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    ],
+    dtype=np.float64,
+)
+
+#: Alpha above which a pixel counts as lying wholly on the object: its normal and color are not mixed with another.
+SOLID_ALPHA = 0.99

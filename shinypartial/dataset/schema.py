@@ -1,0 +1,92 @@
+"""Names and types of the dataset folder: the only place where its layout is spelled out."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from shinypartial.camera import Camera
+
+FORMAT = "shinypartial-dataset"
+FORMAT_VERSION = 1
+MANIFEST = "dataset.json"
+CHECKSUMS = "SHA256SUMS"
+LICENSES = "LICENSES.json"
+SPLITS = ("train", "test")
+COLOR_CHANNELS = ("R", "G", "B", "A")
+NORMAL_CHANNELS = ("normal.X", "normal.Y", "normal.Z")
+DEPTH_CHANNEL = "depth.Z"
+ENVIRONMENT_LATLONG = Path("environment/latlong.exr")
+ENVIRONMENT_LATLONG_Y_UP = Path("environment/latlong_yup.exr")
+ENVIRONMENT_CUBE = Path("environment/cube")
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph with what is known about it.
+
+    `radiance` is linear and premultiplied by alpha; `normals_world` are unit where the object is and zero elsewhere;
+    `depth` is camera z-depth in scene units, zero where the object is not. `None`: the dataset doesn't hold it.
+    `high_dynamic_range` tells whether radiance came from EXR (unbounded) or from 8-bit PNG (in [0, 1]).
+    """
+
+    radiance: Float[np.ndarray, "H W 3"]
+    alpha: Float[np.ndarray, "H W"]
+    normals_world: Float[np.ndarray, "H W 3"] | None
+    depth: Float[np.ndarray, "H W"] | None
+    high_dynamic_range: bool
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A named camera of a split; `stem` is the image path without extension or suffix."""
+
+    name: str
+    camera: Camera
+    stem: Path
+
+    @property
+    def exr(self) -> Path:
+        """Linear RGBA, normals and depth: the ground truth proper."""
+        return self.stem.with_name(self.stem.name + ".exr")
+
+    @property
+    def png(self) -> Path:
+        """RGBA, straight alpha, sRGB of linear light clipped to [0, 1]."""
+        return self.stem.with_name(self.stem.name + ".png")
+
+    @property
+    def alpha_png(self) -> Path:
+        """8-bit alpha."""
+        return self.stem.with_name(self.stem.name + "_alpha.png")
+
+    @property
+    def normal_png(self) -> Path:
+        """World normals as round((n + 1)/2 · 255)."""
+        return self.stem.with_name(self.stem.name + "_normal.png")
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Every file of the frame; the EXR is written last, so its presence means that the frame is complete."""
+        return (self.png, self.alpha_png, self.normal_png, self.exr)
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """An opened dataset folder; `manifest` is empty for a plain NeRF-synthetic folder."""
+
+    root: Path
+    manifest: dict[str, Any]
+    train: tuple[Frame, ...]
+    test: tuple[Frame, ...]
+
+    @property
+    def name(self) -> str:
+        """Folder name, used to name runs and predictions."""
+        return self.root.resolve().name
+
+    def split(self, split: str) -> tuple[Frame, ...]:
+        """Frames of `train` or `test`."""
+        return self.train if split == "train" else self.test

@@ -1,0 +1,256 @@
+"""Check every promise of the dataset format and name each one that a folder breaks."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from shinypartial.camera import Camera, check_pose, opengl_to_opencv
+from shinypartial.conventions import FACES
+from shinypartial.dataset.breaks import REMAKE, Break, break_of
+from shinypartial.dataset.schema import (
+    CHECKSUMS,
+    ENVIRONMENT_CUBE,
+    ENVIRONMENT_LATLONG,
+    ENVIRONMENT_LATLONG_Y_UP,
+    FORMAT,
+    FORMAT_VERSION,
+    LICENSES,
+    MANIFEST,
+    SPLITS,
+    Frame,
+)
+from shinypartial.dataset.validate_frame import check_frame
+from shinypartial.dataset.write import latlong_to_y_up
+from shinypartial.errors import InputError
+from shinypartial.files import read_json, sha256_of
+from shinypartial.images import has_envmap_tag, read_exr_rgb
+from shinypartial.progress import Progress
+from shinypartial.sphere import latlong_to_cube
+
+RESTORE = "Restore the file from the released dataset, or generate the dataset again."
+CONTINUE = "Run the `shinypartial generate` that began the folder again: it continues where it stopped."
+ANGLE_TOLERANCE_RAD = 1e-6
+#: The lat-long and the cube are each rounded to half precision (relative 5e-4).
+RADIANCE_TOLERANCE = 2e-3
+
+
+def validate(root: Path, progress: bool = False) -> list[Break]:
+    """Every promise that the folder breaks, warnings last; empty when it keeps them all.
+
+    Raises InputError when there is no such folder.
+    """
+    if not root.is_dir():
+        raise InputError(
+            expected=f"a dataset folder at {root}",
+            found="a file" if root.exists() else "nothing there",
+            remedy="Check the path, or make one: `shinypartial generate --scene vase`.",
+        )
+    manifest, breaks = _check_manifest(root)
+    frames = []
+    for split in SPLITS:
+        found, problems = _check_transforms(root, split, manifest)
+        frames += found
+        breaks += problems
+    counter = Progress("Validating", len(frames)) if progress and frames else None
+    for frame in frames:
+        breaks += check_frame(root, frame)
+        if counter:
+            counter.advance()
+    breaks += [*_check_environment(root), *_check_licenses(root), *_check_checksums(root)]
+    return sorted(breaks, key=lambda each: each.warning)
+
+
+def _check_manifest(root: Path) -> tuple[dict[str, Any], list[Break]]:
+    try:
+        manifest = read_json(root / MANIFEST, "the manifest")
+    except InputError as error:
+        return {}, [break_of(MANIFEST, error, RESTORE)]
+    if not isinstance(manifest, dict):
+        return {}, [Break(MANIFEST, "expected a table at the top", RESTORE)]
+    breaks = []
+    if (manifest.get("format"), manifest.get("format_version")) != (FORMAT, FORMAT_VERSION):
+        found = f"{manifest.get('format')} version {manifest.get('format_version')}"
+        breaks.append(Break(MANIFEST, f"expected {FORMAT} version {FORMAT_VERSION}, found {found}", RESTORE))
+    if manifest.get("complete") is not True:
+        breaks.append(Break(MANIFEST, "the dataset is not complete", CONTINUE))
+    for key in ("recipe", "generator"):
+        if not isinstance(manifest.get(key), dict) or not manifest[key]:
+            breaks.append(Break(MANIFEST, f"`{key}` is missing: how the dataset was made", RESTORE))
+            manifest[key] = {}
+    if not isinstance(manifest.get("statistics", {}), dict):
+        breaks.append(Break(MANIFEST, "`statistics` is not a table", RESTORE))
+        manifest["statistics"] = {}
+    return manifest, breaks
+
+
+def _check_transforms(root: Path, split: str, manifest: dict[str, Any]) -> tuple[list[Frame], list[Break]]:
+    """The frames whose camera can be read, and what is wrong with the file."""
+    file = f"transforms_{split}.json"
+    try:
+        content = read_json(root / file, f"the cameras of the {split} split")
+    except InputError as error:
+        return [], [break_of(file, error, RESTORE)]
+    entries = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(entries, list) or not entries:
+        return [], [Break(file, "`frames` is not a list with at least one frame", RESTORE)]
+    problems = list(_intrinsics_problems(content))
+    if problems:  # Without intrinsics the images can't be judged.
+        return [], [Break(file, problem, RESTORE) for problem in problems]
+    frames = []
+    for i, entry in enumerate(entries):
+        problem = _entry_problem(entry, split)
+        if problem:
+            problems.append(f"frame {i}: {problem}")
+        else:
+            frames.append(_make_frame(root, entry, content))
+    names = [frame.name for frame in frames]
+    problems += [f"{name} is listed twice" for name in sorted({name for name in names if names.count(name) > 1})]
+    count = manifest.get("statistics", {}).get(split, len(entries))
+    if count != len(entries):
+        problems.append(f"expected {count} frames as {MANIFEST} says, found {len(entries)}")
+    problems += _hemisphere_problems(frames, manifest.get("recipe", {}))
+    return frames, [Break(file, problem, RESTORE) for problem in problems]
+
+
+def _intrinsics_problems(content: dict[str, Any]) -> Iterator[str]:
+    for key in ("camera_angle_x", "fl_x", "fl_y", "cx", "cy", "w", "h"):
+        value = content.get(key)
+        number = isinstance(value, int if key in "wh" else int | float) and not isinstance(value, bool)
+        if value is None or not number or not 0 < value < math.inf:
+            yield f"expected `{key}` to be a positive {'whole ' if key in 'wh' else ''}number, found {value!r}"
+            return
+    angle = 2 * math.atan(content["w"] / (2 * content["fl_x"]))
+    if abs(angle - content["camera_angle_x"]) > ANGLE_TOLERANCE_RAD:
+        yield f"camera_angle_x is {content['camera_angle_x']}, but w and fl_x make it {angle}"
+    if content["cx"] >= content["w"] or content["cy"] >= content["h"]:
+        yield "the principal point (cx, cy) lies outside the picture"
+
+
+def _entry_problem(entry: Any, split: str) -> str | None:
+    name = entry.get("file_path") if isinstance(entry, dict) else None
+    if not isinstance(name, str):
+        return f"expected `file_path` to be a text, found {name!r}"
+    path = PurePosixPath(name)
+    if path.suffix or path.parent != PurePosixPath(split):
+        return f"expected `file_path` to be ./{split}/NAME without extension, found {name}"
+    try:
+        check_pose(np.array(entry.get("transform_matrix"), dtype=np.float64), name)
+    except (TypeError, ValueError):
+        return "`transform_matrix` is not a 4×4 matrix of numbers"
+    except InputError as error:
+        return f"expected {error.expected}, found {error.found}"
+    return None
+
+
+def _make_frame(root: Path, entry: dict[str, Any], content: dict[str, Any]) -> Frame:
+    pose = opengl_to_opencv(np.array(entry["transform_matrix"], dtype=np.float64))
+    camera = Camera(pose, *(content[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")))
+    path = PurePosixPath(entry["file_path"])
+    return Frame(path.as_posix(), camera, root / path)
+
+
+def _hemisphere_problems(frames: list[Frame], recipe: dict[str, Any]) -> Iterator[str]:
+    """Cameras must lie on one side of the target: that of the recipe's axis, or of their mean direction."""
+    if not frames:
+        return
+    camera = recipe.get("camera")
+    target = camera.get("target", (0, 0, 0)) if isinstance(camera, dict) else (0, 0, 0)
+    offsets = np.stack([frame.camera.position_world for frame in frames]) - _vector(target)
+    axis = _vector(recipe.get("hemisphere_axis", offsets.mean(0)))
+    for frame, height in zip(frames, offsets @ axis, strict=True):
+        if not height > 0:
+            yield f"the camera of {frame.name} lies outside the hemisphere that the recipe promises"
+
+
+def _vector(values: Any) -> Float[np.ndarray, "3"]:
+    """Three numbers, or NaN, which no check passes, for anything else."""
+    try:
+        vector = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        return np.full(3, np.nan)
+    return vector if vector.shape == (3,) else np.full(3, np.nan)
+
+
+def _check_environment(root: Path) -> Iterator[Break]:
+    file = ENVIRONMENT_LATLONG.as_posix()
+    try:
+        latlong = read_exr_rgb(root / ENVIRONMENT_LATLONG)
+    except InputError as error:
+        yield break_of(file, error)
+        return
+    height, width = latlong.shape[:2]
+    if width != 2 * height or not np.isfinite(latlong).all() or latlong.min() < 0:
+        yield Break(file, f"expected a finite map ≥ 0, twice as wide as high, found {width}×{height}", REMAKE)
+        return
+    faces = [ENVIRONMENT_CUBE / f"{name}.exr" for name in FACES]
+    maps: dict[Path, Float[np.ndarray, "H W 3"]] = {}
+    for path in (*faces, ENVIRONMENT_LATLONG_Y_UP):
+        try:
+            maps[path] = read_exr_rgb(root / path)
+        except InputError as error:
+            yield break_of(path.as_posix(), error)
+    for path in (ENVIRONMENT_LATLONG, *maps):
+        expected = path == ENVIRONMENT_LATLONG_Y_UP
+        if has_envmap_tag(root / path) != expected:
+            problem = f"the EXR attribute `envmap`, which means +Y up, is {'missing' if expected else 'set'}"
+            yield Break(path.as_posix(), problem, REMAKE)
+    yield from _check_resampled(latlong, maps, faces)
+
+
+def _check_resampled(
+    latlong: Float[np.ndarray, "H W 3"], maps: dict[Path, Float[np.ndarray, "H W 3"]], faces: list[Path]
+) -> Iterator[Break]:
+    """Cube and Y-up map must be what the lat-long map gives when it is resampled."""
+    present = [path for path in faces if path in maps]
+    resolution = maps[present[0]].shape[0] if present else 0
+    cube = latlong_to_cube(latlong, resolution) if resolution else ()
+    expected = dict(zip(faces, cube, strict=False)) | {ENVIRONMENT_LATLONG_Y_UP: latlong_to_y_up(latlong)}
+    for path, found in maps.items():
+        truth = expected[path]
+        if found.shape != truth.shape:
+            problem = f"expected {truth.shape[1]}×{truth.shape[0]} texels, found {found.shape[1]}×{found.shape[0]}"
+            yield Break(path.as_posix(), problem, REMAKE)
+        elif not np.allclose(found, truth, rtol=RADIANCE_TOLERANCE, atol=1e-6):
+            wrong = int((~np.isclose(found, truth, rtol=RADIANCE_TOLERANCE, atol=1e-6)).any(-1).sum())
+            yield Break(path.as_posix(), f"{wrong} texels differ from {ENVIRONMENT_LATLONG.as_posix()}", REMAKE)
+
+
+def _check_licenses(root: Path) -> Iterator[Break]:
+    try:
+        rows = read_json(root / LICENSES, "the licenses")
+    except InputError as error:
+        yield break_of(LICENSES, error, RESTORE)
+        return
+    if not isinstance(rows, list) or not rows:
+        yield Break(LICENSES, "expected a list with a row for each asset", RESTORE)
+        return
+    for i, row in enumerate(rows):
+        texts = [row.get(key) if isinstance(row, dict) else None for key in ("license", "source")]
+        if not all(isinstance(text, str) and text.strip() for text in texts):
+            yield Break(LICENSES, f"row {i} does not name a license and a source", "Add what is missing.")
+
+
+def _check_checksums(root: Path) -> Iterator[Break]:
+    listing = root / CHECKSUMS
+    if not listing.is_file():
+        yield Break(CHECKSUMS, "the list of checksums is missing", CONTINUE)
+        return
+    listed: dict[str, str] = {}
+    for number, line in enumerate(listing.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        digest, separator, name = line.partition("  ")
+        if len(digest) != 64 or not separator or not name:
+            yield Break(CHECKSUMS, f"line {number} is not `SHA-256  FILE`", RESTORE)
+        else:
+            listed[name] = digest
+    present = {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()} - {CHECKSUMS}
+    for name in sorted(present - listed.keys()):
+        yield Break(name, f"the file is not listed in {CHECKSUMS}", "Delete it if it doesn't belong to the dataset.")
+    for name in sorted(listed.keys() - present):
+        yield Break(name, f"the file is listed in {CHECKSUMS} but missing", REMAKE)
+    for name in sorted(listed.keys() & present):
+        if sha256_of(root / name) != listed[name]:
+            yield Break(name, f"the content has changed since {CHECKSUMS} was written", REMAKE)

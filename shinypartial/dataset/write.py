@@ -1,0 +1,159 @@
+"""Write a dataset folder frame by frame; what is there already is kept, so a killed run continues."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from shinypartial.camera import Camera, opencv_to_opengl
+from shinypartial.color import to_display
+from shinypartial.conventions import FACES
+from shinypartial.dataset.schema import (
+    CHECKSUMS,
+    COLOR_CHANNELS,
+    DEPTH_CHANNEL,
+    ENVIRONMENT_CUBE,
+    ENVIRONMENT_LATLONG,
+    ENVIRONMENT_LATLONG_Y_UP,
+    FORMAT,
+    FORMAT_VERSION,
+    LICENSES,
+    MANIFEST,
+    NORMAL_CHANNELS,
+    Frame,
+    View,
+)
+from shinypartial.errors import InputError
+from shinypartial.files import read_json, sha256_of, write_json, write_text
+from shinypartial.images import read_exr_rgb, write_exr, write_exr_rgb, write_png
+from shinypartial.sphere import latlong_directions, latlong_to_cube, sample_latlong
+
+
+def make_frames(root: Path, split: str, cameras: Sequence[Camera]) -> tuple[Frame, ...]:
+    """Frames `SPLIT/r_000 …` of a dataset at `root`."""
+    return tuple(Frame(f"{split}/r_{i:03d}", camera, root / split / f"r_{i:03d}") for i, camera in enumerate(cameras))
+
+
+def claim_folder(root: Path, recipe: dict[str, Any], generator: dict[str, Any]) -> bool:
+    """Make `root` the folder of this recipe; return whether an earlier run had begun it.
+
+    Raises InputError when the folder belongs to another recipe or holds something else.
+    """
+    manifest_path = root / MANIFEST
+    if manifest_path.exists():
+        manifest = read_json(manifest_path, "the manifest")
+        if manifest.get("recipe") != recipe:
+            different = sorted(
+                key
+                for key in {*recipe, *manifest.get("recipe", {})}
+                if recipe.get(key) != manifest.get("recipe", {}).get(key)
+            )
+            raise InputError(
+                expected=f"an output folder that is new or belongs to the same recipe, at {root}",
+                found=f"a dataset of another recipe (different: {', '.join(different)})",
+                remedy="Choose another --output, or delete that folder.",
+            )
+        return True
+    if root.exists() and (not root.is_dir() or any(root.iterdir())):
+        raise InputError(
+            expected=f"a new or empty output folder at {root}",
+            found="files that are not a dataset",
+            remedy="Choose another --output.",
+        )
+    root.mkdir(parents=True, exist_ok=True)
+    manifest = {"format": FORMAT, "format_version": FORMAT_VERSION, "complete": False, "recipe": recipe}
+    write_json(manifest_path, {**manifest, "generator": generator})
+    return False
+
+
+def is_written(frame: Frame) -> bool:
+    """Whether every file of the frame is there (each is written whole, the EXR last)."""
+    return all(path.exists() for path in frame.files)
+
+
+def write_view(frame: Frame, view: View) -> None:
+    """Write the EXR and the 8-bit companions of one frame."""
+    if view.normals_world is None or view.depth is None:
+        raise ValueError("a rendered view has normals and depth")
+    alpha = np.clip(view.alpha, 0, 1)
+    write_png(frame.png, display_rgba(view.radiance, alpha))
+    write_png(frame.alpha_png, encode_unit(alpha))
+    write_png(frame.normal_png, encode_normals(view.normals_world))
+    half = np.clip(np.concatenate([view.radiance, alpha[..., None]], -1), -65504, 65504).astype(np.float16)
+    channels = {name: half[..., i] for i, name in enumerate(COLOR_CHANNELS)}
+    channels |= {name: view.normals_world[..., i].astype(np.float32) for i, name in enumerate(NORMAL_CHANNELS)}
+    channels[DEPTH_CHANNEL] = view.depth.astype(np.float32)
+    write_exr(frame.exr, channels)
+
+
+def display_rgba(radiance: Float[np.ndarray, "H W 3"], alpha: Float[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 4"]:
+    """8-bit picture of premultiplied radiance: sRGB of straight color clipped to [0, 1], and alpha."""
+    straight = np.where(alpha[..., None] > 0, radiance / np.maximum(alpha, 1e-6)[..., None], 0)
+    return np.concatenate([to_display(straight), encode_unit(alpha)[..., None]], -1)
+
+
+def encode_unit(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
+    """8-bit code of values, clipped to [0, 1]: round(255 x)."""
+    return np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)
+
+
+def encode_normals(normals: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    """8-bit code of unit vectors: round(255 (n + 1)/2)."""
+    return encode_unit((normals + 1) / 2)
+
+
+def write_transforms(root: Path, split: str, frames: Sequence[Frame]) -> None:
+    """Write `transforms_SPLIT.json` with OpenGL poses, as NeRF-synthetic and nerfstudio readers expect."""
+    camera = frames[0].camera
+    content = {
+        "camera_angle_x": 2 * math.atan(camera.width / (2 * camera.fx)),
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "w": camera.width,
+        "h": camera.height,
+        "frames": [
+            {
+                "file_path": f"./{split}/{frame.stem.name}",
+                "transform_matrix": opencv_to_opengl(frame.camera.camera_to_world).tolist(),
+            }
+            for frame in frames
+        ],
+    }
+    write_json(root / f"transforms_{split}.json", content)
+
+
+def write_environment(root: Path, latlong: Float[np.ndarray, "H W 3"], cube_resolution: int = 256) -> None:
+    """Write the ground-truth environment as lat-long, cubemap and the tagged Y-up lat-long.
+
+    The other two are resampled from the lat-long map as it is stored, so that all three agree.
+    """
+    write_exr_rgb(root / ENVIRONMENT_LATLONG, latlong)
+    stored = read_exr_rgb(root / ENVIRONMENT_LATLONG)
+    for name, face in zip(FACES, latlong_to_cube(stored, cube_resolution), strict=True):
+        write_exr_rgb(root / ENVIRONMENT_CUBE / f"{name}.exr", face)
+    write_exr_rgb(root / ENVIRONMENT_LATLONG_Y_UP, latlong_to_y_up(stored), y_up_environment=True)
+
+
+def latlong_to_y_up(latlong: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
+    """The same environment in the frame of the EXR `envmap` attribute: +Y up, image center along +Z (ImfEnvmap.h).
+
+    The worlds are related by the usual rotation about X: (x, y, z) with +Z up is (x, z, −y) with +Y up.
+    """
+    # On the tagged pixel grid, what our grid calls forward, left and up is +Z, +X and +Y.
+    forward, left, up = np.moveaxis(latlong_directions(latlong.shape[0]), -1, 0)
+    return sample_latlong(latlong, np.stack([left, -forward, up], -1)).astype(latlong.dtype)
+
+
+def complete_dataset(root: Path, licenses: list[dict[str, str]], statistics: dict[str, Any]) -> None:
+    """Write licenses, mark the manifest complete and list every file's SHA-256."""
+    write_json(root / LICENSES, licenses)
+    manifest = read_json(root / MANIFEST, "the manifest")
+    write_json(root / MANIFEST, {**manifest, "complete": True, "statistics": statistics})
+    files = sorted(path for path in root.rglob("*") if path.is_file() and path.name != CHECKSUMS)
+    lines = [f"{sha256_of(path)}  {path.relative_to(root).as_posix()}" for path in files]
+    write_text(root / CHECKSUMS, "\n".join(lines) + "\n")
