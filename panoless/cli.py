@@ -1,5 +1,6 @@
 """The `panoless` command: fit a dataset, export a finished fit."""
 
+import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +28,7 @@ class Fit:
 
     def run(self) -> None:
         """Load, fit, export and say what to do next."""
+        _prepare_threads()
         from panoless.export import export_prediction
         from panoless.fit import fit
         from shinypartial.dataset.read import newest_dataset, open_dataset
@@ -56,6 +58,7 @@ class Export:
 
     def run(self) -> None:
         """Read the checkpoint and export it."""
+        _prepare_threads()
         from panoless.checkpoint import CHECKPOINT, DESCRIPTION, load_state
         from panoless.config import config_from_dict
         from panoless.export import export_prediction
@@ -77,6 +80,14 @@ class Export:
         claim_prediction(prediction)
         export_prediction(open_dataset(Path(description["dataset"])), state, config, prediction)
         print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
+
+
+def _prepare_threads() -> None:
+    """Before torch loads: let idle OpenMP threads sleep, because spinning ones slow a busy machine tenfold."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    kernels = Path(__file__).parent / "kernels" / "cpu"
+    if not any(kernels.glob("__pycache__/*.nbi")):
+        print("First run on this machine: compiling kernels, about a minute …", file=sys.stderr)
 
 
 def _preset_of(arguments: list[str]) -> str:

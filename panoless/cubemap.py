@@ -12,7 +12,7 @@ from panoless.config import EnvironmentConfig
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap, scatter_cubemap
 
 INITIAL_LOGIT = 5.0
-ROBUST_SCALES = (None, 0.15, 0.15, 0.08)
+ROBUST_SCALES = (None, 0.3, 0.15, 0.08, 0.05)
 CONJUGATE_GRADIENT_STEPS = 6
 CONFIDENT_WEIGHT = 1.0
 

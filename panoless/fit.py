@@ -1,5 +1,6 @@
 """The fit: views in, surfels and environment out. It never sees a score."""
 
+import math
 import resource
 import time
 from collections.abc import Iterator
@@ -37,6 +38,8 @@ from shinypartial.progress import Progress
 CHECKPOINT_INTERVAL_S = 20.0
 CURVE_EVERY = 10
 SOLID_SURFACE_ALPHA = 0.9
+INITIAL_RAYS = 1_000_000
+FINAL_RAYS = 8_000_000
 
 
 @dataclass(frozen=True)
@@ -80,8 +83,6 @@ class Fitter:
     def run(self) -> None:
         """Optimize to the last iteration and complete the state."""
         progress = Progress("fitting", self.config.iterations, self.state.iteration)
-        if self.state.iteration == 0:
-            progress.stream.write("compiling kernels (the first run on a machine takes up to a minute) …\n")
         saved = time.monotonic()
         while self.state.iteration < self.config.iterations:
             with _timed(self.state, "optimize"):
@@ -242,7 +243,7 @@ class Fitter:
         config = self.config
         surfels = self.optimizer.surfels.detached()
         with _timed(self.state, "solve environment"), torch.no_grad():
-            rays = list(observed_rays(self.views, surfels, config))
+            rays = list(observed_rays(self.views, surfels, config, FINAL_RAYS))
             if config.visibility == "final":
                 for batch in rays:
                     accumulate(self.state.evidence, batch.directions, torch.ones(len(batch.directions)), 0.0)
@@ -281,11 +282,16 @@ def _timed(state: FitState, stage: str) -> Iterator[None]:
         state.seconds[stage] = before + time.monotonic() - start
 
 
-def observed_rays(views: Views, surfels: Surfels, config: FitConfig) -> Iterator[Rays]:
-    """Reflection directions and radiance of all pixels that lie wholly on mask and surface, a batch a view."""
-    for view in views.train:
+def observed_rays(views: Views, surfels: Surfels, config: FitConfig, max_rays: int) -> Iterator[Rays]:
+    """Reflection directions and radiance of pixels that lie wholly on mask and surface, a batch a view.
+
+    When the views hold more than `max_rays` such pixels, every k-th is taken, beginning elsewhere in each view.
+    """
+    stride = math.ceil(sum(len(view.solid) for view in views.train) / max_rays)
+    for index, view in enumerate(views.train):
         buffers = surface_buffers(surfels, view.camera, curved=config.surfels.curved, depth_blend=0.0)
-        pixels = view.solid[buffers.alpha.flatten()[view.solid] > SOLID_SURFACE_ALPHA]
+        pixels = view.solid[index % stride :: stride]
+        pixels = pixels[buffers.alpha.flatten()[pixels] > SOLID_SURFACE_ALPHA]
         directions = reflection_directions_world(
             buffers.raster_normals_camera.flatten(1)[:, pixels],
             view.rays_camera.flatten(1)[:, pixels],
@@ -301,7 +307,7 @@ def new_state(views: Views, config: FitConfig) -> FitState:
     environment = initial_environment(config.environment, torch.Generator().manual_seed(config.seed))
     if config.environment.solve and config.environment.activation == "clamp":
         with torch.no_grad():
-            rays = list(observed_rays(views, surfels, config))
+            rays = list(observed_rays(views, surfels, config, INITIAL_RAYS))
             environment = resample(solve_environment(rays, config.environment.resolution // 2), environment.shape[-1])
     length = config.environment.solve_resolution if config.environment.solve else environment.shape[-1]
     return FitState(

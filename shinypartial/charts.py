@@ -65,8 +65,12 @@ def _horizontal_mark(level: float, share: float, logarithmic: bool) -> str:
     value = 10**level if logarithmic else level
     return (
         f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{place:.1f}" y2="{place:.1f}"/>'
-        f'<text x="{LEFT - 6}" y="{place + 4:.1f}" text-anchor="end">{value:.3g}</text>'
+        f'<text x="{LEFT - 6}" y="{place + 4:.1f}" text-anchor="end">{_short(value)}</text>'
     )
+
+
+def _short(value: float) -> str:
+    return f"{value:,.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
 def _thin(values: Sequence[float]) -> list[float]:

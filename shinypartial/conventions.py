@@ -2,7 +2,7 @@
 
 World: right-handed, +Z up, scene units. Camera in memory: OpenCV axes (+x right, +y down, +z forward).
 Camera in `transforms.json`: OpenGL/Blender axes (+x right, +y up, −z forward). Pixel (0, 0) spans [0, 1]², so its
-centre lies at 0.5. Rays point from the camera to the surface. Lat-long maps have shape (H, 2H, 3), row 0 looks
+center lies at 0.5. Rays point from the camera to the surface. Lat-long maps have shape (H, 2H, 3), row 0 looks
 along +Z and the image center along +X. Cubemap faces follow FACES with the orientation of OpenGL 4.6 table 8.19.
 """
 

@@ -28,14 +28,19 @@ from shinypartial.metrics.angular import AngularStatistics, angular_statistics, 
 from shinypartial.metrics.calibration import CalibrationScores, calibration_scores
 from shinypartial.metrics.image import SSIM_RADIUS, l1, psnr, ssim
 from shinypartial.pictures import (
+    ENVIRONMENT_ERROR,
+    ENVIRONMENT_ERROR_MAP,
+    ENVIRONMENT_EXPOSED,
+    ENVIRONMENT_PREDICTION,
+    ENVIRONMENT_TRUTH,
     EVALUATION,
     OBSERVED_MAP,
     VISIBILITY,
     VISIBILITY_MAP,
-    mask_picture,
+    observed_picture,
+    radiance_picture,
     scalar_picture,
     solid_mask,
-    write_environment_pictures,
     write_view_pictures,
 )
 from shinypartial.prediction import (
@@ -71,7 +76,7 @@ VISIBILITY_TOLERANCE = 1e-3
 
 Result = TypeVar("Result")
 Mask = Bool[np.ndarray, "H W"]
-Latlong = Float[np.ndarray, "H W 3"]
+Latlong = Float[np.ndarray, "_H _W 3"]
 
 
 @dataclass(frozen=True)
@@ -97,10 +102,11 @@ class _ViewResult:
 
 @dataclass(frozen=True)
 class _Observed:
-    """Directions that the training views see, at the protocol's size, and their solid-angle share."""
+    """Directions that the training views see, at the protocol's size, and the solid-angle shares; None: unknown."""
 
-    mask: Mask
-    coverage: float
+    masks: environment_metrics.RegionMasks
+    coverage: float | None
+    resolved_coverage: float | None
 
 
 def evaluate(prediction: Path, dataset: Path | None = None, lpips_weights: Path | None = None) -> Scores:
@@ -125,7 +131,8 @@ def evaluate(prediction: Path, dataset: Path | None = None, lpips_weights: Path 
         dataset=data.name,
         dataset_hash=dataset_hash(data),
         dataset_hash_matches=dataset_hash(data) == info.dataset_hash,
-        coverage=observed.coverage if observed else None,
+        coverage=observed.coverage,
+        resolved_coverage=observed.resolved_coverage,
         environment=environment,
         normals=_pool_normals(results, left_out),
         render=_pool_renders(results, networks, left_out),
@@ -172,25 +179,27 @@ def _in_threads(function: Callable[[Frame], Result], frames: Sequence[Frame]) ->
             raise
 
 
-def _observed_directions(data: Dataset, left_out: list[LeftOut], progress: Progress) -> _Observed | None:
+def _observed_directions(data: Dataset, left_out: list[LeftOut], progress: Progress) -> _Observed:
     if read_view(data.train[0]).normals_world is None:
-        left_out += [
-            LeftOut(name, "the dataset's training views have no normals")
-            for name in ("coverage", "environment.observed")
-        ]
+        names = ("coverage", "resolved_coverage", "environment observed", "environment resolved")
+        left_out += [LeftOut(name, "the dataset's training views have no normals") for name in names]
         progress.advance(steps=len(data.train))
-        return None
-    cells = coverage_metrics.no_cells()
-    for seen in _in_threads(_cells_of_view, data.train):
-        cells |= seen
+        return _Observed(environment_metrics.RegionMasks(None, None), None, None)
+    seen = coverage_metrics.nothing_observed()
+    for cells in _in_threads(_cells_of_view, data.train):
+        seen = seen.union(cells)
         progress.advance("coverage")
-    share = coverage_metrics.coverage(cells)
-    if share == 0:
-        left_out.append(LeftOut("environment.observed", "no training view shows the object"))
-    return _Observed(coverage_metrics.observed_latlong(cells, environment_metrics.PROTOCOL_HEIGHT), share)
+    masks: list[Mask | None] = []
+    for name, region in (("observed", seen.observed), ("resolved", seen.resolved)):
+        masks.append(coverage_metrics.cells_to_latlong(region, environment_metrics.PROTOCOL_HEIGHT))
+        if not region.any():
+            left_out.append(LeftOut(f"environment {name}", f"no direction is {name} by the training views"))
+            masks[-1] = None
+    shares = (coverage_metrics.coverage(region) for region in (seen.observed, seen.resolved))
+    return _Observed(environment_metrics.RegionMasks(*masks), *shares)
 
 
-def _cells_of_view(frame: Frame) -> Bool[np.ndarray, "6 L L"]:
+def _cells_of_view(frame: Frame) -> coverage_metrics.ObservedCells:
     view = read_view(frame)
     if view.normals_world is None:
         raise InputError(
@@ -199,11 +208,11 @@ def _cells_of_view(frame: Frame) -> Bool[np.ndarray, "6 L L"]:
             remedy="Generate the dataset again.",
         )
     mask = solid_mask(view)
-    return coverage_metrics.cells_seen(reflect(ray_directions_world(frame.camera)[mask], view.normals_world[mask]))
+    return coverage_metrics.cells_of_view(reflect(ray_directions_world(frame.camera)[mask], view.normals_world[mask]))
 
 
 def _score_environment(
-    prediction: Path, data: Dataset, observed: _Observed | None, networks: _Networks, left_out: list[LeftOut]
+    prediction: Path, data: Dataset, observed: _Observed, networks: _Networks, left_out: list[LeftOut]
 ) -> tuple[EnvironmentScores | None, CalibrationScores | None]:
     missing = None
     if not (data.root / ENVIRONMENT_LATLONG).exists():
@@ -214,24 +223,35 @@ def _score_environment(
         left_out += [LeftOut(name, missing) for name in ("environment", "calibration")]
         return None, None
     truth, predicted = read_environment(data), read_environment_map(prediction)
+    stops = environment_metrics.best_exposure_stops(predicted, truth)
+    exposed = predicted * np.float32(2.0**stops)
     error = environment_metrics.absolute_error_srgb(predicted, truth)
-    maps = environment_metrics.clipped_map(predicted), environment_metrics.clipped_map(truth)
-    write_environment_pictures(prediction / EVALUATION, *maps, error)
-    if observed is not None:
-        write_png(prediction / EVALUATION / OBSERVED_MAP, mask_picture(observed.mask))
-    seen = observed.mask if observed is not None and observed.coverage > 0 else None
-    weights = environment_metrics.direction_weights
-    srgb = linear_to_srgb(maps[0]), linear_to_srgb(maps[1])
+    _write_environment_pictures(prediction / EVALUATION, (predicted, exposed, truth), error, observed)
+    srgb = [linear_to_srgb(environment_metrics.clipped_map(radiance)) for radiance in (predicted, truth)]
     scores = EnvironmentScores(
-        full=environment_metrics.region_scores(predicted, truth, weights()),
-        observed=None if seen is None else environment_metrics.region_scores(predicted, truth, weights(seen)),
-        best_exposure=environment_metrics.exposure_scores(predicted, truth, seen),
+        as_predicted=environment_metrics.region_scores(predicted, truth, observed.masks),
+        exposure_stops=stops,
+        best_exposure=environment_metrics.region_scores(exposed, truth, observed.masks),
         unweighted=environment_metrics.unweighted_scores(predicted, truth),
         perceptual=PerceptualScores(
             networks.alex(*srgb) if networks.alex else None, networks.vgg(*srgb) if networks.vgg else None
         ),
     )
     return scores, _score_calibration(prediction, error, left_out)
+
+
+def _write_environment_pictures(
+    folder: Path, radiances: tuple[Latlong, Latlong, Latlong], error: Float[np.ndarray, "H W"], observed: _Observed
+) -> None:
+    """Radiances are the prediction, the prediction at its best exposure and the truth."""
+    names = (ENVIRONMENT_PREDICTION, ENVIRONMENT_EXPOSED, ENVIRONMENT_TRUTH)
+    for name, radiance in zip(names, radiances, strict=True):
+        write_png(folder / name, radiance_picture(environment_metrics.clipped_map(radiance)))
+    write_png(folder / ENVIRONMENT_ERROR_MAP, scalar_picture(error, ENVIRONMENT_ERROR))
+    masks = observed.masks
+    if masks.observed is not None:
+        resolved = np.zeros_like(masks.observed) if masks.resolved is None else masks.resolved
+        write_png(folder / OBSERVED_MAP, observed_picture(masks.observed, resolved))
 
 
 def _score_calibration(
@@ -317,7 +337,7 @@ def _score_view(frame: Frame, predicted: View, truth: View, lpips: perceptual.Lp
                 angular_statistics(errors).mean_angular_error_deg if errors is not None and errors.size else None
             ),
         ),
-        psnr_foreground=psnr(image, target, data_range=1.0, weights=solid) if solid.any() else None,
+        psnr_foreground=psnr(image, target, data_range=1.0, weights=solid.astype(np.float32)) if solid.any() else None,
         l1=l1(image, target),
         intersection=int((covered & target_covered).sum()),
         union=int((covered | target_covered).sum()),

@@ -12,6 +12,9 @@ from typing import Any
 from shinypartial.errors import InputError
 
 
+PARTIAL_PREFIX = ".partial-"
+
+
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename it to `path` on success, delete it on any failure.
@@ -19,7 +22,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     The temporary name keeps the suffix, because image writers choose their format by it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=".partial-", suffix=path.suffix, dir=path.parent)
+    handle, name = tempfile.mkstemp(prefix=PARTIAL_PREFIX, suffix=path.suffix, dir=path.parent)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -28,6 +31,12 @@ def whole_file(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_partial_files(root: Path) -> None:
+    """Delete the temporary files of a process that was killed while it wrote below `root`."""
+    for path in root.rglob(f"{PARTIAL_PREFIX}*"):
+        path.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -31,6 +31,7 @@ from shinypartial.dataset.write import (
     write_view,
 )
 from shinypartial.errors import InputError
+from shinypartial.files import remove_partial_files
 from shinypartial.progress import Progress
 from shinypartial.scene import FileWorld, SceneSpec
 from shinypartial.trajectory import arc
@@ -63,7 +64,7 @@ def generate(spec: SceneSpec, root: Path) -> Generated:
         if _is_complete(root, every):
             return Generated(root, 0, len(every))
         (root / CHECKSUMS).unlink(missing_ok=True)
-        _remove_leftovers(root)
+        remove_partial_files(root)
         for split in SPLITS:
             write_transforms(root, split, frames[split])
         _write_ground_truth(spec, root)
@@ -89,12 +90,6 @@ def _generator() -> dict[str, Any]:
 def _is_complete(root: Path, frames: Sequence[Frame]) -> bool:
     """The checksum list is written last of all; a frame that was deleted since is made again."""
     return (root / CHECKSUMS).exists() and all(map(is_written, frames))
-
-
-def _remove_leftovers(root: Path) -> None:
-    """Delete temporary files of a run that was killed while it wrote."""
-    for path in root.rglob(".partial-*"):
-        path.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

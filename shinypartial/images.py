@@ -115,11 +115,10 @@ def read_png(path: Path) -> UInt8[np.ndarray, "H W C"]:
             remedy="Check file_path in transforms_*.json.",
         )
     try:
-        with Image.open(path) as image:
-            image.load()
-            if image.mode in ("P", "PA", "LA", "CMYK", "1") or "transparency" in image.info:
-                image = image.convert("RGBA" if image.has_transparency_data else "RGB")
-            array = np.asarray(image)
+        with Image.open(path) as stored:
+            stored.load()
+            convert = stored.mode in ("P", "PA", "LA", "CMYK", "1") or "transparency" in stored.info
+            array = np.asarray(stored.convert("RGBA" if stored.has_transparency_data else "RGB") if convert else stored)
     except (OSError, SyntaxError, ValueError) as error:
         raise InputError(
             expected=f"a complete image at {path}", found=f"{error}", remedy="Restore or re-export the file."

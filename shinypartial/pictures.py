@@ -17,6 +17,7 @@ from shinypartial.metrics.angular import normal_errors_deg
 EVALUATION = "evaluation"
 ENVIRONMENT_TRUTH = "environment_truth.png"
 ENVIRONMENT_PREDICTION = "environment_prediction.png"
+ENVIRONMENT_EXPOSED = "environment_best_exposure.png"
 ENVIRONMENT_ERROR_MAP = "environment_error.png"
 VISIBILITY_MAP = "visibility.png"
 OBSERVED_MAP = "observed.png"
@@ -108,21 +109,10 @@ def normal_picture(normals_world: Float[np.ndarray, "H W 3"]) -> Picture:
     return np.where(present, picture, np.uint8(NEUTRAL_GRAY))
 
 
-def mask_picture(mask: Bool[np.ndarray, "H W"]) -> Picture:
-    """White where true, black where false."""
-    return np.repeat(np.where(mask, np.uint8(255), np.uint8(0))[..., None], 3, -1)
-
-
-def write_environment_pictures(
-    folder: Path,
-    prediction: Float[np.ndarray, "H W 3"],
-    truth: Float[np.ndarray, "H W 3"],
-    error: Float[np.ndarray, "H W"],
-) -> None:
-    """Write truth, prediction and error of the environment; all three in the size of the protocol."""
-    write_png(folder / ENVIRONMENT_TRUTH, radiance_picture(truth))
-    write_png(folder / ENVIRONMENT_PREDICTION, radiance_picture(prediction))
-    write_png(folder / ENVIRONMENT_ERROR_MAP, scalar_picture(error, ENVIRONMENT_ERROR))
+def observed_picture(observed: Bool[np.ndarray, "H W"], resolved: Bool[np.ndarray, "H W"]) -> Picture:
+    """White where training views resolve a direction, gray where they see it more coarsely, black elsewhere."""
+    level = np.where(resolved, 255, np.where(observed, 128, 0)).astype(np.uint8)
+    return np.repeat(level[..., None], 3, -1)
 
 
 def write_view_pictures(folder: Path, stem: str, prediction: View, truth: View) -> None:

@@ -18,6 +18,7 @@ from shinypartial.metrics.registry import Direction
 from shinypartial.pictures import (
     ENVIRONMENT_ERROR,
     ENVIRONMENT_ERROR_MAP,
+    ENVIRONMENT_EXPOSED,
     ENVIRONMENT_PREDICTION,
     ENVIRONMENT_TRUTH,
     EVALUATION,
@@ -46,27 +47,27 @@ JPEG_QUALITY = 88
 LOSSLESS_BYTES = 24_000
 
 HEADLINES = (
-    ("environment.full.psnr_srgb", "environment, all directions"),
-    ("environment.observed.psnr_srgb", "environment, directions seen in training views"),
-    ("environment.full.ssim_srgb", "environment SSIM, all directions"),
+    ("environment.as_predicted.full.psnr_srgb", "environment PSNR, all directions"),
+    ("environment.as_predicted.resolved.psnr_srgb", "environment PSNR, directions that training views resolve"),
+    ("environment.as_predicted.full.ssim_srgb", "environment SSIM, all directions"),
     ("normals.mean_angular_error_deg", "mean normal error, test views"),
-    ("render.psnr", "renders of test views"),
+    ("render.psnr", "PSNR of rendered test views"),
     ("calibration.visibility_error_auroc", "AUROC: low visibility announces error"),
-    ("coverage", "of the sphere is seen in training views"),
+    ("resolved_coverage", "of the sphere is resolved by training views"),
 )
-REGIONS = (
-    ("environment.full", "all directions"),
-    ("environment.observed", "seen directions"),
-    ("environment.best_exposure.full", "all, best exposure"),
-    ("environment.best_exposure.observed", "seen, best exposure"),
+REGION_TABLES = (
+    ("environment.as_predicted", "Environment, weighted by solid angle"),
+    ("environment.best_exposure", "Environment after the best global exposure"),
 )
+SUMMARY_OF_ENVIRONMENT = ("psnr_srgb", "ssim_srgb", "psnr_linear", "log_rmse_stops")
+REGIONS = (("full", "all directions"), ("observed", "seen"), ("resolved", "resolved"))
 GROUPS = (
     ("normals", "Normals of test views, pooled over mask pixels"),
     ("render", "Renders of test views"),
     ("calibration", "Visibility against environment error"),
     ("environment.unweighted", "Environment as a plain picture"),
     ("environment.perceptual", "Environment, perceptual"),
-    ("environment.best_exposure", "Global exposure"),
+    ("environment", "Global exposure"),
     ("", "Dataset"),
 )
 
@@ -96,8 +97,12 @@ def summary_lines(prediction: Path) -> list[str]:
     if not scores.dataset_hash_matches:
         lines.append("  warning       the prediction was made from another version of this dataset")
     groups = (
-        ("environment", "environment.full", ("psnr_srgb", "ssim_srgb", "psnr_linear", "log_rmse_stops")),
-        ("  seen part", "environment.observed", ("psnr_srgb", "ssim_srgb", "psnr_linear", "log_rmse_stops")),
+        ("environment", "environment.as_predicted.full", SUMMARY_OF_ENVIRONMENT),
+        (
+            "  resolved",
+            "environment.as_predicted.resolved",
+            SUMMARY_OF_ENVIRONMENT,
+        ),
         ("normals", "normals", ("mean_angular_error_deg", "median_angular_error_deg", "normal_coverage")),
         ("renders", "render", ("psnr", "ssim", "alpha_iou")),
         ("visibility", "calibration", ("visibility_error_auroc", "visibility_error_spearman")),
@@ -108,7 +113,8 @@ def summary_lines(prediction: Path) -> list[str]:
             parts = [f"{row.metric.name} {row.metric.text(row.value)} {row.metric.direction.value}" for row in found]
             lines.append(f"  {title:13s} {'   '.join(parts)}")
     if scores.coverage is not None:
-        lines.append(f"  {'coverage':13s} {rows['coverage'].metric.text(scores.coverage)} of the sphere")
+        shares = [rows[name].metric.text(rows[name].value) for name in ("coverage", "resolved_coverage")]
+        lines.append(f"  {'coverage':13s} training views see {shares[0]} of the sphere and resolve {shares[1]}")
     if scores.left_out:
         lines.append(f"  {'left out':13s} {', '.join(entry.name for entry in scores.left_out)}")
     return lines
@@ -179,9 +185,10 @@ def _environment_section(prediction: Path) -> str:
     figures = [
         _figure(folder / ENVIRONMENT_TRUTH, "Ground truth: sRGB of radiance clipped to [0, 1]."),
         _figure(folder / ENVIRONMENT_PREDICTION, "Prediction, in the same encoding."),
+        _figure(folder / ENVIRONMENT_EXPOSED, "Prediction after the best global exposure."),
         _figure(
             folder / ENVIRONMENT_ERROR_MAP,
-            "Error: mean over channels of the absolute sRGB difference; dark is good.",
+            "Error of the prediction as it is: mean over channels of the absolute sRGB difference; dark is good.",
             ENVIRONMENT_ERROR,
         ),
         _figure(
@@ -191,7 +198,7 @@ def _environment_section(prediction: Path) -> str:
         ),
         _figure(
             folder / OBSERVED_MAP,
-            "Directions that training views truly see: white where ground-truth normals mirror a training pixel.",
+            "Directions in training views, by ground-truth normals: white resolved (0.7° or finer), gray seen.",
         ),
     ]
     if not any(figures):
@@ -232,7 +239,7 @@ def _view_trios(folder: Path, stem: str) -> str:
         figures = [
             _figure(pictures.truth, f"Ground truth {kind}.", size=SMALL_PX),
             _figure(pictures.prediction, f"Predicted {kind}.", size=SMALL_PX),
-            _figure(pictures.error, f"{scale.title.capitalize()}.", scale, SMALL_PX),
+            _figure(pictures.error, f"{scale.title[0].upper()}{scale.title[1:]}.", scale, SMALL_PX),
         ]
         if any(figures):
             trios.append(f'<div class="trio">{"".join(figures)}</div>')
@@ -290,13 +297,13 @@ def _inline_picture(path: Path, longest_px: int) -> str:
 
 
 def _metrics_section(rows: Sequence[ScoreRow]) -> str:
-    tables = [_region_table(rows)]
+    tables = [_region_table(rows, *table) for table in REGION_TABLES]
     for group, title in GROUPS:
         found = [row for row in rows if row.group == group]
         cells = [
             (row.metric.title, row.metric.text(row.value), row.metric.direction.value, row.metric.name) for row in found
         ]
-        if found:
+        if any(row.value is not None for row in found):
             body = "".join(
                 f'<tr><td>{html.escape(name)} <code class="name">{html.escape(key)}</code></td>'
                 f'<td class="number">{html.escape(value)}</td><td>{arrow}</td></tr>'
@@ -307,8 +314,8 @@ def _metrics_section(rows: Sequence[ScoreRow]) -> str:
     return f'<h2>Metrics</h2><p class="dim">{note}</p>{"".join(tables)}'
 
 
-def _region_table(rows: Sequence[ScoreRow]) -> str:
-    columns = [(title, [row for row in rows if row.group == group]) for group, title in REGIONS]
+def _region_table(rows: Sequence[ScoreRow], place: str, heading: str) -> str:
+    columns = [(title, [row for row in rows if row.group == f"{place}.{region}"]) for region, title in REGIONS]
     columns = [(title, found) for title, found in columns if found]
     if not columns:
         return ""
@@ -319,7 +326,7 @@ def _region_table(rows: Sequence[ScoreRow]) -> str:
         name = f'{html.escape(row.metric.title)} <code class="name">{row.metric.name}</code>'
         lines.append(f"<tr><td>{name}</td>{cells}<td>{row.metric.direction.value}</td></tr>")
     return (
-        "<h3>Environment, weighted by solid angle</h3>"
+        f"<h3>{html.escape(heading)}</h3>"
         f'<div class="scroll"><table><tr><th></th>{head}<th></th></tr>{"".join(lines)}</table></div>'
     )
 
@@ -350,7 +357,7 @@ def _charts(series: Iterable[Series]) -> str:
         for one in series
         if len(one.y) > 1
     ]
-    return f'<div class="maps" style="margin-top: 1rem">{"".join(figures)}</div>' if figures else ""
+    return f'<div class="charts">{"".join(figures)}</div>' if figures else ""
 
 
 def _cost_section(info: PredictionInfo) -> str:

@@ -14,7 +14,7 @@ from shinypartial.errors import InputError
 from shinypartial.files import read_json, write_json
 from shinypartial.metrics.angular import AngularStatistics
 from shinypartial.metrics.calibration import CalibrationScores
-from shinypartial.metrics.environment import ExposureScores, RegionScores, UnweightedScores
+from shinypartial.metrics.environment import Regions, UnweightedScores
 from shinypartial.metrics.registry import METRICS, Metric, metric
 
 FORMAT = "shinypartial-scores"
@@ -33,11 +33,11 @@ class PerceptualScores:
 
 @dataclass(frozen=True)
 class EnvironmentScores:
-    """The environment map; `observed` and `coverage` are None where the dataset has no normals."""
+    """The environment map as predicted, and after the one global exposure that brings it closest to the truth."""
 
-    full: RegionScores
-    observed: RegionScores | None
-    best_exposure: ExposureScores
+    as_predicted: Regions
+    exposure_stops: float
+    best_exposure: Regions
     unweighted: UnweightedScores
     perceptual: PerceptualScores
 
@@ -91,6 +91,7 @@ class Scores:
     dataset_hash: str
     dataset_hash_matches: bool
     coverage: float | None
+    resolved_coverage: float | None
     environment: EnvironmentScores | None
     normals: AngularStatistics | None
     render: RenderScores | None
@@ -102,7 +103,7 @@ class Scores:
 
 @dataclass(frozen=True)
 class ScoreRow:
-    """One number with its place in the scores, such as `environment.observed.psnr_srgb`."""
+    """One number with its place in the scores, such as `environment.as_predicted.full.psnr_srgb`."""
 
     path: str
     metric: Metric
@@ -143,10 +144,10 @@ def read_scores(prediction: Path) -> Scores:
         raise InputError(
             expected=f"scores at {path}",
             found="no such file",
-            remedy=f"Evaluate first: `shinypartial evaluate --prediction {prediction}`.",
+            remedy=f"Evaluate first: `shinypartial evaluate {prediction}`.",
         )
     content = read_json(path, "the scores")
-    remedy = f"Evaluate again: `shinypartial evaluate --prediction {prediction}`."
+    remedy = f"Evaluate again: `shinypartial evaluate {prediction}`."
     if content.pop("format", None) != FORMAT or content.pop("format_version", None) != FORMAT_VERSION:
         raise InputError(
             expected=f"{SCORES} with format {FORMAT} version {FORMAT_VERSION}", found="another format", remedy=remedy
@@ -163,7 +164,7 @@ def _restore(kind: Any, content: Any) -> Any:
         return None
     if isinstance(kind, types.UnionType):
         kind = next(option for option in typing.get_args(kind) if option is not type(None))
-    if dataclasses.is_dataclass(kind):
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
         hints = typing.get_type_hints(kind)
         return kind(**{name: _restore(hint, content[name]) for name, hint in hints.items()})
     if typing.get_origin(kind) is tuple:

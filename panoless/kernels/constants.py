@@ -15,13 +15,21 @@ MEDIAN_TRANSMITTANCE = 0.5
 """The median depth is that of the last fragment met while the transmittance is above this."""
 
 LOW_PASS_SIGMA = math.sqrt(2) / 2
-"""Standard deviation, in pixels, of the screen-space Gaussian below which no surfel shrinks (Huang et al. 2024, Eq. 11)."""
+"""Standard deviation, in pixels, of the screen-space Gaussian below which no surfel shrinks (Huang et al. 2024, Eq.
+11).
+"""
 
 HIT_RATIO_MIN = 0.1
-"""A ray–surfel hit counts while (depth of the center) / (depth of the hit) is at least this; it excludes hits behind the camera."""
+"""A ray–surfel hit counts while (depth of the center) / (depth of the hit) is at least this; it excludes hits behind
+the camera.
+"""
 
 EDGE_ON_COSINE_MIN = 1e-4
-"""Below this |cos| between normal and viewing ray a surfel has no usable intersection and is drawn by its low pass alone."""
+"""Below this |cos| between normal and viewing ray a surfel has no usable intersection and is drawn by its low pass
+alone.
+"""
 
 CAMERA_PLANE_MARGIN = 1e-3
-"""A surfel whose disk comes this close (relative to its squared depth) to the plane of the camera is given the whole image as its box."""
+"""A surfel whose disk comes this close (relative to its squared depth) to the plane of the camera is given the whole
+image as its box.
+"""

@@ -187,7 +187,7 @@ def _check_environment(root: Path) -> Iterator[Break]:
         yield Break(file, f"expected a finite map ≥ 0, twice as wide as high, found {width}×{height}", REMAKE)
         return
     faces = [ENVIRONMENT_CUBE / f"{name}.exr" for name in FACES]
-    maps: dict[Path, Float[np.ndarray, "H W 3"]] = {}
+    maps: dict[Path, np.ndarray] = {}
     for path in (*faces, ENVIRONMENT_LATLONG_Y_UP):
         try:
             maps[path] = read_exr_rgb(root / path)
@@ -202,7 +202,7 @@ def _check_environment(root: Path) -> Iterator[Break]:
 
 
 def _check_resampled(
-    latlong: Float[np.ndarray, "H W 3"], maps: dict[Path, Float[np.ndarray, "H W 3"]], faces: list[Path]
+    latlong: Float[np.ndarray, "H W 3"], maps: dict[Path, np.ndarray], faces: list[Path]
 ) -> Iterator[Break]:
     """Cube and Y-up map must be what the lat-long map gives when it is resampled."""
     present = [path for path in faces if path in maps]

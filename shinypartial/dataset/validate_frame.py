@@ -101,7 +101,7 @@ def _check_values(file: str, frame: Frame, view: View) -> Iterator[Break]:
 def _check_companions(root: Path, frame: Frame, view: View, missing: list[Path]) -> Iterator[Break]:
     assert view.normals_world is not None
     compared = view.alpha >= COMPARED_ALPHA
-    expected: dict[Path, UInt8[np.ndarray, "H W C"]] = {
+    expected: dict[Path, np.ndarray] = {
         frame.png: display_rgba(view.radiance, view.alpha),
         frame.alpha_png: encode_unit(view.alpha)[..., None],
         frame.normal_png: encode_normals(view.normals_world),

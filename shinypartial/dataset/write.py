@@ -27,7 +27,7 @@ from shinypartial.dataset.schema import (
     View,
 )
 from shinypartial.errors import InputError
-from shinypartial.files import read_json, sha256_of, write_json, write_text
+from shinypartial.files import PARTIAL_PREFIX, read_json, sha256_of, write_json, write_text
 from shinypartial.images import read_exr_rgb, write_exr, write_exr_rgb, write_png
 from shinypartial.sphere import latlong_directions, latlong_to_cube, sample_latlong
 
@@ -57,7 +57,7 @@ def claim_folder(root: Path, recipe: dict[str, Any], generator: dict[str, Any]) 
                 remedy="Choose another --output, or delete that folder.",
             )
         return True
-    if root.exists() and (not root.is_dir() or any(root.iterdir())):
+    if root.exists() and (not root.is_dir() or any(not _is_partial(path) for path in root.iterdir())):
         raise InputError(
             expected=f"a new or empty output folder at {root}",
             found="files that are not a dataset",
@@ -67,6 +67,11 @@ def claim_folder(root: Path, recipe: dict[str, Any], generator: dict[str, Any]) 
     manifest = {"format": FORMAT, "format_version": FORMAT_VERSION, "complete": False, "recipe": recipe}
     write_json(manifest_path, {**manifest, "generator": generator})
     return False
+
+
+def _is_partial(path: Path) -> bool:
+    """A run that is killed while it writes its first file leaves nothing else."""
+    return path.name.startswith(PARTIAL_PREFIX)
 
 
 def is_written(frame: Frame) -> bool:

@@ -26,7 +26,7 @@ def angular_error_deg(a: Float[np.ndarray, "... 3"], b: Float[np.ndarray, "... 3
     """Angle atan2(‖a × b‖, a·b) in degrees, [0, 180]; lengths do not matter, and small angles keep their precision."""
     a, b = a.astype(np.float64), b.astype(np.float64)
     cross = np.linalg.norm(np.cross(a, b), axis=-1)
-    return np.degrees(np.arctan2(cross, np.sum(a * b, -1)))
+    return np.asarray(np.degrees(np.arctan2(cross, np.sum(a * b, -1))))
 
 
 def normal_errors_deg(

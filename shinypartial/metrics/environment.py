@@ -20,8 +20,10 @@ LOG_FLOOR = 1e-3
 EXPOSURE_RANGE_STOPS = 6.0
 EXPOSURE_STEP_STOPS = 0.5
 
-Latlong = Float[np.ndarray, "H W 3"]
+#: Prediction and truth may differ in size, so these axes are not compared.
+Latlong = Float[np.ndarray, "_H _W 3"]
 TexelWeights = Float[np.ndarray, "H W"]
+Mask = Bool[np.ndarray, "H W"]
 
 
 @dataclass(frozen=True)
@@ -47,12 +49,20 @@ class UnweightedScores:
 
 
 @dataclass(frozen=True)
-class ExposureScores:
-    """Scores after the one global exposure that brings the prediction closest to the truth."""
+class RegionMasks:
+    """Directions that training views see at all, and with the protocol's resolution; None: unknown or none."""
 
-    exposure_stops: float
+    observed: Mask | None
+    resolved: Mask | None
+
+
+@dataclass(frozen=True)
+class Regions:
+    """Scores over all directions and over those that training views see; None where a mask is None."""
+
     full: RegionScores
     observed: RegionScores | None
+    resolved: RegionScores | None
 
 
 def to_protocol_size(latlong: Float[np.ndarray, "H W C"], height: int = PROTOCOL_HEIGHT) -> Float[np.ndarray, "h w C"]:
@@ -85,19 +95,26 @@ def absolute_error_srgb(prediction: Latlong, truth: Latlong) -> TexelWeights:
     return np.abs(difference).mean(-1)
 
 
-def region_scores(prediction: Latlong, truth: Latlong, weights: TexelWeights) -> RegionScores:
-    """Compare two maps of unbounded linear radiance over the weighted directions."""
+def region_scores(prediction: Latlong, truth: Latlong, masks: RegionMasks) -> Regions:
+    """Compare two maps of unbounded linear radiance over all directions and over the masked ones."""
     linear, true_linear = clipped_map(prediction), clipped_map(truth)
     srgb, true_srgb = linear_to_srgb(linear), linear_to_srgb(true_linear)
-    logs = [np.log2(np.maximum(to_protocol_size(radiance), 0) + LOG_FLOOR) for radiance in (prediction, truth)]
-    return RegionScores(
-        psnr_srgb=psnr(srgb, true_srgb, data_range=1.0, weights=weights),
-        psnr_linear=psnr(linear, true_linear, data_range=1.0, weights=weights),
-        ssim_srgb=weighted_mean(_wrapped_ssim_map(srgb, true_srgb), weights),
-        l1_srgb=l1(srgb, true_srgb, weights=weights),
-        l1_linear=l1(linear, true_linear, weights=weights),
-        log_rmse_stops=float(np.sqrt(weighted_mean((logs[0] - logs[1]) ** 2, weights))),
-    )
+    logs, true_logs = (np.log2(np.maximum(to_protocol_size(image), 0) + LOG_FLOOR) for image in (prediction, truth))
+    similarity, squared_logs = _wrapped_ssim_map(srgb, true_srgb), (logs.astype(np.float64) - true_logs) ** 2
+
+    def score(mask: Mask | None) -> RegionScores:
+        weights = direction_weights(mask)
+        return RegionScores(
+            psnr_srgb=psnr(srgb, true_srgb, data_range=1.0, weights=weights),
+            psnr_linear=psnr(linear, true_linear, data_range=1.0, weights=weights),
+            ssim_srgb=weighted_mean(similarity, weights),
+            l1_srgb=l1(srgb, true_srgb, weights=weights),
+            l1_linear=l1(linear, true_linear, weights=weights),
+            log_rmse_stops=float(np.sqrt(weighted_mean(squared_logs, weights))),
+        )
+
+    observed, resolved = (None if mask is None else score(mask) for mask in (masks.observed, masks.resolved))
+    return Regions(score(None), observed, resolved)
 
 
 def _wrapped_ssim_map(prediction: Latlong, truth: Latlong) -> Latlong:
@@ -119,10 +136,10 @@ def unweighted_scores(prediction: Latlong, truth: Latlong) -> UnweightedScores:
     )
 
 
-def direction_weights(observed: Bool[np.ndarray, "H W"] | None = None) -> TexelWeights:
-    """Solid angle of every texel of the protocol's size, zero where not observed."""
+def direction_weights(mask: Mask | None = None) -> TexelWeights:
+    """Solid angle of every texel of the protocol's size, zero outside the mask."""
     weights = latlong_solid_angles(PROTOCOL_HEIGHT)
-    return weights if observed is None else weights * observed
+    return weights if mask is None else weights * mask
 
 
 def best_exposure_stops(prediction: Latlong, truth: Latlong) -> float:
@@ -144,14 +161,3 @@ def best_exposure_stops(prediction: Latlong, truth: Latlong) -> float:
     bounds = (start - EXPOSURE_STEP_STOPS, start + EXPOSURE_STEP_STOPS)
     refined = minimize_scalar(error, bounds=bounds, method="bounded", options={"xatol": 1e-4})
     return float(refined.x if refined.fun < error(start) else start)
-
-
-def exposure_scores(prediction: Latlong, truth: Latlong, observed: Bool[np.ndarray, "H W"] | None) -> ExposureScores:
-    """Scores after the best global exposure, which is fitted over all directions."""
-    stops = best_exposure_stops(prediction, truth)
-    exposed = prediction * np.float32(2.0**stops)
-    return ExposureScores(
-        exposure_stops=stops,
-        full=region_scores(exposed, truth, direction_weights()),
-        observed=None if observed is None else region_scores(exposed, truth, direction_weights(observed)),
-    )

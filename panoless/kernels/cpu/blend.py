@@ -1,4 +1,6 @@
-"""Front-to-back blending of tiles: each 4×4 block of pixels is one vector whose state stays in registers while its surfels pass."""
+"""Front-to-back blending of tiles: each 4×4 block of pixels is one vector whose state stays in registers while its
+surfels pass.
+"""
 
 from typing import Any, NamedTuple
 
@@ -17,20 +19,16 @@ from panoless.kernels.cpu.simd import (
     LANES,
     any_lane,
     exp2,
-    fetch_add,
     lane_columns,
     lane_rows,
     lanes,
-    load_block,
-    load_lanes,
     lowest_bit,
     mask_bits,
     maximum,
     minimum,
-    store_block,
-    store_lanes,
     where,
 )
+from panoless.kernels.cpu.simd_memory import fetch_add, store_block, store_lanes
 
 LOW_PASS_PRECISION = np.float32(1 / LOW_PASS_SIGMA**2)
 HALF_LOG2_E = np.float32(0.5 * np.log2(np.e))
@@ -63,6 +61,7 @@ class Fragment(NamedTuple):
 
 @njit(forceinline=True)
 def intersect(table, k, x, y):
+    """See surfel k through the pixels at (x, y): Huang et al. 2024, Eq. 10 and 11."""
     dx = x - table[k, rec.CENTER_X]
     dy = y - table[k, rec.CENTER_Y]
     w = table[k, rec.A2] * dx + (table[k, rec.B2] * dy + table[k, rec.HIT_CENTER])
@@ -78,12 +77,14 @@ def intersect(table, k, x, y):
 
 @njit(forceinline=True)
 def uncapped_alpha(table, k, rho):
+    """Opacity times Gaussian, before it is capped at ALPHA_MAX."""
     return exp2(table[k, rec.LOG2_OPACITY] - HALF_LOG2_E * rho)
 
 
 @njit(forceinline=True)
 def touched_blocks(table, k, left, top):
-    """Bit i is set if block i of the tile may hold a pixel with alpha ≥ ALPHA_MIN: the ellipse or the low-pass disk meets it.
+    """Bit i is set if block i of the tile may hold a pixel with alpha ≥ ALPHA_MIN: the ellipse or the low-pass disk
+    meets it.
 
     A convex quadratic is least over a rectangle on one of the two edges that face its center.
     """
@@ -207,6 +208,9 @@ def blend_block(curved, table, surfels, masks, block, positions, length, x, y, i
 
 @njit(forceinline=True)
 def blend_tiles(curved, counter, table, bins, camera_plane, planes, saved, masks):
+    """Claim tiles from the counter and blend them; `curved` must be a literal, so that flat surfels do not pay for
+    it.
+    """
     tile_starts, entry_surfels, longest = bins
     width, height, distance = camera_plane
     tiles_across = (width + rec.TILE - 1) // rec.TILE

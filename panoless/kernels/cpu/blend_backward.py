@@ -1,4 +1,6 @@
-"""Gradients of the blended images to the records, front to back: what lies behind a fragment is the total minus what was passed."""
+"""Gradients of the blended images to the records, front to back: what lies behind a fragment is the total minus what
+was passed.
+"""
 
 from typing import Any, NamedTuple
 
@@ -21,23 +23,21 @@ from panoless.kernels.cpu.blend import (
 from panoless.kernels.cpu.simd import (
     LANES,
     any_lane,
-    fetch_add,
     lane_columns,
     lane_rows,
     lanes,
-    load_block,
-    load_lanes,
     minimum,
-    store_lanes,
     sum_each,
     where,
 )
+from panoless.kernels.cpu.simd_memory import fetch_add, load_block, load_lanes, store_lanes
 
 
 class Cotangent(NamedTuple):
     """Gradients that reach a block's pixels, with the distortion's folded into a quadratic in m.
 
-    A fragment of weight w at distance coordinate m adds w·(constant + linear·m + quadratic·m²) for the distortion and the alpha.
+    A fragment of weight w at distance coordinate m adds w·(constant + linear·m + quadratic·m²) for the distortion and
+    the alpha.
     """
 
     red: Any
@@ -58,6 +58,7 @@ class Cotangent(NamedTuple):
 
 @njit(forceinline=True)
 def load_cotangent(outputs, gradients, saved, saved_at, offset, width, plane_size, inside):
+    """Load the gradients of a block's pixels and form what every fragment needs of them."""
     m1 = load_lanes(saved, saved_at + SAVED_M1 * LANES)
     m2 = load_lanes(saved, saved_at + SAVED_M2 * LANES)
     red = load_block(gradients.colors, offset, width, inside)
@@ -193,7 +194,10 @@ def blend_block_backward(curved, table, surfels, positions, length, x, y, inside
 
 
 @njit(forceinline=True)
-def blend_tiles_backward(curved, counter, table, bins, camera_plane, outputs, gradients, saved, masks, entry_slots, slots):
+def blend_tiles_backward(
+    curved, counter, table, bins, camera_plane, outputs, gradients, saved, masks, entry_slots, slots
+):
+    """Claim tiles from the counter and pull their pixels' gradients back to one row a (tile, surfel) pair."""
     tile_starts, entry_surfels, longest = bins
     width, height, distance = camera_plane
     tiles_across = (width + rec.TILE - 1) // rec.TILE

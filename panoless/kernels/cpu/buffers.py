@@ -1,7 +1,8 @@
 """Large arrays that are used again, because fresh pages cost as much as the kernels that fill them.
 
-An array from `take` belongs to the caller alone until its last reference is gone; then its memory may be handed out again. That holds for
-views and for tensors made by `torch.from_numpy`, which keep the array alive, so autograd state and results are safe as long as anyone can see them.
+An array from `take` belongs to the caller alone until its last reference is gone; then its memory may be handed out
+again. That holds for views and for tensors made by `torch.from_numpy`, which keep the array alive, so autograd state
+and results are safe as long as anyone can see them.
 """
 
 import math

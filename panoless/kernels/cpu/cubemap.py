@@ -12,19 +12,23 @@ constant to the compiler.
 """
 
 from functools import lru_cache
+from threading import get_ident
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from numba import njit, prange
+from numba import njit
 from torch import Tensor
 
-from panoless.kernels.cpu.threads import FINITE_AWARE_FAST_MATH, match_torch_threads
+from panoless.kernels.cpu.compilation import VECTORIZED_LOOPS
+from panoless.kernels.cpu.simd_memory import fetch_add
+from panoless.kernels.cpu.workers import run_shared, thread_count
 from panoless.kernels.reference.cubemap import SHORTEST_DIRECTION, cubemap_padding
 
 f32 = np.float32
 SHORTEST, LARGEST = f32(SHORTEST_DIRECTION), np.finfo(np.float32).max
 RAYS_PER_BLOCK = 512
+LINES_PER_CLAIM = 16
 
 
 class SampleCubemap(torch.autograd.Function):
@@ -32,15 +36,15 @@ class SampleCubemap(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, cubemap, directions):
-        match_torch_threads()
         _, channels, resolution, _ = cubemap.shape
         padding = cubemap_padding(resolution, torch.device("cpu"))
         texture = cubemap.new_empty(6, resolution + 2, resolution + 2, channels)
         faces = cubemap.detach().contiguous().numpy()
-        _pad(faces, padding.sources.numpy(), padding.corners.numpy(), texture.numpy())
+        run_shared(_pad, faces, padding.sources.numpy(), padding.corners.numpy(), texture.numpy())
         directions = directions.detach().contiguous()
         values = directions.new_empty(len(directions), channels)
-        _sample(_flat(texture), resolution, _flat(directions), _flat(values), (0,) * channels)
+        rays = _flat(directions), _flat(values)
+        run_shared(_sample, _flat(texture), resolution, *rays, (0,) * channels)
         ctx.save_for_backward(texture, directions)
         return values
 
@@ -53,11 +57,10 @@ class SampleCubemap(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             grad_cubemap = scatter_cubemap(grad_values, directions, texture.shape[1] - 2)
         if ctx.needs_input_grad[1]:
-            match_torch_threads()
             grad_directions = torch.empty_like(directions)
             _, padded, _, channels = texture.shape
             rays = _flat(directions), _flat(grad_values), _flat(grad_directions)
-            _pull_to_directions(_flat(texture), padded - 2, *rays, (0,) * channels)
+            run_shared(_pull_to_directions, _flat(texture), padded - 2, *rays, (0,) * channels)
         return grad_cubemap, grad_directions
 
 
@@ -65,16 +68,16 @@ def scatter_cubemap(
     values: Float[Tensor, "P C"], directions: Float[Tensor, "P 3"], resolution: int
 ) -> Float[Tensor, "6 C L L"]:
     """The adjoint of `SampleCubemap` in its first argument."""
-    threads = match_torch_threads()
     channels = values.shape[1]
     padding = cubemap_padding(resolution, torch.device("cpu"))
     # Clearing and adding up one more buffer must cost less than the work it takes from the others.
     useful = max(1, 4 * len(directions) // (6 * resolution**2))
-    buffers = _scatter_buffers(min(threads, useful), resolution, channels)
+    buffers = _scatter_buffers(min(thread_count(), useful), resolution, channels, get_ident())
     flat_buffers = buffers.reshape(len(buffers), -1)
-    _scatter(_flat(values), _flat(directions), flat_buffers, resolution, (0,) * channels)
+    run_shared(_scatter, _flat(values), _flat(directions), flat_buffers, resolution, (0,) * channels)
     cubemap = values.new_empty(6, channels, resolution, resolution)
-    _fold(buffers, padding.sources.numpy(), padding.corners.numpy(), cubemap.numpy())
+    run_shared(_add_up, buffers, cubemap.numpy())
+    _fold_rings(buffers, padding.sources.numpy(), padding.corners.numpy(), cubemap.numpy())
     return cubemap
 
 
@@ -83,32 +86,37 @@ def _flat(tensor: Tensor) -> Float[np.ndarray, "N"]:
 
 
 @lru_cache(maxsize=4)
-def _scatter_buffers(count: int, resolution: int, channels: int) -> Float[np.ndarray, "buffers 6 padded padded C"]:
-    """Scratch that every scatter of this shape clears and uses again."""
+def _scatter_buffers(
+    count: int, resolution: int, channels: int, owner: int
+) -> Float[np.ndarray, "buffers 6 padded padded C"]:
+    """Scratch of one Python thread (`owner`) that every scatter of this shape clears and uses again."""
     return np.empty((count, 6, resolution + 2, resolution + 2, channels), f32)
 
 
-@njit(parallel=True, cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
-def _pad(cubemap, sources, corners, texture):
+@njit(**VECTORIZED_LOOPS)
+def _pad(counter, cubemap, sources, corners, texture):
     """Copy the faces, channels last, with their ring of neighbors."""
     _, channels, resolution, _ = cubemap.shape
     last = resolution + 1
-    for line in prange(6 * (resolution + 2)):
-        face, row = line // (resolution + 2), line % (resolution + 2)
-        out = texture[face, row]
-        if 0 < row < last:
-            for channel in range(channels):
-                texels = cubemap[face, channel, row - 1]
-                for i in range(resolution):
-                    out[i + 1, channel] = texels[i]
-        step = last if 0 < row < last else 1
-        for column in range(0, resolution + 2, step):
-            source = sources[face, row, column]
-            for channel in range(channels):
-                out[column, channel] = _extended_texel(cubemap, corners, source, channel)
+    while True:
+        first = fetch_add(counter, LINES_PER_CLAIM)
+        if first >= 6 * (resolution + 2):
+            return
+        for line in range(first, min(first + LINES_PER_CLAIM, 6 * (resolution + 2))):
+            face, row = line // (resolution + 2), line % (resolution + 2)
+            out = texture[face, row]
+            if 0 < row < last:
+                for channel in range(channels):
+                    texels = cubemap[face, channel, row - 1]
+                    for i in range(resolution):
+                        out[i + 1, channel] = texels[i]
+            for column in range(0, resolution + 2, last if 0 < row < last else 1):
+                source = sources[face, row, column]
+                for channel in range(channels):
+                    out[column, channel] = _extended_texel(cubemap, corners, source, channel)
 
 
-@njit(cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
+@njit(**VECTORIZED_LOOPS)
 def _extended_texel(cubemap, corners, source, channel):
     area = cubemap.shape[2] * cubemap.shape[3]
     if source < 6 * area:
@@ -119,7 +127,7 @@ def _extended_texel(cubemap, corners, source, channel):
     return total / f32(3)
 
 
-@njit(cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
+@njit(**VECTORIZED_LOOPS)
 def _locate(directions, resolution, cells, rights, downs, present):
     """Upper left of the four texels around each ray, position between them, and 1, or 0 if it looks nowhere."""
     half = f32(0.5) * f32(resolution)
@@ -148,18 +156,21 @@ def _locate(directions, resolution, cells, rights, downs, present):
         present[i] = f32(1) if usable else f32(0)
 
 
-@njit(parallel=True, cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
-def _sample(texture, resolution, directions, values, unrolled):
+@njit(**VECTORIZED_LOOPS)
+def _sample(counter, texture, resolution, directions, values, unrolled):
     rays, channels = directions.size // 3, len(unrolled)
-    for block in prange((rays + RAYS_PER_BLOCK - 1) // RAYS_PER_BLOCK):
-        begin, end = block * RAYS_PER_BLOCK, min((block + 1) * RAYS_PER_BLOCK, rays)
-        cells, places = np.empty(RAYS_PER_BLOCK, np.int32), np.empty((3, RAYS_PER_BLOCK), np.float32)
+    cells, places = np.empty(RAYS_PER_BLOCK, np.int32), np.empty((3, RAYS_PER_BLOCK), np.float32)
+    while True:
+        begin = fetch_add(counter, RAYS_PER_BLOCK)
+        if begin >= rays:
+            return
+        end = min(begin + RAYS_PER_BLOCK, rays)
         _locate(directions[3 * begin : 3 * end], resolution, cells, places[0], places[1], places[2])
         out = values[channels * begin : channels * end]
         _interpolate(texture, resolution + 2, cells, places, out, unrolled)
 
 
-@njit(cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
+@njit(**VECTORIZED_LOOPS)
 def _interpolate(texture, stride, cells, places, values, unrolled):
     channels = len(unrolled)
     for i in range(values.size // channels):
@@ -174,15 +185,18 @@ def _interpolate(texture, stride, cells, places, values, unrolled):
             values[channels * i + k] = up * upper + down * lower
 
 
-@njit(parallel=True, cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
-def _scatter(values, directions, buffers, resolution, unrolled):
-    """Each thread clears a padded buffer of its own and adds its share of the rays to it."""
+@njit(**VECTORIZED_LOOPS)
+def _scatter(counter, values, directions, buffers, resolution, unrolled):
+    """Clear each padded buffer and add its share of the rays to it: the same share whichever thread comes to it."""
     rays, channels = directions.size // 3, len(unrolled)
     count = len(buffers)
-    for task in prange(count):
+    cells, places = np.empty(RAYS_PER_BLOCK, np.int32), np.empty((3, RAYS_PER_BLOCK), np.float32)
+    while True:
+        task = fetch_add(counter, 1)
+        if task >= count:
+            return
         buffer = buffers[task]
         buffer[:] = f32(0)
-        cells, places = np.empty(RAYS_PER_BLOCK, np.int32), np.empty((3, RAYS_PER_BLOCK), np.float32)
         last = (task + 1) * rays // count
         for begin in range(task * rays // count, last, RAYS_PER_BLOCK):
             end = min(begin + RAYS_PER_BLOCK, last)
@@ -190,7 +204,7 @@ def _scatter(values, directions, buffers, resolution, unrolled):
             _deposit(values[channels * begin : channels * end], resolution + 2, cells, places, buffer, unrolled)
 
 
-@njit(cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
+@njit(**VECTORIZED_LOOPS)
 def _deposit(values, stride, cells, places, buffer, unrolled):
     channels = len(unrolled)
     for i in range(values.size // channels):
@@ -207,20 +221,30 @@ def _deposit(values, stride, cells, places, buffer, unrolled):
             buffer[d + k] += down * right * value
 
 
-@njit(parallel=True, cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
-def _fold(buffers, sources, corners, cubemap):
-    """Sum the buffers; then add what was deposited in each ring to the texels that it shows."""
+@njit(**VECTORIZED_LOOPS)
+def _add_up(counter, buffers, cubemap):
+    """Sum the inner parts of the buffers, in their order, channels first."""
     count, _, padded, _, channels = buffers.shape
     resolution = padded - 2
-    for line in prange(6 * resolution):
-        face, row = line // resolution, line % resolution
-        for channel in range(channels):
-            out = cubemap[face, channel, row]
-            for i in range(resolution):
-                total = f32(0)
-                for buffer in range(count):
-                    total += buffers[buffer, face, row + 1, i + 1, channel]
-                out[i] = total
+    while True:
+        first = fetch_add(counter, LINES_PER_CLAIM)
+        if first >= 6 * resolution:
+            return
+        for line in range(first, min(first + LINES_PER_CLAIM, 6 * resolution)):
+            face, row = line // resolution, line % resolution
+            for channel in range(channels):
+                out = cubemap[face, channel, row]
+                for i in range(resolution):
+                    total = f32(0)
+                    for buffer in range(count):
+                        total += buffers[buffer, face, row + 1, i + 1, channel]
+                    out[i] = total
+
+
+@njit(**VECTORIZED_LOOPS)
+def _fold_rings(buffers, sources, corners, cubemap):
+    """Add what was deposited in the ring around each face to the texels that it shows."""
+    count, _, padded, _, channels = buffers.shape
     for face in range(6):
         for row in range(padded):
             for column in range(0, padded, padded - 1 if 0 < row < padded - 1 else 1):
@@ -232,7 +256,7 @@ def _fold(buffers, sources, corners, cubemap):
                     _add_to_extended_texel(cubemap, corners, source, channel, total)
 
 
-@njit(cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
+@njit(**VECTORIZED_LOOPS)
 def _add_to_extended_texel(cubemap, corners, source, channel, value):
     resolution = cubemap.shape[3]
     area = resolution * resolution
@@ -243,13 +267,16 @@ def _add_to_extended_texel(cubemap, corners, source, channel, value):
         cubemap[texel // area, channel, texel % area // resolution, texel % resolution] += value / f32(3)
 
 
-@njit(parallel=True, cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
-def _pull_to_directions(texture, resolution, directions, grad_values, grad_directions, unrolled):
+@njit(**VECTORIZED_LOOPS)
+def _pull_to_directions(counter, texture, resolution, directions, grad_values, grad_directions, unrolled):
     """Derivative of the interpolation by the place in the cell, then of the central projection by the direction."""
     rays, channels = directions.size // 3, len(unrolled)
-    for block in prange((rays + RAYS_PER_BLOCK - 1) // RAYS_PER_BLOCK):
-        begin, end = block * RAYS_PER_BLOCK, min((block + 1) * RAYS_PER_BLOCK, rays)
-        cells, places = np.empty(RAYS_PER_BLOCK, np.int32), np.empty((3, RAYS_PER_BLOCK), np.float32)
+    cells, places = np.empty(RAYS_PER_BLOCK, np.int32), np.empty((3, RAYS_PER_BLOCK), np.float32)
+    while True:
+        begin = fetch_add(counter, RAYS_PER_BLOCK)
+        if begin >= rays:
+            return
+        end = min(begin + RAYS_PER_BLOCK, rays)
         share = directions[3 * begin : 3 * end]
         _locate(share, resolution, cells, places[0], places[1], places[2])
         _pull_to_places(
@@ -258,7 +285,7 @@ def _pull_to_directions(texture, resolution, directions, grad_values, grad_direc
         _pull_through_projection(share, resolution, places[0], places[1], grad_directions[3 * begin : 3 * end])
 
 
-@njit(cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
+@njit(**VECTORIZED_LOOPS)
 def _pull_to_places(texture, stride, cells, places, grad_values, unrolled):
     """Replace each ray's place in its cell by the derivatives of the loss by it."""
     channels = len(unrolled)
@@ -276,7 +303,7 @@ def _pull_to_places(texture, stride, cells, places, grad_values, unrolled):
         places[0, i], places[1, i] = by_right, by_down
 
 
-@njit(cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
+@njit(**VECTORIZED_LOOPS)
 def _pull_through_projection(directions, resolution, by_rights, by_downs, grad_directions):
     """With s = s_c/|m|: ∂/∂s_c = ∂/∂s / |m| and ∂/∂m = −sign(m)·(s·∂/∂s + t·∂/∂t) / |m|; see `_locate`."""
     half = f32(0.5) * f32(resolution)

@@ -8,18 +8,22 @@ loop it gives up proving that they don't overlap.
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from threading import get_ident
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from numba import njit, prange
+from numba import njit
 
-from panoless.kernels.cpu.threads import FINITE_AWARE_FAST_MATH, match_torch_threads
+from panoless.kernels.cpu.compilation import VECTORIZED_LOOPS
+from panoless.kernels.cpu.simd_memory import fetch_add
+from panoless.kernels.cpu.workers import run_shared, thread_count
 from panoless.kernels.reference.image import SSIM_C1, SSIM_C2, SSIM_RADIUS, ssim_window
 
 f32 = np.float32
 LARGEST = np.finfo(np.float32).max
 NORMAL_STRIP_ROWS = 16
+NUMBERS_PER_CLAIM = 1 << 15
 C1, C2 = f32(SSIM_C1), f32(SSIM_C2)
 WINDOW = 2 * SSIM_RADIUS + 1
 W0, W1, W2, W3, W4, W5 = (f32(weight) for weight in ssim_window()[SSIM_RADIUS:])
@@ -35,22 +39,21 @@ class DepthNormals(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, depth, fx, fy, cx, cy):
-        match_torch_threads()
         depth = depth.contiguous()
         normals = depth.new_empty(3, *depth.shape)
         ctx.camera = (f32(fx), f32(fy), f32(cx), f32(cy))
         ctx.save_for_backward(depth)
-        _normals_forward(depth.detach().numpy(), *ctx.camera, normals.numpy())
+        run_shared(_normals_forward, depth.detach().numpy(), *ctx.camera, normals.numpy())
         return normals
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_normals):
-        match_torch_threads()
         (depth,) = ctx.saved_tensors
         grad_depth = torch.empty_like(depth)
         grad_normals = grad_normals.contiguous().numpy()
-        _normals_backward(depth.detach().numpy(), *ctx.camera, grad_normals, grad_depth.numpy())
+        arrays = grad_normals, grad_depth.numpy()
+        run_shared(_normals_backward, depth.detach().numpy(), *ctx.camera, *arrays)
         return grad_depth, None, None, None, None
 
 
@@ -59,14 +62,14 @@ class Ssim(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, image, target):
-        threads = match_torch_threads()
+        threads = thread_count()
         channels, height, width = image.shape
         needs_gradient = ctx.needs_input_grad[0]
         gradient = image.new_empty(image.shape if needs_gradient else (channels, 0, width))
         strips = min(threads // math.gcd(threads, channels), height)
-        scratch = _ssim_scratch(channels * strips, width)
+        scratch = _ssim_scratch(channels * strips, width, get_ident())
         pixels, target_pixels = image.detach().contiguous().numpy(), target.detach().contiguous().numpy()
-        _ssim_strips(pixels, target_pixels, scratch.rows, scratch.totals, gradient.numpy())
+        run_shared(_ssim_strips, pixels, target_pixels, scratch.rows, scratch.totals, gradient.numpy())
         ctx.save_for_backward(gradient)
         return image.new_tensor(scratch.totals.sum() / image.numel())
 
@@ -74,7 +77,9 @@ class Ssim(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_ssim):
         (gradient,) = ctx.saved_tensors
-        return gradient * grad_ssim, None
+        grad_image = torch.empty_like(gradient)
+        run_shared(_scale, gradient.numpy().reshape(-1), f32(grad_ssim.item()), grad_image.numpy().reshape(-1))
+        return grad_image, None
 
 
 @dataclass(frozen=True)
@@ -86,13 +91,14 @@ class SsimScratch:
 
 
 @lru_cache(maxsize=16)
-def _ssim_scratch(strips: int, width: int) -> SsimScratch:
+def _ssim_scratch(strips: int, width: int, owner: int) -> SsimScratch:
+    """Scratch of one Python thread (`owner`), so that two of them may compute SSIM at once."""
     # The outer columns are the zeros that continue the image: no kernel ever writes there.
     return SsimScratch(np.zeros((strips, SCRATCH_ROWS, width + 2 * SSIM_RADIUS), f32), np.zeros(strips))
 
 
-@njit(parallel=True, cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
-def _ssim_strips(image, target, scratch, totals, gradient):
+@njit(**VECTORIZED_LOOPS)
+def _ssim_strips(counter, image, target, scratch, totals, gradient):
     """Sum the SSIM of each strip and, unless `gradient` is empty, find the gradient of the mean over everything.
 
     Three fronts move down together: products are read at `row`, SSIM is known `SSIM_RADIUS` rows above, and its
@@ -102,7 +108,10 @@ def _ssim_strips(image, target, scratch, totals, gradient):
     strips = scratch.shape[0] // channels
     scale = f32(1) / f32(image.size)
     halo = 2 * SSIM_RADIUS if gradient.size > 0 else SSIM_RADIUS
-    for task in prange(channels * strips):
+    while True:
+        task = fetch_add(counter, 1)
+        if task >= channels * strips:
+            return
         channel, strip = task // strips, task % strips
         begin, end = strip * height // strips, (strip + 1) * height // strips
         rows = scratch[task]
@@ -135,7 +144,7 @@ def _ssim_strips(image, target, scratch, totals, gradient):
         totals[task] = total
 
 
-@njit(cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
+@njit(**VECTORIZED_LOOPS)
 def _products(x, y, rows):
     """x, y, x² + y² and xy of one row, inside the zero padding."""
     mean_x, mean_y, squares, cross = rows[PRODUCTS], rows[PRODUCTS + 1], rows[PRODUCTS + 2], rows[PRODUCTS + 3]
@@ -146,7 +155,7 @@ def _products(x, y, rows):
         cross[i + SSIM_RADIUS] = x[i] * y[i]
 
 
-@njit(cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
+@njit(**VECTORIZED_LOOPS)
 def _push_row(rows, source, ring, row, inside, width):
     """Put the horizontal mean of a padded row into its place in a ring; outside the image that is zero."""
     a = rows[source]
@@ -160,7 +169,7 @@ def _push_row(rows, source, ring, row, inside, width):
         out[i] = far + near
 
 
-@njit(cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
+@njit(**VECTORIZED_LOOPS)
 def _mean_down(rows, ring, middle, out, width):
     """Vertical mean around row `middle` of the eleven horizontal means in a ring."""
     first = RINGS + ring * WINDOW
@@ -176,7 +185,7 @@ def _mean_down(rows, ring, middle, out, width):
         out[i] = far + near
 
 
-@njit(cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
+@njit(**VECTORIZED_LOOPS)
 def _statistics(rows, scale, width):
     """Sum of SSIM over a row, and `scale` times its derivatives by the means of x, of x² + y² and of xy."""
     mean_x, mean_y, squares, cross = rows[MEANS], rows[MEANS + 1], rows[MEANS + 2], rows[MEANS + 3]
@@ -197,12 +206,23 @@ def _statistics(rows, scale, width):
     return total
 
 
-@njit(cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
+@njit(**VECTORIZED_LOOPS)
 def _chain(x, y, rows, gradient):
     """Gradient of one row of the image from the means of the derivatives around it."""
     by_mean, by_squares, by_cross = rows[PULLED], rows[PULLED + 1], rows[PULLED + 2]
     for i in range(x.size):
         gradient[i] = by_mean[i] + f32(2) * x[i] * by_squares[i] + y[i] * by_cross[i]
+
+
+@njit(**VECTORIZED_LOOPS)
+def _scale(counter, numbers, factor, out):
+    """A product that torch would hand to its OpenMP threads, which spin on afterwards and hold up the next kernel."""
+    while True:
+        begin = fetch_add(counter, NUMBERS_PER_CLAIM)
+        if begin >= numbers.size:
+            return
+        for i in range(begin, min(begin + NUMBERS_PER_CLAIM, numbers.size)):
+            out[i] = numbers[i] * factor
 
 
 # With a, b the depths right and left of a pixel, c, e below and above it, and X, Y its offset from the principal
@@ -211,19 +231,23 @@ def _chain(x, y, rows, gradient):
 # faces the camera: N · (X/fx, Y/fy, 1) = −1.
 
 
-@njit(parallel=True, cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
-def _normals_forward(depth, fx, fy, cx, cy, normals):
+@njit(**VECTORIZED_LOOPS)
+def _normals_forward(counter, depth, fx, fy, cx, cy, normals):
     height, width = depth.shape
-    for row in prange(height):
-        if row == 0 or row == height - 1 or width < 3:
-            normals[:, row] = f32(0)
-            continue
-        _normals_of_row(depth, fx, fy, cx, cy, row, normals)
-        normals[:, row, 0] = f32(0)
-        normals[:, row, width - 1] = f32(0)
+    while True:
+        begin = fetch_add(counter, NORMAL_STRIP_ROWS)
+        if begin >= height:
+            return
+        for row in range(begin, min(begin + NORMAL_STRIP_ROWS, height)):
+            if row == 0 or row == height - 1 or width < 3:
+                normals[:, row] = f32(0)
+                continue
+            _normals_of_row(depth, fx, fy, cx, cy, row, normals)
+            normals[:, row, 0] = f32(0)
+            normals[:, row, width - 1] = f32(0)
 
 
-@njit(cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
+@njit(**VECTORIZED_LOOPS)
 def _normals_of_row(depth, fx, fy, cx, cy, row, normals):
     y = f32(row) + f32(0.5) - cy
     above, here, below = depth[row - 1], depth[row], depth[row + 1]
@@ -241,15 +265,17 @@ def _normals_of_row(depth, fx, fy, cx, cy, row, normals):
         out_z[i] = nz * inverse if defined else f32(0)
 
 
-@njit(parallel=True, cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
-def _normals_backward(depth, fx, fy, cx, cy, grad_normals, grad_depth):
+@njit(**VECTORIZED_LOOPS)
+def _normals_backward(counter, depth, fx, fy, cx, cy, grad_normals, grad_depth):
     """Each strip finds what its pixels, and those just around it, send to their neighbors, then gathers it."""
     height, width = depth.shape
-    strips = (height + NORMAL_STRIP_ROWS - 1) // NORMAL_STRIP_ROWS
-    for strip in prange(strips):
-        begin, end = strip * NORMAL_STRIP_ROWS, min((strip + 1) * NORMAL_STRIP_ROWS, height)
-        # One ring of rows for each neighbor: right, left, below, above.
-        sent = np.zeros((4, 3, width + 2), np.float32)
+    # One ring of three rows for each neighbor: right, left, below, above.
+    sent = np.zeros((4, 3, width + 2), np.float32)
+    while True:
+        begin = fetch_add(counter, NORMAL_STRIP_ROWS)
+        if begin >= height:
+            return
+        end = min(begin + NORMAL_STRIP_ROWS, height)
         for row in range(begin - 1, end + 1):
             slot = (row + 3) % 3
             if 0 < row < height - 1:
@@ -260,7 +286,7 @@ def _normals_backward(depth, fx, fy, cx, cy, grad_normals, grad_depth):
                 _normals_gather(sent, row, grad_depth[row - 1])
 
 
-@njit(cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
+@njit(**VECTORIZED_LOOPS)
 def _normals_send(depth, fx, fy, cx, cy, grad_normals, row, sent, slot):
     """Derivatives of the loss by the four depths around each pixel of a row, through that pixel's normal."""
     y = f32(row) + f32(0.5) - cy
@@ -286,7 +312,7 @@ def _normals_send(depth, fx, fy, cx, cy, grad_normals, row, sent, slot):
         to_above[i] = -c * by_y if defined else f32(0)
 
 
-@njit(cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy")
+@njit(**VECTORIZED_LOOPS)
 def _normals_gather(sent, row, grad_depth):
     """Gradient of the row before `row`: what its own pixels and the rows above and below send to it."""
     to_right, to_left = sent[0, (row + 2) % 3], sent[1, (row + 2) % 3]
@@ -296,7 +322,7 @@ def _normals_gather(sent, row, grad_depth):
         grad_depth[i] = to_right[i - 1] + to_left[i + 1] + to_below[i] + to_above[i]
 
 
-@njit(cache=True, fastmath=FINITE_AWARE_FAST_MATH, error_model="numpy", inline="always")
+@njit(**VECTORIZED_LOOPS)
 def _all_usable(a, b, c, e):
     positive = (a > f32(0)) & (b > f32(0)) & (c > f32(0)) & (e > f32(0))
     return positive & (a <= LARGEST) & (b <= LARGEST) & (c <= LARGEST) & (e <= LARGEST)

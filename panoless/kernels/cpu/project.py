@@ -10,19 +10,16 @@ from panoless.kernels.cpu import records as rec
 from panoless.kernels.cpu.simd import (
     LANES,
     absolute,
-    fetch_add,
     float_bits,
     lane_indices,
-    load_strided,
     log2,
     mask_bits,
     maximum,
     minimum,
     square_root,
-    store_lanes,
-    store_strided,
     where,
 )
+from panoless.kernels.cpu.simd_memory import fetch_add, load_strided, store_lanes, store_strided
 
 GROUPS_PER_CLAIM = 16
 THIN_ELLIPSE = np.float32(1e-4)
@@ -59,21 +56,25 @@ class UnitQuat(NamedTuple):
 
 @njit(forceinline=True)
 def cross(a, b):
+    """Vector product of two triples."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 @njit(forceinline=True)
 def dot(a, b):
+    """Scalar product of two triples."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @njit(forceinline=True)
 def scaled(a, s):
+    """A triple times a scalar or lanes."""
     return (a[0] * s, a[1] * s, a[2] * s)
 
 
 @njit(forceinline=True)
 def added(a, b):
+    """Sum of two triples."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
@@ -110,6 +111,7 @@ def load_vector(array, first, active):
 
 @njit(forceinline=True)
 def store_vector(array, start, stride, active, vector):
+    """Store a triple of lanes in three consecutive columns of a table."""
     store_strided(array, start, stride, active, vector[0])
     store_strided(array, start + 1, stride, active, vector[1])
     store_strided(array, start + 2, stride, active, vector[2])
@@ -117,6 +119,7 @@ def store_vector(array, start, stride, active, vector):
 
 @njit(forceinline=True)
 def load_quat(quats, first, active):
+    """Rows first … first + 15 of a (K, 4) array, normalized."""
     w = load_strided(quats, 4 * first, 4, active)
     x = load_strided(quats, 4 * first + 1, 4, active)
     y = load_strided(quats, 4 * first + 2, 4, active)
@@ -127,6 +130,7 @@ def load_quat(quats, first, active):
 
 @njit(forceinline=True)
 def surfel_frame(mean, q, camera):
+    """Bring sixteen surfels to camera coordinates; the tangents and the normal are the columns of the rotation."""
     tangent_u = (1.0 - 2.0 * (q.y * q.y + q.z * q.z), 2.0 * (q.x * q.y + q.w * q.z), 2.0 * (q.x * q.z - q.w * q.y))
     tangent_v = (2.0 * (q.x * q.y - q.w * q.z), 1.0 - 2.0 * (q.x * q.x + q.z * q.z), 2.0 * (q.y * q.z + q.w * q.x))
     normal = (2.0 * (q.x * q.z + q.w * q.y), 2.0 * (q.y * q.z - q.w * q.x), 1.0 - 2.0 * (q.x * q.x + q.y * q.y))
@@ -161,7 +165,9 @@ class Extent(NamedTuple):
 
 @njit(forceinline=True)
 def extent_along(axis, center, scaled_u, scaled_v, rho, inverse_plane):
-    """The surfel's outline along one axis: the tangents' slopes against the viewing ray keep the formula free of cancellation."""
+    """The surfel's outline along one axis: the tangents' slopes against the viewing ray keep the formula free of
+    cancellation.
+    """
     slope = center[axis] / center[2]
     lean_u = scaled_u[axis] - slope * scaled_u[2]
     lean_v = scaled_v[axis] - slope * scaled_v[2]
@@ -172,6 +178,7 @@ def extent_along(axis, center, scaled_u, scaled_v, rho, inverse_plane):
 
 @njit(forceinline=True)
 def store_field(table, first, field, active, value):
+    """Store one field of sixteen consecutive records."""
     store_strided(table, first * rec.RECORD_SIZE + field, rec.RECORD_SIZE, active, value)
 
 
@@ -223,11 +230,13 @@ def store_outline(table, boxes, first, active, camera, center_xy, frame, scaled_
 
 @njit(forceinline=True)
 def first_pixel(edge):
+    """The first pixel whose center is not left of `edge`."""
     return np.int64(np.ceil(max(edge, np.float32(-1e6)) - np.float32(0.5)))
 
 
 @njit(forceinline=True)
 def last_pixel(edge):
+    """The last pixel whose center is not right of `edge`."""
     return np.int64(np.floor(min(edge, np.float32(1e6)) - np.float32(0.5)))
 
 
@@ -254,6 +263,7 @@ def store_tiles(keys, tile_ranges, first, drawn_bits, boxes, depths, width, heig
 
 @njit(forceinline=True)
 def project_group(first, surfels, camera, width, height, curved, table, keys, tile_ranges, boxes, depths):
+    """Project surfels first … first + 15: records, keys and tile ranges."""
     means, quats, scales, opacities, colors, curvatures, offsets = surfels
     active = lane_indices() < np.float32(min(keys.size - first, LANES))
     frame = surfel_frame(load_vector(means, first, active), load_quat(quats, first, active), camera)

@@ -19,15 +19,11 @@ from panoless.kernels.cpu.project import (
 )
 from panoless.kernels.cpu.simd import (
     LANES,
-    fetch_add,
     lane_indices,
     lanes,
-    load_lanes,
-    load_strided,
-    store_lanes,
-    store_strided,
     where,
 )
+from panoless.kernels.cpu.simd_memory import fetch_add, load_lanes, load_strided, store_lanes, store_strided
 
 
 @njit(forceinline=True)
@@ -68,6 +64,7 @@ def sum_slots(slots, slot_starts, first, curved, sums, visible):
 
 @njit(forceinline=True)
 def load_sums(sums, field, active):
+    """Three consecutive columns of the summed rows; 0 where `active` fails."""
     size = sums.shape[1]
     return (
         load_strided(sums, field, size, active),
@@ -78,6 +75,7 @@ def load_sums(sums, field, active):
 
 @njit(forceinline=True)
 def project_group_backward(first, count, surfels, camera, curved, sums, visible, gradients):
+    """Chain the summed record gradients of sixteen surfels back to their parameters."""
     means, quats, scales, opacities, _, curvatures, _ = surfels
     grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_curvatures, grad_offsets = gradients
     active = lane_indices() < np.float32(min(count - first, LANES))

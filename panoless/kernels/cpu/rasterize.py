@@ -1,7 +1,7 @@
 """The Numba rasterizer as a differentiable torch operator.
 
-Memory between a forward and its backward belongs to that forward alone, so several may be in flight; buffers that nothing refers to any more
-are used again. Results are the same bit for bit whatever the number of threads.
+Memory between a forward and its backward belongs to that forward alone, so several may be in flight; buffers that
+nothing refers to any more are used again. Results are the same bit for bit whatever the number of threads.
 """
 
 from dataclasses import dataclass
@@ -37,7 +37,8 @@ class Footprints:
     drawn: np.ndarray
 
     @property
-    def bins(self):
+    def bins(self) -> tuple[np.ndarray, np.ndarray, int]:
+        """Where each tile's list starts, the surfels on the lists, and the longest list's length."""
         return self.tile_starts, self.entry_surfels, self.longest
 
 
@@ -63,7 +64,7 @@ def _camera_array(camera) -> np.ndarray:
 
 
 def _find_footprints(surfels, camera_array, width, height, curved) -> Footprints:
-    count = surfels[0].shape[0]
+    count = surfels[3].size
     table = take((count, rec.RECORD_SIZE))
     keys = take((count,), np.uint32)
     tile_ranges = take((count, 4), np.int32)
@@ -174,10 +175,12 @@ def _cotangent_planes(cotangents, outputs: Planes) -> Planes:
 
 def _zero_gradients(parameters) -> tuple[Tensor, ...]:
     count = parameters[0].shape[0]
-    return tuple(
-        torch.zeros(count * width) if parameter is None else torch.zeros_like(parameter, memory_format=torch.contiguous_format)
-        for parameter, width in zip(parameters, _PARAMETER_WIDTHS, strict=True)
-    )
+    gradients = []
+    for parameter, width in zip(parameters, _PARAMETER_WIDTHS, strict=True):
+        array = take((count, width) if parameter is None else tuple(parameter.shape))
+        array[:] = 0
+        gradients.append(torch.from_numpy(array))
+    return tuple(gradients)
 
 
 def rasterize_cpu(means, quats, scales, opacities, colors, curvatures, screen_offsets, camera):

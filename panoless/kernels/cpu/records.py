@@ -1,8 +1,8 @@
 """What one surfel looks like to the tile kernels: two cache lines of float32, and the gradient of the first of them.
 
-With (dx, dy) the pixel minus the projected center and w = HIT_CENTER + A2·dx + B2·dy, the ray meets the surfel at
-u = (A0·dx + B0·dy) / w, v = (A1·dx + B1·dy) / w, at depth DEPTH / w. An edge-on surfel has HIT_CENTER = 0 and no slopes, so that w = 0
-marks every hit as invalid; otherwise HIT_CENTER is 1.
+With (dx, dy) the pixel minus the projected center and w = HIT_CENTER + A2·dx + B2·dy, the ray meets the surfel at u =
+(A0·dx + B0·dy) / w, v = (A1·dx + B1·dy) / w, at depth DEPTH / w. An edge-on surfel has HIT_CENTER = 0 and no slopes,
+so that w = 0 marks every hit as invalid; otherwise HIT_CENTER is 1.
 """
 
 CENTER_X, CENTER_Y = 0, 1
@@ -15,7 +15,9 @@ RHO_MAX = 11
 COLOR = 12
 NORMAL = 15
 CURVED_U = 18
-"""The normal's derivative with respect to u; CURVED_V with respect to v. Left unset, and never read, where surfels are flat."""
+"""The normal's derivative with respect to u; CURVED_V with respect to v. Left unset, and never read, where surfels
+are flat.
+"""
 CURVED_V = 21
 ELLIPSE_X, ELLIPSE_Y = 24, 25
 FORM_XX, FORM_XY, FORM_YY = 26, 27, 28

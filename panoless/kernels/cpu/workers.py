@@ -1,7 +1,8 @@
 """Threads for kernels that release the interpreter lock and share their work through an atomic counter.
 
-Numba's own layers were measured and not taken: its OpenMP layer spins after every region, which on a busy machine costs many times the
-kernel, and its work queue ends the process when two Python threads enter it at once.
+Numba's own layers were measured and not taken. A region of 1.1 ms of work on two cores takes 0.54 ms with OpenMP, 0.58
+here and 0.63 with the work queue while the machine is idle, but 8.0, 1.1 and 2.3 ms beside two other busy processes:
+OpenMP's threads spin for one another. The work queue also ends the process when two Python threads enter it at once.
 """
 
 import os

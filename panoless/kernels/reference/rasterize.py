@@ -18,7 +18,9 @@ from panoless.kernels.constants import (
 )
 
 PAIRS_AT_ONCE = 1 << 22
-"""Surfel–pixel pairs held in memory together; larger images are done in chunks of pixels that the backward computes again."""
+"""Surfel–pixel pairs held in memory together; larger images are done in chunks of pixels that the backward computes
+again.
+"""
 
 
 class Footprint(NamedTuple):
@@ -59,7 +61,8 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 def bounding_boxes(footprint: Footprint, camera) -> Tensor:
     """(K, 4) left, right, top, bottom in pixels of where alpha may reach ALPHA_MIN.
 
-    With slopes taken against the ray to the center, the outline u² + v² = ρ lies within middle ± √(middle² − ρ·|lean|²/plane).
+    With slopes taken against the ray to the center, the outline u² + v² = ρ lies within middle ± √(middle² −
+    ρ·|lean|²/plane).
     """
     rho = 2 * torch.log(footprint.opacities / ALPHA_MIN)
     depth = footprint.centers[:, 2]
@@ -87,8 +90,9 @@ def touches_image(boxes: Tensor, camera) -> Tensor:
     return (columns >= 0) & (rows >= 0)
 
 
-def project(means, quats, scales, opacities, colors, curvatures, offsets, camera) -> Footprint:
-    """Bring surfels to camera coordinates."""
+def project(parameters: tuple[Tensor, ...], camera) -> Footprint:
+    """Bring surfels, given in the order of `rasterize_reference`, to camera coordinates."""
+    means, quats, scales, opacities, colors, curvatures, offsets = parameters
     world_to_camera = camera.world_to_camera.to(means)
     centers = means @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
     tangents_u, tangents_v, normals = (world_to_camera[:3, :3] @ rotation_matrices(quats)).unbind(-1)
@@ -190,12 +194,12 @@ def rasterize_reference(means, quats, scales, opacities, colors, curvatures, scr
     offsets = means.new_zeros(count, 2) if screen_offsets is None else screen_offsets
     parameters = (means, quats, scales, opacities, colors, curvatures, offsets)
     with torch.no_grad():
-        finite = torch.stack([p.reshape(count, -1).isfinite().all(-1) for p in parameters]).all(0)
+        finite = torch.stack([(p if p.ndim == 2 else p[:, None]).isfinite().all(-1) for p in parameters]).all(0)
         world_to_camera = camera.world_to_camera.to(means)
         depth = means @ world_to_camera[2, :3] + world_to_camera[2, 3]
         drawn = finite & (depth >= camera.near) & (opacities >= ALPHA_MIN) & (scales > 0).all(-1) & (quats != 0).any(-1)
         found = drawn.nonzero()[:, 0]
-        boxes = bounding_boxes(project(*(p[found] for p in parameters), camera), camera)
+        boxes = bounding_boxes(project(tuple(p[found] for p in parameters), camera), camera)
         drawn[found] = touches_image(boxes, camera)
     kept = drawn.nonzero()[:, 0]
     rows = torch.arange(camera.height, dtype=means.dtype, device=means.device) + 0.5
@@ -204,12 +208,13 @@ def rasterize_reference(means, quats, scales, opacities, colors, curvatures, scr
     if len(kept) == 0:
         image = means.new_zeros(10, camera.height, camera.width)
     else:
-        footprint = sort_by_depth(project(*(p[kept] for p in parameters), camera))
+        footprint = sort_by_depth(project(tuple(p[kept] for p in parameters), camera))
         chunks = pixels.split(max(1, PAIRS_AT_ONCE // len(kept)))
         blended = [
-            checkpoint(blend, footprint, chunk, camera, use_reentrant=False) if len(chunks) > 1 else blend(footprint, chunk, camera)
+            checkpoint(blend, footprint, chunk, camera, use_reentrant=False)
+            if len(chunks) > 1
+            else blend(footprint, chunk, camera)
             for chunk in chunks
         ]
         image = torch.cat(blended).T.reshape(10, camera.height, camera.width)
     return image[:3], image[3:6], image[6], image[7], image[8], image[9], drawn
-

@@ -1,0 +1,55 @@
+# make demo    render a dataset, fit it, score it and write an HTML report
+# make test    every check: format, lint, types, import contracts, documentation, tests
+# make docs    build the documentation into build/site
+# make format  let ruff rewrite what it can
+
+SHELL := /bin/bash
+VENV ?= .venv
+BIN := $(VENV)/bin
+PYTHON ?= $(shell for p in python3.11 python3; do \
+    $$p -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null && { echo $$p; break; }; done)
+NEED_PYTHON := expected Python 3.11 as python3.11 or python3 (the newest Blender module for it is the one in use)
+PIP_INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
+CODE := shinypartial panoless tests docs
+
+.PHONY: demo test docs format setup clean
+.DEFAULT_GOAL := demo
+
+demo: $(VENV)/.installed-demo
+	$(BIN)/shinypartial generate --scene vase --resolution 400
+	$(BIN)/panoless fit
+	$(BIN)/shinypartial evaluate
+	$(BIN)/shinypartial report
+
+test: setup
+	$(BIN)/ruff check $(CODE)
+	$(BIN)/ruff format --check $(CODE)
+	$(BIN)/mypy shinypartial panoless
+	$(BIN)/lint-imports
+	$(BIN)/mkdocs build --quiet --strict -f docs/mkdocs.yml
+	$(BIN)/python -m pytest
+
+docs: setup
+	$(BIN)/mkdocs build --strict -f docs/mkdocs.yml
+
+format: setup
+	$(BIN)/ruff check --fix $(CODE)
+	$(BIN)/ruff format $(CODE)
+
+setup: $(VENV)/.installed-dev
+
+$(VENV)/.installed-demo: extras := fit,blender
+$(VENV)/.installed-dev: extras := dev
+$(VENV)/.installed-demo $(VENV)/.installed-dev: pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" && $(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { \
+	  echo "error: $(NEED_PYTHON)" >&2; \
+	  echo "       found    $$($(or $(PYTHON),python3) --version 2>&1 | head -n 1)" >&2; \
+	  echo "       remedy   Install Python 3.11, or name it: make PYTHON=/path/to/python3.11 $(MAKECMDGOALS)" >&2; \
+	  exit 2; }
+	@test -x $(BIN)/pip || { echo "Making $(VENV) …"; $(PYTHON) -m venv --clear $(VENV); }
+	@echo "Installing panoless[$(extras)] into $(VENV): a minute here, longer where torch comes with CUDA …"
+	@$(PIP_INSTALL) -e '.[$(extras)]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis

@@ -1,0 +1,72 @@
+"""What a reader may rely on: documented names, short modules, file names that say something, checked shapes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from jaxtyping import TypeCheckError
+
+from shinypartial.dataset.schema import View
+from shinypartial.sphere import directions_to_latlong
+from tests.architecture.source import ROOT, source_files, undocumented
+from tests.conftest import checked_modules
+
+MAX_LINES = 450
+EMPTY_NAMES = {"utils", "util", "helpers", "helper", "misc", "common", "stuff"}
+
+every_file = pytest.mark.parametrize("path", source_files(), ids=lambda path: str(path.relative_to(ROOT)))
+
+
+@every_file
+def test_public_names_have_a_docstring(path: Path) -> None:
+    assert list(undocumented(path.read_text(encoding="utf-8"))) == []
+
+
+def test_a_missing_docstring_would_be_seen() -> None:
+    source = "class A:\n    '''Doc.'''\n    def b(self): ...\n    def _c(self): ...\ndef d(): ...\n"
+    assert list(undocumented(source)) == ["the module", "A.b", "d"]
+
+
+@every_file
+def test_modules_are_short(path: Path) -> None:
+    lines = len(path.read_text(encoding="utf-8").splitlines())
+    assert lines <= MAX_LINES, f"{lines} lines: split it by topic."
+
+
+@every_file
+def test_file_names_say_what_is_inside(path: Path) -> None:
+    assert path.stem not in EMPTY_NAMES
+
+
+@every_file
+def test_shapes_can_be_checked(path: Path) -> None:
+    """Postponed annotations are strings, which a runtime check of shapes does not see."""
+    source = path.read_text(encoding="utf-8")
+    assert not ("jaxtyping" in source and "from __future__ import annotations" in source)
+
+
+def test_tests_check_shapes_of_functions() -> None:
+    with pytest.raises(TypeCheckError):
+        directions_to_latlong(np.zeros((5, 2)))
+
+
+def test_tests_check_shapes_of_dataclasses_against_each_other() -> None:
+    with pytest.raises(TypeCheckError):
+        View(np.zeros((4, 4, 3)), np.zeros((4, 5)), None, None, False)
+
+
+def test_tests_check_dtypes() -> None:
+    with pytest.raises(TypeCheckError):
+        directions_to_latlong(np.zeros((5, 3), dtype=np.int64))
+
+
+def test_all_but_the_compiled_kernels_are_checked() -> None:
+    checked = tuple(checked_modules())
+
+    def is_checked(path: Path) -> bool:
+        module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        return any(module == name or module.startswith(name + ".") for name in checked)
+
+    unchecked = {str(path.relative_to(ROOT / "panoless")) for path in source_files() if not is_checked(path)}
+    allowed = ("__init__.py", "kernels/__init__.py", "kernels/cpu", "kernels/gpu")
+    assert all(name.startswith(allowed) for name in unchecked), unchecked

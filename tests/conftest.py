@@ -1,0 +1,54 @@
+"""What every test shares: array shapes checked at each call, reproducible examples, few threads, a dataset to read."""
+
+import os
+from pathlib import Path
+
+# Read when torch and OpenMP start: several test processes on few cores are slower with more.
+os.environ.setdefault("OMP_NUM_THREADS", str(min(4, os.cpu_count() or 1)))
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import pytest
+from hypothesis import settings
+from jaxtyping import install_import_hook
+
+ROOT = Path(__file__).resolve().parent.parent
+#: As PEP 484 has it, an int will do where a float is asked for.
+TYPE_CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
+#: Numba and Triton compile these from their source, which a decorator in between would hide.
+COMPILED = ("cpu", "gpu")
+
+
+def checked_modules() -> list[str]:
+    """The modules whose annotations are checked: all but the compiled kernels."""
+    rooms = _children("panoless", leave_out=("kernels",))
+    return ["shinypartial", "tests.support", *rooms, *_children("panoless.kernels", leave_out=COMPILED)]
+
+
+def _children(package: str, leave_out: tuple[str, ...]) -> list[str]:
+    folder = ROOT.joinpath(*package.split("."))
+    names = {path.stem for path in folder.glob("*") if path.suffix == ".py" or (path / "__init__.py").exists()}
+    return [f"{package}.{name}" for name in sorted(names) if not name.startswith(("__", *leave_out))]
+
+
+# Installed while pytest collects, so before any test imports the packages.
+install_import_hook(checked_modules(), TYPE_CHECKER)
+
+settings.register_profile("local", deadline=None, max_examples=50)
+settings.register_profile("ci", deadline=None, max_examples=20, derandomize=True)
+settings.load_profile("ci" if os.environ.get("CI") else "local")
+
+
+@pytest.fixture(scope="session")
+def sphere_dataset(tmp_path_factory: pytest.TempPathFactory):
+    """A small dataset in the full format, made once; tests only read it."""
+    from tests.support.synthetic_dataset import make_sphere_dataset
+
+    return make_sphere_dataset(tmp_path_factory.mktemp("datasets") / "sphere")
+
+
+@pytest.fixture
+def damaged_dataset(tmp_path: Path, sphere_dataset) -> Path:
+    """A copy of that dataset for a test to damage."""
+    import shutil
+
+    return Path(shutil.copytree(sphere_dataset.root, tmp_path / "damaged"))

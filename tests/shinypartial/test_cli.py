@@ -1,0 +1,106 @@
+"""The command line: help, bad usage, exit codes, and the newest folder where none is named."""
+
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from shinypartial.cli import main
+from shinypartial.dataset.schema import Dataset
+
+ROOT = Path(__file__).resolve().parents[2]
+COMMANDS = ("generate", "validate", "evaluate", "report")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_each_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--help"]) == 0
+    assert f"shinypartial {command}" in capsys.readouterr().out
+
+
+def test_help_lists_all_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    out = capsys.readouterr().out
+    assert all(command in out for command in COMMANDS)
+
+
+def test_help_is_fast() -> None:
+    command = [sys.executable, "-m", "shinypartial.cli", "--help"]
+    times = []
+    for _ in range(3):
+        start = time.perf_counter()
+        subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+        times.append(time.perf_counter() - start)
+    assert min(times) < 1.0  # Measured 0.2 s on an idle machine.
+
+
+BAD_USAGE = {
+    "no command": [],
+    "unknown command": ["paint"],
+    "no scene": ["generate"],
+    "unknown option": ["generate", "--scene", "vase", "--lens", "50"],
+    "not a number": ["generate", "--scene", "vase", "--resolution", "big"],
+    "not whole": ["generate", "--scene", "vase", "--train", "1.5"],
+}
+
+
+@pytest.mark.parametrize("arguments", BAD_USAGE.values(), ids=BAD_USAGE.keys())
+def test_bad_usage_exits_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert "Traceback" not in out + err
+    assert out + err
+
+
+BAD_INPUT = {
+    "unknown scene": (["generate", "--scene", "teapot"], "vase"),
+    "too small": (["generate", "--scene", "vase", "--resolution", "0"], "render.resolution"),
+    "no views": (["generate", "--scene", "vase", "--train", "0"], "camera.train"),
+    "no recipe": (["generate", "--scene", "none/scene.toml"], "Check the path"),
+    "no dataset": (["validate", "none"], "nothing there"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "advice"), BAD_INPUT.values(), ids=BAD_INPUT.keys())
+def test_bad_input_exits_with_2_and_advice(
+    arguments: list[str], advice: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    err = capsys.readouterr().err
+    assert advice in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize("command", ["validate", "evaluate", "report"])
+def test_nothing_to_work_on_says_how_to_make_it(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main([command]) == 2
+    assert re.search("shinypartial generate|panoless fit", capsys.readouterr().err)
+
+
+def test_validate_passes_a_sound_dataset(sphere_dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["validate", str(sphere_dataset.root)]) == 0
+    assert "keeps every promise" in capsys.readouterr().out
+
+
+def test_validate_lists_breaks_and_exits_with_2(damaged_dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (damaged_dataset / "train/r_000.png").unlink()
+    assert main(["validate", str(damaged_dataset)]) == 2
+    out, err = capsys.readouterr()
+    assert "train/r_000.png" in out
+    assert "2 broken promises" in err, "The frame and the checksum list both miss the file."
+
+
+def test_validate_takes_the_newest_dataset_and_says_so(
+    sphere_dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "datasets").mkdir()
+    (tmp_path / "datasets" / "sphere").symlink_to(sphere_dataset.root)
+    monkeypatch.chdir(tmp_path)
+    assert main(["validate"]) == 0
+    assert "Newest dataset: datasets/sphere" in capsys.readouterr().out

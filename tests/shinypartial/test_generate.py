@@ -1,0 +1,249 @@
+"""Making a dataset: it validates, plain readers open it, a killed run continues, and bad surroundings are told."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shinypartial.dataset.read import open_dataset, read_environment, read_view
+from shinypartial.dataset.schema import CHECKSUMS, LICENSES, MANIFEST
+from shinypartial.dataset.validate import validate
+from shinypartial.errors import InputError
+from shinypartial.files import PARTIAL_PREFIX
+from shinypartial.generate import generate
+from shinypartial.scene import SceneSpec, load_scene
+from tests.support.tiny_scene import WORLD_HEIGHT, direction_colors, tiny_scene, write_recipe
+
+pytest.importorskip("bpy")
+
+ROOT = Path(__file__).resolve().parents[2]
+#: Smaller than any EXR and larger than any PNG of the test scene, so that a limit stops the run in between.
+LONG_ENOUGH_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory: pytest.TempPathFactory) -> SceneSpec:
+    return tiny_scene(tmp_path_factory.mktemp("recipe"))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory, spec: SceneSpec) -> Path:
+    """A finished dataset; tests only read it."""
+    return generate(spec, tmp_path_factory.mktemp("generated") / "tiny").root
+
+
+def run(*arguments: str | Path, before: str = "") -> subprocess.CompletedProcess[str]:
+    """The command line in a fresh process, which may first execute a statement."""
+    program = f"import sys; {before}\nfrom shinypartial.cli import main\nsys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", program, *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=LONG_ENOUGH_S)
+
+
+def partial_files(root: Path) -> list[Path]:
+    return list(root.rglob(f"{PARTIAL_PREFIX}*"))
+
+
+def modification_times(root: Path) -> dict[str, int]:
+    """Of every frame's files, by name."""
+    return {
+        path.relative_to(root).as_posix(): path.stat().st_mtime_ns
+        for split in ("train", "test")
+        for path in (root / split).glob("r_*")
+    }
+
+
+def test_what_is_made_keeps_every_promise(made: Path, spec: SceneSpec) -> None:
+    assert [each for each in validate(made) if not each.warning] == []
+    dataset = open_dataset(made)
+    assert (len(dataset.train), len(dataset.test)) == (spec.camera.train, spec.camera.test)
+    assert dataset.manifest["recipe"]["object"] == spec.recipe()["object"]
+    assert dataset.manifest["complete"] is True
+    assert dataset.manifest["generator"]["blender"].startswith("5.")
+    np.testing.assert_allclose(read_environment(dataset), direction_colors(WORLD_HEIGHT), atol=5e-4)
+
+
+def test_a_world_file_brings_its_license(made: Path) -> None:
+    scene, light = json.loads((made / LICENSES).read_text(encoding="utf-8"))
+    assert scene["license"] == "CC0-1.0"
+    assert light == {"asset": "environment world.exr", "license": "CC0-1.0", "source": "computed"}
+
+
+def test_a_plain_reader_needs_pictures_and_transforms_alone(made: Path, tmp_path: Path) -> None:
+    for path in made.rglob("*"):
+        if path.name.startswith("transforms_") or path.match("r_???.png"):
+            copy = tmp_path / path.relative_to(made)
+            copy.parent.mkdir(exist_ok=True)
+            copy.write_bytes(path.read_bytes())
+    plain, full = open_dataset(tmp_path), open_dataset(made)
+    for ours, theirs in zip((*full.train, *full.test), (*plain.train, *plain.test), strict=True):
+        np.testing.assert_array_equal(ours.camera.camera_to_world, theirs.camera.camera_to_world)
+        low, high = read_view(theirs), read_view(ours)
+        # 8-bit sRGB: half a level is at most 0.0045 of linear light; alpha half of 1/255.
+        np.testing.assert_allclose(low.radiance, np.clip(high.radiance, 0, 1), atol=0.007)
+        np.testing.assert_allclose(low.alpha, high.alpha, atol=0.002)
+
+
+def test_a_finished_dataset_is_left_alone(made: Path, spec: SceneSpec) -> None:
+    before = {path: path.stat().st_mtime_ns for path in made.rglob("*")}
+    again = generate(spec, made)
+    assert (again.rendered, again.kept) == (0, spec.camera.train + spec.camera.test)
+    assert {path: path.stat().st_mtime_ns for path in made.rglob("*")} == before
+
+
+def test_a_deleted_frame_alone_is_made_again(tmp_path: Path, spec: SceneSpec) -> None:
+    root = generate(spec, tmp_path / "tiny").root
+    before = modification_times(root)
+    (root / "train/r_001.exr").unlink()
+    (root / f"train/{PARTIAL_PREFIX}left.exr").write_bytes(b"half")
+    assert generate(spec, root).rendered == 1
+    changed = {name for name, when in modification_times(root).items() if before[name] != when}
+    assert changed == {f"train/r_001{end}" for end in (".exr", ".png", "_alpha.png", "_normal.png")}
+    assert [each for each in validate(root) if not each.warning] == []
+
+
+@pytest.mark.skipif(os.name != "posix", reason="SIGKILL is a POSIX signal.")
+def test_a_killed_run_continues_without_rendering_anything_twice(tmp_path: Path) -> None:
+    scene, root = write_recipe(tmp_path, train=30, test=30), tmp_path / "out"
+    command = [sys.executable, "-m", "shinypartial.cli", "generate", "--scene", str(scene), "--output", str(root)]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + LONG_ENOUGH_S
+    while len(list(root.glob("*/r_???.exr"))) < 5 and time.monotonic() < deadline:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL, "It must not have ended by itself."
+    finished = {path.name: path.stat().st_mtime_ns for path in root.glob("train/r_???.exr")}
+    assert 5 <= len(finished) < 60
+    assert not (root / CHECKSUMS).exists()
+    with pytest.raises(InputError, match="not ended"):
+        open_dataset(root)
+
+    result = run("generate", "--scene", scene, "--output", root)
+    assert result.returncode == 0, result.stderr
+    assert f"kept {len(finished)}" in result.stdout
+    for name, when in finished.items():
+        assert (root / "train" / name).stat().st_mtime_ns == when
+    assert [each for each in validate(root) if not each.warning] == []
+    assert partial_files(root) == []
+
+
+def test_a_run_that_was_killed_before_its_manifest_continues(tmp_path: Path, spec: SceneSpec) -> None:
+    (tmp_path / f"{PARTIAL_PREFIX}dataset.json").write_text("{")
+    assert generate(spec, tmp_path).rendered == 4
+    assert partial_files(tmp_path) == []
+
+
+def test_a_folder_of_another_recipe_is_refused(made: Path, tmp_path: Path) -> None:
+    result = run("generate", "--scene", "vase", "--output", made)
+    assert result.returncode == 2
+    assert "another recipe" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_only_one_run_writes_to_a_folder(tmp_path: Path, spec: SceneSpec) -> None:
+    fcntl = pytest.importorskip("fcntl")
+    handle = os.open(tmp_path, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        with pytest.raises(InputError, match="another run"):
+            generate(spec, tmp_path)
+    finally:
+        os.close(handle)
+
+
+def test_an_output_that_can_not_be_a_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    result = run("generate", "--scene", "vase", "--output", tmp_path / "file" / "below")
+    assert result.returncode == 2
+    assert "permissions, or choose another --output" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_an_unknown_scene_is_refused_with_what_exists() -> None:
+    result = run("generate", "--scene", "teapot")
+    assert result.returncode == 2
+    assert "vase" in result.stderr
+
+
+@pytest.mark.parametrize("limit_bytes", [3000, 400], ids=["at an EXR", "at the manifest"])
+def test_a_full_disk_leaves_nothing_half_written(tmp_path: Path, limit_bytes: int) -> None:
+    """A limit on the size of files fails writes as a full disk does; a roomier rerun then finishes the dataset."""
+    resource = pytest.importorskip("resource")
+    scene, root = write_recipe(tmp_path), tmp_path / "out"
+    limit = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_bytes}, resource.RLIM_INFINITY))"
+    result = run("generate", "--scene", scene, "--output", root, before=limit)
+    assert resource
+    assert result.returncode == 2, result.stderr
+    assert "Free some space" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert partial_files(root) == []
+    for path in root.rglob("*.exr"):
+        assert path.stat().st_size < limit_bytes, "A file under its final name is whole, so below the limit."
+    assert run("generate", "--scene", scene, "--output", root).returncode == 0
+    assert [each for each in validate(root) if not each.warning] == []
+
+
+def test_writes_that_fail_between_frames_stop_the_run_cleanly(
+    tmp_path: Path, spec: SceneSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second frame's EXR does not fit: the first stays, nothing of the second looks finished."""
+    import errno
+
+    from shinypartial.dataset import write
+
+    whole, written = write.write_exr, []
+
+    def fill_up(path: Path, channels: dict[str, np.ndarray], **options: bool) -> None:
+        if path.parent.name in ("train", "test") and (written.append(path) or len(written) == 2):
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        whole(path, channels, **options)
+
+    monkeypatch.setattr(write, "write_exr", fill_up)
+    with pytest.raises(OSError, match="No space"):
+        generate(spec, tmp_path / "out")
+    assert [path.name for path in (tmp_path / "out").glob("*/r_???.exr")] == ["r_000.exr"]
+    assert partial_files(tmp_path) == []
+    monkeypatch.undo()
+    assert generate(spec, tmp_path / "out").kept == 1
+
+
+def test_without_bpy_one_sentence_tells_how_to_install_it(tmp_path: Path) -> None:
+    result = run("generate", "--scene", "vase", "--output", tmp_path / "out", before="sys.modules['bpy'] = None")
+    assert result.returncode == 2
+    assert "pip install 'panoless[blender]'" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert not (tmp_path / "out").exists(), "It must refuse before it makes anything."
+
+
+def test_another_python_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    from shinypartial.blender import runtime
+
+    monkeypatch.setattr(runtime.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(runtime.sys, "version_info", (3, 13, 0))
+    with pytest.raises(InputError, match=r"Python 3\.11.*3\.13.*pip install 'panoless\[blender\]'"):
+        runtime.check_blender()
+
+
+def test_a_finished_dataset_needs_no_blender(made: Path, spec: SceneSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+    from shinypartial.blender import runtime
+
+    monkeypatch.setattr(runtime.importlib.util, "find_spec", lambda name: None)
+    assert generate(spec, made).rendered == 0
+
+
+def test_a_world_that_is_no_latlong_map_is_refused(tmp_path: Path) -> None:
+    from shinypartial.images import write_exr_rgb
+
+    recipe = write_recipe(tmp_path)
+    write_exr_rgb(tmp_path / "world.exr", np.ones((8, 8, 3), np.float32))
+    with pytest.raises(InputError, match="twice as wide as high"):
+        generate(load_scene(str(recipe)), tmp_path / "out")
+
+
+def test_the_manifest_is_strict_json(made: Path) -> None:
+    json.loads((made / MANIFEST).read_text(encoding="utf-8"), parse_constant=lambda name: pytest.fail(name))
