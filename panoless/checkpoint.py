@@ -1,5 +1,6 @@
 """The state of a fit on disk: enough to continue after a kill at any moment, and to export when it is done."""
 
+import io
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -8,10 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from panoless.config import FitConfig
+from panoless.config import FitConfig, config_from_dict
 from panoless.surfels import Surfels
 from shinypartial.errors import InputError
-from shinypartial.files import read_json, whole_file, write_json
+from shinypartial.files import PARTIAL_PREFIX, read_json, remove_partial_files, whole_file, write_json
 
 CHECKPOINT = "checkpoint.pt"
 DESCRIPTION = "fit.json"
@@ -43,8 +44,11 @@ def save_state(folder: Path, state: FitState) -> None:
     """Write the checkpoint whole or not at all."""
     content = {**vars(state), "surfels": {name: value.detach() for name, value in state.surfels.named().items()}}
     content["environment"] = state.environment.detach()
+    # Through memory, because torch reports a full disk as an internal error of its own.
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
     with whole_file(folder / CHECKPOINT) as temporary:
-        torch.save(content, temporary)
+        temporary.write_bytes(buffer.getbuffer())
 
 
 def load_state(folder: Path) -> FitState | None:
@@ -69,17 +73,43 @@ def claim_run(folder: Path, dataset: Path, dataset_hash: str, config: FitConfig)
     path = folder / DESCRIPTION
     if path.exists():
         found = read_json(path, "the description of a run")
-        if any(found.get(key) != value for key, value in description.items()):
+        if not isinstance(found, dict) or any(found.get(key) != value for key, value in description.items()):
             raise InputError(
                 expected=f"a run folder that is new or belongs to the same dataset and configuration, at {folder}",
                 found="a run of another dataset or configuration",
                 remedy="Choose another --output, or delete that folder.",
             )
+        remove_partial_files(folder)
         return
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if folder.exists() and (not folder.is_dir() or any(not _is_partial(path) for path in folder.iterdir())):
         raise InputError(
             expected=f"a new or empty run folder at {folder}",
             found="files that are not a run",
             remedy="Choose another --output.",
         )
     write_json(path, {"dataset": str(dataset.resolve()), **description})
+
+
+def _is_partial(path: Path) -> bool:
+    """A run that is killed while it writes its first file leaves nothing else."""
+    return path.name.startswith(PARTIAL_PREFIX)
+
+
+@dataclass(frozen=True)
+class RunDescription:
+    """What a run folder says about itself."""
+
+    dataset: Path
+    config: FitConfig
+
+
+def read_description(folder: Path) -> RunDescription:
+    """Read which dataset and configuration a run folder belongs to; InputError when it is no run of this version."""
+    content = read_json(folder / DESCRIPTION, "the description of a run")
+    if not isinstance(content, dict) or not {"dataset", "config"} <= content.keys():
+        raise InputError(
+            expected=f"the dataset and the configuration of a run in {folder / DESCRIPTION}",
+            found="other content",
+            remedy="Delete that run folder and fit again.",
+        )
+    return RunDescription(Path(content["dataset"]), config_from_dict(content["config"]))

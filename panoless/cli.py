@@ -42,7 +42,7 @@ class Fit:
         name = f"{dataset.name}-{self.config.preset}"
         prediction = self.output or Path("predictions") / name
         claim_prediction(prediction)
-        state = fit(dataset, self.config, RUNS / prediction.name)
+        state = fit(dataset, self.config, RUNS / prediction.resolve().name)
         export_prediction(dataset, state, self.config, prediction)
         print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
 
@@ -59,26 +59,24 @@ class Export:
     def run(self) -> None:
         """Read the checkpoint and export it."""
         _prepare_threads()
-        from panoless.checkpoint import CHECKPOINT, DESCRIPTION, load_state
-        from panoless.config import config_from_dict
+        from panoless.checkpoint import CHECKPOINT, DESCRIPTION, load_state, read_description
         from panoless.export import export_prediction
         from shinypartial.dataset.read import open_dataset
-        from shinypartial.files import newest_folder, read_json
+        from shinypartial.files import newest_folder
         from shinypartial.prediction import claim_prediction
 
         folder = self.run_folder or newest_folder(RUNS, DESCRIPTION, "a run", "Make one: `panoless fit`.")
-        description = read_json(folder / DESCRIPTION, "the description of a run")
-        config = config_from_dict(description["config"])
+        description = read_description(folder)
         state = load_state(folder)
         if state is None or state.final_environment is None:
             raise InputError(
                 expected=f"a finished run in {folder}",
-                found=f"no {CHECKPOINT}" if state is None else f"{state.iteration} of {config.iterations} iterations",
+                found=f"no {CHECKPOINT}" if state is None else f"{state.iteration} of {description.config.iterations} iterations",
                 remedy="Run the same `panoless fit` command again: it continues where it stopped.",
             )
         prediction = self.output or Path("predictions") / folder.resolve().name
         claim_prediction(prediction)
-        export_prediction(open_dataset(Path(description["dataset"])), state, config, prediction)
+        export_prediction(open_dataset(description.dataset), state, description.config, prediction)
         print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
 
 

@@ -6,6 +6,8 @@ Durations are shares of `iterations`, so every schedule scales with the length o
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, Literal
 
+from shinypartial.errors import InputError
+
 
 @dataclass(frozen=True)
 class SurfelConfig:
@@ -176,13 +178,21 @@ PRESETS: dict[str, FitConfig] = {
 
 
 def config_from_dict(content: dict[str, Any]) -> FitConfig:
-    """The configuration that `dataclasses.asdict` was taken from."""
+    """The configuration that `dataclasses.asdict` was taken from; InputError when its options are not today's."""
     return _rebuild(FitConfig(), content)
 
 
-def _rebuild(default: Any, content: dict[str, Any]) -> Any:
+def _rebuild(default: Any, content: Any) -> Any:
+    names = {item.name for item in fields(default)}
+    found = set(content) if isinstance(content, dict) else set()
+    if names != found:
+        raise InputError(
+            expected=f"the options of this version's {type(default).__name__}",
+            found=f"others: {', '.join(sorted(names ^ found))}",
+            remedy="Use the version of panoless that made the run, or fit again.",
+        )
     values = {}
-    for item in fields(default):
-        value = getattr(default, item.name)
-        values[item.name] = _rebuild(value, content[item.name]) if is_dataclass(value) else content[item.name]
+    for name in names:
+        value = getattr(default, name)
+        values[name] = _rebuild(value, content[name]) if is_dataclass(value) else content[name]
     return type(default)(**values)

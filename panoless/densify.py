@@ -72,7 +72,7 @@ def grow_and_prune(
     merged = Surfels(**{name: torch.cat([part.named()[name] for part in parts]) for name in surfels.named()})
     source = torch.cat([kept, clones, children])
     unchanged = torch.arange(len(source)) < len(kept)
-    alive = (merged.opacities > config.prune_opacity) & (merged.scales.amax(1) < LARGEST_SCALE)
+    alive = (merged.opacities >= config.prune_opacity) & (merged.scales.amax(1) < LARGEST_SCALE)
     if not alive.any():
         alive[merged.opacities.argmax()] = True
     return Edit(merged.select(alive), source[alive], unchanged[alive])

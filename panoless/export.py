@@ -23,9 +23,10 @@ from panoless.views import Normalization, raster_camera, unit_rays_camera
 from panoless.visibility import visibility_from_evidence
 from shinypartial.color import to_display
 from shinypartial.dataset.schema import Dataset, View
-from shinypartial.files import whole_file
+from shinypartial.files import remove_partial_files, whole_file
 from shinypartial.images import write_png
 from shinypartial.prediction import (
+    DESCRIPTION,
     PredictionInfo,
     dataset_hash,
     write_environment_map,
@@ -87,9 +88,15 @@ def render(
 
 
 def export_prediction(dataset: Dataset, state: FitState, config: FitConfig, folder: Path) -> None:
-    """Write environment, visibility, test views, pictures, PLY and, last, prediction.json."""
+    """Write environment, visibility, test views, pictures, PLY and, last, prediction.json.
+
+    An earlier prediction.json is removed first, so that it never describes a mixture; `test` marks the folder as begun.
+    """
     if state.final_environment is None:
         raise ValueError("only a finished fit can be exported")
+    (folder / "test").mkdir(parents=True, exist_ok=True)
+    (folder / DESCRIPTION).unlink(missing_ok=True)
+    remove_partial_files(folder)
     environment = state.final_environment
     visibility = visibility_from_evidence(state.evidence)
     height = 2 * environment.shape[-1]

@@ -23,8 +23,8 @@ def photometric_paper(
 
 
 def photometric_masked(color: Float[Tensor, "P 3"], target: Float[Tensor, "P 3"]) -> Float[Tensor, ""]:
-    """Mean over pixels of √(‖e‖² + ε²), ε = 0.01: quadratic near zero, robust beyond."""
-    return torch.sqrt((color - target).square().sum(1) + CHARBONNIER**2).mean()
+    """Mean over pixels of √(‖e‖² + ε²), ε = 0.01: quadratic near zero, robust beyond; zero when there is no pixel."""
+    return torch.sqrt((color - target).square().sum(1) + CHARBONNIER**2).sum() / max(len(color), 1)
 
 
 def silhouette(alpha: Float[Tensor, "H W"], mask: Float[Tensor, "H W"]) -> Float[Tensor, ""]:

@@ -50,10 +50,6 @@ class SurfelOptimizer:
         self._adam.step()
         self._adam.zero_grad(set_to_none=True)
 
-    def replace_environment(self, environment: Tensor) -> None:
-        """Set the environment's values and forget its moments."""
-        self._replace(ENVIRONMENT, environment, None)
-
     def edit_surfels(self, surfels: Surfels, source: Tensor, keep_moments: Tensor) -> None:
         """Take `surfels`; row i inherits the moments of old row `source[i]` where `keep_moments[i]`, else zeros."""
         for name, value in surfels.named().items():

@@ -11,10 +11,13 @@ import numpy as np
 from jaxtyping import Float
 
 from shinypartial.blender.assemble import DEPTH_PASS, assemble
-from shinypartial.blender.runtime import import_blender, quiet
+from shinypartial.blender.runtime import import_blender, interrupts_deferred, quiet
 from shinypartial.camera import Camera, opencv_to_opengl
 from shinypartial.errors import InputError
 from shinypartial.scene import SceneSpec
+
+DEPTH_CHANNEL = f"{DEPTH_PASS}.X"
+PASSES = (*(f"Combined.{name}" for name in "RGBA"), *(f"Normal.{name}" for name in "XYZ"), DEPTH_CHANNEL)
 
 
 @dataclass(frozen=True)
@@ -46,13 +49,13 @@ class Renderer:
         scene.camera.matrix_world = opencv_to_opengl(camera.camera_to_world).T.tolist()
         scene.render.filepath = str(path)
         try:
-            with quiet():
+            with interrupts_deferred(), quiet():
                 self.bpy.ops.render.render(write_still=True)
         except RuntimeError as error:
             raise InputError(
                 expected=f"Blender to render a view and to write it to {self.scratch}",
                 found=" ".join(str(error).split()),
-                remedy="Free space there or set TMPDIR to another folder, then run the same command again.",
+                remedy="Free some space there or set TMPDIR to another folder, then run the same command again.",
             ) from None
         return _from_passes(_read_passes(path))
 
@@ -62,7 +65,7 @@ def open_renderer(spec: SceneSpec) -> Iterator[Renderer]:
     """Assemble the scene; its passes go through a temporary folder that is removed at the end."""
     bpy = import_blender()
     with tempfile.TemporaryDirectory(prefix="shinypartial-") as scratch:
-        with quiet():
+        with interrupts_deferred(), quiet():
             device = assemble(bpy, spec)
         yield Renderer(bpy, Path(scratch), device, bpy.app.version_string)
 
@@ -73,17 +76,25 @@ def _read_passes(path: Path) -> dict[str, Float[np.ndarray, "H W"]]:
 
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            return {
+            passes = {
                 name.partition(".")[2]: channel.pixels.astype(np.float32)
                 for part in file.parts
                 for name, channel in part.channels.items()
             }
     except Exception as error:
-        raise InputError(
-            expected=f"Blender's passes in {path}",
-            found=f"a file that can't be read ({str(error).strip()})",
-            remedy="Free space there or set TMPDIR to another folder, then run the same command again.",
-        ) from None
+        raise _unreadable(path, str(error).strip()) from None
+    missing = sorted(set(PASSES) - passes.keys())
+    if missing:  # Where a part is cut off, OpenEXR warns and leaves it out.
+        raise _unreadable(path, f"no {', '.join(missing)}")
+    return passes
+
+
+def _unreadable(path: Path, found: str) -> InputError:
+    return InputError(
+        expected=f"every pass that Blender writes to {path}",
+        found=f"an incomplete file ({found})",
+        remedy="Free some space there or set TMPDIR to another folder, then run the same command again.",
+    )
 
 
 def _from_passes(passes: dict[str, Float[np.ndarray, "H W"]]) -> RenderedView:
@@ -93,7 +104,7 @@ def _from_passes(passes: dict[str, Float[np.ndarray, "H W"]]) -> RenderedView:
     radiance = np.stack([passes[f"Combined.{name}"] for name in "RGB"], -1)
     normals = np.stack([passes[f"Normal.{name}"] for name in "XYZ"], -1)
     length = np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), np.finfo(np.float32).tiny)
-    depth = passes[f"{DEPTH_PASS}.X"] / np.where(inside, alpha, 1)
+    depth = passes[DEPTH_CHANNEL] / np.where(inside, alpha, 1)
     return RenderedView(
         np.where(inside[..., None], radiance, 0),
         alpha,

@@ -5,8 +5,10 @@ import ctypes
 import importlib
 import importlib.util
 import os
+import signal
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -65,6 +67,26 @@ def quiet() -> Iterator[BinaryIO]:
             for stream, copy in saved.items():
                 os.dup2(copy, stream)
                 os.close(copy)
+
+
+@contextlib.contextmanager
+def interrupts_deferred() -> Iterator[None]:
+    """Hold back Ctrl-C and raise KeyboardInterrupt at the end.
+
+    Python code that Blender calls would raise it in the middle of a render, and Blender would swallow it.
+    """
+    previous = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(previous):
+        yield
+        return
+    received: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, _: received.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    if received:
+        raise KeyboardInterrupt
 
 
 def _flush_c_streams() -> None:

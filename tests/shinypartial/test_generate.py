@@ -23,7 +23,7 @@ from tests.support.tiny_scene import WORLD_HEIGHT, direction_colors, tiny_scene,
 pytest.importorskip("bpy")
 
 ROOT = Path(__file__).resolve().parents[2]
-#: Smaller than any EXR and larger than any PNG of the test scene, so that a limit stops the run in between.
+#: For a process that takes seconds on an idle machine.
 LONG_ENOUGH_S = 60.0
 
 
@@ -132,6 +132,27 @@ def test_a_killed_run_continues_without_rendering_anything_twice(tmp_path: Path)
     assert partial_files(root) == []
 
 
+@pytest.mark.skipif(os.name != "posix", reason="SIGINT is sent to another process.")
+def test_an_interrupt_ends_the_run_after_the_frame_at_hand(tmp_path: Path) -> None:
+    scene, root = write_recipe(tmp_path, train=200, test=200), tmp_path / "out"
+    command = [sys.executable, "-m", "shinypartial.cli", "generate", "--scene", str(scene), "--output", str(root)]
+    # A shell without job control starts background processes with interrupts ignored; this process may be one.
+    restore = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler)}
+    process = subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, **restore
+    )
+    deadline = time.monotonic() + LONG_ENOUGH_S
+    while len(list(root.glob("*/r_???.exr"))) < 3 and time.monotonic() < deadline:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=LONG_ENOUGH_S)
+    assert process.returncode == 130
+    assert "Run the same command again to continue" in err
+    assert "Traceback" not in err
+    assert len(list(root.glob("*/r_???.exr"))) < 400
+    assert partial_files(root) == []
+
+
 def test_a_run_that_was_killed_before_its_manifest_continues(tmp_path: Path, spec: SceneSpec) -> None:
     (tmp_path / f"{PARTIAL_PREFIX}dataset.json").write_text("{")
     assert generate(spec, tmp_path).rendered == 4
@@ -170,14 +191,15 @@ def test_an_unknown_scene_is_refused_with_what_exists() -> None:
     assert "vase" in result.stderr
 
 
-@pytest.mark.parametrize("limit_bytes", [3000, 400], ids=["at an EXR", "at the manifest"])
+@pytest.mark.parametrize(
+    "limit_bytes", [400, 3000, 100_000], ids=["at the manifest", "at the map", "at Blender's file"]
+)
 def test_a_full_disk_leaves_nothing_half_written(tmp_path: Path, limit_bytes: int) -> None:
     """A limit on the size of files fails writes as a full disk does; a roomier rerun then finishes the dataset."""
-    resource = pytest.importorskip("resource")
-    scene, root = write_recipe(tmp_path), tmp_path / "out"
+    pytest.importorskip("resource")
+    scene, root = write_recipe(tmp_path, resolution=64), tmp_path / "out"
     limit = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_bytes}, resource.RLIM_INFINITY))"
     result = run("generate", "--scene", scene, "--output", root, before=limit)
-    assert resource
     assert result.returncode == 2, result.stderr
     assert "Free some space" in result.stderr
     assert "Traceback" not in result.stderr

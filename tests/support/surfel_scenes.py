@@ -34,7 +34,7 @@ class SurfelScene:
     def cast(self, dtype: torch.dtype) -> "SurfelScene":
         """Fresh leaves of another type that require gradients."""
         leaves = {n: p.detach().to(dtype).clone().requires_grad_() for n, p in self.parameters().items()}
-        return SurfelScene(**{"curvatures": None, **leaves}, camera=self.camera)
+        return self.replace(**leaves)
 
     def replace(self, **changes) -> "SurfelScene":
         """The same scene with some arguments changed."""

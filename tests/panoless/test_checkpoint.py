@@ -1,0 +1,143 @@
+"""A run folder: its state survives the disk, damage is named, and nobody else's folder is taken."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from panoless.checkpoint import (
+    CHECKPOINT,
+    DESCRIPTION,
+    FitState,
+    claim_run,
+    load_state,
+    read_description,
+    save_state,
+)
+from panoless.config import PRESETS
+from shinypartial.errors import InputError
+from tests.support.mirror_sphere import sphere_surfels
+
+CONFIG = PRESETS["default"]
+DATASET = Path("datasets/vase")
+
+
+def some_state(final: bool) -> FitState:
+    return FitState(
+        surfels=sphere_surfels(7),
+        environment=torch.rand(6, 3, 4, 4),
+        iteration=42,
+        optimizer={"state": {0: {"exp_avg": torch.rand(7, 3)}}, "param_groups": [{"lr": 0.1, "name": "means"}]},
+        gradient_sum=torch.rand(7),
+        gradient_count=torch.ones(7),
+        evidence=torch.rand(6, 4, 4),
+        center=[1.0, 2.0, 3.0],
+        radius=0.5,
+        final_environment=torch.rand(6, 3, 8, 8) if final else None,
+        seconds={"optimize": 1.5},
+        curves={"loss": [3.0, 2.0]},
+        peak_memory_bytes=10,
+    )
+
+
+@pytest.mark.parametrize("final", [False, True])
+def test_a_state_survives_the_disk(tmp_path: Path, final: bool) -> None:
+    state = some_state(final)
+    save_state(tmp_path, state)
+    assert [path.name for path in tmp_path.iterdir()] == [CHECKPOINT]
+    loaded = load_state(tmp_path)
+    assert isinstance(loaded, FitState)
+    torch.testing.assert_close(loaded.surfels.named(), state.surfels.named(), rtol=0, atol=0)
+    for name in set(vars(state)) - {"surfels", "optimizer", "final_environment"}:
+        first, second = getattr(loaded, name), getattr(state, name)
+        assert torch.equal(first, second) if isinstance(first, torch.Tensor) else first == second, name
+    assert loaded.optimizer["param_groups"] == state.optimizer["param_groups"]
+    assert torch.equal(loaded.optimizer["state"][0]["exp_avg"], state.optimizer["state"][0]["exp_avg"])
+    assert (loaded.final_environment is not None) == final
+    if final:
+        assert torch.equal(loaded.final_environment, state.final_environment)
+
+
+def test_before_the_first_checkpoint_there_is_none(tmp_path: Path) -> None:
+    assert load_state(tmp_path) is None
+
+
+@pytest.mark.parametrize("damage", ["truncated", "text", "empty", "another version"])
+def test_a_damaged_checkpoint_is_named(tmp_path: Path, damage: str) -> None:
+    save_state(tmp_path, some_state(False))
+    path = tmp_path / CHECKPOINT
+    content = path.read_bytes()
+    if damage == "another version":
+        torch.save({"surfels": {}, "iteration": 3}, path)
+    else:
+        path.write_bytes({"truncated": content[: len(content) // 2], "text": b"hello", "empty": b""}[damage])
+    with pytest.raises(InputError, match=r"checkpoint\.pt.*Delete that run folder"):
+        load_state(tmp_path)
+
+
+def test_a_failed_save_keeps_the_last_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save_state(tmp_path, some_state(False))
+
+    def full(*_) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match="No space"):
+        save_state(tmp_path, replace(some_state(False), iteration=43))
+    assert [path.name for path in tmp_path.iterdir()] == [CHECKPOINT]
+    loaded = load_state(tmp_path)
+    assert loaded is not None
+    assert loaded.iteration == 42
+
+
+def test_a_run_can_be_claimed_again_by_the_same_fit(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    for _ in range(2):
+        claim_run(folder, DATASET, "hash", CONFIG)
+    description = read_description(folder)
+    assert description.config == CONFIG
+    assert description.dataset == DATASET.resolve()
+
+
+@pytest.mark.parametrize(
+    ("dataset_hash", "config"),
+    [("other", CONFIG), ("hash", replace(CONFIG, seed=1)), ("hash", PRESETS["paper"])],
+    ids=["dataset", "seed", "preset"],
+)
+def test_another_fit_is_refused(tmp_path: Path, dataset_hash: str, config) -> None:
+    claim_run(tmp_path / "run", DATASET, "hash", CONFIG)
+    before = (tmp_path / "run" / DESCRIPTION).read_bytes()
+    with pytest.raises(InputError, match="another dataset or configuration"):
+        claim_run(tmp_path / "run", DATASET, dataset_hash, config)
+    assert (tmp_path / "run" / DESCRIPTION).read_bytes() == before
+
+
+@pytest.mark.parametrize("what", ["folder", "file"])
+def test_a_foreign_place_is_refused(tmp_path: Path, what: str) -> None:
+    place = tmp_path / "thesis"
+    if what == "folder":
+        place.mkdir()
+        (place / "chapter.tex").touch()
+    else:
+        place.touch()
+    with pytest.raises(InputError, match="not a run"):
+        claim_run(place, DATASET, "hash", CONFIG)
+    assert not (tmp_path / "thesis" / DESCRIPTION).exists()
+
+
+def test_what_a_killed_process_left_is_no_obstacle(tmp_path: Path) -> None:
+    """Killed while it wrote its first file, and later while it wrote a checkpoint."""
+    for _ in range(2):
+        (tmp_path / ".partial-x.pt").write_bytes(b"half")
+        claim_run(tmp_path, DATASET, "hash", CONFIG)
+    assert [path.name for path in tmp_path.iterdir()] == [DESCRIPTION]
+
+
+@pytest.mark.parametrize("content", ["[]", "{}", '{"dataset": "a"}', '{"dataset": "a", "config": {}}', "{"])
+def test_a_damaged_description_is_named(tmp_path: Path, content: str) -> None:
+    (tmp_path / DESCRIPTION).write_text(content)
+    with pytest.raises(InputError):
+        read_description(tmp_path)
+    with pytest.raises(InputError):
+        claim_run(tmp_path, DATASET, "hash", CONFIG)

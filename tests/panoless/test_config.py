@@ -1,0 +1,68 @@
+"""Configurations survive their file, and every option is read by some code."""
+
+import ast
+import json
+from dataclasses import asdict, fields, is_dataclass
+from pathlib import Path
+
+import pytest
+
+import panoless
+from panoless.config import PRESETS, FitConfig, RateConfig, config_from_dict
+from panoless.surfels import Surfels
+from shinypartial.errors import InputError
+
+ROOT = Path(panoless.__file__).parent
+SECTIONS = {item.name: item.default_factory for item in fields(FitConfig) if is_dataclass(item.default_factory)}  # type: ignore[arg-type]
+NAMES_OF_SECTIONS = {"config", "rates", "loss", "density", "surfels", "environment"}
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_preset_survives_json(preset: str) -> None:
+    config = PRESETS[preset]
+    assert config.preset == preset
+    assert config_from_dict(json.loads(json.dumps(asdict(config)))) == config
+
+
+def test_presets_differ_beyond_their_name() -> None:
+    contents = [json.dumps({**asdict(config), "preset": ""}, sort_keys=True) for config in PRESETS.values()]
+    assert len(set(contents)) == len(contents)
+
+
+@pytest.mark.parametrize("damage", ["missing", "unknown"])
+def test_a_configuration_of_another_version_is_named(damage: str) -> None:
+    content = asdict(PRESETS["default"])
+    if damage == "missing":
+        del content["loss"]["lambda_ssim"]
+    else:
+        content["loss"]["lambda_of_the_future"] = 1.0
+    with pytest.raises(InputError, match=r"lambda_ssim|lambda_of_the_future"):
+        config_from_dict(content)
+
+
+def reads() -> set[tuple[str, str]]:
+    """(owner, name) of every attribute that any module but config.py reads: `config.loss.x` gives (loss, x)."""
+    found = set()
+    for path in ROOT.rglob("*.py"):
+        if path.name == "config.py":
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
+                owner = node.value
+                name = owner.attr if isinstance(owner, ast.Attribute) else getattr(owner, "id", "")
+                found.add((name, node.attr))
+    return found
+
+
+@pytest.mark.parametrize("section", ["", *SECTIONS])
+def test_every_option_is_read(section: str) -> None:
+    kind = SECTIONS[section] if section else FitConfig
+    owners = {"config", section} if section else {"config"}
+    looked_up_by_name = {item.name for item in fields(Surfels)} | {"environment"} if kind is RateConfig else set()
+    seen = {name for owner, name in reads() if owner in owners}
+    assert {item.name for item in fields(kind)} - looked_up_by_name - seen == set()  # type: ignore[arg-type]
+
+
+def test_every_parameter_has_a_rate() -> None:
+    rates = {item.name for item in fields(RateConfig)}
+    assert rates - {"drop_at", "drop_factor"} == {item.name for item in fields(Surfels)} | {"environment"}

@@ -1,0 +1,153 @@
+"""First surfels: the hull of a sphere is nearly that sphere, with its normals and its curvature."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from panoless.config import SurfelConfig
+from panoless.initialize import HULL_HALF_SIDE, carve_hull, initial_surfels
+from panoless.surfels import Surfels, rotation_matrices
+from panoless.views import TrainView, Views
+from shinypartial.errors import InputError
+
+CONFIG = SurfelConfig(count=800, hull_resolution=48)
+VOXEL = 2 * HULL_HALF_SIDE / 47
+
+
+@pytest.fixture(scope="module")
+def hull(views: Views) -> Surfels:
+    return initial_surfels(views, CONFIG, seed=0)
+
+
+def radial(surfels: Surfels, views: Views) -> tuple[torch.Tensor, torch.Tensor, float]:
+    """Unit directions from the sphere's center and distances from it, with its radius, in the normalized frame."""
+    frame = views.normalization
+    offsets = surfels.means - torch.from_numpy(-frame.center / frame.radius).float()
+    return torch.nn.functional.normalize(offsets, dim=1), offsets.norm(dim=1), 1 / frame.radius
+
+
+def facing_the_cameras(surfels: Surfels, views: Views) -> torch.Tensor:
+    """Where the arc of cameras around +X bounds the hull from both sides."""
+    return radial(surfels, views)[0][:, 0] > 0.5
+
+
+def test_surfels_lie_on_the_sphere(hull: Surfels, views: Views) -> None:
+    _, distances, radius = radial(hull, views)
+    front = facing_the_cameras(hull, views)
+    assert hull.count == CONFIG.count
+    assert front.float().mean() > 0.2
+    error = (distances - radius).abs()[front]
+    # A mask pixel is 0.06 units here, more than a voxel (0.047).
+    assert float(error.median()) < VOXEL
+    assert float(error.quantile(0.95)) < 2 * VOXEL
+
+
+def test_normals_point_outward(hull: Surfels, views: Views) -> None:
+    directions, _, _ = radial(hull, views)
+    normals = rotation_matrices(hull.quats)[:, :, 2]
+    front = facing_the_cameras(hull, views)
+    angles = torch.rad2deg(torch.acos((directions * normals).sum(1).clamp(-1, 1)))[front]
+    assert float(angles.median()) < 5.0
+    assert float(angles.quantile(0.95)) < 15.0
+
+
+def test_curvature_is_that_of_the_sphere(hull: Surfels, views: Views) -> None:
+    """The shape operator of a sphere with outward normals is −1/r in every direction."""
+    front = facing_the_cameras(hull, views)
+    _, _, radius = radial(hull, views)
+    a, b, c = hull.curvatures[front].median(0).values.tolist()
+    assert a == pytest.approx(-1 / radius, rel=0.25)
+    assert c == pytest.approx(-1 / radius, rel=0.25)
+    assert b == pytest.approx(0.0, abs=0.1 / radius)
+
+
+def test_the_normal_field_bends_as_the_sphere_does(hull: Surfels, views: Views) -> None:
+    """n(u, v) at an offset of a fifth of the radius is nearer to the sphere's normal there than n₀ is."""
+    front = facing_the_cameras(hull, views)
+    surfels, (_, _, radius) = hull.select(front), radial(hull, views)
+    frames = rotation_matrices(surfels.quats)
+    a, b, c = surfels.curvatures.unbind(1)
+    for du, dv in ((0.2, 0.0), (0.0, -0.2), (0.15, 0.15)):
+        u, v = du * radius, dv * radius
+        own = frames[:, :, 2]
+        bent = own - (a * u + b * v)[:, None] * frames[:, :, 0] - (b * u + c * v)[:, None] * frames[:, :, 1]
+        truth = own + (u * frames[:, :, 0] + v * frames[:, :, 1]) / radius
+        cosine, unbent = (
+            torch.nn.functional.cosine_similarity(normal, truth, dim=1).clamp(-1, 1).acos() for normal in (bent, own)
+        )
+        assert float(cosine.median()) < 0.35 * float(unbent.median())
+
+
+def test_surfels_cover_the_visible_sphere(hull: Surfels, views: Views) -> None:
+    """No direction toward the cameras is further than three surfel radii from a surfel."""
+    directions, distances, _ = radial(hull, views)
+    rng = np.random.default_rng(0)
+    probes = torch.from_numpy(rng.normal(size=(300, 3))).float()
+    probes = torch.nn.functional.normalize(probes, dim=1)
+    probes = probes[probes[:, 0] > 0.5]
+    gaps = torch.cdist(probes, directions).amin(1) * float(distances.mean())
+    assert float(gaps.max()) < 3 * float(hull.scales.mean())
+
+
+def test_the_same_seed_gives_the_same_surfels(views: Views) -> None:
+    for config in (replace(CONFIG, count=50), SurfelConfig(initial="random", count=50)):
+        first, again, other = (initial_surfels(views, config, seed) for seed in (3, 3, 4))
+        for name, value in first.named().items():
+            assert torch.equal(value, again.named()[name])
+        assert not torch.equal(first.means, other.means)
+
+
+def test_random_surfels_fill_the_cube(views: Views) -> None:
+    surfels = initial_surfels(views, SurfelConfig(initial="random", count=2000), seed=0)
+    assert float(surfels.means.abs().max()) <= 1.0
+    # Uniform in [−1, 1]: mean 0 ± 0.013, variance 1/3 ± 0.007.
+    torch.testing.assert_close(surfels.means.mean(0), torch.zeros(3), rtol=0, atol=0.06)
+    torch.testing.assert_close(surfels.means.var(0), torch.full((3,), 1 / 3), rtol=0, atol=0.03)
+    normals = rotation_matrices(surfels.quats)[:, :, 2]
+    torch.testing.assert_close(normals.mean(0), torch.zeros(3), rtol=0, atol=0.06)
+    assert float(surfels.opacities.min()) == pytest.approx(0.1)
+
+
+def masked(view: TrainView, pixel: tuple[int, int] | None) -> TrainView:
+    """A view whose mask is one pixel, or nothing."""
+    mask = torch.zeros_like(view.mask)
+    if pixel is not None:
+        mask[pixel] = 1
+    return replace(view, mask=mask)
+
+
+def test_masks_that_contradict_each_other_leave_no_hull(views: Views) -> None:
+    corners = tuple(masked(view, (0, 0) if i % 2 else (-1, -1)) for i, view in enumerate(views.train))
+    with pytest.raises(InputError, match="no point in space"):
+        initial_surfels(replace(views, train=corners), CONFIG, seed=0)
+
+
+def test_a_vote_forgives_one_wrong_mask(views: Views) -> None:
+    damaged = replace(views, train=(masked(views.train[0], None), *views.train[1:]))
+    whole = carve_hull(views, 32, votes=1.0).distance < 0
+    forgiving = carve_hull(damaged, 32, votes=0.9).distance < 0
+    assert whole.any()
+    assert forgiving[whole].all()
+    with pytest.raises(InputError, match="100% of the masks"):
+        carve_hull(damaged, 32, votes=1.0)
+
+
+def test_the_hull_is_a_signed_distance(views: Views) -> None:
+    hull = carve_hull(views, 48, votes=1.0)
+    points = np.stack(np.meshgrid(*[np.linspace(-HULL_HALF_SIDE, HULL_HALF_SIDE, 48)] * 3, indexing="ij"), -1)
+    center = -views.normalization.center / views.normalization.radius
+    truth = np.linalg.norm(points - center, axis=-1) - 1 / views.normalization.radius
+    # Along +X, where cameras bound the hull.
+    line = truth[24:, 23:25, 23:25]
+    np.testing.assert_allclose(hull.distance[24:, 23:25, 23:25], line, atol=3 * VOXEL)
+    np.testing.assert_allclose(hull.to_index(points.reshape(-1, 3)).reshape(points.shape)[5, 7, 9], [5, 7, 9], atol=1e-6)
+
+
+def test_select_and_named_keep_rows_together(hull: Surfels) -> None:
+    index = torch.tensor([5, 1])
+    chosen = hull.select(index)
+    assert list(chosen.named()) == list(hull.named())
+    for name, value in chosen.named().items():
+        assert torch.equal(value, hull.named()[name][index])

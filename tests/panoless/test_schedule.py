@@ -1,0 +1,75 @@
+"""When things happen: shares scale with the length of the fit, and the paper preset has the published numbers."""
+
+from dataclasses import replace
+
+import pytest
+
+from panoless.config import PRESETS, FitConfig
+from panoless.schedule import Schedule
+
+PERIODIC = ("density_round", "opacity_reset", "propagation")
+
+
+def events(config: FitConfig, name: str) -> list[int]:
+    """Iterations after which something happens."""
+    ask = getattr(Schedule(config), name)
+    return [iteration for iteration in range(config.iterations) if ask(iteration)]
+
+
+@pytest.mark.parametrize("name", PERIODIC)
+@pytest.mark.parametrize("times", [2, 3])
+def test_periodic_events_scale_with_the_length(name: str, times: int) -> None:
+    config = replace(PRESETS["paper"], iterations=4500)
+    longer = replace(config, iterations=4500 * times)
+    assert events(longer, name) == [times * iteration for iteration in events(config, name)] != []
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_phases_scale_with_the_length(preset: str) -> None:
+    short = replace(PRESETS[preset], iterations=3000)
+    long = Schedule(replace(short, iterations=6000))
+    for iteration in range(3000):
+        for name in ("geometry_moves", "rate_factor", "lambda_silhouette"):
+            assert getattr(long, name)(2 * iteration) == getattr(Schedule(short), name)(iteration)
+
+
+def test_the_paper_preset_has_the_published_schedule() -> None:
+    config = PRESETS["paper"]
+    schedule = Schedule(config)
+    assert config.iterations == 45_000
+    assert events(config, "density_round") == list(range(500, 12_000, 100))
+    assert events(config, "opacity_reset") == [3000, 6000, 9000]
+    assert (schedule.lambda_silhouette(2999), schedule.lambda_silhouette(3000)) == (1.0, 0.0)
+    assert schedule.geometry_moves(0)
+    assert {schedule.rate_factor(iteration) for iteration in (0, 20_000, 44_999)} == {1.0}
+
+
+def test_propagation_never_meets_a_reset() -> None:
+    config = PRESETS["paper"]
+    propagations = events(config, "propagation")
+    assert propagations[:4] == [1000, 2000, 4000, 5000]
+    assert not set(propagations) & set(events(config, "opacity_reset"))
+
+
+def test_nothing_happens_without_density_control() -> None:
+    config = replace(PRESETS["paper"], density=replace(PRESETS["paper"].density, enabled=False))
+    assert [events(config, name) for name in PERIODIC] == [[], [], []]
+
+
+def test_propagation_can_be_turned_off() -> None:
+    config = replace(PRESETS["paper"], density=replace(PRESETS["paper"].density, propagate_every=0.0))
+    assert events(config, "propagation") == []
+
+
+def test_the_rates_drop_once() -> None:
+    config = replace(PRESETS["default"], iterations=1000)
+    factors = [Schedule(config).rate_factor(iteration) for iteration in range(1000)]
+    drop = round(config.rates.drop_at * 1000)
+    assert factors == [1.0] * drop + [config.rates.drop_factor] * (1000 - drop)
+
+
+def test_even_the_shortest_fit_has_a_schedule() -> None:
+    for iterations in (1, 2, 7):
+        for config in PRESETS.values():
+            for name in PERIODIC:
+                events(replace(config, iterations=iterations), name)

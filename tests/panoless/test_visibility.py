@@ -1,0 +1,84 @@
+"""Visibility: evidence is conserved, and its map to [0, 1] is zero exactly where nothing was seen."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.nn.functional import normalize
+
+from panoless.kernels.cubemap import cubemap_directions, cubemap_solid_angles
+from panoless.visibility import accumulate, visibility_from_evidence
+
+LENGTH = 8
+
+
+def rays(seed: int, count: int = 300) -> tuple[torch.Tensor, torch.Tensor]:
+    """Directions in a half space, and alphas."""
+    generator = torch.Generator().manual_seed(seed)
+    directions = normalize(torch.randn(count, 3, generator=generator), dim=1)
+    directions[:, 0].abs_()
+    return directions, torch.rand(count, generator=generator)
+
+
+@given(st.integers(0, 1000), st.floats(0.0, 0.9))
+def test_evidence_is_the_sum_of_the_alphas_above_the_threshold(seed: int, threshold: float) -> None:
+    directions, alpha = rays(seed)
+    evidence = torch.zeros(6, LENGTH, LENGTH)
+    accumulate(evidence, directions, alpha, threshold)
+    kept = alpha[alpha > threshold].sum()
+    # Sums of a few hundred single-precision numbers.
+    assert float(evidence.sum()) == pytest.approx(float(kept), rel=1e-5, abs=1e-6)
+
+
+def test_the_threshold_itself_is_left_out() -> None:
+    evidence = torch.zeros(6, LENGTH, LENGTH)
+    directions = normalize(torch.randn(3, 3), dim=1)
+    accumulate(evidence, directions, torch.tensor([0.5, 0.5, 0.2]), 0.5)
+    assert float(evidence.abs().max()) == 0.0
+
+
+def test_evidence_adds_up() -> None:
+    directions, alpha = rays(0)
+    whole, parts = torch.zeros(6, LENGTH, LENGTH), torch.zeros(6, LENGTH, LENGTH)
+    accumulate(whole, directions, alpha, 0.0)
+    for piece in (slice(0, 100), slice(100, None)):
+        accumulate(parts, directions[piece], alpha[piece], 0.0)
+    torch.testing.assert_close(whole, parts)
+
+
+@given(st.integers(0, 1000))
+def test_visibility_is_zero_exactly_where_no_ray_fell(seed: int) -> None:
+    directions, alpha = rays(seed, 60)
+    evidence = torch.zeros(6, LENGTH, LENGTH)
+    accumulate(evidence, directions, alpha, 0.0)
+    visibility = visibility_from_evidence(evidence)
+    assert float(visibility.min()) >= 0.0
+    assert float(visibility.max()) == 1.0
+    assert torch.equal(visibility > 0, evidence > 0)
+
+
+def test_more_evidence_is_never_less_visible() -> None:
+    """Compared among the six faces, because texels in the same place of a face have the same solid angle."""
+    evidence = torch.rand(6, LENGTH, LENGTH, generator=torch.Generator().manual_seed(0)) * 10
+    order = evidence.argsort(0)
+    visibility = visibility_from_evidence(evidence).gather(0, order)
+    assert (visibility.diff(dim=0) >= 0).all()
+    below_saturation = visibility[1:] < 1
+    assert below_saturation.float().mean() > 0.8
+    assert (visibility.diff(dim=0)[below_saturation] > 0).all()
+
+
+def test_equal_density_is_equally_visible() -> None:
+    """Rays that come evenly from everywhere put less on the small texels at a corner; visibility corrects that."""
+    fine = cubemap_directions(256).reshape(-1, 3)
+    weight = cubemap_solid_angles(256).expand(6, -1, -1).reshape(-1)
+    evidence = torch.zeros(6, LENGTH, LENGTH)
+    accumulate(evidence, fine, 1000 * weight, 0.0)
+    assert float(evidence.max() / evidence.min()) > 2
+    inner = visibility_from_evidence(evidence)
+    # Bilinear weights smear the solid angle by a few percent; the logarithm leaves less.
+    assert float(inner.min()) > 0.95
+
+
+def test_nothing_seen_is_nowhere_visible() -> None:
+    assert float(visibility_from_evidence(torch.zeros(6, LENGTH, LENGTH)).abs().max()) == 0.0
