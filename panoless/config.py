@@ -47,6 +47,8 @@ class LossConfig:
 
     photometric: Literal["masked", "paper"] = "masked"
     """`paper`: Eq. 9 over the whole image; `masked`: mean √(‖e‖² + ε²) over pixels that lie wholly on the object."""
+    robust_scale: float = 0.3
+    """Residual (linear radiance) beyond which a pixel loses its vote in `masked`; 0 lets all pixels vote."""
     lambda_ssim: float = 0.2
     """Weight of D-SSIM in Eq. 9; read by `paper`."""
     lambda_normal_consistency: float = 0.05
@@ -114,7 +116,7 @@ class FitConfig:
 
     preset: str = "default"
     """Name of the preset that the values started from."""
-    iterations: int = 2400
+    iterations: int = 1000
     """Number of optimization steps (one view each)."""
     seed: int = 0
     """Seed of the initial surfels and of the order of views."""

@@ -16,6 +16,7 @@ from panoless.checkpoint import FitState
 from panoless.config import FitConfig
 from panoless.cubemap import look_up
 from panoless.fit import normalization_of
+from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.rasterize import RasterCamera
 from panoless.shading import ALPHA_FLOOR, compose, reflection_directions_world, surface_buffers
 from panoless.surfels import Surfels, rotation_matrices
@@ -170,10 +171,10 @@ def _write_pictures(folder: Path, parts: Decomposition) -> None:
         write_png(folder / f"{name}.png", picture)
 
 
-def cube_to_latlong(cube: Float[Tensor, "6 C L L"], height: int) -> Float[np.ndarray, "H 2H C"]:
+def cube_to_latlong(cube: Float[Tensor, "6 C L L"], height: int) -> Float[np.ndarray, "H 2*H C"]:
     """Area-averaged lat-long map of a cubemap: seamless lookups at 2×2 points a texel."""
     fine = latlong_directions(height * SUPERSAMPLING).reshape(-1, 3)
-    values = look_up(cube, torch.from_numpy(fine).to(torch.float32), "clamp").numpy()
+    values = sample_cubemap(cube, torch.from_numpy(fine).to(torch.float32)).numpy()
     blocks = values.reshape(height, SUPERSAMPLING, 2 * height, SUPERSAMPLING, -1)
     return blocks.mean((1, 3))
 

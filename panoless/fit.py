@@ -180,7 +180,7 @@ class Fitter:
         albedo = buffers.albedo.flatten(1)[:, pixels]
         color = compose(albedo, specular.T, alpha, self.config.alpha_applied)
         target = view.radiance.flatten(1)[:, pixels]
-        return photometric_masked(color.T, target.T), Observed(directions.detach(), alpha.detach())
+        return photometric_masked(color.T, target.T, self.config.loss.robust_scale), Observed(directions.detach(), alpha.detach())
 
     def _composited(
         self, view: TrainView, buffers: SurfaceBuffers, surfels: Surfels, iteration: int

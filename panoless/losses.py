@@ -22,9 +22,20 @@ def photometric_paper(
     return (1 - lambda_ssim) * l1 + lambda_ssim * (1 - ssim(image, target))
 
 
-def photometric_masked(color: Float[Tensor, "P 3"], target: Float[Tensor, "P 3"]) -> Float[Tensor, ""]:
-    """Mean over pixels of √(‖e‖² + ε²), ε = 0.01: quadratic near zero, robust beyond; zero when there is no pixel."""
-    return torch.sqrt((color - target).square().sum(1) + CHARBONNIER**2).sum() / max(len(color), 1)
+def photometric_masked(
+    color: Float[Tensor, "P 3"], target: Float[Tensor, "P 3"], robust_scale: float
+) -> Float[Tensor, ""]:
+    """Weighted mean over pixels of √(‖e‖² + ε²), ε = 0.01: quadratic near zero, linear beyond.
+
+    With `robust_scale` s > 0 each pixel weighs (1 + ‖e‖²/s²)⁻² (Geman–McClure, held constant in the gradient), so
+    that pixels which see the object itself instead of the environment lose their vote. Zero when there is no pixel.
+    """
+    squared = (color - target).square().sum(1)
+    distance = torch.sqrt(squared + CHARBONNIER**2)
+    if robust_scale <= 0:
+        return distance.sum() / max(len(color), 1)
+    weight = (1 + squared.detach() / robust_scale**2) ** -2
+    return (weight * distance).sum() / max(len(color), 1)
 
 
 def silhouette(alpha: Float[Tensor, "H W"], mask: Float[Tensor, "H W"]) -> Float[Tensor, ""]:

@@ -49,19 +49,31 @@ def test_equal_images_lose_nothing() -> None:
 
 
 def test_the_masked_loss_by_hand() -> None:
-    color = torch.tensor([[0.3, 0.0, 0.4], [0.0, 0.0, 0.0]])
-    expected = (math.sqrt(0.25 + 1e-4) + 0.01) / 2
-    assert float(photometric_masked(color, torch.zeros(2, 3))) == pytest.approx(expected, rel=1e-6)
+    color, target = torch.tensor([[0.3, 0.0, 0.4], [0.0, 0.0, 0.0]]), torch.zeros(2, 3)
+    far = math.sqrt(0.25 + 1e-4)
+    assert float(photometric_masked(color, target, 0.0)) == pytest.approx((far + 0.01) / 2, rel=1e-6)
+    # At a residual of the robust scale itself, ‖e‖ = s = 0.5, the weight is a quarter.
+    assert float(photometric_masked(color, target, 0.5)) == pytest.approx((far / 4 + 0.01) / 2, rel=1e-6)
 
 
-def test_the_masked_loss_is_bounded_by_outliers_linearly() -> None:
-    near, far = (float(photometric_masked(torch.full((1, 3), x), torch.zeros(1, 3))) for x in (1.0, 10.0))
-    assert far / near == pytest.approx(10.0, rel=1e-3)
+@pytest.mark.parametrize("robust_scale", [0.0, 0.3])
+def test_an_outlier_pulls_no_harder_than_any_other_pixel(robust_scale: float) -> None:
+    """The gradient is bounded by one over the number of pixels, and vanishes far out when the loss is robust."""
+    color = torch.tensor([[0.02, 0.0, 0.0], [0.2, 0.0, 0.0], [5.0, 0.0, 0.0]], requires_grad=True)
+    photometric_masked(color, torch.zeros(3, 3), robust_scale).backward()
+    small, medium, large = color.grad[:, 0].tolist()
+    assert 0 <= large <= 1 / 3
+    assert 0 < small <= 1 / 3
+    if robust_scale:
+        assert large < 0.001 * medium < 0.001 * small
+    else:
+        assert large == pytest.approx(1 / 3, rel=1e-4)
 
 
-def test_a_view_without_a_solid_pixel_adds_nothing() -> None:
+@pytest.mark.parametrize("robust_scale", [0.0, 0.3])
+def test_a_view_without_a_solid_pixel_adds_nothing(robust_scale: float) -> None:
     color = torch.zeros(0, 3, requires_grad=True)
-    loss = photometric_masked(color, torch.zeros(0, 3))
+    loss = photometric_masked(color, torch.zeros(0, 3), robust_scale)
     loss.backward()
     assert loss.item() == 0.0
 
@@ -135,7 +147,7 @@ def test_every_gradient_is_finite(distance: float, curved: bool) -> None:
     target = torch.rand(3, 24, 24)
     terms = [
         photometric_paper(buffers.albedo, target, 0.2),
-        photometric_masked(buffers.albedo.flatten(1).T, target.flatten(1).T),
+        photometric_masked(buffers.albedo.flatten(1).T, target.flatten(1).T, 0.3),
         silhouette(buffers.alpha, mask),
         normal_consistency(buffers, camera, mask),
         buffers.distortion.mean(),

@@ -1,0 +1,103 @@
+"""The command line is the configuration: help, presets, usage errors."""
+
+import json
+import re
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+
+import pytest
+
+from panoless.cli import main
+from panoless.config import PRESETS, FitConfig
+from shinypartial.dataset.schema import Dataset
+
+TINY = ["--config.iterations", "4", "--config.surfels.count", "40", "--config.surfels.hull-resolution", "24"]
+
+
+def option_names(config: object, prefix: str = "--config.") -> list[str]:
+    names: list[str] = []
+    for item in fields(config):  # type: ignore[arg-type]
+        value, name = getattr(config, item.name), item.name.replace("_", "-")
+        names += option_names(value, f"{prefix}{name}.") if is_dataclass(value) else [prefix + name]
+    return names
+
+
+def help_text(arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> str:
+    """Help in one column, without its boxes and line breaks."""
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main([*arguments, "--help"]) == 0
+    return re.sub(r"[│╭╮╰╯─\s]+", " ", capsys.readouterr().out)
+
+
+def test_help_lists_every_option(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    text = help_text(["fit"], capsys, monkeypatch)
+    for name in option_names(FitConfig()):
+        assert name in text, name
+    assert "Eq. 12" in text
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("form", ["{} {}", "{}={}"])
+def test_a_preset_sets_the_defaults(
+    preset: str, form: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = help_text(["fit", *form.format("--preset", preset).split()], capsys, monkeypatch)
+    assert f"default: {PRESETS[preset].iterations})" in text
+    assert f"default: {preset})" in text
+
+
+def test_other_commands_explain_themselves(capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    assert "newest below ./runs" in help_text(["export"], capsys, monkeypatch)
+    text = help_text([], capsys, monkeypatch)
+    assert "fit" in text
+    assert "export" in text
+
+
+BAD_USAGE = {
+    "no command": [],
+    "unknown command": ["paint"],
+    "unknown preset": ["fit", "--preset", "magic"],
+    "preset without a name": ["fit", "--preset"],
+    "unknown option": ["fit", "--config.loss.lambda-magic", "1"],
+    "not a number": ["fit", "--config.iterations", "many"],
+    "not whole": ["fit", "--config.surfels.count", "1.5"],
+    "not a choice": ["fit", "--config.environment.activation", "tanh"],
+}
+
+
+@pytest.mark.parametrize("arguments", BAD_USAGE.values(), ids=BAD_USAGE.keys())
+def test_bad_usage_exits_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert "Traceback" not in out + err
+    assert out + err
+
+
+def test_options_reach_the_fit_and_are_saved(
+    tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    options = [*TINY, "--preset", "paper", "--config.density.no-enabled", "--config.loss.lambda-ssim", "0.25"]
+    assert main(["fit", str(sphere_dataset.root), *options]) == 0
+    folder = tmp_path / "predictions" / f"{sphere_dataset.name}-paper"
+    saved = json.loads((folder / "prediction.json").read_text())["config"]
+    assert saved == json.loads((tmp_path / "runs" / folder.name / "fit.json").read_text())["config"]
+    assert saved["iterations"] == 4
+    assert saved["loss"]["lambda_ssim"] == 0.25
+    assert saved["density"]["enabled"] is False
+    assert saved["environment"]["activation"] == "sigmoid"
+    assert "Next: shinypartial evaluate predictions" in capsys.readouterr().out
+
+
+def test_the_newest_folder_is_taken_where_none_is_named(
+    tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "datasets").mkdir()
+    (tmp_path / "datasets" / "sphere").symlink_to(sphere_dataset.root)
+    assert main(["fit", *TINY]) == 0
+    assert "No dataset named" in capsys.readouterr().out
+    assert main(["export", "--output", "again"]) == 0
+    first = next((tmp_path / "predictions").iterdir())
+    for name in ("environment.exr", "visibility.exr", "surfels.ply", "test/r_000.png"):
+        assert (first / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name

@@ -1,0 +1,198 @@
+"""What a fit leaves behind: a prediction that the evaluator reads, a PLY in world units, and renders that are right."""
+
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from panoless.export import PICTURES, PLY_NAME, cube_to_latlong, export_prediction, render, write_ply
+from panoless.kernels.cubemap import cubemap_directions
+from panoless.views import Normalization, raster_camera
+from shinypartial.dataset.read import read_view
+from shinypartial.errors import InputError
+from shinypartial.evaluate import evaluate
+from shinypartial.prediction import (
+    claim_prediction,
+    dataset_hash,
+    prediction_frame,
+    read_environment_map,
+    read_info,
+    read_visibility,
+)
+from shinypartial.sphere import latlong_directions
+from tests.panoless.conftest import FinishedFit
+from tests.support.mirror_sphere import clipped_environment, sphere_surfels, tiny_config
+from tests.support.synthetic_dataset import render_sphere, sphere_cameras
+
+UNIT_FRAME = Normalization(np.zeros(3), 1.0)
+
+
+@pytest.fixture(scope="module")
+def prediction(finished: FinishedFit, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("predictions") / "sphere"
+    claim_prediction(folder)
+    export_prediction(finished.dataset, finished.state, finished.config, folder)
+    return folder
+
+
+def test_the_readers_accept_the_prediction(prediction: Path, finished: FinishedFit) -> None:
+    info = read_info(prediction)
+    assert info.dataset_hash == dataset_hash(finished.dataset)
+    assert info.config["surfels"]["count"] == finished.config.surfels.count
+    assert info.parameter_counts["surfels"] == finished.state.surfels.count
+    assert info.peak_memory_bytes > 1e7
+    assert set(info.seconds) >= {"read views", "initialize", "optimize", "solve environment"}
+    assert all(len(series) == len(info.curves["iteration"]) for series in info.curves.values())
+    environment, visibility = read_environment_map(prediction), read_visibility(prediction)
+    assert visibility is not None
+    assert environment.shape[:2] == visibility.shape == (48, 96)
+    assert 0.0 <= visibility.min() < visibility.max() <= 1.0
+    for frame in finished.dataset.test:
+        view = read_view(prediction_frame(prediction, frame))
+        assert view.normals_world is not None
+        lengths = np.linalg.norm(view.normals_world, axis=-1)
+        np.testing.assert_allclose(lengths[view.alpha > 0.01], 1, atol=1e-5)
+
+
+def test_the_evaluator_scores_it(prediction: Path, finished: FinishedFit) -> None:
+    scores = evaluate(prediction, finished.dataset.root)
+    assert (prediction / "scores.json").exists()
+    # Far below what a second of fitting reaches (3°, 25 dB), far above what a wrong axis leaves.
+    assert scores.normals is not None
+    assert scores.normals.median_angular_error_deg < 6.0
+
+
+def test_pictures_of_the_decomposition_are_there(prediction: Path) -> None:
+    names = [path.name for path in sorted((prediction / PICTURES).iterdir())]
+    assert [name[0] for name in names] == list("123456")
+
+
+def test_nothing_half_written_stays(prediction: Path) -> None:
+    assert not list(prediction.rglob(".partial-*"))
+
+
+def test_an_export_that_fails_claims_nothing(tmp_path: Path, finished: FinishedFit, monkeypatch) -> None:
+    """An old prediction.json must not describe half of a new prediction, and the next export may take the folder."""
+    claim_prediction(tmp_path)
+    export_prediction(finished.dataset, finished.state, finished.config, tmp_path)
+    with monkeypatch.context() as patch:
+
+        def fail(*_) -> None:
+            raise OSError(28, "No space left on device")
+
+        patch.setattr("panoless.export.write_ply", fail)
+        with pytest.raises(OSError, match="No space"):
+            export_prediction(finished.dataset, finished.state, finished.config, tmp_path)
+    with pytest.raises(InputError):
+        read_info(tmp_path)
+    claim_prediction(tmp_path)
+    export_prediction(finished.dataset, finished.state, finished.config, tmp_path)
+    read_info(tmp_path)
+
+
+def test_an_export_killed_at_its_first_file_may_be_repeated(tmp_path: Path, finished: FinishedFit, monkeypatch) -> None:
+    folder = tmp_path / "prediction"
+    claim_prediction(folder)
+    with monkeypatch.context() as patch:
+
+        def killed(*_) -> None:
+            (folder / ".partial-x.exr").touch()
+            raise KeyboardInterrupt
+
+        patch.setattr("panoless.export.write_visibility", killed)
+        with pytest.raises(KeyboardInterrupt):
+            export_prediction(finished.dataset, finished.state, finished.config, folder)
+    claim_prediction(folder)
+    export_prediction(finished.dataset, finished.state, finished.config, folder)
+    assert not list(folder.rglob(".partial-*"))
+
+
+def read_ply(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a binary PLY of single-precision vertices."""
+    header, _, body = path.read_bytes().partition(b"end_header\n")
+    lines = header.decode("ascii").splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    count = int(next(line for line in lines if line.startswith("element vertex")).split()[-1])
+    names = [line.split()[-1] for line in lines if line.startswith("property float")]
+    rows = [struct.unpack_from(f"<{len(names)}f", body, 4 * len(names) * row) for row in range(count)]
+    assert len(body) == 4 * len(names) * count
+    return dict(zip(names, np.array(rows).T, strict=True))
+
+
+def test_the_ply_holds_the_surfels_in_world_units(tmp_path: Path) -> None:
+    radius, center = 2.0, np.array([10.0, -20.0, 30.0])
+    write_ply(tmp_path / "s.ply", sphere_surfels(50), Normalization(center, radius))
+    table = read_ply(tmp_path / "s.ply")
+    points = np.stack([table[name] for name in "xyz"], 1)
+    normals = np.stack([table[name] for name in ("nx", "ny", "nz")], 1)
+    np.testing.assert_allclose(points, center + radius * normals, atol=1e-5)
+    np.testing.assert_allclose(np.exp(table["scale_0"]), radius * sphere_surfels(50).scales[:, 0], rtol=1e-5)
+    # A sphere of radius 2 has the curvature −1/2.
+    np.testing.assert_allclose(table["curvature_a"], -0.5, rtol=1e-6)
+    w, x, y, z = (table[f"rot_{i}"] for i in range(4))
+    axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
+    np.testing.assert_allclose(axis, normals, atol=1e-6)
+    # Black albedo as the degree-0 harmonic that viewers turn into color: 0.5 + 0.2821 f.
+    np.testing.assert_allclose(0.5 + 0.28209479 * table["f_dc_0"], 0.0, atol=1e-6)
+
+
+def test_the_exported_ply_lies_on_the_sphere(prediction: Path, finished: FinishedFit) -> None:
+    table = read_ply(prediction / PLY_NAME)
+    assert len(table["x"]) == finished.state.surfels.count
+    points = np.stack([table[name] for name in "xyz"], 1)
+    front = points[:, 0] > 0.5
+    assert abs(np.median(np.linalg.norm(points[front], axis=1)) - 1) < 0.05
+
+
+def test_a_map_colored_by_direction_shows_each_direction() -> None:
+    cube = cubemap_directions(64).permute(0, 3, 1, 2).contiguous()
+    # Area averages shorten by 0.1 %; bilinear lookups at 64 texels err by 0.03 %, more at corners.
+    np.testing.assert_allclose(cube_to_latlong(cube, 64), latlong_directions(64), atol=3e-3)
+
+
+def test_a_lat_long_texel_is_the_mean_of_what_it_covers() -> None:
+    cube = torch.rand(6, 2, 4, 4)
+    fine, coarse = cube_to_latlong(cube, 64), cube_to_latlong(cube, 32)
+    blocks = fine.reshape(32, 2, 64, 2, 2).mean((1, 3))
+    # Four against sixteen samples of a piecewise bilinear function.
+    np.testing.assert_allclose(coarse, blocks, atol=0.03)
+
+
+@pytest.mark.parametrize("scale", [1.0, 30.0])
+def test_a_rendered_mirror_sphere_is_the_traced_one(scale: float) -> None:
+    """Exact surfels and the exact environment give the picture that ray tracing gives, in a world of any size."""
+    environment = clipped_environment(cubemap_directions(128)).permute(0, 3, 1, 2).contiguous()
+    camera = sphere_cameras("test", 1, 64)[0]
+    truth = render_sphere(camera)
+    pose = camera.camera_to_world.copy()
+    pose[:3, 3] *= scale
+    frame = Normalization(np.zeros(3), scale)
+    raster = raster_camera(replace(camera, camera_to_world=pose), frame, 0.3)
+    parts = render(sphere_surfels(6000), environment, raster, frame, tiny_config())
+    # Blended Gaussians reach beyond a silhouette by their radius, so the rim is left out.
+    solid = truth.alpha > 0.99
+    solid &= np.abs((truth.normals_world * (camera.position_world / 4.0)).sum(-1)) > 0.35
+    assert solid.mean() > 0.15
+    assert parts.alpha.numpy()[solid].min() > 0.98
+    # Measured: 0.2° and 0.003; disks of radius 0.037 in front of the tangent plane.
+    cosine = (parts.normals_world.permute(1, 2, 0).numpy() * truth.normals_world).sum(-1)[solid]
+    assert np.degrees(np.arccos(cosine.clip(-1, 1))).max() < 1.5
+    np.testing.assert_allclose(parts.depth.numpy()[solid], scale * truth.depth[solid], atol=0.02 * scale)
+    difference = parts.radiance.permute(1, 2, 0).numpy() - truth.radiance.clip(0, 1)
+    assert np.abs(difference[solid]).mean() < 0.01
+    assert parts.alpha.numpy()[truth.alpha == 0].mean() < 0.02
+
+
+def test_only_a_finished_fit_is_exported(tmp_path: Path, finished: FinishedFit) -> None:
+    unfinished = replace(finished.state, final_environment=None)
+    with pytest.raises(ValueError, match="finished"):
+        export_prediction(finished.dataset, unfinished, finished.config, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_info_is_strict_json(prediction: Path) -> None:
+    json.loads((prediction / "prediction.json").read_text(), parse_constant=lambda name: pytest.fail(name))
