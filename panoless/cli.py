@@ -71,7 +71,9 @@ class Export:
         if state is None or state.final_environment is None:
             raise InputError(
                 expected=f"a finished run in {folder}",
-                found=f"no {CHECKPOINT}" if state is None else f"{state.iteration} of {description.config.iterations} iterations",
+                found=f"no {CHECKPOINT}"
+                if state is None
+                else f"{state.iteration} of {description.config.iterations} iterations",
                 remedy="Run the same `panoless fit` command again: it continues where it stopped.",
             )
         prediction = self.output or Path("predictions") / folder.resolve().name

@@ -3,6 +3,8 @@
 Durations are shares of `iterations`, so every schedule scales with the length of the fit.
 """
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, Literal
 
@@ -198,3 +200,52 @@ def _rebuild(default: Any, content: Any) -> Any:
         value = getattr(default, name)
         values[name] = _rebuild(value, content[name]) if is_dataclass(value) else content[name]
     return type(default)(**values)
+
+
+_COUNTS = {
+    "iterations": 1,
+    "surfels.count": 1,
+    "surfels.hull_resolution": 8,
+    "environment.resolution": 2,
+    "environment.solve_resolution": 1,
+    "density.max_surfels": 1,
+    "crop_margin_px": -1,
+}
+"""Smallest values of whole numbers; a hull of fewer voxels has no inside to speak of."""
+
+_UNBOUNDED_NUMBERS = {"seed", "density.gradient_threshold", "density.dense_share", "loss.robust_scale"}
+
+
+def check_config(config: FitConfig) -> None:
+    """Raise InputError for a number outside its range: counts from their smallest value, weights and rates from 0,
+    shares and opacities in [0, 1].
+    """
+    for name, value in _numbers(config, ""):
+        high = math.inf
+        if name in _COUNTS:
+            low: float = _COUNTS[name]
+        elif name in _UNBOUNDED_NUMBERS:
+            low = -math.inf
+        else:
+            low = 0
+            open_ended = name.startswith(("rates.", "loss.lambda_")) and name not in (
+                "rates.drop_at",
+                "loss.lambda_ssim",
+            )
+            high = math.inf if open_ended else 1
+        if not (low <= value <= high and math.isfinite(value)):
+            raise InputError(
+                expected=f"--config.{name.replace('_', '-')} to be a number of at least {low}"
+                + (f" and at most {high}" if math.isfinite(high) else ""),
+                found=str(value),
+                remedy="See `panoless fit --help` for what it means.",
+            )
+
+
+def _numbers(config: Any, prefix: str) -> Iterator[tuple[str, float]]:
+    for item in fields(config):
+        value = getattr(config, item.name)
+        if is_dataclass(value):
+            yield from _numbers(value, f"{prefix}{item.name}.")
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            yield prefix + item.name, value

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from panoless.checkpoint import FitState, claim_run, load_state, save_state
-from panoless.config import FitConfig
+from panoless.config import FitConfig, check_config
 from panoless.cubemap import Rays, initial_environment, look_up, resample, solve_environment
 from panoless.densify import DensityStatistics, Edit, grow_and_prune, propagate_normals, reset_opacities
 from panoless.initialize import initial_surfels
@@ -180,7 +180,8 @@ class Fitter:
         albedo = buffers.albedo.flatten(1)[:, pixels]
         color = compose(albedo, specular.T, alpha, self.config.alpha_applied)
         target = view.radiance.flatten(1)[:, pixels]
-        return photometric_masked(color.T, target.T, self.config.loss.robust_scale), Observed(directions.detach(), alpha.detach())
+        term = photometric_masked(color.T, target.T, self.config.loss.robust_scale)
+        return term, Observed(directions.detach(), alpha.detach())
 
     def _composited(
         self, view: TrainView, buffers: SurfaceBuffers, surfels: Surfels, iteration: int
@@ -325,6 +326,7 @@ def new_state(views: Views, config: FitConfig) -> FitState:
 
 def fit(dataset: Dataset, config: FitConfig, folder: Path) -> FitState:
     """Fit a dataset in a run folder; a killed fit continues from its last checkpoint, a finished one is returned."""
+    check_config(config)
     claim_run(folder, dataset.root, dataset_hash(dataset), config)
     state = load_state(folder)
     if state is not None and state.final_environment is not None:

@@ -2,13 +2,13 @@
 
 import ast
 import json
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path
 
 import pytest
 
 import panoless
-from panoless.config import PRESETS, FitConfig, RateConfig, config_from_dict
+from panoless.config import PRESETS, FitConfig, RateConfig, check_config, config_from_dict
 from panoless.surfels import Surfels
 from shinypartial.errors import InputError
 
@@ -66,3 +66,42 @@ def test_every_option_is_read(section: str) -> None:
 def test_every_parameter_has_a_rate() -> None:
     rates = {item.name for item in fields(RateConfig)}
     assert rates - {"drop_at", "drop_factor"} == {item.name for item in fields(Surfels)} | {"environment"}
+
+
+def with_value(config: FitConfig, name: str, value: float) -> FitConfig:
+    section, _, leaf = name.rpartition(".")
+    if not section:
+        return replace(config, **{leaf: value})
+    return replace(config, **{section: replace(getattr(config, section), **{leaf: value})})
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_are_in_range(preset: str) -> None:
+    check_config(PRESETS[preset])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("iterations", 0),
+        ("surfels.count", 0),
+        ("surfels.hull_votes", 1.01),
+        ("environment.resolution", 1),
+        ("environment.warmup", -0.1),
+        ("loss.depth_blend", 2.0),
+        ("loss.lambda_ssim", 1.5),
+        ("loss.lambda_silhouette", -1.0),
+        ("rates.means", float("nan")),
+        ("rates.environment", float("inf")),
+        ("crop_margin_px", -2),
+        ("visibility_alpha", 1.5),
+    ],
+)
+def test_a_value_out_of_range_is_named_as_the_command_line_names_it(name: str, value: float) -> None:
+    with pytest.raises(InputError, match="--config." + name.replace("_", "-")):
+        check_config(with_value(PRESETS["default"], name, value))
+
+
+@pytest.mark.parametrize(("name", "value"), [("loss.lambda_distortion", 1000.0), ("crop_margin_px", -1), ("seed", -5)])
+def test_unusual_values_are_allowed(name: str, value: float) -> None:
+    check_config(with_value(PRESETS["default"], name, value))

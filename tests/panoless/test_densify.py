@@ -130,8 +130,10 @@ def stepped(count: int) -> SurfelOptimizer:
     """An optimizer whose moments differ in every row."""
     optimizer = SurfelOptimizer(sphere_surfels(count), torch.rand(6, 3, 4, 4), RateConfig())
     for _ in range(3):
-        loss = sum((value * torch.arange(1.0, count + 1).view(-1, *[1] * (value.dim() - 1))).square().sum()
-                   for value in optimizer.surfels.named().values())
+        loss = sum(
+            (value * torch.arange(1.0, count + 1).view(-1, *[1] * (value.dim() - 1))).square().sum()
+            for value in optimizer.surfels.named().values()
+        )
         loss.backward()
         optimizer.step(1.0, geometry=True, frozen=frozenset())
     return optimizer

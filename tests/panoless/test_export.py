@@ -172,19 +172,20 @@ def test_a_rendered_mirror_sphere_is_the_traced_one(scale: float) -> None:
     pose[:3, 3] *= scale
     frame = Normalization(np.zeros(3), scale)
     raster = raster_camera(replace(camera, camera_to_world=pose), frame, 0.3)
-    parts = render(sphere_surfels(6000), environment, raster, frame, tiny_config())
-    # Blended Gaussians reach beyond a silhouette by their radius, so the rim is left out.
-    solid = truth.alpha > 0.99
-    solid &= np.abs((truth.normals_world * (camera.position_world / 4.0)).sum(-1)) > 0.35
-    assert solid.mean() > 0.15
-    assert parts.alpha.numpy()[solid].min() > 0.98
-    # Measured: 0.2° and 0.003; disks of radius 0.037 in front of the tangent plane.
-    cosine = (parts.normals_world.permute(1, 2, 0).numpy() * truth.normals_world).sum(-1)[solid]
-    assert np.degrees(np.arccos(cosine.clip(-1, 1))).max() < 1.5
-    np.testing.assert_allclose(parts.depth.numpy()[solid], scale * truth.depth[solid], atol=0.02 * scale)
-    difference = parts.radiance.permute(1, 2, 0).numpy() - truth.radiance.clip(0, 1)
-    assert np.abs(difference[solid]).mean() < 0.01
-    assert parts.alpha.numpy()[truth.alpha == 0].mean() < 0.02
+    parts = render(sphere_surfels(1500), environment, raster, frame, tiny_config())
+    # Blended Gaussians reach beyond a silhouette by their radius and bend its normals, so the rim is left out.
+    cosine = np.abs((truth.normals_world * (camera.position_world / 4.0)).sum(-1))
+    inner = (truth.alpha > 0.99) & (cosine > 0.6)
+    assert inner.mean() > 0.3
+    assert parts.alpha.numpy()[inner].min() > 0.99
+    angles = np.degrees(
+        np.arccos((parts.normals_world.permute(1, 2, 0).numpy() * truth.normals_world).sum(-1).clip(-1, 1))
+    )
+    # Measured with disks of radius 0.07: at most 1.0°, 0.031 in depth, 0.0033 in mean radiance.
+    assert angles[inner].max() < 2.0
+    np.testing.assert_allclose(parts.depth.numpy()[inner], scale * truth.depth[inner], atol=0.06 * scale)
+    difference = np.abs(parts.radiance.permute(1, 2, 0).numpy() - truth.radiance.clip(0, 1))
+    assert difference[inner].mean() < 0.01
 
 
 def test_only_a_finished_fit_is_exported(tmp_path: Path, finished: FinishedFit) -> None:

@@ -1,4 +1,4 @@
-"""Whole fits of a mirror sphere, a second each: they improve, repeat themselves, survive a kill, and never see a score."""
+"""Whole fits of a mirror sphere, a second each: they improve, repeat themselves, survive a kill and see no score."""
 
 import math
 import subprocess
@@ -72,7 +72,9 @@ def test_unseen_views_are_rendered_better_than_by_the_start(finished: FinishedFi
 
 
 def test_normals_become_better_than_the_hull(finished: FinishedFit, views: Views) -> None:
-    before = normal_errors_deg(new_state(views, finished.config).surfels, finished.config, finished.dataset, finished.state)
+    before = normal_errors_deg(
+        new_state(views, finished.config).surfels, finished.config, finished.dataset, finished.state
+    )
     after = normal_errors_deg(finished.state.surfels, finished.config, finished.dataset, finished.state)
     assert float(after.median()) < float(before.median())
     assert float(after.median()) < 3.0
@@ -197,7 +199,8 @@ def test_geometry_rests_while_the_environment_warms_up(tmp_path: Path, sphere_da
 def test_another_seed_is_another_fit(tmp_path: Path, sphere_dataset: Dataset) -> None:
     config = tiny_config(iterations=5, count=60)
     first, again, other = (
-        fit(sphere_dataset, replace(config, seed=seed), tmp_path / name) for seed, name in ((0, "a"), (0, "b"), (1, "c"))
+        fit(sphere_dataset, replace(config, seed=seed), tmp_path / name)
+        for seed, name in ((0, "a"), (0, "b"), (1, "c"))
     )
     assert_same(first, again)
     assert not torch.equal(first.surfels.means, other.surfels.means)
@@ -241,13 +244,18 @@ def test_a_fit_loads_neither_metrics_nor_blender(tmp_path: Path, sphere_dataset:
     """Method and score are blind to each other: in the process of a fit no module that scores exists."""
     program = (
         "import sys; from panoless.cli import main; code = main(sys.argv[1:]); "
-        "bad = {'shinypartial.metrics', 'shinypartial.evaluate', 'shinypartial.blender', 'shinypartial.scores', 'bpy'}; "
-        "found = [name for name in sys.modules if any(name == b or name.startswith(b + '.') for b in bad)]; "
+        "rooms = [f'shinypartial.{room}' for room in ('metrics', 'evaluate', 'scores', 'scene', 'blender')]; "
+        "found = [name for name in sys.modules if any(name == b or name.startswith(b + '.') for b in [*rooms, 'bpy'])]; "
         "assert not found, found; sys.exit(code)"
     )
     options = ["--config.iterations", "3", "--config.surfels.count", "50", "--config.surfels.hull-resolution", "24"]
     command = [sys.executable, "-c", program, "fit", str(sphere_dataset.root), "--output", "out", *options]
-    environment = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "OMP_WAIT_POLICY": "PASSIVE", "HOME": str(tmp_path)}
+    environment = {
+        "PYTHONPATH": str(ROOT),
+        "PATH": "/usr/bin:/bin",
+        "OMP_WAIT_POLICY": "PASSIVE",
+        "HOME": str(tmp_path),
+    }
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "out" / "prediction.json").exists()

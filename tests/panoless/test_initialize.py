@@ -142,7 +142,9 @@ def test_the_hull_is_a_signed_distance(views: Views) -> None:
     # Along +X, where cameras bound the hull.
     line = truth[24:, 23:25, 23:25]
     np.testing.assert_allclose(hull.distance[24:, 23:25, 23:25], line, atol=3 * VOXEL)
-    np.testing.assert_allclose(hull.to_index(points.reshape(-1, 3)).reshape(points.shape)[5, 7, 9], [5, 7, 9], atol=1e-6)
+    np.testing.assert_allclose(
+        hull.to_index(points.reshape(-1, 3)).reshape(points.shape)[5, 7, 9], [5, 7, 9], atol=1e-6
+    )
 
 
 def test_select_and_named_keep_rows_together(hull: Surfels) -> None:

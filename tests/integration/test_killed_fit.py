@@ -1,0 +1,68 @@
+"""A fit that the system kills at any moment continues with the same command, and ends as if nothing had happened."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from panoless.checkpoint import load_state
+from shinypartial.dataset.schema import Dataset
+from shinypartial.prediction import read_info
+
+ROOT = Path(__file__).resolve().parents[2]
+ITERATIONS = 400
+PROGRAM = """
+import sys
+import panoless.fit
+from panoless.cli import main
+panoless.fit.CHECKPOINT_INTERVAL_S = 0.05
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def start(dataset: Dataset, place: Path, output: str) -> subprocess.Popen[str]:
+    """The command in a process of its own, with frequent checkpoints."""
+    options = ["--config.iterations", str(ITERATIONS), "--config.surfels.count", "100"]
+    options += ["--config.surfels.hull-resolution", "24", "--config.environment.resolution", "16"]
+    options += ["--config.environment.solve-resolution", "16"]
+    return subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, "fit", str(dataset.root), "--output", output, *options],
+        cwd=place,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_WAIT_POLICY": "PASSIVE"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_for(path: Path, process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + 120
+    while not path.exists():
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_a_killed_fit_continues(tmp_path: Path, sphere_dataset: Dataset) -> None:
+    run = tmp_path / "runs" / "killed"
+    process = start(sphere_dataset, tmp_path, "killed")
+    wait_for(run / "checkpoint.pt", process)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    state = load_state(run)
+    assert state is not None
+    assert 0 < state.iteration < ITERATIONS
+    assert not (tmp_path / "killed" / "prediction.json").exists()
+
+    for output in ("killed", "whole"):
+        process = start(sphere_dataset, tmp_path, output)
+        _, errors = process.communicate(timeout=120)
+        assert process.returncode == 0, errors
+    first, second = (tmp_path / name for name in ("killed", "whole"))
+    assert read_info(first).curves == read_info(second).curves
+    for name in ("environment.exr", "visibility.exr", "surfels.ply", "test/r_001.png"):
+        assert (first / name).read_bytes() == (second / name).read_bytes(), name
+    assert not list(tmp_path.rglob(".partial-*"))
