@@ -22,7 +22,8 @@ DESCRIPTION = "fit.json"
 class FitState:
     """What changes during a fit. `iteration` counts finished steps; `environment` is as the optimizer holds it.
 
-    `final_environment` (radiance) and `evidence` are set when the fit is complete.
+    `evidence` is what online visibility has accumulated. `final_environment` (radiance) and `visibility` in [0, 1] are
+    set when the fit is complete.
     """
 
     surfels: Surfels
@@ -35,6 +36,7 @@ class FitState:
     center: list[float]
     radius: float
     final_environment: Tensor | None = None
+    visibility: Tensor | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     curves: dict[str, list[float]] = field(default_factory=dict)
     peak_memory_bytes: int = 0

@@ -129,7 +129,7 @@ class FitConfig:
     crop_margin_px: int = 12
     """Work on the mask's bounding box with this margin; −1 works on whole images."""
     visibility: Literal["final", "online"] = "final"
-    """`online`: accumulated at each iteration as in the paper; `final`: one pass with the converged geometry."""
+    """`online`: evidence of every iteration, as in the paper; `final`: how far rays of the converged geometry agree."""
     visibility_alpha: float = 0.5
     """τ: only pixels with alpha above it count as observations."""
     surfels: SurfelConfig = field(default_factory=SurfelConfig)

@@ -53,13 +53,17 @@ def solve_environment(rays: Sequence[Rays], resolution: int) -> Float[Tensor, "6
     for scale in ROBUST_SCALES:
         if scale is not None:
             for batch, weight in zip(rays, weights, strict=True):
-                error = (sample_cubemap(environment, batch.directions) - batch.radiance).square().sum(1)
-                weight.copy_((1 + error / scale**2) ** -2)
+                weight.copy_(robust_weight(sample_cubemap(environment, batch.directions) - batch.radiance, scale))
         total = _normal_product(torch.ones(6, 1, resolution, resolution), rays, weights)
         right_side = _right_side(rays, weights, resolution)
         splat = fill_unobserved(right_side / total.clamp(min=1e-9), total[:, 0])
         environment = _sharpen(splat, right_side, total, rays, weights)
     return environment.clamp(0, 1)
+
+
+def robust_weight(error: Float[Tensor, "P 3"], scale: float) -> Float[Tensor, "P"]:
+    """Geman–McClure weight (1 + ‖e‖²/s²)⁻²."""
+    return (1 + error.square().sum(1) / scale**2) ** -2
 
 
 def _right_side(rays: Sequence[Rays], weights: Sequence[Tensor], resolution: int) -> Float[Tensor, "6 3 L L"]:

@@ -21,7 +21,6 @@ from panoless.kernels.rasterize import RasterCamera
 from panoless.shading import ALPHA_FLOOR, compose, reflection_directions_world, surface_buffers
 from panoless.surfels import Surfels, rotation_matrices
 from panoless.views import Normalization, raster_camera, unit_rays_camera
-from panoless.visibility import visibility_from_evidence
 from shinypartial.color import to_display
 from shinypartial.dataset.schema import Dataset, View
 from shinypartial.files import remove_partial_files, whole_file
@@ -93,16 +92,15 @@ def export_prediction(dataset: Dataset, state: FitState, config: FitConfig, fold
 
     An earlier prediction.json is removed first, so that it never describes a mixture; `test` marks the folder as begun.
     """
-    if state.final_environment is None:
+    if state.final_environment is None or state.visibility is None:
         raise ValueError("only a finished fit can be exported")
     (folder / "test").mkdir(parents=True, exist_ok=True)
     (folder / DESCRIPTION).unlink(missing_ok=True)
     remove_partial_files(folder)
     environment = state.final_environment
-    visibility = visibility_from_evidence(state.evidence)
     height = 2 * environment.shape[-1]
     write_environment_map(folder, cube_to_latlong(environment, height))
-    write_visibility(folder, cube_to_latlong(visibility[:, None], height)[..., 0].clip(0, 1))
+    write_visibility(folder, cube_to_latlong(state.visibility[:, None], height)[..., 0].clip(0, 1))
     write_ply(folder / PLY_NAME, state.surfels, normalization_of(state))
     _write_test_views(dataset, state, config, folder)
     info = PredictionInfo(

@@ -29,7 +29,12 @@ from panoless.shading import (
 )
 from panoless.surfels import Surfels
 from panoless.views import Normalization, TrainView, Views, load_views
-from panoless.visibility import accumulate
+from panoless.visibility import (
+    accumulate,
+    agreement,
+    visibility_from_agreement,
+    visibility_from_evidence,
+)
 from shinypartial.dataset.schema import Dataset
 from shinypartial.errors import InputError
 from shinypartial.prediction import dataset_hash
@@ -240,20 +245,21 @@ class Fitter:
             self.state.curves.setdefault(name, []).append(value)
 
     def _complete(self) -> None:
-        """Solve the environment for the converged geometry and count what each direction received."""
-        config = self.config
+        """Solve the environment for the converged geometry, and say how well each direction was observed."""
+        config, state = self.config, self.state
         surfels = self.optimizer.surfels.detached()
-        with _timed(self.state, "solve environment"), torch.no_grad():
+        with _timed(state, "solve environment"), torch.no_grad():
             rays = list(observed_rays(self.views, surfels, config, FINAL_RAYS))
-            if config.visibility == "final":
-                for batch in rays:
-                    accumulate(self.state.evidence, batch.directions, torch.ones(len(batch.directions)), 0.0)
             if config.environment.solve:
-                self.state.final_environment = solve_environment(rays, config.environment.solve_resolution)
+                state.final_environment = solve_environment(rays, config.environment.solve_resolution)
             else:
                 parameters = self.optimizer.environment.detach()
                 sigmoid = config.environment.activation == "sigmoid"
-                self.state.final_environment = torch.sigmoid(parameters) if sigmoid else parameters
+                state.final_environment = torch.sigmoid(parameters) if sigmoid else parameters
+            if config.visibility == "online":
+                state.visibility = visibility_from_evidence(state.evidence)
+            else:
+                state.visibility = visibility_from_agreement(agreement(rays, state.final_environment))
 
     def _save(self) -> None:
         state = self.state
@@ -310,7 +316,7 @@ def new_state(views: Views, config: FitConfig) -> FitState:
         with torch.no_grad():
             rays = list(observed_rays(views, surfels, config, INITIAL_RAYS))
             environment = resample(solve_environment(rays, config.environment.resolution // 2), environment.shape[-1])
-    length = config.environment.solve_resolution if config.environment.solve else environment.shape[-1]
+    length = environment.shape[-1]
     return FitState(
         surfels=surfels,
         environment=environment,

@@ -1,12 +1,31 @@
 """How well each direction of the environment was observed (paper Sec. 3.5)."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from panoless.kernels.cubemap import cubemap_solid_angles, scatter_cubemap
+from panoless.cubemap import Rays, robust_weight
+from panoless.kernels.cubemap import cubemap_solid_angles, sample_cubemap, scatter_cubemap
+from shinypartial.color import linear_to_srgb
 
 SATURATING_QUANTILE = 0.9
+VOTE_SCALE = 0.05
+HALVING_DISAGREEMENT = 0.05
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What the rays that look in a texel's direction say about it, on the cubemap's grid.
+
+    `votes` is the sum of their robust weights: how many rays agree that this is the environment. `disagreement` is
+    the weighted mean of their absolute sRGB difference from the map, in [0, 1]: small only where they all see the same.
+    """
+
+    votes: Float[Tensor, "6 L L"]
+    disagreement: Float[Tensor, "6 L L"]
 
 
 def accumulate(
@@ -31,3 +50,35 @@ def visibility_from_evidence(evidence: Float[Tensor, "6 L L"]) -> Float[Tensor, 
     if not len(observed):
         return torch.zeros_like(evidence)
     return (density / torch.quantile(observed[:: max(1, len(observed) // 100_000)], SATURATING_QUANTILE)).clamp(0, 1)
+
+
+def agreement(rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"]) -> Agreement:
+    """Weigh each ray by (1 + ‖e‖²/s²)⁻², s = 0.05 (linear), and average its sRGB residual over the texels it meets."""
+    resolution = environment.shape[-1]
+    votes = torch.zeros(6, resolution, resolution)
+    residual = torch.zeros(6, resolution, resolution)
+    for batch in rays:
+        seen = sample_cubemap(environment, batch.directions)
+        weight = robust_weight(seen - batch.radiance, VOTE_SCALE)
+        difference = (_srgb(seen) - _srgb(batch.radiance)).abs().mean(1)
+        both = torch.stack([weight, weight * difference], 1)
+        summed = scatter_cubemap(both, batch.directions, resolution)
+        votes += summed[:, 0]
+        residual += summed[:, 1]
+    return Agreement(votes, residual / votes.clamp(min=1e-6))
+
+
+def _srgb(radiance: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+    return torch.from_numpy(linear_to_srgb(radiance.clamp(0, 1).numpy()))
+
+
+def visibility_from_agreement(found: Agreement) -> Float[Tensor, "6 L L"]:
+    """Confidence in [0, 1]: v/(1 + v) · 1/(1 + d/0.05), with v the votes a mean-sized texel would have had.
+
+    Zero exactly where no ray fell; ½ at most where a single ray did or where rays disagree by 0.05. It uses training
+    views only, yet orders directions by their actual error: rays disagree where normals are wrong, where the map is
+    too coarse, and where the object sees itself.
+    """
+    relative = cubemap_solid_angles(found.votes.shape[-1]).to(found.votes.dtype)
+    votes = found.votes / (relative / relative.mean())
+    return votes / (1 + votes) / (1 + found.disagreement / HALVING_DISAGREEMENT)

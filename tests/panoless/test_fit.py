@@ -18,7 +18,6 @@ from panoless.fit import Fitter, LossTerms, fit, new_state, normalization_of
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.surfels import Surfels
 from panoless.views import Views, load_views, raster_camera
-from panoless.visibility import visibility_from_evidence
 from shinypartial.camera import Camera
 from shinypartial.dataset.read import read_view
 from shinypartial.dataset.schema import Dataset
@@ -45,8 +44,9 @@ def normal_errors_deg(surfels: Surfels, config: FitConfig, dataset: Dataset, sta
 def environment_psnr(state: FitState) -> float:
     """Over the directions that were well observed, against the environment that the views were traced with."""
     assert state.final_environment is not None
-    directions = cubemap_directions(state.evidence.shape[-1])
-    observed = visibility_from_evidence(state.evidence) > 0.5
+    assert state.visibility is not None
+    directions = cubemap_directions(state.visibility.shape[-1])
+    observed = state.visibility > 0.5
     assert observed.float().mean() > 0.1
     found = look_up(state.final_environment, directions[observed], "clamp")
     error = (found - clipped_environment(directions[observed])).square().mean()
@@ -98,7 +98,7 @@ def assert_same(first: FitState, second: FitState) -> None:
     """Equal to the last bit in everything that a prediction is made of."""
     for name, value in first.surfels.named().items():
         assert torch.equal(value, second.surfels.named()[name]), name
-    for name in ("environment", "evidence", "final_environment", "gradient_sum", "gradient_count"):
+    for name in ("environment", "evidence", "final_environment", "visibility", "gradient_sum", "gradient_count"):
         assert torch.equal(getattr(first, name), getattr(second, name)), name
     assert first.curves == second.curves
 

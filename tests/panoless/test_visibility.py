@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.nn.functional import normalize
 
+from panoless.cubemap import Rays
 from panoless.kernels.cubemap import cubemap_directions, cubemap_solid_angles
-from panoless.visibility import accumulate, visibility_from_evidence
+from panoless.visibility import accumulate, agreement, visibility_from_agreement, visibility_from_evidence
 
 LENGTH = 8
 
@@ -82,3 +83,47 @@ def test_equal_density_is_equally_visible() -> None:
 
 def test_nothing_seen_is_nowhere_visible() -> None:
     assert float(visibility_from_evidence(torch.zeros(6, LENGTH, LENGTH)).abs().max()) == 0.0
+
+
+def agreeing_rays(noise: float) -> tuple[Rays, torch.Tensor]:
+    """Rays in a half space that see a constant map, with noise where x > y."""
+    directions, _ = rays(3, 4000)
+    radiance = torch.full((len(directions), 3), 0.4)
+    noisy = directions[:, 0] > directions[:, 1]
+    radiance[noisy] += noise * torch.randn(int(noisy.sum()), 3, generator=torch.Generator().manual_seed(1))
+    return Rays(directions, radiance), torch.full((6, 3, LENGTH, LENGTH), 0.4)
+
+
+def test_confidence_lies_in_the_unit_interval_and_is_zero_exactly_where_no_ray_fell() -> None:
+    batch, environment = agreeing_rays(0.02)
+    found = agreement([batch], environment)
+    confidence = visibility_from_agreement(found)
+    assert float(confidence.min()) >= 0.0
+    assert float(confidence.max()) < 1.0
+    assert torch.equal(confidence > 0, found.votes > 0)
+
+
+def test_directions_in_which_rays_disagree_are_trusted_less() -> None:
+    batch, environment = agreeing_rays(0.05)
+    confidence = visibility_from_agreement(agreement([batch], environment))
+    directions = cubemap_directions(LENGTH)
+    inside = directions[..., 0] > 0.3
+    noisy = inside & (directions[..., 0] > directions[..., 1] + 0.3)
+    quiet = inside & (directions[..., 0] < directions[..., 1] - 0.3)
+    assert float(confidence[noisy].max()) < float(confidence[quiet].median())
+
+
+def test_more_votes_are_never_trusted_less() -> None:
+    batch, environment = agreeing_rays(0.0)
+    once = visibility_from_agreement(agreement([batch], environment))
+    twice = visibility_from_agreement(agreement([batch, batch], environment))
+    assert bool((twice >= once).all())
+    assert bool((twice > once)[once > 0].all())
+
+
+def test_rays_split_into_batches_say_the_same() -> None:
+    batch, environment = agreeing_rays(0.05)
+    halves = [Rays(batch.directions[half::2], batch.radiance[half::2]) for half in (0, 1)]
+    whole, split = agreement([batch], environment), agreement(halves, environment)
+    torch.testing.assert_close(split.votes, whole.votes, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(split.disagreement, whole.disagreement, rtol=1e-4, atol=1e-5)
