@@ -97,7 +97,7 @@ class DensityConfig:
 
 @dataclass(frozen=True)
 class RateConfig:
-    """Learning rates of Adam, in the normalized frame; all drop once, because a late drop beats a decay here."""
+    """Learning rates of Adam, in the normalized frame; constant at first, then falling, which improves the normals."""
 
     means: float = 1e-4
     quats: float = 2e-3
@@ -107,9 +107,10 @@ class RateConfig:
     curvatures: float = 3e-2
     roughness_logits: float = 1e-2
     environment: float = 3e-2
-    drop_at: float = 0.7
-    """Share of the iterations after which every rate is multiplied by `drop_factor`."""
-    drop_factor: float = 0.3
+    drop_at: float = 0.4
+    """Share of the iterations after which every rate falls geometrically."""
+    drop_factor: float = 0.01
+    """Factor of the rates at the last iteration."""
 
 
 @dataclass(frozen=True)

@@ -51,11 +51,17 @@ class Edit:
 
 
 def grow_and_prune(
-    surfels: Surfels, statistics: DensityStatistics, config: DensityConfig, generator: torch.Generator
+    surfels: Surfels,
+    statistics: DensityStatistics,
+    config: DensityConfig,
+    generator: torch.Generator,
+    *,
+    prune_faint: bool = True,
 ) -> Edit:
     """Clone small and split large surfels whose mean gradient is above threshold; prune faint and huge ones.
 
-    A split replaces a surfel by two drawn from its own Gaussian, scales divided by 1.6.
+    A split replaces a surfel by two drawn from its own Gaussian, scales divided by 1.6. Without `prune_faint` only
+    huge surfels go: right after an opacity reset all are faint.
     """
     surfels = surfels.detached()
     largest = surfels.scales.amax(1)
@@ -72,7 +78,9 @@ def grow_and_prune(
     merged = Surfels(**{name: torch.cat([part.named()[name] for part in parts]) for name in surfels.named()})
     source = torch.cat([kept, clones, children])
     unchanged = torch.arange(len(source)) < len(kept)
-    alive = (merged.opacities >= config.prune_opacity) & (merged.scales.amax(1) < LARGEST_SCALE)
+    alive = merged.scales.amax(1) < LARGEST_SCALE
+    if prune_faint:
+        alive &= merged.opacities >= config.prune_opacity
     if not alive.any():
         alive[merged.opacities.argmax()] = True
     return Edit(merged.select(alive), source[alive], unchanged[alive])

@@ -220,7 +220,8 @@ class Fitter:
         surfels = self.optimizer.surfels
         if self.schedule.density_round(iteration):
             generator = self._generator(iteration, 2)
-            edit = grow_and_prune(surfels, self.statistics, self.config.density, generator)
+            prune_faint = self.schedule.opacities_recovered(iteration)
+            edit = grow_and_prune(surfels, self.statistics, self.config.density, generator, prune_faint=prune_faint)
             self._apply(edit)
             self.statistics = DensityStatistics.empty(self.optimizer.surfels.count)
         if self.schedule.opacity_reset(iteration):

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 from panoless.config import FitConfig
 
+RECOVERY_STEPS = 100
+
 
 @dataclass(frozen=True)
 class Schedule:
@@ -23,9 +25,12 @@ class Schedule:
         return iteration >= self._iteration(self.config.environment.warmup)
 
     def rate_factor(self, iteration: int) -> float:
-        """1, and the drop factor after the drop."""
+        """1 until the drop begins, then a geometric fall that ends at the drop factor with the last iteration."""
         rates = self.config.rates
-        return rates.drop_factor if iteration >= self._iteration(rates.drop_at) else 1.0
+        begin, end = self._iteration(rates.drop_at), self.config.iterations
+        if iteration < begin:
+            return 1.0
+        return rates.drop_factor ** ((iteration + 1 - begin) / max(end - begin, 1))
 
     def lambda_silhouette(self, iteration: int) -> float:
         """The weight of Eq. 13, zero when its time is over ([t < 3000] in Eq. 14)."""
@@ -44,6 +49,14 @@ class Schedule:
     def opacity_reset(self, iteration: int) -> bool:
         """Whether opacities are reset after this iteration."""
         return self._density_active(iteration) and self._due(iteration, self.config.density.reset_every)
+
+    def opacities_recovered(self, iteration: int) -> bool:
+        """Whether surfels have had time to earn their opacity back since the last reset, so that pruning is fair.
+
+        Recovery takes steps, not a share of the fit: a hundred of them, or half the time between resets if that is less.
+        """
+        period = max(self._iteration(self.config.density.reset_every), 1)
+        return iteration < period or iteration % period >= min(RECOVERY_STEPS, period // 2)
 
     def propagation(self, iteration: int) -> bool:
         """Whether normals are propagated after this iteration; an opacity reset has precedence."""

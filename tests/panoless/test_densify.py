@@ -165,3 +165,10 @@ def test_an_edit_before_the_first_step_is_an_edit() -> None:
     optimizer.edit_surfels(optimizer.surfels.select(index), index, torch.tensor([True, False]))
     assert optimizer.surfels.count == 2
     assert moments(optimizer) == {}
+
+
+def test_faint_surfels_survive_a_round_that_does_not_prune_them() -> None:
+    surfels = replace(sized([0.01, 0.6]), opacity_logits=torch.tensor([-8.0, 4.0]))
+    statistics = DensityStatistics.empty(2)
+    edit = grow_and_prune(surfels, statistics, CONFIG, torch.Generator().manual_seed(0), prune_faint=False)
+    assert edit.source.tolist() == [0]

@@ -58,6 +58,13 @@ def test_the_readers_accept_the_prediction(prediction: Path, finished: FinishedF
         np.testing.assert_allclose(lengths[view.alpha > 0.01], 1, atol=1e-5)
 
 
+def test_the_written_visibility_is_that_of_the_fit(prediction: Path, finished: FinishedFit) -> None:
+    visibility, written = finished.state.visibility, read_visibility(prediction)
+    assert visibility is not None
+    assert written is not None
+    np.testing.assert_allclose(written, cube_to_latlong(visibility[:, None], 48)[..., 0], atol=1e-6)
+
+
 def test_the_evaluator_scores_it(prediction: Path, finished: FinishedFit) -> None:
     scores = evaluate(prediction, finished.dataset.root)
     assert (prediction / "scores.json").exists()
