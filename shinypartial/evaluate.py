@@ -1,32 +1,36 @@
-"""Folders in, scores out: a prediction is compared with its dataset under protocol linear-v1, whatever method wrote it.
+"""Folders in, scores out: a prediction is compared with its dataset under named protocols, whatever method wrote it.
 
 Reads only the two folders; writes PREDICTION/scores.json and the pictures in PREDICTION/evaluation. The definitions
 are in docs/metrics.md.
 """
 
-import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from shinypartial.camera import ray_directions_world, reflect
 from shinypartial.color import linear_to_srgb
-from shinypartial.conventions import SOLID_ALPHA
 from shinypartial.dataset.read import open_dataset, read_environment, read_view
-from shinypartial.dataset.schema import ENVIRONMENT_LATLONG, Dataset, Frame, View
+from shinypartial.dataset.schema import ENVIRONMENT_LATLONG, Dataset, Frame
 from shinypartial.errors import InputError
 from shinypartial.images import write_png
+from shinypartial.masks import environment_mask
 from shinypartial.metrics import coverage as coverage_metrics
 from shinypartial.metrics import environment as environment_metrics
 from shinypartial.metrics import perceptual
-from shinypartial.metrics.angular import AngularStatistics, angular_statistics, normal_errors_deg
 from shinypartial.metrics.calibration import CalibrationScores, calibration_scores
-from shinypartial.metrics.image import SSIM_RADIUS, l1, psnr, ssim
+from shinypartial.metrics.paper import (
+    PAPER_PROTOCOL,
+    PaperEnvironment,
+    PaperScores,
+    paper_environment,
+    pool_paper,
+    reinhard_picture,
+)
 from shinypartial.pictures import (
     ENVIRONMENT_ERROR,
     ENVIRONMENT_ERROR_MAP,
@@ -40,14 +44,12 @@ from shinypartial.pictures import (
     observed_picture,
     radiance_picture,
     scalar_picture,
-    solid_mask,
     write_view_pictures,
 )
 from shinypartial.prediction import (
     ENVIRONMENT,
     PredictionInfo,
     dataset_hash,
-    prediction_frame,
     read_environment_map,
     read_info,
     read_visibility,
@@ -58,23 +60,23 @@ from shinypartial.prediction import (
 from shinypartial.progress import Progress
 from shinypartial.scores import (
     PROTOCOL,
-    Counts,
     EnvironmentScores,
     LeftOut,
     PerceptualScores,
-    RenderScores,
     Scores,
-    ViewScores,
+    read_bound,
     write_scores,
 )
+from shinypartial.threads import in_threads
+from shinypartial.view_scores import ViewResult, count_all, pool_normals, pool_renders, read_prediction, score_view
 
 #: Test views that are shown in the report, spread evenly over the split.
 PICTURED_VIEWS = 4
-MAX_WORKERS = 8
 #: Slack for values that 16-bit storage rounds beyond [0, 1].
 VISIBILITY_TOLERANCE = 1e-3
 
-Result = TypeVar("Result")
+#: What to score: the benchmark's own protocol, with or without the one that serves comparison with published tables.
+Protocols = Literal["both", "linear-v1"]
 Mask = Bool[np.ndarray, "H W"]
 Latlong = Float[np.ndarray, "_H _W 3"]
 
@@ -88,19 +90,6 @@ class _Networks:
 
 
 @dataclass(frozen=True)
-class _ViewResult:
-    """What one test view adds; `normal_errors` holds one value per mask pixel, NaN for a hole."""
-
-    scores: ViewScores
-    psnr_foreground: float | None
-    l1: float
-    intersection: int
-    union: int
-    lpips_alex: float | None
-    normal_errors: Float[np.ndarray, "P"] | None
-
-
-@dataclass(frozen=True)
 class _Observed:
     """Directions that the training views see, at the protocol's size, and the solid-angle shares; None: unknown."""
 
@@ -109,10 +98,26 @@ class _Observed:
     resolved_coverage: float | None
 
 
-def evaluate(prediction: Path, dataset: Path | None = None, lpips_weights: Path | None = None) -> Scores:
+@dataclass(frozen=True)
+class _MapScores:
+    """What the environment and visibility maps of a prediction score; None for what could not be scored."""
+
+    environment: EnvironmentScores | None
+    calibration: CalibrationScores | None
+    paper: PaperEnvironment | None
+
+
+def evaluate(
+    prediction: Path,
+    dataset: Path | None = None,
+    lpips_weights: Path | None = None,
+    protocol: Protocols = "both",
+    oracle: Path | None = None,
+) -> Scores:
     """Score a prediction folder against its dataset and write scores.json and pictures into it.
 
-    `dataset` defaults to the path in prediction.json; `lpips_weights` to the places that `metrics.perceptual` names.
+    `dataset` defaults to the path in prediction.json; `lpips_weights` to the places that `metrics.perceptual` names;
+    `oracle`, a folder with the scores of the dataset's bound, to the sibling DATASET-oracle where there is one.
     What can't be computed is left out by name. Raises InputError for files that are missing, broken or misshapen.
     """
     info = read_info(prediction)
@@ -123,9 +128,12 @@ def evaluate(prediction: Path, dataset: Path | None = None, lpips_weights: Path 
         old.unlink()
     progress = Progress("evaluate", total=len(data.train) + len(data.test) + 1)
     observed = _observed_directions(data, left_out, progress)
-    environment, calibration = _score_environment(prediction, data, observed, networks, left_out)
+    with_paper = protocol == "both"
+    maps = _score_maps(prediction, data, observed, networks, left_out, with_paper)
     progress.advance("environment")
-    results = list(_score_views(prediction, data, networks, progress))
+    results = list(_score_views(prediction, data, networks, progress, with_paper))
+    if not with_paper:
+        left_out.append(LeftOut(PAPER_PROTOCOL, "not asked for (--protocol both)"))
     scores = Scores(
         protocol=PROTOCOL,
         dataset=data.name,
@@ -133,16 +141,23 @@ def evaluate(prediction: Path, dataset: Path | None = None, lpips_weights: Path 
         dataset_hash_matches=dataset_hash(data) == info.dataset_hash,
         coverage=observed.coverage,
         resolved_coverage=observed.resolved_coverage,
-        environment=environment,
-        normals=_pool_normals(results, left_out),
-        render=_pool_renders(results, networks, left_out),
-        calibration=calibration,
+        environment=maps.environment,
+        normals=pool_normals(results, left_out),
+        render=pool_renders(results, networks.alex, left_out),
+        calibration=maps.calibration,
+        paper=_pool_paper(maps, results) if with_paper else None,
+        oracle=None if oracle is None else str(oracle.resolve()),
         views=tuple(result.scores for result in results),
         left_out=tuple(left_out),
-        counts=_counts(data, results),
+        counts=count_all(data, results),
     )
+    read_bound(prediction, scores)
     write_scores(prediction, scores)
     return scores
+
+
+def _pool_paper(maps: _MapScores, results: list[ViewResult]) -> PaperScores:
+    return pool_paper(maps.paper, [result.paper for result in results if result.paper is not None])
 
 
 def _open_dataset(info: PredictionInfo, dataset: Path | None, prediction: Path) -> Dataset:
@@ -169,16 +184,6 @@ def _load_networks(folder: Path | None, left_out: list[LeftOut]) -> _Networks:
     return _Networks(*loaded)
 
 
-def _in_threads(function: Callable[[Frame], Result], frames: Sequence[Frame]) -> Iterator[Result]:
-    """Results in the order of the frames; the first failure cancels what has not begun."""
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_WORKERS)) as executor:
-        try:
-            yield from executor.map(function, frames)
-        except BaseException:
-            executor.shutdown(wait=False, cancel_futures=True)
-            raise
-
-
 def _observed_directions(data: Dataset, left_out: list[LeftOut], progress: Progress) -> _Observed:
     if read_view(data.train[0]).normals_world is None:
         names = ("coverage", "resolved_coverage", "environment observed", "environment resolved")
@@ -186,7 +191,7 @@ def _observed_directions(data: Dataset, left_out: list[LeftOut], progress: Progr
         progress.advance(steps=len(data.train))
         return _Observed(environment_metrics.RegionMasks(None, None), None, None)
     seen = coverage_metrics.nothing_observed()
-    for cells in _in_threads(_cells_of_view, data.train):
+    for cells in in_threads(_cells_of_view, data.train):
         seen = seen.union(cells)
         progress.advance("coverage")
     masks: list[Mask | None] = []
@@ -207,13 +212,18 @@ def _cells_of_view(frame: Frame) -> coverage_metrics.ObservedCells:
             found="none",
             remedy="Generate the dataset again.",
         )
-    mask = solid_mask(view)
+    mask = environment_mask(view)
     return coverage_metrics.cells_of_view(reflect(ray_directions_world(frame.camera)[mask], view.normals_world[mask]))
 
 
-def _score_environment(
-    prediction: Path, data: Dataset, observed: _Observed, networks: _Networks, left_out: list[LeftOut]
-) -> tuple[EnvironmentScores | None, CalibrationScores | None]:
+def _score_maps(
+    prediction: Path,
+    data: Dataset,
+    observed: _Observed,
+    networks: _Networks,
+    left_out: list[LeftOut],
+    with_paper: bool,
+) -> _MapScores:
     missing = None
     if not (data.root / ENVIRONMENT_LATLONG).exists():
         missing = f"the dataset has no ground-truth environment ({ENVIRONMENT_LATLONG})"
@@ -221,7 +231,7 @@ def _score_environment(
         missing = f"the prediction has no {ENVIRONMENT}"
     if missing:
         left_out += [LeftOut(name, missing) for name in ("environment", "calibration")]
-        return None, None
+        return _MapScores(None, None, None)
     truth, predicted = read_environment(data), read_environment_map(prediction)
     stops = environment_metrics.best_exposure_stops(predicted, truth)
     exposed = predicted * np.float32(2.0**stops)
@@ -237,7 +247,13 @@ def _score_environment(
             networks.alex(*srgb) if networks.alex else None, networks.vgg(*srgb) if networks.vgg else None
         ),
     )
-    return scores, _score_calibration(prediction, error, left_out)
+    paper = _score_paper(predicted, truth, networks) if with_paper else None
+    return _MapScores(scores, _score_calibration(prediction, error, left_out), paper)
+
+
+def _score_paper(predicted: Latlong, truth: Latlong, networks: _Networks) -> PaperEnvironment:
+    picture, target = reinhard_picture(predicted), reinhard_picture(truth)
+    return paper_environment(picture, target, networks.alex(picture, target) if networks.alex else None)
 
 
 def _write_environment_pictures(
@@ -283,119 +299,18 @@ def _require_visibility(visibility: Float[np.ndarray, "H W"], path: Path) -> Non
     )
 
 
-def _score_views(prediction: Path, data: Dataset, networks: _Networks, progress: Progress) -> Iterator[_ViewResult]:
+def _score_views(
+    prediction: Path, data: Dataset, networks: _Networks, progress: Progress, with_paper: bool
+) -> Iterator[ViewResult]:
     spread = np.linspace(0, len(data.test) - 1, min(PICTURED_VIEWS, len(data.test)))
     pictured = {data.test[round(index)].name for index in spread}
 
-    def score(frame: Frame) -> _ViewResult:
-        truth, predicted = read_view(frame), _read_prediction(prediction, frame)
+    def score(frame: Frame) -> ViewResult:
+        truth, predicted = read_view(frame), read_prediction(prediction, frame)
         if frame.name in pictured:
             write_view_pictures(prediction / EVALUATION, frame.stem.name, predicted, truth)
-        return _score_view(frame, predicted, truth, networks.alex)
+        return score_view(frame, predicted, truth, networks.alex, with_paper=with_paper)
 
-    for result in _in_threads(score, data.test):
+    for result in in_threads(score, data.test):
         yield result
         progress.advance("test views")
-
-
-def _read_prediction(prediction: Path, frame: Frame) -> View:
-    predicted = prediction_frame(prediction, frame)
-    remedy = "Export every test view of the prediction again: see docs/prediction-format.md."
-    if not predicted.exr.exists() and not predicted.png.exists():
-        raise InputError(
-            expected=f"the prediction of {frame.name} at {predicted.exr}",
-            found="neither that file nor a PNG beside it",
-            remedy=remedy,
-        )
-    try:
-        return read_view(predicted)
-    except InputError as error:
-        raise InputError(
-            expected=f"{error.expected} (prediction {predicted.stem})", found=error.found, remedy=remedy
-        ) from None
-
-
-def _score_view(frame: Frame, predicted: View, truth: View, lpips: perceptual.Lpips | None) -> _ViewResult:
-    """Compare one view; colors are sRGB of premultiplied linear light clipped to [0, 1], that is, on black."""
-    if min(truth.alpha.shape) <= 2 * SSIM_RADIUS:
-        raise InputError(
-            expected=f"test views larger than {2 * SSIM_RADIUS} px",
-            found=f"{frame.name} of {frame.camera.width}×{frame.camera.height}",
-            remedy="Generate the dataset with a higher resolution.",
-        )
-    image, target = (linear_to_srgb(np.clip(view.radiance, 0, 1)) for view in (predicted, truth))
-    solid = truth.alpha > SOLID_ALPHA
-    covered, target_covered = predicted.alpha > 0.5, truth.alpha > 0.5
-    errors = _normal_errors(frame, predicted, truth)
-    large_enough = min(truth.alpha.shape) >= perceptual.SMALLEST_SIDE
-    return _ViewResult(
-        scores=ViewScores(
-            name=frame.name,
-            psnr=psnr(image, target, data_range=1.0),
-            ssim=ssim(image, target),
-            mean_angular_error_deg=(
-                angular_statistics(errors).mean_angular_error_deg if errors is not None and errors.size else None
-            ),
-        ),
-        psnr_foreground=psnr(image, target, data_range=1.0, weights=solid.astype(np.float32)) if solid.any() else None,
-        l1=l1(image, target),
-        intersection=int((covered & target_covered).sum()),
-        union=int((covered | target_covered).sum()),
-        lpips_alex=lpips(image, target) if lpips is not None and large_enough else None,
-        normal_errors=errors,
-    )
-
-
-def _normal_errors(frame: Frame, predicted: View, truth: View) -> Float[np.ndarray, "P"] | None:
-    if truth.normals_world is None or predicted.normals_world is None:
-        return None
-    mask = solid_mask(truth)
-    return normal_errors_deg(predicted.normals_world[mask], truth.normals_world[mask])
-
-
-def _pool_normals(results: Sequence[_ViewResult], left_out: list[LeftOut]) -> AngularStatistics | None:
-    errors = [result.normal_errors for result in results if result.normal_errors is not None]
-    if results and 0 < len(errors) < len(results):
-        lacking = next(result.scores.name for result in results if result.normal_errors is None)
-        raise InputError(
-            expected="normals in every test view, or in none",
-            found=f"{len(errors)} of {len(results)} views with normals; {lacking} has none",
-            remedy="Export the test views again with channels normal.X, normal.Y and normal.Z.",
-        )
-    if not errors or not sum(error.size for error in errors):
-        reason = "dataset or prediction has no normals" if results else "the dataset has no test views"
-        left_out.append(LeftOut("normals", reason))
-        return None
-    return angular_statistics(np.concatenate(errors))
-
-
-def _pool_renders(results: Sequence[_ViewResult], networks: _Networks, left_out: list[LeftOut]) -> RenderScores | None:
-    if not results:
-        left_out.append(LeftOut("render", "the dataset has no test views"))
-        return None
-    if networks.alex is not None and all(result.lpips_alex is None for result in results):
-        left_out.append(LeftOut("render.lpips_alex", f"test views are smaller than {perceptual.SMALLEST_SIDE} px"))
-    union = sum(result.union for result in results)
-    return RenderScores(
-        psnr=float(np.mean([result.scores.psnr for result in results])),
-        psnr_foreground=_mean_or_none([result.psnr_foreground for result in results]),
-        ssim=float(np.mean([result.scores.ssim for result in results])),
-        l1=float(np.mean([result.l1 for result in results])),
-        alpha_iou=sum(result.intersection for result in results) / union if union else 1.0,
-        lpips_alex=_mean_or_none([result.lpips_alex for result in results]),
-    )
-
-
-def _mean_or_none(values: Sequence[float | None]) -> float | None:
-    present = [value for value in values if value is not None]
-    return float(np.mean(present)) if present else None
-
-
-def _counts(data: Dataset, results: Sequence[_ViewResult]) -> Counts:
-    errors = [result.normal_errors for result in results if result.normal_errors is not None]
-    return Counts(
-        train_views=len(data.train),
-        test_views=len(data.test),
-        normal_pixels=sum(error.size for error in errors),
-        normal_holes=sum(int(np.isnan(error).sum()) for error in errors),
-    )

@@ -70,9 +70,10 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def newest_folder(parent: Path, marker: str, what: str, remedy: str) -> Path:
-    """The folder directly below `parent` whose file `marker` was written last."""
+def newest_folder(parent: Path, marker: str, what: str, remedy: str, unless_suffix: str | None = None) -> Path:
+    """The folder directly below `parent` whose file `marker` was written last; names with that ending don't count."""
     found = [path.parent for path in parent.glob(f"*/{marker}")]
+    found = [folder for folder in found if unless_suffix is None or not folder.name.endswith(unless_suffix)]
     if not found:
         raise InputError(
             expected=f"{what} below {parent.resolve()}",

@@ -7,16 +7,21 @@ started again: files appear whole or not at all, and a frame that is there is no
 import contextlib
 import os
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from shinypartial import __version__
+from shinypartial.blender.crew import Crew, CrewClosed, open_crew
 from shinypartial.blender.runtime import check_blender
+from shinypartial.camera_plot import CAMERA_PLOT, plot_cameras
+from shinypartial.contact_sheet import write_contact_sheet
 from shinypartial.dataset.schema import (
     CHECKSUMS,
+    ENVIRONMENT_LATLONG,
     ENVIRONMENT_LATLONG_Y_UP,
+    FORMAT_MINOR,
     SPLITS,
     Frame,
     View,
@@ -24,7 +29,7 @@ from shinypartial.dataset.schema import (
 from shinypartial.dataset.write import (
     claim_folder,
     complete_dataset,
-    is_written,
+    is_rendered,
     make_frames,
     write_environment,
     write_transforms,
@@ -32,9 +37,11 @@ from shinypartial.dataset.write import (
 )
 from shinypartial.errors import InputError
 from shinypartial.files import remove_partial_files
+from shinypartial.images import read_exr_rgb
 from shinypartial.progress import Progress
 from shinypartial.scene import FileWorld, SceneSpec
-from shinypartial.trajectory import arc
+from shinypartial.statistics import dataset_statistics
+from shinypartial.trajectory import plan_cameras
 
 STUDIO_LIGHT_SOURCE = "Blender's studio lights, by Greg Zaal (Poly Haven, https://polyhaven.com)"
 
@@ -53,13 +60,13 @@ def generate(spec: SceneSpec, root: Path) -> Generated:
 
     Raises InputError when the folder holds something else or Blender can't run; OSError when it can't be written.
     """
-    trajectory = arc(spec.camera, spec.render.resolution)
+    trajectory = plan_cameras(spec.camera, spec.render.resolution)
     frames = {split: make_frames(root, split, getattr(trajectory, split)) for split in SPLITS}
     every = [frame for split in SPLITS for frame in frames[split]]
     recipe = {**spec.recipe(), "hemisphere_axis": trajectory.hemisphere_axis.tolist()}
     if not _is_complete(root, every):
         check_blender()
-    claim_folder(root, recipe, _generator())
+    claim_folder(root, recipe, _generator(), FORMAT_MINOR)
     with _only_writer(root):
         if _is_complete(root, every):
             return Generated(root, 0, len(every))
@@ -68,10 +75,13 @@ def generate(spec: SceneSpec, root: Path) -> Generated:
         for split in SPLITS:
             write_transforms(root, split, frames[split])
         _write_ground_truth(spec, root)
-        missing = [frame for frame in every if not is_written(frame)]
+        if not (root / CAMERA_PLOT).exists():
+            plot_cameras(root / CAMERA_PLOT, trajectory)
+        missing = [frame for frame in every if not is_rendered(frame)]
         if missing:
             _render_frames(spec, missing, len(every))
-        statistics = {split: len(frames[split]) for split in SPLITS}
+        write_contact_sheet(root, frames["train"], read_exr_rgb(root / ENVIRONMENT_LATLONG))
+        statistics = dataset_statistics(frames["train"], frames["test"])
         complete_dataset(root, licenses(spec), statistics)
     return Generated(root, len(missing), len(every) - len(missing))
 
@@ -89,7 +99,7 @@ def _generator() -> dict[str, Any]:
 
 def _is_complete(root: Path, frames: Sequence[Frame]) -> bool:
     """The checksum list is written last of all; a frame that was deleted since is made again."""
-    return (root / CHECKSUMS).exists() and all(map(is_written, frames))
+    return (root / CHECKSUMS).exists() and all(map(is_rendered, frames))
 
 
 @contextlib.contextmanager
@@ -116,22 +126,39 @@ def _only_writer(root: Path) -> Iterator[None]:
 
 
 def _render_frames(spec: SceneSpec, frames: Sequence[Frame], total: int) -> None:
-    """Render and write; one thread writes a frame while Blender renders the next."""
-    from shinypartial.blender.render import open_renderer
-
+    """Render and write; while a thread writes its frame, another's is being rendered."""
     progress = Progress("Rendering", total, total - len(frames))
-    with ThreadPoolExecutor(max_workers=1) as writer, open_renderer(spec) as renderer:
-        pending: Future[None] | None = None
-        for frame in frames:
-            rendered = renderer.render(frame.camera)
-            if pending:
-                pending.result()
+    with open_crew(spec) as crew, ThreadPoolExecutor(crew.plan.workers + 1) as pool:
+        results = [pool.submit(_make_frame, crew, frame) for frame in frames]
+        try:
+            for done in as_completed(results):
+                done.result()
                 progress.advance()
-            view = View(rendered.radiance, rendered.alpha, rendered.normals_world, rendered.depth, True)
-            pending = writer.submit(write_view, frame, view)
-        if pending:
-            pending.result()
-            progress.advance()
+        except BaseException as error:
+            crew.close()
+            pool.shutdown(cancel_futures=True)
+            if not isinstance(error, CrewClosed):
+                raise
+            failures = [each.exception() for each in results if not each.cancelled()]
+            raise next((each for each in failures if each and not isinstance(each, CrewClosed)), error) from None
+
+
+def _make_frame(crew: Crew, frame: Frame) -> None:
+    """One frame from camera to files; where it fails nothing else is begun."""
+    try:
+        rendered = crew.render(frame.camera, frame.name)
+        view = View(
+            rendered.radiance,
+            rendered.alpha,
+            rendered.normals_world,
+            rendered.depth,
+            high_dynamic_range=True,
+            self_reflection=rendered.self_reflection,
+        )
+        write_view(frame, view)
+    except BaseException:
+        crew.close()
+        raise
 
 
 def _write_ground_truth(spec: SceneSpec, root: Path) -> None:
@@ -139,7 +166,7 @@ def _write_ground_truth(spec: SceneSpec, root: Path) -> None:
     from shinypartial.blender.assemble import world_radiance
 
     if not (root / ENVIRONMENT_LATLONG_Y_UP).exists():
-        write_environment(root, world_radiance(spec.world))
+        write_environment(root, world_radiance(spec.world, spec.render.exposure))
 
 
 def licenses(spec: SceneSpec) -> list[dict[str, str]]:

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from shinypartial.color import to_display
-from shinypartial.conventions import SOLID_ALPHA
 from shinypartial.dataset.schema import View
 from shinypartial.images import write_png
+from shinypartial.masks import solid_mask
 from shinypartial.metrics.angular import normal_errors_deg
 
 #: Where an evaluation leaves its pictures, and their names.
@@ -71,13 +71,6 @@ ENVIRONMENT_ERROR = Scale("absolute sRGB error", "magma", 0.0, 0.5)
 RENDER_ERROR = Scale("absolute sRGB error", "magma", 0.0, 0.25)
 NORMAL_ERROR = Scale("angular error", "magma", 0.0, 30.0, "°")
 VISIBILITY = Scale("visibility", "viridis", 0.0, 1.0, bounded=True)
-
-
-def solid_mask(truth: View) -> Bool[np.ndarray, "H W"]:
-    """Pixels that lie wholly on the object and have a ground-truth normal."""
-    if truth.normals_world is None:
-        return truth.alpha > SOLID_ALPHA
-    return (truth.alpha > SOLID_ALPHA) & (np.linalg.norm(truth.normals_world, axis=-1) > 0.5)
 
 
 @lru_cache(maxsize=4)

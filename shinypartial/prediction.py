@@ -23,6 +23,8 @@ FORMAT = "shinypartial-prediction"
 FORMAT_VERSION = 1
 DEFAULT_FOLDER = Path("predictions")
 DESCRIPTION = "prediction.json"
+#: The bound of a dataset lies beside the predictions made from it, under the dataset's name with this ending.
+ORACLE_SUFFIX = "-oracle"
 ENVIRONMENT = "environment.exr"
 VISIBILITY = "visibility.exr"
 VISIBILITY_CHANNEL = "Y"
@@ -50,8 +52,9 @@ def dataset_hash(dataset: Dataset) -> str:
 
 
 def newest_prediction(parent: Path = DEFAULT_FOLDER) -> Path:
-    """The prediction below `parent` that was written last."""
-    return newest_folder(parent, DESCRIPTION, "a prediction", "Make one: `panoless fit`, or name a folder.")
+    """The prediction below `parent` that was written last; bounds are passed over."""
+    remedy = "Make one: `panoless fit`, or name a folder."
+    return newest_folder(parent, DESCRIPTION, "a prediction", remedy, unless_suffix=ORACLE_SUFFIX)
 
 
 def prediction_frame(root: Path, frame: Frame) -> Frame:

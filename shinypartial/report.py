@@ -33,7 +33,8 @@ from shinypartial.pictures import (
 from shinypartial.prediction import PredictionInfo, read_info
 from shinypartial.progress import format_seconds
 from shinypartial.report_style import STYLE
-from shinypartial.scores import ScoreRow, Scores, ViewScores, read_scores, score_rows
+from shinypartial.report_tables import Bounds, beside, bounds_by_path, metrics_section, paper_section
+from shinypartial.scores import ScoreRow, Scores, ViewScores, read_bound, read_scores, score_rows
 
 REPORT = "report.html"
 #: Pictures that the method itself exports, shown under the names of their files.
@@ -55,21 +56,7 @@ HEADLINES = (
     ("calibration.visibility_error_auroc", "AUROC: low visibility announces error"),
     ("resolved_coverage", "of the sphere is resolved by training views"),
 )
-REGION_TABLES = (
-    ("environment.as_predicted", "Environment, weighted by solid angle"),
-    ("environment.best_exposure", "Environment after the best global exposure"),
-)
 SUMMARY_OF_ENVIRONMENT = ("psnr_srgb", "ssim_srgb", "psnr_linear", "log_rmse_stops")
-REGIONS = (("full", "all directions"), ("observed", "seen"), ("resolved", "resolved"))
-GROUPS = (
-    ("normals", "Normals of test views, pooled over mask pixels"),
-    ("render", "Renders of test views"),
-    ("calibration", "Visibility against environment error"),
-    ("environment.unweighted", "Environment as a plain picture"),
-    ("environment.perceptual", "Environment, perceptual"),
-    ("environment", "Global exposure"),
-    ("", "Dataset"),
-)
 
 
 def write_report(prediction: Path, output: Path | None = None) -> Path:
@@ -93,6 +80,7 @@ def summary_lines(prediction: Path) -> list[str]:
     """The scores in a few lines for a terminal."""
     info, scores = read_info(prediction), read_scores(prediction)
     rows = {row.path: row for row in score_rows(scores)}
+    bounds = bounds_by_path(read_bound(prediction, scores))
     lines = [f"{info.method} on {scores.dataset}, protocol {scores.protocol}"]
     if not scores.dataset_hash_matches:
         lines.append("  warning       the prediction was made from another version of this dataset")
@@ -110,11 +98,16 @@ def summary_lines(prediction: Path) -> list[str]:
     for title, group, names in groups:
         found = [rows[path] for name in names if (path := f"{group}.{name}") in rows]
         if found:
-            parts = [f"{row.metric.name} {row.metric.text(row.value)} {row.metric.direction.value}" for row in found]
+            parts = [
+                f"{row.metric.name} {row.metric.text(row.value)} {row.metric.direction.value}{beside(row, bounds)}"
+                for row in found
+            ]
             lines.append(f"  {title:13s} {'   '.join(parts)}")
     if scores.coverage is not None:
         shares = [rows[name].metric.text(rows[name].value) for name in ("coverage", "resolved_coverage")]
         lines.append(f"  {'coverage':13s} training views see {shares[0]} of the sphere and resolve {shares[1]}")
+    if scores.environment is not None and not bounds and info.method != "oracle":
+        lines.append(f"  {'bound':13s} unknown: run `shinypartial oracle` to see how good a map these views allow")
     if scores.left_out:
         lines.append(f"  {'left out':13s} {', '.join(entry.name for entry in scores.left_out)}")
     return lines
@@ -122,15 +115,16 @@ def summary_lines(prediction: Path) -> list[str]:
 
 def report_html(prediction: Path, info: PredictionInfo, scores: Scores) -> str:
     """The page as text."""
-    rows = score_rows(scores)
+    rows, bounds = score_rows(scores), bounds_by_path(read_bound(prediction, scores))
     title = f"{info.method} on {scores.dataset}"
     sections = [
         _header(info, scores, title),
-        _headlines(info, rows),
+        _headlines(info, rows, bounds),
         _environment_section(prediction),
         _views_section(prediction, scores),
         _method_section(prediction),
-        _metrics_section(rows),
+        metrics_section(rows, bounds, scores.protocol),
+        paper_section(rows, bounds, scores),
         _left_out_section(scores),
         _curves_section(info),
         _cost_section(info),
@@ -159,10 +153,10 @@ def _header(info: PredictionInfo, scores: Scores, title: str) -> str:
     return f'<header><h1>{html.escape(title)}</h1><p class="dim">{html.escape(line)}</p>{warning}</header>'
 
 
-def _headlines(info: PredictionInfo, rows: Sequence[ScoreRow]) -> str:
+def _headlines(info: PredictionInfo, rows: Sequence[ScoreRow], bounds: Bounds) -> str:
     by_path = {row.path: row for row in rows}
     cards = [
-        _card(_with_arrow(by_path[path]), text)
+        _card(_with_arrow(by_path[path]), text + beside(by_path[path], bounds))
         for path, text in HEADLINES
         if path in by_path and by_path[path].value is not None
     ]
@@ -294,41 +288,6 @@ def _inline_picture(path: Path, longest_px: int) -> str:
         return "data:image/png;base64," + base64.b64encode(lossless.getvalue()).decode()
     picture.save(lossy, "JPEG", quality=JPEG_QUALITY, optimize=True)
     return "data:image/jpeg;base64," + base64.b64encode(lossy.getvalue()).decode()
-
-
-def _metrics_section(rows: Sequence[ScoreRow]) -> str:
-    tables = [_region_table(rows, *table) for table in REGION_TABLES]
-    for group, title in GROUPS:
-        found = [row for row in rows if row.group == group]
-        cells = [
-            (row.metric.title, row.metric.text(row.value), row.metric.direction.value, row.metric.name) for row in found
-        ]
-        if any(row.value is not None for row in found):
-            body = "".join(
-                f'<tr><td>{html.escape(name)} <code class="name">{html.escape(key)}</code></td>'
-                f'<td class="number">{html.escape(value)}</td><td>{arrow}</td></tr>'
-                for name, value, arrow, key in cells
-            )
-            tables.append(f"<h3>{html.escape(title)}</h3><div class='scroll'><table>{body}</table></div>")
-    note = "↑ higher is better, ↓ lower is better, · a description. Definitions: docs/metrics.md."
-    return f'<h2>Metrics</h2><p class="dim">{note}</p>{"".join(tables)}'
-
-
-def _region_table(rows: Sequence[ScoreRow], place: str, heading: str) -> str:
-    columns = [(title, [row for row in rows if row.group == f"{place}.{region}"]) for region, title in REGIONS]
-    columns = [(title, found) for title, found in columns if found]
-    if not columns:
-        return ""
-    head = "".join(f'<th class="number">{html.escape(title)}</th>' for title, _ in columns)
-    lines = []
-    for i, row in enumerate(columns[0][1]):
-        cells = "".join(f'<td class="number">{found[i].metric.text(found[i].value)}</td>' for _, found in columns)
-        name = f'{html.escape(row.metric.title)} <code class="name">{row.metric.name}</code>'
-        lines.append(f"<tr><td>{name}</td>{cells}<td>{row.metric.direction.value}</td></tr>")
-    return (
-        f"<h3>{html.escape(heading)}</h3>"
-        f'<div class="scroll"><table><tr><th></th>{head}<th></th></tr>{"".join(lines)}</table></div>'
-    )
 
 
 def _left_out_section(scores: Scores) -> str:

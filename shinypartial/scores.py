@@ -15,10 +15,12 @@ from shinypartial.files import read_json, write_json
 from shinypartial.metrics.angular import AngularStatistics
 from shinypartial.metrics.calibration import CalibrationScores
 from shinypartial.metrics.environment import Regions, UnweightedScores
+from shinypartial.metrics.paper import PaperScores
 from shinypartial.metrics.registry import METRICS, Metric, metric
+from shinypartial.prediction import ORACLE_SUFFIX
 
 FORMAT = "shinypartial-scores"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 PROTOCOL = "linear-v1"
 SCORES = "scores.json"
 
@@ -84,7 +86,11 @@ class Counts:
 
 @dataclass(frozen=True)
 class Scores:
-    """Everything that one evaluation found; None for a group that was left out, which `left_out` names."""
+    """Everything that one evaluation found; None for a group that was left out, which `left_out` names.
+
+    All groups follow `protocol` but `paper`, which names its own. `oracle` is the folder of the dataset's bound when
+    it is not the usual one.
+    """
 
     protocol: str
     dataset: str
@@ -96,6 +102,8 @@ class Scores:
     normals: AngularStatistics | None
     render: RenderScores | None
     calibration: CalibrationScores | None
+    paper: PaperScores | None
+    oracle: str | None
     views: tuple[ViewScores, ...]
     left_out: tuple[LeftOut, ...]
     counts: Counts
@@ -156,6 +164,27 @@ def read_scores(prediction: Path) -> Scores:
         return _restore(Scores, content)
     except (KeyError, TypeError, AttributeError) as error:
         raise InputError(expected=f"complete scores in {path}", found=f"{error!r}", remedy=remedy) from None
+
+
+def read_bound(prediction: Path, scores: Scores) -> Scores | None:
+    """Scores of the dataset's oracle, from the folder that the scores name or the sibling DATASET-oracle.
+
+    None when there is no such sibling, when it is the prediction itself, or when it was made from another version of
+    the dataset; a folder that was named must hold scores of the same dataset, else InputError.
+    """
+    folder = Path(scores.oracle) if scores.oracle else prediction.resolve().parent / (scores.dataset + ORACLE_SUFFIX)
+    if folder.resolve() == prediction.resolve() or (scores.oracle is None and not (folder / SCORES).is_file()):
+        return None
+    bound = read_scores(folder)
+    if bound.dataset_hash == scores.dataset_hash and bound.dataset_hash_matches:
+        return bound
+    if scores.oracle is None:
+        return None
+    raise InputError(
+        expected=f"the oracle of {scores.dataset} (hash {scores.dataset_hash[:12]}…) in {folder}",
+        found=f"that of {bound.dataset} (hash {bound.dataset_hash[:12]}…)",
+        remedy=f"Make it: `shinypartial oracle {scores.dataset}`, or leave out --oracle.",
+    )
 
 
 def _restore(kind: Any, content: Any) -> Any:

@@ -7,15 +7,18 @@ import numpy as np
 from jaxtyping import Float
 
 from shinypartial.blender.geometry import make_mesh
+from shinypartial.blender.materials import DEPTH_PASS, environment_texture, make_room_material
+from shinypartial.blender.objects import mesh_of, place_objects
 from shinypartial.blender.runtime import choose_device, studio_light
+from shinypartial.blender.self_reflection import assemble_probe
 from shinypartial.errors import InputError
 from shinypartial.images import read_exr_rgb
-from shinypartial.scene import FileWorld, Material, Render, SceneSpec, StudioWorld
-from shinypartial.trajectory import Arc
+from shinypartial.scene import FileWorld, Render, SceneSpec, Sphere, StudioWorld
+from shinypartial.trajectory import CameraPath
 
-DEPTH_PASS = "z_depth"
 BOUNCES = 16
-LOWEST_RADIANCE = -1e-3
+#: Measured in Blender's own maps: −0.0022 (forest), beside radiance up to 1400.
+LOWEST_RADIANCE = -1e-2
 
 
 def assemble(bpy: Any, spec: SceneSpec) -> str:
@@ -26,11 +29,11 @@ def assemble(bpy: Any, spec: SceneSpec) -> str:
     device = choose_device(bpy)
     _set_sampling(scene, spec.render)
     _set_output(scene, spec.render)
-    scene.world = _make_world(bpy, spec.world)
-    body = bpy.data.objects.new("object", _make_mesh(bpy, spec))
-    scene.collection.objects.link(body)
+    place_objects(bpy, scene, spec)
+    _surround(bpy, scene, spec)
     scene.camera = _make_camera(bpy, spec.camera)
     scene.collection.objects.link(scene.camera)
+    assemble_probe(bpy)
     return device
 
 
@@ -39,8 +42,8 @@ def world_file(world: StudioWorld | FileWorld) -> Path:
     return Path(world.path) if isinstance(world, FileWorld) else studio_light(world.name)
 
 
-def world_radiance(world: StudioWorld | FileWorld) -> Float[np.ndarray, "H W 3"]:
-    """The lat-long map that lights the scene: the file times the strength, in the world frame.
+def world_radiance(world: StudioWorld | FileWorld, exposure: float = 0.0) -> Float[np.ndarray, "H W 3"]:
+    """The lat-long map that lights the scene: the file times the strength times 2^exposure, in the world frame.
 
     Lossy compression leaves values a hair below zero in Blender's own maps; they become zero.
     """
@@ -53,7 +56,7 @@ def world_radiance(world: StudioWorld | FileWorld) -> Float[np.ndarray, "H W 3"]
             found=f"{width}×{height}, lowest value {radiance.min():.4g}, highest {radiance.max():.4g}",
             remedy="Use another world, or export this one as a 2:1 map without NaN, infinity or negative values.",
         )
-    return np.maximum(radiance, 0) * np.float32(world.strength)
+    return np.maximum(radiance, 0) * np.float32(world.strength * 2.0**exposure)
 
 
 def _set_sampling(scene: Any, render: Render) -> None:
@@ -92,60 +95,31 @@ def _set_output(scene: Any, render: Render) -> None:
     depth.name, depth.type = DEPTH_PASS, "VALUE"
 
 
-def _make_world(bpy: Any, spec: StudioWorld | FileWorld) -> Any:
-    world = bpy.data.worlds.new("world")
-    nodes, links = world.node_tree.nodes, world.node_tree.links
+def _surround(bpy: Any, scene: Any, spec: SceneSpec) -> None:
+    """Light from infinitely far, or from the inside of a sphere that cameras see through."""
+    image = bpy.data.images.load(str(world_file(spec.world).resolve()))
+    image.colorspace_settings.name = "Non-Color"  # The numbers in the file are the radiance.
+    scene.world = bpy.data.worlds.new("world")
+    nodes, links = scene.world.node_tree.nodes, scene.world.node_tree.links
     nodes.clear()
-    texture = nodes.new("ShaderNodeTexEnvironment")
-    texture.image = bpy.data.images.load(str(world_file(spec).resolve()))
-    texture.image.colorspace_settings.name = "Non-Color"  # The numbers in the file are the radiance.
-    texture.projection, texture.interpolation = "EQUIRECTANGULAR", "Linear"
-    # Light is sampled by a map as fine as the image; the automatic choice costs a second and gains nothing.
-    world.cycles.sampling_method = "MANUAL"
-    world.cycles.sample_map_resolution = min(texture.image.size[0], 8192)
-    background = nodes.new("ShaderNodeBackground")
-    background.inputs["Strength"].default_value = spec.strength
-    output = nodes.new("ShaderNodeOutputWorld")
-    links.new(texture.outputs["Color"], background.inputs["Color"])
+    background, output = nodes.new("ShaderNodeBackground"), nodes.new("ShaderNodeOutputWorld")
+    background.inputs["Strength"].default_value = spec.light_factor
     links.new(background.outputs["Background"], output.inputs["Surface"])
-    return world
+    if spec.world.distance is None:
+        links.new(environment_texture(nodes, image).outputs["Color"], background.inputs["Color"])
+        # Light is sampled by a map as fine as the image; the automatic choice costs a second and gains nothing.
+        scene.world.cycles.sampling_method = "MANUAL"
+        scene.world.cycles.sample_map_resolution = min(image.size[0], 8192)
+        return
+    background.inputs["Color"].default_value = (0, 0, 0, 1)
+    mesh = mesh_of(bpy, "room", make_mesh(Sphere(radius=spec.world.distance)))
+    mesh.materials.append(make_room_material(bpy, image, spec.light_factor))
+    room = bpy.data.objects.new("room", mesh)
+    room.visible_camera = False
+    scene.collection.objects.link(room)
 
 
-def _make_mesh(bpy: Any, spec: SceneSpec) -> Any:
-    """The shape with its exact vertex normals, interpolated across faces, and its material."""
-    shape = make_mesh(spec.object)
-    mesh = bpy.data.meshes.new("object")
-    mesh.from_pydata(shape.vertices.tolist(), [], shape.faces)
-    mesh.shade_smooth()
-    # The attribute holds float normals; normals_split_custom_set would round them to 16 bits.
-    attribute = mesh.attributes.new("custom_normal", "FLOAT_VECTOR", "POINT")
-    attribute.data.foreach_set("vector", shape.normals.astype(np.float32).ravel())
-    mesh.materials.append(_make_material(bpy, spec.material))
-    return mesh
-
-
-def _make_material(bpy: Any, spec: Material) -> Any:
-    """The Principled shader, and the z-depth of every sample as a pass.
-
-    Blender's own depth pass keeps one random sample of each pixel, which may miss the object; this pass is averaged
-    over the pixel as color is.
-    """
-    material = bpy.data.materials.new("material")
-    nodes, links = material.node_tree.nodes, material.node_tree.links
-    nodes.clear()
-    shader = nodes.new("ShaderNodeBsdfPrincipled")
-    shader.inputs["Base Color"].default_value = (*spec.base_color, 1)
-    shader.inputs["Metallic"].default_value = spec.metallic
-    shader.inputs["Roughness"].default_value = spec.roughness
-    output = nodes.new("ShaderNodeOutputMaterial")
-    links.new(shader.outputs["BSDF"], output.inputs["Surface"])
-    depth = nodes.new("ShaderNodeOutputAOV")
-    depth.aov_name = DEPTH_PASS
-    links.new(nodes.new("ShaderNodeCameraData").outputs["View Z Depth"], depth.inputs["Value"])
-    return material
-
-
-def _make_camera(bpy: Any, spec: Arc) -> Any:
+def _make_camera(bpy: Any, spec: CameraPath) -> Any:
     camera = bpy.data.cameras.new("camera")
     camera.type, camera.sensor_fit = "PERSP", "HORIZONTAL"
     camera.lens, camera.sensor_width = spec.lens_mm, spec.sensor_mm

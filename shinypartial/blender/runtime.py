@@ -117,8 +117,27 @@ def choose_device(bpy: Any) -> str:
     return "CPU"
 
 
+def set_threads(bpy: Any, threads: int | None) -> None:
+    """How many CPU threads render every scene; one for each core when None."""
+    for scene in bpy.data.scenes:
+        scene.render.threads_mode = "FIXED" if threads else "AUTO"
+        if threads:
+            scene.render.threads = threads
+
+
 def studio_light(name: str) -> Path:
-    """The file of one of Blender's environment maps."""
+    """The file of one of Blender's environment maps, found without loading Blender."""
     check_blender()
-    bpy = import_blender()
-    return Path(bpy.utils.resource_path("LOCAL")) / "datafiles" / "studiolights" / "world" / f"{name}.exr"
+    spec = importlib.util.find_spec("bpy")
+    found = [
+        path
+        for folder in (spec.submodule_search_locations or [] if spec else [])
+        for path in Path(folder).glob(f"[0-9]*/datafiles/studiolights/world/{name}.exr")
+    ]
+    if not found:
+        raise InputError(
+            expected=f"Blender's environment map {name} among the files of the module bpy",
+            found="no such file",
+            remedy=f"Install it again: {INSTALL}",
+        )
+    return found[0]

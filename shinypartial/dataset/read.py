@@ -17,6 +17,7 @@ from shinypartial.dataset.schema import (
     FORMAT_VERSION,
     MANIFEST,
     NORMAL_CHANNELS,
+    SELF_REFLECTION_CHANNEL,
     SPLITS,
     Dataset,
     Frame,
@@ -56,7 +57,7 @@ def open_dataset(root: Path) -> Dataset:
         raise InputError(
             expected=f"a complete dataset in {root}",
             found="one whose generation has not ended",
-            remedy="Wait for it, or run the same `shinypartial generate` again: it continues where it stopped.",
+            remedy="Wait for it, or run the command that makes it again: it continues where it stopped.",
         )
     train, test = (_read_frames(root, split) for split in SPLITS)
     return Dataset(root, manifest, train, test)
@@ -168,7 +169,13 @@ def read_view(frame: Frame) -> View:
             found=f"{view.alpha.shape[1]}×{view.alpha.shape[0]}",
             remedy="Render the frame again or correct w and h.",
         )
-    arrays = {"radiance": view.radiance, "alpha": view.alpha, "normals": view.normals_world, "depth": view.depth}
+    arrays = {
+        "radiance": view.radiance,
+        "alpha": view.alpha,
+        "normals": view.normals_world,
+        "depth": view.depth,
+        "self-reflection": view.self_reflection,
+    }
     for what, array in arrays.items():
         if array is not None and not np.isfinite(array).all():
             raise InputError(
@@ -187,7 +194,15 @@ def _read_exr_view(frame: Frame) -> View:
     has_normals = all(name in channels for name in NORMAL_CHANNELS)
     normals = stack_channels(channels, NORMAL_CHANNELS, frame.exr) if has_normals else None
     depth = channels[DEPTH_CHANNEL].astype(np.float32) if DEPTH_CHANNEL in channels else None
-    return View(rgba[..., :3], rgba[..., 3], normals, depth, high_dynamic_range=True)
+    self_reflection = channels.get(SELF_REFLECTION_CHANNEL)
+    return View(
+        rgba[..., :3],
+        rgba[..., 3],
+        normals,
+        depth,
+        high_dynamic_range=True,
+        self_reflection=None if self_reflection is None else self_reflection.astype(np.float32),
+    )
 
 
 def _read_png_view(frame: Frame) -> View:

@@ -11,6 +11,8 @@ from shinypartial.camera import Camera
 
 FORMAT = "shinypartial-dataset"
 FORMAT_VERSION = 1
+#: What a minor version adds may be ignored: 1 adds self-reflection to every view. A manifest without one means 0.
+FORMAT_MINOR = 1
 MANIFEST = "dataset.json"
 CHECKSUMS = "SHA256SUMS"
 LICENSES = "LICENSES.json"
@@ -18,6 +20,8 @@ SPLITS = ("train", "test")
 COLOR_CHANNELS = ("R", "G", "B", "A")
 NORMAL_CHANNELS = ("normal.X", "normal.Y", "normal.Z")
 DEPTH_CHANNEL = "depth.Z"
+SELF_REFLECTION_CHANNEL = "self_reflection.V"
+CONTACT_SHEET = "contact_sheet.jpg"
 ENVIRONMENT_LATLONG = Path("environment/latlong.exr")
 ENVIRONMENT_LATLONG_Y_UP = Path("environment/latlong_yup.exr")
 ENVIRONMENT_CUBE = Path("environment/cube")
@@ -30,6 +34,8 @@ class View:
     `radiance` is linear and premultiplied by alpha; `normals_world` are unit where the object is and zero elsewhere;
     `depth` is camera z-depth in scene units, zero where the object is not. `None`: the dataset doesn't hold it.
     `high_dynamic_range` tells whether radiance came from EXR (unbounded) or from 8-bit PNG (in [0, 1]).
+    `self_reflection` is 1 where the mirror ray of the pixel's center meets the object again, or something else that
+    stands near it, in place of the environment; 0 elsewhere, also where the object is not.
     """
 
     radiance: Float[np.ndarray, "H W 3"]
@@ -37,6 +43,7 @@ class View:
     normals_world: Float[np.ndarray, "H W 3"] | None
     depth: Float[np.ndarray, "H W"] | None
     high_dynamic_range: bool
+    self_reflection: Float[np.ndarray, "H W"] | None = None
 
 
 @dataclass(frozen=True)
@@ -68,8 +75,16 @@ class Frame:
         return self.stem.with_name(self.stem.name + "_normal.png")
 
     @property
+    def self_png(self) -> Path:
+        """8-bit self-reflection, 0 or 255."""
+        return self.stem.with_name(self.stem.name + "_self.png")
+
+    @property
     def files(self) -> tuple[Path, ...]:
-        """Every file of the frame; the EXR is written last, so its presence means that the frame is complete."""
+        """Every file that each frame has, the EXR last, so that its presence means that the frame is complete.
+
+        Frames of rendered datasets also have `self_png`.
+        """
         return (self.png, self.alpha_png, self.normal_png, self.exr)
 
 

@@ -56,8 +56,10 @@ def validate(root: Path, progress: bool = False) -> list[Break]:
         frames += found
         breaks += problems
     counter = Progress("Validating", len(frames)) if progress and frames else None
+    minor = manifest.get("format_minor", 0)
+    complete = isinstance(minor, int) and minor >= 1
     for frame in frames:
-        breaks += check_frame(root, frame)
+        breaks += check_frame(root, frame, self_reflection=complete)
         if counter:
             counter.advance()
     breaks += [*_check_environment(root), *_check_licenses(root), *_check_checksums(root)]
@@ -240,7 +242,9 @@ def _check_checksums(root: Path) -> Iterator[Break]:
         yield Break(CHECKSUMS, "the list of checksums is missing", CONTINUE)
         return
     listed: dict[str, str] = {}
-    for number, line in enumerate(listing.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+    # Split at line feeds only: a damaged byte may become one of the other separators that `splitlines` knows.
+    lines = listing.read_bytes().decode("utf-8", errors="replace").removesuffix("\n").split("\n")
+    for number, line in enumerate(lines, 1):
         digest, separator, name = line.partition("  ")
         if len(digest) != 64 or not separator or not name:
             yield Break(CHECKSUMS, f"line {number} is not `SHA-256  FILE`", RESTORE)

@@ -8,7 +8,14 @@ from jaxtyping import Bool, Float, UInt8
 
 from shinypartial.camera import ray_directions_world
 from shinypartial.dataset.breaks import REMAKE, Break, break_of
-from shinypartial.dataset.schema import COLOR_CHANNELS, DEPTH_CHANNEL, NORMAL_CHANNELS, Frame, View
+from shinypartial.dataset.schema import (
+    COLOR_CHANNELS,
+    DEPTH_CHANNEL,
+    NORMAL_CHANNELS,
+    SELF_REFLECTION_CHANNEL,
+    Frame,
+    View,
+)
 from shinypartial.dataset.write import display_rgba, encode_normals, encode_unit
 from shinypartial.errors import InputError
 from shinypartial.images import read_exr, read_png, stack_channels
@@ -23,15 +30,16 @@ LEVEL_TOLERANCE = 1
 COMPARED_ALPHA = 1 / 64
 
 
-def check_frame(root: Path, frame: Frame) -> Iterator[Break]:
-    """Every broken promise of a frame's four files."""
-    missing = [path for path in frame.files if not path.is_file()]
+def check_frame(root: Path, frame: Frame, self_reflection: bool = False) -> Iterator[Break]:
+    """Every broken promise of a frame's files; without `self_reflection` it may have that or not."""
+    expected = (*frame.files, frame.self_png) if self_reflection else frame.files
+    missing = [path for path in expected if not path.is_file()]
     yield from (Break(_name(root, path), "the file is missing", REMAKE) for path in missing)
     if frame.exr in missing:
         return
     try:
         channels = read_exr(frame.exr)
-        view, problems = _read_view(frame, channels)
+        view, problems = _read_view(frame, channels, self_reflection or SELF_REFLECTION_CHANNEL in channels)
     except InputError as error:
         yield break_of(_name(root, frame.exr), error)
         return
@@ -46,11 +54,12 @@ def _name(root: Path, path: Path) -> str:
     return path.relative_to(root).as_posix()
 
 
-def _read_view(frame: Frame, channels: dict[str, np.ndarray]) -> tuple[View | None, list[str]]:
+def _read_view(frame: Frame, channels: dict[str, np.ndarray], self_reflection: bool) -> tuple[View | None, list[str]]:
     """The view and what is wrong with its types; no view when size or channels make the rest meaningless."""
     expected = {
         **dict.fromkeys(COLOR_CHANNELS, "float16"),
         **dict.fromkeys((*NORMAL_CHANNELS, DEPTH_CHANNEL), "float32"),
+        **({SELF_REFLECTION_CHANNEL: "float16"} if self_reflection else {}),
     }
     if channels.keys() != expected.keys():
         return None, [f"expected the channels {', '.join(sorted(expected))}, found {', '.join(sorted(channels))}"]
@@ -62,7 +71,8 @@ def _read_view(frame: Frame, channels: dict[str, np.ndarray]) -> tuple[View | No
     problems = [f"expected channel {n} as {t}, found {types[n]}" for n, t in expected.items() if types[n] != t]
     rgba = stack_channels(channels, COLOR_CHANNELS, frame.exr)
     normals = stack_channels(channels, NORMAL_CHANNELS, frame.exr)
-    view = View(rgba[..., :3], rgba[..., 3], normals, channels[DEPTH_CHANNEL].astype(np.float32), True)
+    mask = channels[SELF_REFLECTION_CHANNEL].astype(np.float32) if self_reflection else None
+    view = View(rgba[..., :3], rgba[..., 3], normals, channels[DEPTH_CHANNEL].astype(np.float32), True, mask)
     infinite = [
         f"{int((~np.isfinite(channels[name])).sum())} values of channel {name} are NaN or infinite"
         for name in expected
@@ -87,6 +97,10 @@ def _check_values(file: str, frame: Frame, view: View) -> Iterator[Break]:
         "depths that are not positive where alpha > 0": inside & ~(view.depth > 0),
         "depths that are not zero where alpha is zero": ~inside & (view.depth != 0),
     }
+    if view.self_reflection is not None:
+        binary = (view.self_reflection == 0) | (view.self_reflection == 1)
+        counts["self-reflection that is neither 0 nor 1"] = ~binary
+        counts["self-reflection where alpha is zero"] = ~inside & (view.self_reflection != 0)
     for what, wrong in counts.items():
         if wrong.any():
             yield Break(file, f"{int(wrong.sum())} pixels have {what}", REMAKE)
@@ -106,6 +120,8 @@ def _check_companions(root: Path, frame: Frame, view: View, missing: list[Path])
         frame.alpha_png: encode_unit(view.alpha)[..., None],
         frame.normal_png: encode_normals(view.normals_world),
     }
+    if view.self_reflection is not None:
+        expected[frame.self_png] = encode_unit(view.self_reflection)[..., None]
     for path, picture in expected.items():
         if path not in missing:
             yield from _compare_picture(_name(root, path), path, picture, compared)

@@ -23,6 +23,7 @@ from shinypartial.dataset.schema import (
     LICENSES,
     MANIFEST,
     NORMAL_CHANNELS,
+    SELF_REFLECTION_CHANNEL,
     Frame,
     View,
 )
@@ -37,8 +38,10 @@ def make_frames(root: Path, split: str, cameras: Sequence[Camera]) -> tuple[Fram
     return tuple(Frame(f"{split}/r_{i:03d}", camera, root / split / f"r_{i:03d}") for i, camera in enumerate(cameras))
 
 
-def claim_folder(root: Path, recipe: dict[str, Any], generator: dict[str, Any]) -> bool:
+def claim_folder(root: Path, recipe: dict[str, Any], generator: dict[str, Any], format_minor: int = 0) -> bool:
     """Make `root` the folder of this recipe; return whether an earlier run had begun it.
+
+    `format_minor` says what the frames will hold beyond the first version: see `schema.FORMAT_MINOR`.
 
     Raises InputError when the folder belongs to another recipe or holds something else.
     """
@@ -64,8 +67,8 @@ def claim_folder(root: Path, recipe: dict[str, Any], generator: dict[str, Any]) 
             remedy="Choose another --output.",
         )
     root.mkdir(parents=True, exist_ok=True)
-    manifest = {"format": FORMAT, "format_version": FORMAT_VERSION, "complete": False, "recipe": recipe}
-    write_json(manifest_path, {**manifest, "generator": generator})
+    versions = {"format": FORMAT, "format_version": FORMAT_VERSION, "format_minor": format_minor}
+    write_json(manifest_path, {**versions, "complete": False, "recipe": recipe, "generator": generator})
     return False
 
 
@@ -79,6 +82,11 @@ def is_written(frame: Frame) -> bool:
     return all(path.exists() for path in frame.files)
 
 
+def is_rendered(frame: Frame) -> bool:
+    """Whether the frame is written with all that Blender knows, self-reflection included."""
+    return is_written(frame) and frame.self_png.exists()
+
+
 def write_view(frame: Frame, view: View) -> None:
     """Write the EXR and the 8-bit companions of one frame."""
     if view.normals_world is None or view.depth is None:
@@ -87,10 +95,14 @@ def write_view(frame: Frame, view: View) -> None:
     write_png(frame.png, display_rgba(view.radiance, alpha))
     write_png(frame.alpha_png, encode_unit(alpha))
     write_png(frame.normal_png, encode_normals(view.normals_world))
+    if view.self_reflection is not None:
+        write_png(frame.self_png, encode_unit(view.self_reflection))
     half = np.clip(np.concatenate([view.radiance, alpha[..., None]], -1), -65504, 65504).astype(np.float16)
     channels = {name: half[..., i] for i, name in enumerate(COLOR_CHANNELS)}
     channels |= {name: view.normals_world[..., i].astype(np.float32) for i, name in enumerate(NORMAL_CHANNELS)}
     channels[DEPTH_CHANNEL] = view.depth.astype(np.float32)
+    if view.self_reflection is not None:
+        channels[SELF_REFLECTION_CHANNEL] = view.self_reflection.astype(np.float16)
     write_exr(frame.exr, channels)
 
 

@@ -9,6 +9,7 @@ PSNR_CEILING_DB = 100.0
 WANG = "Wang et al., Image quality assessment, IEEE TIP 2004, doi:10.1109/TIP.2003.819861"
 ZHANG = "Zhang et al., The unreasonable effectiveness of deep features, CVPR 2018, arXiv:1801.03924"
 FOUHEY = "Fouhey et al., Data-driven 3D primitives, ICCV 2013 (thresholds 11.25°, 22.5°)"
+REINHARD = "Reinhard et al., Photographic tone reproduction, SIGGRAPH 2002, doi:10.1145/566654.566575"
 ILG = "Ilg et al., Uncertainty estimates for optical flow, ECCV 2018, arXiv:1802.07095"
 HANLEY = "Hanley and McNeil, Radiology 143, 1982, doi:10.1148/radiology.143.1.7063747"
 SPEARMAN = "Spearman, American Journal of Psychology 15, 1904, doi:10.2307/1412159"
@@ -56,6 +57,9 @@ METRICS = (
     Metric("psnr_linear_unweighted", "PSNR of linear radiance, every texel equal", "dB", _HIGHER, ".2f", DEFINED_HERE),
     Metric("ssim_srgb_unweighted", "SSIM of the sRGB map, every texel equal", "", _HIGHER, ".4f", WANG),
     Metric("l1_srgb_unweighted", "Mean absolute difference, sRGB, every texel equal", "", _LOWER, ".4f", DEFINED_HERE),
+    Metric("psnr_reinhard", "PSNR of the tone-mapped 8-bit map, every texel equal", "dB", _HIGHER, ".2f", REINHARD),
+    Metric("ssim_reinhard", "SSIM of the tone-mapped 8-bit map, every texel equal", "", _HIGHER, ".4f", WANG),
+    Metric("l1_reinhard", "Mean absolute difference, tone-mapped 8-bit", "", _LOWER, ".4f", REINHARD),
     Metric("exposure_stops", "Best global exposure of the prediction", "stops", _DESCRIPTION, "+.2f", DEFINED_HERE),
     Metric(
         "coverage", "Solid-angle share of the sphere that training views see", "", _DESCRIPTION, ".1%", DEFINED_HERE
@@ -77,7 +81,7 @@ METRICS = (
     Metric("lpips_vgg", "LPIPS v0.1, VGG-16", "", _LOWER, ".4f", ZHANG),
     Metric("visibility_error_spearman", "Rank correlation of visibility and error", "", _LOWER, "+.3f", SPEARMAN),
     Metric("visibility_error_auroc", "AUROC of low visibility for error > 0.1", "", _HIGHER, ".3f", HANLEY),
-    Metric("sparsification_area", "Area between sparsification curve and oracle", "", _LOWER, ".3f", ILG),
+    Metric("sparsification_area", "Area between sparsification curve and perfect order", "", _LOWER, ".3f", ILG),
 )
 
 _BY_NAME = {metric.name: metric for metric in METRICS}

@@ -16,7 +16,7 @@ from shinypartial.blender.render import open_renderer
 from shinypartial.camera import ray_directions_world, reflect
 from shinypartial.conventions import SOLID_ALPHA
 from shinypartial.sphere import latlong_to_cube, sample_cube, sample_latlong
-from shinypartial.trajectory import arc
+from shinypartial.trajectory import plan_cameras
 from tests.support.tiny_scene import tiny_scene
 
 pytest.importorskip("bpy")
@@ -36,8 +36,8 @@ class Reflections:
     def __init__(self, folder: Path) -> None:
         path = {"azimuth": "[-80, 80]", "elevation": "[-80, 80]", "sweeps": 3, "train": 3, "test": 3}
         spec = tiny_scene(folder, **path, samples=64, resolution=48)
-        front = arc(spec.camera, 48).train
-        back = arc(dataclasses.replace(spec.camera, facing_azimuth_deg=180.0), 48).train
+        front = plan_cameras(spec.camera, 48).train
+        back = plan_cameras(dataclasses.replace(spec.camera, facing_azimuth_deg=180.0), 48).train
         directions, colors = [], []
         with open_renderer(spec) as renderer:
             for camera in (*front, *back):

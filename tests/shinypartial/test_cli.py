@@ -12,7 +12,7 @@ from shinypartial.cli import main
 from shinypartial.dataset.schema import Dataset
 
 ROOT = Path(__file__).resolve().parents[2]
-COMMANDS = ("generate", "validate", "evaluate", "report")
+COMMANDS = ("generate", "subset", "validate", "evaluate", "report", "release", "leaderboard", "oracle", "compare", "weights")
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -56,7 +56,7 @@ def test_bad_usage_exits_with_2(arguments: list[str], capsys: pytest.CaptureFixt
 
 
 BAD_INPUT = {
-    "unknown scene": (["generate", "--scene", "teapot"], "vase"),
+    "unknown scene": (["generate", "--scene", "kettle"], "vase"),
     "too small": (["generate", "--scene", "vase", "--resolution", "0"], "render.resolution"),
     "no views": (["generate", "--scene", "vase", "--train", "0"], "camera.train"),
     "no recipe": (["generate", "--scene", "none/scene.toml"], "Check the path"),
@@ -74,7 +74,7 @@ def test_bad_input_exits_with_2_and_advice(
     assert "Traceback" not in err
 
 
-@pytest.mark.parametrize("command", ["validate", "evaluate", "report"])
+@pytest.mark.parametrize("command", ["validate", "evaluate", "report", "oracle"])
 def test_nothing_to_work_on_says_how_to_make_it(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -68,6 +68,19 @@ def test_no_error_leaves_every_statistic_undefined() -> None:
     assert set(vars(scores).values()) == {None}
 
 
+def test_four_directions_by_hand() -> None:
+    """Visibility 1, 2, 2, 4 of errors 0.4, 0.2, 0, 0: all pairs counted, all curves integrated on paper."""
+    visibility, error, ones = np.array([1.0, 2.0, 2.0, 4.0]), np.array([0.4, 0.2, 0.0, 0.0]), np.ones(4)
+    # Mid-ranks 1, 2.5, 2.5, 4 and 4, 3, 1.5, 1.5: covariance −3.75, variances 4.5 and 4.5.
+    assert spearman(visibility, error, ones) == pytest.approx(-3.75 / 4.5)
+    # Wrong: the first two. Pairs with the third and fourth: 1 + 1 + ½ + 1 of 4.
+    assert auroc(visibility, error > 0.1, ones) == pytest.approx(3.5 / 4)
+    # Kept weight t: error 0 to t = 1, then 0.1 (t − 1)/t to 3, then (0.2 + 0.4 (t − 3))/t to 4;
+    # in perfect order 0 to 2, 0.2 (t − 2)/t to 3, (0.2 + 0.4 (t − 3))/t to 4. The last parts cancel.
+    stated, perfect = 0.1 * (2 - np.log(3)), 0.2 * (1 - 2 * np.log(1.5))
+    assert sparsification_area(visibility, error, ones) == pytest.approx((stated - perfect) / 0.6)
+
+
 def test_other_shapes_are_refused() -> None:
     with pytest.raises((ValueError, TypeCheckError)):
         calibration_scores(VISIBILITY.reshape(10, 30)[0], ERROR[:30], ONES[:29])

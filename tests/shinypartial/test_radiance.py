@@ -15,7 +15,7 @@ from shinypartial.camera import Camera, ray_directions_world, reflect
 from shinypartial.conventions import SOLID_ALPHA
 from shinypartial.scene import SceneSpec, SurfaceOfRevolution, load_scene, override
 from shinypartial.sphere import sample_latlong
-from shinypartial.trajectory import arc
+from shinypartial.trajectory import plan_cameras
 from tests.support.tiny_scene import tiny_scene
 
 pytest.importorskip("bpy")
@@ -50,7 +50,7 @@ def render_middle(spec: SceneSpec) -> Rendered:
 
     Where the two differ, a reflected ray met the object again: that pixel does not show the environment alone.
     """
-    cameras = arc(spec.camera, spec.render.resolution).train
+    cameras = plan_cameras(spec.camera, spec.render.resolution).train
     camera = cameras[len(cameras) // 2]
     with open_renderer(spec) as renderer:
         view = renderer.render(camera)
@@ -171,5 +171,5 @@ def test_what_is_not_the_object_is_zero(rendered: Rendered) -> None:
 def test_nothing_is_printed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     spec = tiny_scene(tmp_path)
     with open_renderer(spec) as renderer:
-        renderer.render(arc(spec.camera, spec.render.resolution).train[0])
+        renderer.render(plan_cameras(spec.camera, spec.render.resolution).train[0])
     assert capfd.readouterr() == ("", "")

@@ -85,6 +85,11 @@ def first(content: Any) -> Any:
     return content["frames"][0]
 
 
+def add_self_reflection(value: float) -> Callable[[Path], None]:
+    """A view that has the mask, though the format of its dataset does not ask for it, with one value everywhere."""
+    return edit_frame(lambda c: c.update({"self_reflection.V": np.full_like(c["A"], value)}))
+
+
 def turn_inside_out(channels: dict[str, np.ndarray]) -> None:
     """Normals that point away from the camera."""
     for axis in "XYZ":
@@ -103,6 +108,13 @@ def half_normals(channels: dict[str, np.ndarray]) -> None:
 
 TRAIN = "transforms_train.json"
 DAMAGES = {
+    "no self-reflection": (
+        edit_json("dataset.json", lambda m: m.update(format_minor=1)),
+        "train/r_000_self.png",
+        "missing",
+    ),
+    "self-reflection in part": (add_self_reflection(0.5), EXR, "neither 0 nor 1"),
+    "self-reflection of the background": (add_self_reflection(1.0), EXR, "self-reflection where alpha"),
     "no manifest": (remove("dataset.json"), "dataset.json", "no such file"),
     "broken manifest": (truncate("dataset.json"), "dataset.json", "JSON"),
     "manifest of a list": (lambda r: (r / "dataset.json").write_text("[]"), "dataset.json", "table"),

@@ -1,0 +1,71 @@
+"""Shader nodes: the object's material with its depth pass, the room's light, and the probe of self-reflection."""
+
+from typing import Any
+
+from shinypartial.scene import Material
+
+DEPTH_PASS = "z_depth"
+
+
+def make_material(bpy: Any, spec: Material) -> Any:
+    """The Principled shader."""
+    material, nodes, links = _empty(bpy, "material")
+    shader = nodes.new("ShaderNodeBsdfPrincipled")
+    shader.inputs["Base Color"].default_value = (*spec.base_color, 1)
+    shader.inputs["Metallic"].default_value = spec.metallic
+    shader.inputs["Roughness"].default_value = spec.roughness
+    links.new(shader.outputs["BSDF"], nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
+    return material
+
+
+def add_depth_pass(material: Any) -> None:
+    """Give out the z-depth of every sample as a pass.
+
+    Blender's own depth pass keeps one random sample of each pixel, which may miss the object; this pass is averaged
+    over the pixel as color is.
+    """
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    depth = nodes.new("ShaderNodeOutputAOV")
+    depth.aov_name = DEPTH_PASS
+    links.new(nodes.new("ShaderNodeCameraData").outputs["View Z Depth"], depth.inputs["Value"])
+
+
+def make_probe_material(bpy: Any) -> Any:
+    """A perfect mirror to the camera and a light of radiance 1 to every reflected ray."""
+    material, nodes, links = _empty(bpy, "probe")
+    mirror, light = nodes.new("ShaderNodeBsdfGlossy"), nodes.new("ShaderNodeEmission")
+    mirror.inputs["Roughness"].default_value = 0
+    mirror.inputs["Color"].default_value = (1, 1, 1, 1)
+    choice = nodes.new("ShaderNodeMixShader")
+    links.new(nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"], choice.inputs[0])
+    links.new(light.outputs["Emission"], choice.inputs[1])
+    links.new(mirror.outputs["BSDF"], choice.inputs[2])
+    links.new(choice.outputs["Shader"], nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
+    material.cycles.emission_sampling = "NONE"  # Reflected rays find it by themselves.
+    return material
+
+
+def make_room_material(bpy: Any, image: Any, strength: float) -> Any:
+    """Light that depends on where the room's wall is, as seen from the origin: the map in that direction."""
+    material, nodes, links = _empty(bpy, "room")
+    texture, light = environment_texture(nodes, image), nodes.new("ShaderNodeEmission")
+    light.inputs["Strength"].default_value = strength
+    links.new(nodes.new("ShaderNodeNewGeometry").outputs["Position"], texture.inputs["Vector"])
+    links.new(texture.outputs["Color"], light.inputs["Color"])
+    links.new(light.outputs["Emission"], nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
+    return material
+
+
+def environment_texture(nodes: Any, image: Any) -> Any:
+    """A node that looks a direction up in a lat-long image."""
+    texture = nodes.new("ShaderNodeTexEnvironment")
+    texture.image = image
+    texture.projection, texture.interpolation = "EQUIRECTANGULAR", "Linear"
+    return texture
+
+
+def _empty(bpy: Any, name: str) -> tuple[Any, Any, Any]:
+    """A new material without nodes, its nodes and its links."""
+    material = bpy.data.materials.new(name)
+    material.node_tree.nodes.clear()
+    return material, material.node_tree.nodes, material.node_tree.links

@@ -1,0 +1,78 @@
+"""Values of a recipe that are each in range but contradict one another."""
+
+import math
+from itertools import pairwise
+
+from shinypartial.scene.shapes import Assembly, BlendFile, Frame, Part, Plane, SurfaceOfRevolution, Tube
+from shinypartial.scene.spec import SceneSpec
+from shinypartial.scene.tables import Place
+
+
+def check_scene(spec: SceneSpec, place: Place) -> None:
+    """Raise InputError, naming the value, for shapes without a surface, falling ranges and things inside others."""
+    _check_object(spec, place)
+    _check_parts(spec.props, place.below("props"))
+    for key in ("azimuth_deg", "elevation_deg"):
+        low, high = getattr(spec.camera, key)
+        if low > high:
+            raise place.below("camera").below(key).error("first value ≤ second value", f"[{low}, {high}]")
+    reach = f"the object reaches {spec.extent:.3g} from the origin"
+    if spec.camera.radius <= spec.extent + math.hypot(*spec.camera.target):
+        raise (
+            place.below("camera")
+            .below("radius")
+            .error("cameras outside the object", f"{spec.camera.radius}, but {reach}")
+        )
+    around = max([spec.extent, *(spec.scale * part.shape.extent for part in spec.props)])
+    if spec.world.distance is not None and spec.world.distance <= around:
+        found = f"{spec.world.distance}, but {reach}, and what stands around it {around:.3g}"
+        raise place.below("world").below("distance").error("surroundings that enclose the object", found)
+
+
+def _check_object(spec: SceneSpec, place: Place) -> None:
+    below = place.below("object")
+    if isinstance(spec.object, Assembly):
+        if not spec.object.parts:
+            raise below.below("parts").error("at least one part", "none")
+        _check_parts(spec.object.parts, below.below("parts"))
+    elif not isinstance(spec.object, BlendFile):
+        _check_parts((Part(spec.object),), below, numbered=False)
+    if spec.material is None and not isinstance(spec.object, BlendFile):
+        raise place.below("material").error("a material, unless the object comes from a Blender file", "none")
+
+
+def _check_parts(parts: tuple[Part, ...], place: Place, numbered: bool = True) -> None:
+    for i, part in enumerate(parts):
+        at = place.below(str(i)).below("shape") if numbered else place
+        if isinstance(part.shape, SurfaceOfRevolution):
+            _check_profile(part.shape, at)
+        if isinstance(part.shape, Plane | Frame) and math.hypot(*part.shape.normal) < 1e-6:
+            raise at.below("normal").error("a direction", "a vector of length zero")
+        if isinstance(part.shape, Frame):
+            _check_distinct(part.shape.profile, 2, at.below("profile"))
+        if isinstance(part.shape, Tube):
+            _check_distinct(part.shape.path, 3, at.below("path"))
+            if len(part.shape.radii) != len(part.shape.path):
+                found = f"{len(part.shape.radii)} for {len(part.shape.path)} points"
+                raise at.below("radii").error("a radius for each point of the path", found)
+
+
+def _check_distinct(points: tuple[tuple[float, ...], ...], fewest: int, place: Place) -> None:
+    if len(points) < fewest:
+        raise place.error(f"at least {('two', 'three')[fewest - 2]} points", f"{len(points)}")
+    for i, (before, point) in enumerate(pairwise(points), 1):
+        if math.dist(before, point) < 1e-9:
+            raise place.error("points that differ from the one before", f"point {i} twice")
+
+
+def _check_profile(surface: SurfaceOfRevolution, place: Place) -> None:
+    """Points must be distinct neighbors with radius ≥ 0; only the ends may lie on the axis."""
+    profile, last = place.below("profile"), len(surface.profile) - 1
+    for i, (radius, _) in enumerate(surface.profile):
+        if radius < 0 or (0 < i < last and radius == 0):
+            raise profile.error("radii ≥ 0, and above 0 between the ends", f"radius {radius} at point {i}")
+    _check_distinct(surface.profile, 3, profile)
+    ends = (0, *surface.creases, last)
+    if any(before >= after for before, after in pairwise(ends)):
+        found = f"{list(surface.creases)}"
+        raise place.below("creases").error(f"rising numbers of inner points, from 1 to {last - 1}", found)

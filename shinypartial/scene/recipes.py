@@ -1,0 +1,194 @@
+"""Find scenes, load them, and vary them as the command line asks."""
+
+import dataclasses
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from shinypartial.errors import InputError
+from shinypartial.scene.check import check_scene
+from shinypartial.scene.shapes import BlendFile, Material
+from shinypartial.scene.spec import STUDIO_LIGHTS, FileWorld, SceneSpec
+from shinypartial.scene.tables import Place, parse_table
+from shinypartial.trajectory import SWEPT_PATHS
+
+SCENES = Path(__file__).resolve().parents[2] / "blender_scenes"
+RECIPE = "scene.toml"
+BLEND = ".blend"
+
+
+def scene_names() -> list[str]:
+    """Names of the scenes that come with the repository."""
+    return sorted(path.parent.name for path in SCENES.glob(f"*/{RECIPE}"))
+
+
+def find_scene(scene: str, object_name: str | None = None) -> SceneSpec:
+    """A scene by name, by the path of its scene.toml, or by that of a Blender file and the name of an object in it.
+
+    Raises InputError as `load_scene` and `from_blend_file` do, and for an object's name that nothing needs.
+    """
+    if scene.lower().endswith(BLEND):
+        return from_blend_file(Path(scene), object_name)
+    if object_name is not None:
+        raise InputError(
+            expected="--object with a .blend file only",
+            found=f"--object {object_name} with the scene {scene}",
+            remedy="Leave it out: a recipe says itself what its object is.",
+        )
+    return load_scene(scene)
+
+
+def load_scene(scene: str) -> SceneSpec:
+    """Read a scene by name, or by the path of its scene.toml.
+
+    Raises InputError, naming file and key, for an unknown scene, broken TOML, and values that are missing, unknown,
+    of the wrong type, not finite or out of range.
+    """
+    by_path = scene.endswith(".toml")
+    path = Path(scene) if by_path else SCENES / scene / RECIPE
+    if not by_path and scene not in scene_names():
+        raise InputError(
+            expected=f"one of the scenes {', '.join(scene_names()) or '(none found)'}, or the path of a {RECIPE}",
+            found=f"'{scene}'",
+            remedy=f"Correct --scene, or add {SCENES / scene / RECIPE}.",
+        )
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(
+            expected=f"{path} to be TOML", found=str(error), remedy="Correct the file; docs/adding-a-scene.md helps."
+        ) from None
+    spec = parse_scene(table, str(path))
+    remedy = "Correct the path; it is relative to the folder of scene.toml."
+    if isinstance(spec.world, FileWorld):
+        file = _require(path.parent / spec.world.path, ".exr", f"`world.path` of {path} to name an EXR file", remedy)
+        spec = dataclasses.replace(spec, world=dataclasses.replace(spec.world, path=str(file)))
+    if isinstance(spec.object, BlendFile):
+        file = _require(path.parent / spec.object.path, BLEND, f"`object.path` of {path} to name a .blend file", remedy)
+        spec = dataclasses.replace(spec, object=dataclasses.replace(spec.object, path=str(file)))
+    return spec
+
+
+def from_blend_file(path: Path, object_name: str | None) -> SceneSpec:
+    """The scene of a user's own Blender file: the named object before the default cameras, with its own materials.
+
+    Raises InputError without a file or a name. Whether the file holds that object is found when it is opened.
+    """
+    file = _require(path, BLEND, "--scene to name a Blender file that exists", "Correct the path.")
+    if not object_name:
+        raise InputError(
+            expected=f"the name of the object in {path} that reflects",
+            found="no --object",
+            remedy="Add --object NAME, as Blender's outliner shows it.",
+        )
+    table = {
+        "name": path.stem,
+        "title": f"{object_name} of {path.name}",
+        "provenance": f"Object {object_name} of the file {path.name}.",
+        "license": "that of the file",
+        "object": {"kind": "blend", "path": str(file), "object": object_name},
+        "world": {"kind": "studiolight", "name": "interior"},
+        "material": None,
+    }
+    return parse_scene(table, f"the scene of {path.name}")
+
+
+def override(
+    spec: SceneSpec,
+    *,
+    resolution: int | None = None,
+    samples: int | None = None,
+    exposure: float | None = None,
+    world: str | None = None,
+    surroundings_distance: float | None = None,
+    roughness: float | None = None,
+    base_color: tuple[float, float, float] | None = None,
+    metallic: float | None = None,
+    deformation: float | None = None,
+    object_scale: float | None = None,
+    **camera: Any,
+) -> SceneSpec:
+    """Replace what is given (`camera`: fields of CameraPath) and check everything again.
+
+    `world` is the name of a studio light or the path of an EXR file. A value of the material changes the scene's
+    material; where a Blender file's own materials were kept, a mirror with that value takes their place.
+    """
+    table = dataclasses.asdict(spec)
+    if world is not None:
+        table["world"] = _world_table(world) | {key: table["world"][key] for key in ("strength", "distance")}
+    if table["material"] is None and (roughness, base_color, metallic) != (None, None, None):
+        table["material"] = dataclasses.asdict(Material())
+    for section, key, value in (
+        ("render", "resolution", resolution),
+        ("render", "samples", samples),
+        ("render", "exposure", exposure),
+        ("world", "distance", surroundings_distance),
+        ("material", "roughness", roughness),
+        ("material", "base_color", base_color),
+        ("material", "metallic", metallic),
+        ("deformation", "amplitude", deformation),
+        *(("camera", key, value) for key, value in camera.items()),
+    ):
+        if value is not None:
+            table[section][key] = value
+    if object_scale is not None:
+        table["scale"] = object_scale
+    source = f"the scene {spec.name} with the options given"
+    if camera.get("sweeps") is not None and table["camera"]["path"] not in SWEPT_PATHS:
+        found = f"{camera['sweeps']} for the path {table['camera']['path']}, which has no sweeps"
+        raise Place(source, "camera.sweeps").error(f"a path among {', '.join(SWEPT_PATHS)}", found)
+    return parse_scene(table, source)
+
+
+def variant_name(original: SceneSpec, varied: SceneSpec) -> str:
+    """A folder name that differs between variants: scene, path, resolution, and what the options changed in the scene.
+
+    What else the camera and the sampling have is left out: the recipe in the folder keeps such runs apart.
+    """
+    path = [varied.camera.path] if varied.camera.path != original.camera.path else []
+    words = [varied.name, *path, str(varied.render.resolution)]
+    if varied.world != original.world:
+        same_map = dataclasses.replace(varied.world, distance=original.world.distance) == original.world
+        words += [] if same_map else [Path(_world_name(varied)).stem]
+        words += [f"distance{varied.world.distance:g}"] if varied.world.distance != original.world.distance else []
+    if varied.material and varied.material != original.material:
+        before = original.material or Material()
+        color = "-".join(f"{channel:g}" for channel in varied.material.base_color)
+        words += [f"color{color}"] if varied.material.base_color != before.base_color else []
+        words += [f"metallic{varied.material.metallic:g}"] if varied.material.metallic != before.metallic else []
+        changed = original.material is None or varied.material.roughness != before.roughness
+        words += [f"roughness{varied.material.roughness:g}"] if changed else []
+    if varied.deformation != original.deformation:
+        words.append(f"deformation{varied.deformation.amplitude:g}")
+    words += [f"scale{varied.scale:g}"] if varied.scale != original.scale else []
+    if varied.render.exposure != original.render.exposure:
+        words.append(f"exposure{varied.render.exposure:g}")
+    return "-".join(words)
+
+
+def parse_scene(table: dict[str, Any], source: str) -> SceneSpec:
+    """Build a SceneSpec from nested tables; `source` names their origin in messages."""
+    place = Place(source)
+    spec = parse_table(SceneSpec, table, place)
+    check_scene(spec, place)
+    return spec
+
+
+def _world_name(spec: SceneSpec) -> str:
+    return spec.world.path if isinstance(spec.world, FileWorld) else spec.world.name
+
+
+def _world_table(world: str) -> dict[str, Any]:
+    """The table of a studio light's name or of an EXR file's path."""
+    if world in STUDIO_LIGHTS:
+        return {"kind": "studiolight", "name": world}
+    expected = f"--world to be one of {', '.join(STUDIO_LIGHTS)}, or the path of an EXR file"
+    path = _require(Path(world), ".exr", expected, "Correct --world.")
+    return {"kind": "file", "path": str(path), "license": "that of the file", "source": f"the file {path.name}"}
+
+
+def _require(path: Path, suffix: str, expected: str, remedy: str) -> Path:
+    if path.suffix.lower() != suffix or not path.is_file():
+        found = f"{path}, which is {'of another kind' if path.is_file() else 'not there'}"
+        raise InputError(expected=expected, found=found, remedy=remedy)
+    return path

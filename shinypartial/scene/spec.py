@@ -1,0 +1,118 @@
+"""What a whole recipe holds: object, surroundings, world, camera path and sampling."""
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from shinypartial.files import sha256_of
+from shinypartial.scene.shapes import (
+    Assembly,
+    BlendFile,
+    Blob,
+    Material,
+    Part,
+    Plane,
+    Sphere,
+    SurfaceOfRevolution,
+    Tube,
+)
+from shinypartial.trajectory import CameraPath, limits
+
+FORMAT_VERSION = 1
+STUDIO_LIGHTS = ("city", "courtyard", "forest", "interior", "night", "studio", "sunrise", "sunset")
+
+
+@dataclass(frozen=True)
+class StudioWorld:
+    """One of the eight CC0 environment maps that Blender brings along."""
+
+    name: str = field(metadata={"choices": STUDIO_LIGHTS})
+    kind: str = "studiolight"
+    strength: float = field(default=1.0, metadata=limits(0.0, 1e4))
+    distance: float | None = field(default=None, metadata=limits(1e-3, 1e6))
+    """Radius of the sphere about the origin that carries the map; infinitely far when not given."""
+
+
+@dataclass(frozen=True)
+class FileWorld:
+    """A linear lat-long EXR in the world frame (+Z up, image center along +X)."""
+
+    path: str
+    """Relative to the folder of scene.toml, or absolute."""
+    license: str
+    """License of the file, copied into the dataset."""
+    source: str
+    """Where the file comes from, copied into the dataset."""
+    kind: str = "file"
+    strength: float = field(default=1.0, metadata=limits(0.0, 1e4))
+    distance: float | None = field(default=None, metadata=limits(1e-3, 1e6))
+    """Radius of the sphere about the origin that carries the map; infinitely far when not given."""
+
+
+@dataclass(frozen=True)
+class Deformation:
+    """A seeded smooth displacement of the object along its normals."""
+
+    amplitude: float = field(default=0.0, metadata=limits(0.0, 10.0))
+    """Root mean square of the displacement in scene units, before the object is scaled."""
+    wavelength: float = field(default=0.8, metadata=limits(1e-2, 1e3))
+    """Typical distance between bumps in scene units."""
+    seed: int = field(default=0, metadata=limits(0, 2**31 - 1))
+    """Determines where the bumps lie."""
+
+
+@dataclass(frozen=True)
+class Render:
+    """How Cycles samples an image; a pixel is the average over its area."""
+
+    samples: int = field(default=16, metadata=limits(1, 65536))
+    """Samples per pixel."""
+    resolution: int = field(default=800, metadata=limits(4, 16384))
+    """Pixels per side."""
+    seed: int = field(default=0, metadata=limits(0, 2**31 - 1))
+    """Seed of the sampling pattern."""
+    exposure: float = field(default=0.0, metadata=limits(-20.0, 20.0))
+    """Photographic stops: the light of the world is multiplied by 2^exposure, in pictures and in the stored map."""
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """Everything that determines a dataset: object, material, world, camera path and sampling."""
+
+    name: str
+    title: str
+    provenance: str
+    license: str
+    object: SurfaceOfRevolution | Sphere | Plane | Tube | Blob | Assembly | BlendFile
+    world: StudioWorld | FileWorld
+    material: Material | None = Material()
+    """Of the object, but for parts that have their own. None: a Blender file's own materials."""
+    props: tuple[Part, ...] = ()
+    """What stands around the object: it hides it and is mirrored in it, and is no part of the mask."""
+    deformation: Deformation = Deformation()
+    scale: float = field(default=1.0, metadata=limits(1e-3, 1e3))
+    """Enlarges object and props about the origin."""
+    camera: CameraPath = CameraPath()
+    render: Render = Render()
+    format: int = field(default=FORMAT_VERSION, metadata=limits(FORMAT_VERSION, FORMAT_VERSION))
+
+    @property
+    def light_factor(self) -> float:
+        """What the numbers of the world's file are multiplied by to give radiance."""
+        return self.world.strength * 2.0**self.render.exposure
+
+    @property
+    def extent(self) -> float:
+        """Distance from the origin that the object does not exceed; displacements reach three times their RMS."""
+        return self.scale * (self.object.extent + 3 * self.deformation.amplitude)
+
+    def recipe(self) -> dict[str, Any]:
+        """The specification as JSON holds it; files are named by their content, so that they may move."""
+        content = json.loads(json.dumps(dataclasses.asdict(self)))
+        for key, part in (("world", self.world), ("object", self.object)):
+            if isinstance(part, FileWorld | BlendFile):
+                path = Path(part.path)
+                content[key] |= {"path": path.name, "sha256": sha256_of(path)}
+        return content
