@@ -51,9 +51,9 @@ class Schedule:
         return self._density_active(iteration) and self._due(iteration, self.config.density.reset_every)
 
     def opacities_recovered(self, iteration: int) -> bool:
-        """Whether surfels have had time to earn their opacity back since the last reset, so that pruning is fair.
+        """Whether surfels had time to earn their opacity back since the last reset, so that pruning is fair.
 
-        Recovery takes steps, not a share of the fit: a hundred of them, or half the time between resets if that is less.
+        Recovery takes steps, not a share of the fit: a hundred, or half the time between resets if that is less.
         """
         period = max(self._iteration(self.config.density.reset_every), 1)
         return iteration < period or iteration % period >= min(RECOVERY_STEPS, period // 2)

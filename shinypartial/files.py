@@ -11,7 +11,6 @@ from typing import Any
 
 from shinypartial.errors import InputError
 
-
 PARTIAL_PREFIX = ".partial-"
 
 
