@@ -43,7 +43,7 @@ def plan_crew(cores: int | None = None) -> CrewPlan:
     """One process for every two cores, at most four.
 
     What a frame costs besides its samples (preparing the scene, passing files) runs on one thread, so several
-    processes keep many cores busier than one; each holds the scene in memory, so they aren't one a core.
+    processes should keep many cores busier than one; each holds the scene in memory. On two cores one was faster.
     """
     if cores is None:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
