@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from panoless.config import DensityConfig
-from panoless.surfels import Surfels, rotation_matrices
+from panoless.kernels.reference.rasterize import rotation_matrices
+from panoless.surfels import Surfels
 
 SPLIT_INTO = 2
 SPLIT_SHRINK = 0.8 * SPLIT_INTO

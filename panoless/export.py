@@ -18,8 +18,9 @@ from panoless.cubemap import look_up
 from panoless.fit import normalization_of
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.reference.rasterize import rotation_matrices
 from panoless.shading import ALPHA_FLOOR, compose, reflection_directions_world, surface_buffers
-from panoless.surfels import Surfels, rotation_matrices
+from panoless.surfels import Surfels
 from panoless.views import Normalization, raster_camera, unit_rays_camera
 from shinypartial.color import to_display
 from shinypartial.dataset.schema import Dataset, View

@@ -51,20 +51,3 @@ class Surfels:
     def detached(self) -> "Surfels":
         """The same numbers without gradients."""
         return Surfels(**{name: value.detach() for name, value in self.named().items()})
-
-
-def rotation_matrices(quats: Float[Tensor, "K 4"]) -> Float[Tensor, "K 3 3"]:
-    """Rotation matrices of wxyz quaternions of any length; columns are tangent_u, tangent_v and the normal."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    ]
-    return torch.stack(rows, 1).view(-1, 3, 3)

@@ -18,6 +18,7 @@ from shinypartial.dataset.schema import ENVIRONMENT_LATLONG, Dataset, Frame, Vie
 from shinypartial.errors import InputError
 from shinypartial.latlong_solver import ROBUST_SCALES, Rays, SolvedMap, solve_latlong
 from shinypartial.masks import environment_mask
+from shinypartial.metrics.coverage import cells_of_view, cells_to_latlong
 from shinypartial.metrics.environment import PROTOCOL_HEIGHT, RegionMasks, region_scores
 from shinypartial.prediction import (
     PredictionInfo,
@@ -45,7 +46,7 @@ Mask = Bool[np.ndarray, "H W"]
 
 @dataclass(frozen=True)
 class Candidate:
-    """One way to estimate the map, and its PSNR against the truth (linear, all directions; None without a truth)."""
+    """One way to estimate the map, and its linear PSNR over observed directions (None without a truth)."""
 
     estimate: str
     height: int
@@ -69,8 +70,8 @@ def make_oracle(dataset: Path, output: Path) -> Oracle:
     """Solve the environment of a dataset from its training views and ground-truth normals; write it to `output`.
 
     Of the plain average and the robust least squares, on grids as fine as the rays allow, the one with the smallest
-    error against the ground truth is taken: this makes the bound as tight as these estimators can. Raises InputError
-    when the dataset has no normals, and when `output` holds something else than a prediction.
+    error against the ground truth over observed directions is taken: this makes the bound as tight as these estimators
+    can. Raises InputError when the dataset has no normals, and when `output` holds something else than a prediction.
     """
     start, data = time.monotonic(), open_dataset(dataset)
     _require_normals(data)
@@ -171,18 +172,26 @@ def heights_to_try(rays: int) -> tuple[int, ...]:
 def _candidates(rays: Rays, data: Dataset, progress: Progress) -> tuple[Candidate, ...]:
     truth = read_environment(data) if (data.root / ENVIRONMENT_LATLONG).exists() else None
     found: list[Candidate] = []
+    observed = cells_to_latlong(cells_of_view(rays.directions).observed, PROTOCOL_HEIGHT)
     heights = heights_to_try(len(rays.directions))
     progress.advance(steps=(len(HEIGHTS) - len(heights)) * len(ROBUST_SCALES))
     for height in heights:
         solved = solve_latlong(rays, height, lambda: progress.advance("environment"))
-        found += [_candidate(name, getattr(solved, name), solved, truth) for name in ("averaged", "robust")]
+        found += [_candidate(name, getattr(solved, name), solved, truth, observed) for name in ("averaged", "robust")]
     return tuple(found)
 
 
 def _candidate(
-    estimate: str, radiance: Float[np.ndarray, "H W 3"], solved: SolvedMap, truth: Float[np.ndarray, "_H _W 3"] | None
+    estimate: str,
+    radiance: Float[np.ndarray, "H W 3"],
+    solved: SolvedMap,
+    truth: Float[np.ndarray, "_H _W 3"] | None,
+    observed: Bool[np.ndarray, "h w"],
 ) -> Candidate:
-    psnr = None if truth is None else region_scores(radiance, truth, RegionMasks(None, None)).full.psnr_linear
+    psnr = None
+    if truth is not None:
+        scores = region_scores(radiance, truth, RegionMasks(observed, None))
+        psnr = (scores.observed or scores.full).psnr_linear
     return Candidate(estimate, radiance.shape[0], radiance, solved.evidence, psnr)
 
 

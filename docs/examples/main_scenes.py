@@ -32,8 +32,12 @@ def method_row(folder: Path) -> dict[str, Any] | None:
     return {
         "method": info.method,
         "environment_psnr_linear_full_db": environment and environment.full.psnr_linear,
-        "environment_psnr_linear_observed_db": environment and environment.observed and environment.observed.psnr_linear,
-        "environment_psnr_linear_resolved_db": environment and environment.resolved and environment.resolved.psnr_linear,
+        "environment_psnr_linear_observed_db": environment
+        and environment.observed
+        and environment.observed.psnr_linear,
+        "environment_psnr_linear_resolved_db": environment
+        and environment.resolved
+        and environment.resolved.psnr_linear,
         "normals_mean_deg": scores.normals and scores.normals.mean_angular_error_deg,
         "normals_median_deg": scores.normals and scores.normals.median_angular_error_deg,
         "render_psnr_db": scores.render and scores.render.psnr,
@@ -63,7 +67,9 @@ def main(output: Path, roots: list[Path]) -> None:
     print("| --- | --- | --- | --- | --- | --- |")
     for name, scene in scenes.items():
         for row in scene["methods"]:
-            environment = " / ".join(number(row[f"environment_psnr_linear_{part}_db"]) for part in ("full", "observed", "resolved"))
+            environment = " / ".join(
+                number(row[f"environment_psnr_linear_{part}_db"]) for part in ("full", "observed", "resolved")
+            )
             normals = f"{number(row['normals_mean_deg'])} / {number(row['normals_median_deg'])}"
             render = number(row["render_psnr_db"])
             print(f"| {name} | {row['method']} | {environment} | {normals} | {render} | {row['seconds']:.0f} |")

@@ -17,8 +17,9 @@ from panoless.densify import (
     propagate_normals,
     reset_opacities,
 )
+from panoless.kernels.reference.rasterize import rotation_matrices
 from panoless.optimizer import SurfelOptimizer
-from panoless.surfels import Surfels, rotation_matrices
+from panoless.surfels import Surfels
 from tests.support.mirror_sphere import sphere_surfels
 
 CONFIG = DensityConfig(enabled=True, gradient_threshold=1e-3, dense_share=0.05)

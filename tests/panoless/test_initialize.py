@@ -8,7 +8,8 @@ import torch
 
 from panoless.config import SurfelConfig
 from panoless.initialize import HULL_HALF_SIDE, carve_hull, initial_surfels
-from panoless.surfels import Surfels, rotation_matrices
+from panoless.kernels.reference.rasterize import rotation_matrices
+from panoless.surfels import Surfels
 from panoless.views import TrainView, Views
 from shinypartial.errors import InputError
 

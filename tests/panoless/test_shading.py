@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from torch.nn.functional import normalize
 
 from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.reference.rasterize import rotation_matrices
 from panoless.shading import compose, reflection_directions_world, surface_buffers
-from panoless.surfels import Surfels, rotation_matrices
+from panoless.surfels import Surfels
 from shinypartial.camera import reflect
 from tests.support.mirror_sphere import sphere_surfels
 

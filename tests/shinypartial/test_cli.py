@@ -12,7 +12,18 @@ from shinypartial.cli import main
 from shinypartial.dataset.schema import Dataset
 
 ROOT = Path(__file__).resolve().parents[2]
-COMMANDS = ("generate", "subset", "validate", "evaluate", "report", "release", "leaderboard", "oracle", "compare", "weights")
+COMMANDS = (
+    "generate",
+    "subset",
+    "validate",
+    "evaluate",
+    "report",
+    "release",
+    "leaderboard",
+    "oracle",
+    "compare",
+    "weights",
+)
 
 
 @pytest.mark.parametrize("command", COMMANDS)

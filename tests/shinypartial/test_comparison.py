@@ -95,7 +95,7 @@ def test_the_interval_covers_the_truth_about_as_often_as_it_says() -> None:
     covered = np.mean(
         [each.low <= 0.3 <= each.high for each in found if each.low is not None and each.high is not None]
     )
-    # The percentile bootstrap of 20 pairs covers 92.4 % (3,000 trials) where it says 95 %; 400 trials have a spread of 1.3 %.
+    # The percentile bootstrap of 20 pairs covers 92.4 % (3,000 trials) where it says 95 %; 400 trials spread by 1.3 %.
     assert 0.88 < covered < 0.97
 
 

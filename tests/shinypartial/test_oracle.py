@@ -47,7 +47,9 @@ def test_the_bound_is_a_scored_prediction(oracle: Oracle, dataset: Dataset) -> N
     assert info.method == "oracle"
     assert info.dataset_hash == dataset_hash(dataset)
     assert scores.environment is not None
-    assert scores.environment.as_predicted.full.psnr_linear == pytest.approx(oracle.chosen.psnr_linear, abs=0.02)
+    observed = scores.environment.as_predicted.observed
+    assert observed is not None
+    assert observed.psnr_linear == pytest.approx(oracle.chosen.psnr_linear, abs=0.02)
     # Smooth but for a sun, seen through 96 px: 35 dB measured.
     assert scores.environment.as_predicted.full.psnr_linear > 30
     assert scores.normals is not None

@@ -42,7 +42,7 @@ class Footprint(NamedTuple):
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """(K, 4) quaternions wxyz of any norm to (K, 3, 3) rotations."""
+    """(K, 4) quaternions wxyz of any norm to (K, 3, 3) rotations; columns are tangent_u, tangent_v and the normal."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
     entries = [
         1 - 2 * (y * y + z * z),
