@@ -176,11 +176,7 @@ class Fitter:
     def _masked(self, view: TrainView, buffers: SurfaceBuffers) -> tuple[Tensor, Observed]:
         pixels = view.solid
         alpha = buffers.alpha.flatten()[pixels]
-        directions = reflection_directions_world(
-            buffers.raster_normals_camera.flatten(1)[:, pixels],
-            view.rays_camera.flatten(1)[:, pixels],
-            view.camera_to_world_rotation,
-        )
+        directions = _reflections(view, buffers, pixels)
         specular = look_up(self.optimizer.environment, directions, self.config.environment.activation)
         albedo = buffers.albedo.flatten(1)[:, pixels]
         color = compose(albedo, specular.T, alpha, self.config.alpha_applied)
@@ -193,11 +189,7 @@ class Fitter:
     ) -> tuple[Tensor, Observed]:
         pixels = torch.nonzero(buffers.alpha.detach().flatten() > ALPHA_FLOOR)[:, 0]
         alpha = buffers.alpha.flatten()[pixels]
-        directions = reflection_directions_world(
-            buffers.raster_normals_camera.flatten(1)[:, pixels],
-            view.rays_camera.flatten(1)[:, pixels],
-            view.camera_to_world_rotation,
-        )
+        directions = _reflections(view, buffers, pixels)
         specular = look_up(self.optimizer.environment, directions, self.config.environment.activation).T
         if self.config.loss.roughness_weighted:
             specular = specular * (1 - self._roughness(view, surfels).flatten()[pixels]).square()
@@ -290,6 +282,15 @@ def _timed(state: FitState, stage: str) -> Iterator[None]:
         state.seconds[stage] = before + time.monotonic() - start
 
 
+def _reflections(view: TrainView, buffers: SurfaceBuffers, pixels: Tensor) -> Float[Tensor, "P 3"]:
+    """World directions that the given pixels (flat indices) of a view mirror."""
+    return reflection_directions_world(
+        buffers.raster_normals_camera.flatten(1)[:, pixels],
+        view.rays_camera.flatten(1)[:, pixels],
+        view.camera_to_world_rotation,
+    )
+
+
 def observed_rays(views: Views, surfels: Surfels, config: FitConfig, max_rays: int) -> Iterator[Rays]:
     """Reflection directions and radiance of pixels that lie wholly on mask and surface, a batch a view.
 
@@ -300,11 +301,7 @@ def observed_rays(views: Views, surfels: Surfels, config: FitConfig, max_rays: i
         buffers = surface_buffers(surfels, view.camera, curved=config.surfels.curved, depth_blend=0.0)
         pixels = view.solid[index % stride :: stride]
         pixels = pixels[buffers.alpha.flatten()[pixels] > SOLID_SURFACE_ALPHA]
-        directions = reflection_directions_world(
-            buffers.raster_normals_camera.flatten(1)[:, pixels],
-            view.rays_camera.flatten(1)[:, pixels],
-            view.camera_to_world_rotation,
-        )
+        directions = _reflections(view, buffers, pixels)
         diffuse = buffers.albedo.flatten(1)[:, pixels]
         yield Rays(directions, (view.radiance.flatten(1)[:, pixels] - diffuse).T.contiguous())
 

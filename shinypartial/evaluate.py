@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from shinypartial.camera import ray_directions_world, reflect
 from shinypartial.color import linear_to_srgb
-from shinypartial.dataset.read import open_dataset, read_environment, read_view
+from shinypartial.dataset.read import open_dataset, read_environment, read_view, require_normals
 from shinypartial.dataset.schema import ENVIRONMENT_LATLONG, Dataset, Frame
 from shinypartial.errors import InputError
 from shinypartial.images import write_png
@@ -206,14 +206,9 @@ def _observed_directions(data: Dataset, left_out: list[LeftOut], progress: Progr
 
 def _cells_of_view(frame: Frame) -> coverage_metrics.ObservedCells:
     view = read_view(frame)
-    if view.normals_world is None:
-        raise InputError(
-            expected=f"normals in {frame.name}, as in the first training view",
-            found="none",
-            remedy="Generate the dataset again.",
-        )
+    normals = require_normals(frame, view)
     mask = environment_mask(view)
-    return coverage_metrics.cells_of_view(reflect(ray_directions_world(frame.camera)[mask], view.normals_world[mask]))
+    return coverage_metrics.cells_of_view(reflect(ray_directions_world(frame.camera)[mask], normals[mask]))
 
 
 def _score_maps(

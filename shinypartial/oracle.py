@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from shinypartial.camera import ray_directions_world, reflect
-from shinypartial.dataset.read import open_dataset, read_environment, read_view
+from shinypartial.dataset.read import open_dataset, read_environment, read_view, require_normals
 from shinypartial.dataset.schema import ENVIRONMENT_LATLONG, Dataset, Frame, View
 from shinypartial.errors import InputError
 from shinypartial.latlong_solver import ROBUST_SCALES, Rays, SolvedMap, solve_latlong
@@ -127,14 +127,9 @@ def rays_of_view(frame: Frame) -> Rays:
     Pixels on the outline and, where the dataset knows them, pixels that see the object itself are left out.
     """
     view = read_view(frame)
-    if view.normals_world is None:
-        raise InputError(
-            expected=f"normals in {frame.name}, as in the first training view",
-            found="none",
-            remedy="Generate the dataset again.",
-        )
+    normals = require_normals(frame, view)
     mask = environment_mask(view)
-    directions = reflect(ray_directions_world(frame.camera), view.normals_world.astype(np.float64))
+    directions = reflect(ray_directions_world(frame.camera), normals.astype(np.float64))
     footprint = pixel_footprint_sr(directions, mask)[mask]
     return Rays(directions[mask].astype(np.float32), view.radiance[mask].astype(np.float32), footprint)
 
@@ -198,17 +193,12 @@ def _candidate(
 def _render(output: Path, frame: Frame, environment: Float[np.ndarray, "H W 3"]) -> None:
     """A test view as the map shows it in a perfect mirror with the ground-truth normals."""
     truth = read_view(frame)
-    if truth.normals_world is None:
-        raise InputError(
-            expected=f"normals in {frame.name}, as in the training views",
-            found="none",
-            remedy="Generate the dataset again.",
-        )
+    normals = require_normals(frame, truth)
     radiance = np.zeros_like(truth.radiance)
-    mask = (truth.alpha > 0) & (np.linalg.norm(truth.normals_world, axis=-1) > 0.5)
-    directions = reflect(ray_directions_world(frame.camera)[mask], truth.normals_world[mask])
+    mask = (truth.alpha > 0) & (np.linalg.norm(normals, axis=-1) > 0.5)
+    directions = reflect(ray_directions_world(frame.camera)[mask], normals[mask])
     radiance[mask] = sample_latlong(environment, directions) * truth.alpha[mask][:, None]
-    write_test_view(output, frame, View(radiance, truth.alpha, truth.normals_world, truth.depth, True))
+    write_test_view(output, frame, View(radiance, truth.alpha, normals, truth.depth, True))
 
 
 def _info(oracle: Oracle, data: Dataset) -> PredictionInfo:

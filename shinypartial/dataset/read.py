@@ -186,6 +186,17 @@ def read_view(frame: Frame) -> View:
     return view
 
 
+def require_normals(frame: Frame, view: View) -> Float[np.ndarray, "H W 3"]:
+    """Ground-truth normals of a frame's view; raises InputError when it has none though others of its dataset do."""
+    if view.normals_world is None:
+        raise InputError(
+            expected=f"normals in {frame.name}, as in the first training view",
+            found="none",
+            remedy="Generate the dataset again.",
+        )
+    return view.normals_world
+
+
 def _read_exr_view(frame: Frame) -> View:
     channels = read_exr(frame.exr)
     if "A" not in channels:

@@ -7,6 +7,8 @@ import shutil
 import subprocess
 import sys
 import tarfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -105,34 +107,33 @@ def damaged(breaks: list, warnings: bool = False) -> set[str]:
     return {each.file for each in breaks if warnings or not each.warning}
 
 
-@given(st.data())
-def test_each_flipped_byte_of_a_release_is_found_and_named(released: Path, data: st.DataObject) -> None:
-    name = data.draw(st.sampled_from([CHECKSUMS, *list_files(released)]))
-    path = released / name
+@contextmanager
+def flipped_byte(root: Path, data: st.DataObject) -> Iterator[str]:
+    """Damage one drawn byte of one drawn file, name the file, and restore it afterward."""
+    name = data.draw(st.sampled_from([CHECKSUMS, *list_files(root)]))
+    path = root / name
     original = path.read_bytes()
     place = data.draw(st.integers(0, len(original) - 1))
     mask = data.draw(st.integers(1, 255))
     path.write_bytes(original[:place] + bytes([original[place] ^ mask]) + original[place + 1 :])
     try:
-        assert damaged(validate_release(released)) == {name}
+        yield name
     finally:
         path.write_bytes(original)
+
+
+@given(st.data())
+def test_each_flipped_byte_of_a_release_is_found_and_named(released: Path, data: st.DataObject) -> None:
+    with flipped_byte(released, data) as name:
+        assert damaged(validate_release(released)) == {name}
 
 
 @given(st.data())
 def test_each_flipped_byte_of_an_unpacked_dataset_is_found_and_named(unpacked: Path, data: st.DataObject) -> None:
     """A dataset has no second list to judge its checksums by, so damage there is named beside the file it speaks of."""
-    name = data.draw(st.sampled_from([CHECKSUMS, *list_files(unpacked)]))
-    path = unpacked / name
-    original = path.read_bytes()
-    place = data.draw(st.integers(0, len(original) - 1))
-    mask = data.draw(st.integers(1, 255))
-    path.write_bytes(original[:place] + bytes([original[place] ^ mask]) + original[place + 1 :])
-    try:
+    with flipped_byte(unpacked, data) as name:
         breaks = [each for each in validate(unpacked) if not each.warning]
         assert any(name == each.file or name in each.problem for each in breaks)
-    finally:
-        path.write_bytes(original)
 
 
 @pytest.mark.parametrize("separator", ["\x0b", "\x0c", "\r", "\x1c", "\x85"])
