@@ -68,7 +68,15 @@ from shinypartial.scores import (
     write_scores,
 )
 from shinypartial.threads import in_threads
-from shinypartial.view_scores import ViewResult, count_all, pool_normals, pool_renders, read_prediction, score_view
+from shinypartial.view_scores import (
+    ViewResult,
+    count_all,
+    pool_environment_normals,
+    pool_normals,
+    pool_renders,
+    read_prediction,
+    score_view,
+)
 
 #: Test views that are shown in the report, spread evenly over the split.
 PICTURED_VIEWS = 4
@@ -143,6 +151,7 @@ def evaluate(
         resolved_coverage=observed.resolved_coverage,
         environment=maps.environment,
         normals=pool_normals(results, left_out),
+        normals_environment=pool_environment_normals(results, left_out),
         render=pool_renders(results, networks.alex, left_out),
         calibration=maps.calibration,
         paper=_pool_paper(maps, results) if with_paper else None,

@@ -12,6 +12,7 @@ REGION_TABLES = (
 REGIONS = (("full", "all directions"), ("observed", "seen"), ("resolved", "resolved"))
 GROUPS = (
     ("normals", "Normals of test views, pooled over mask pixels"),
+    ("normals_environment", "Normals of test views, pixels that see the environment and not the object itself"),
     ("render", "Renders of test views"),
     ("calibration", "Visibility against environment error"),
     ("environment.unweighted", "Environment as a plain picture"),
@@ -34,7 +35,7 @@ PAPER_NOTE = (
     "weighted by solid angle, holes in the normals not counted."
 )
 #: The oracle has the true geometry, so these groups and this path say nothing.
-WITHOUT_BOUND = ("normals", "paper.normals", "", "render.alpha_iou")
+WITHOUT_BOUND = ("normals", "normals_environment", "paper.normals", "", "render.alpha_iou")
 
 Bounds = Mapping[str, ScoreRow]
 

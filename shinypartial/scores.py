@@ -20,7 +20,7 @@ from shinypartial.metrics.registry import METRICS, Metric, metric
 from shinypartial.prediction import ORACLE_SUFFIX
 
 FORMAT = "shinypartial-scores"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 PROTOCOL = "linear-v1"
 SCORES = "scores.json"
 
@@ -89,7 +89,7 @@ class Scores:
     """Everything that one evaluation found; None for a group that was left out, which `left_out` names.
 
     All groups follow `protocol` but `paper`, which names its own. `oracle` is the folder of the dataset's bound when
-    it is not the usual one.
+    it is not the usual one. `normals_environment` takes only the pixels whose mirror ray leaves the scene.
     """
 
     protocol: str
@@ -100,6 +100,7 @@ class Scores:
     resolved_coverage: float | None
     environment: EnvironmentScores | None
     normals: AngularStatistics | None
+    normals_environment: AngularStatistics | None
     render: RenderScores | None
     calibration: CalibrationScores | None
     paper: PaperScores | None

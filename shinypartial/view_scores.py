@@ -5,14 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from shinypartial.color import linear_to_srgb
 from shinypartial.conventions import SOLID_ALPHA
 from shinypartial.dataset.read import read_view
 from shinypartial.dataset.schema import Dataset, Frame, View
 from shinypartial.errors import InputError
-from shinypartial.masks import solid_mask
+from shinypartial.masks import environment_mask, solid_mask
 from shinypartial.metrics import perceptual
 from shinypartial.metrics.angular import AngularStatistics, angular_statistics, normal_errors_deg
 from shinypartial.metrics.image import SSIM_RADIUS, l1, psnr, ssim
@@ -23,7 +23,10 @@ from shinypartial.scores import Counts, LeftOut, RenderScores, ViewScores
 
 @dataclass(frozen=True)
 class ViewResult:
-    """What one test view adds; `normal_errors` holds one value per mask pixel, NaN for a hole."""
+    """What one test view adds; `normal_errors` holds one value per mask pixel, NaN for a hole.
+
+    `sees_environment` tells which of these pixels do; None where the dataset doesn't know.
+    """
 
     scores: ViewScores
     psnr_foreground: float | None
@@ -32,6 +35,7 @@ class ViewResult:
     union: int
     lpips_alex: float | None
     normal_errors: Float[np.ndarray, "P"] | None
+    sees_environment: Bool[np.ndarray, "P"] | None
     paper: PaperView | None
 
 
@@ -83,6 +87,7 @@ def score_view(
         union=int((covered | target_covered).sum()),
         lpips_alex=lpips(image, target) if lpips is not None and large_enough else None,
         normal_errors=errors,
+        sees_environment=None if truth.self_reflection is None else environment_mask(truth)[solid_mask(truth)],
         paper=PaperView(paper_render(image, target), _claimed_errors(predicted, truth)) if with_paper else None,
     )
 
@@ -116,6 +121,22 @@ def pool_normals(results: Sequence[ViewResult], left_out: list[LeftOut]) -> Angu
         left_out.append(LeftOut("normals", reason))
         return None
     return angular_statistics(np.concatenate(errors))
+
+
+def pool_environment_normals(results: Sequence[ViewResult], left_out: list[LeftOut]) -> AngularStatistics | None:
+    """The same over those pixels alone that see the environment: the others' normals reflect the object itself."""
+    pairs = [
+        (result.normal_errors, result.sees_environment)
+        for result in results
+        if result.normal_errors is not None and result.sees_environment is not None
+    ]
+    errors = np.concatenate([error[sees] for error, sees in pairs] or [np.zeros(0)])
+    if errors.size:
+        return angular_statistics(errors)
+    known = any(result.sees_environment is not None for result in results)
+    reason = "no normals to score" if known else "the dataset doesn't mark pixels that see the object itself"
+    left_out.append(LeftOut("normals_environment", reason))
+    return None
 
 
 def pool_renders(

@@ -27,6 +27,7 @@ from shinypartial.prediction import (
     write_visibility,
 )
 from shinypartial.scores import read_scores, score_rows
+from shinypartial.view_scores import pool_environment_normals, pool_normals, score_view
 from tests.support.synthetic_dataset import make_plain_sphere_dataset
 from tests.support.truth_prediction import write_truth_prediction
 
@@ -70,11 +71,31 @@ def test_scores_are_strict_json_and_read_back_as_written(truth: Path) -> None:
     assert read_scores(truth) == scores
 
 
+def test_normals_where_the_object_sees_itself_count_in_one_group_and_not_in_the_other(sphere_dataset: Dataset) -> None:
+    """A quarter turn wherever the mirror ray stays in the scene: its share of the mean, and nothing of the other."""
+    frame = sphere_dataset.test[0]
+    truth = read_view(frame)
+    assert truth.normals_world is not None
+    marked = np.zeros(truth.alpha.shape, dtype=np.float32)
+    marked[: len(marked) // 2] = 1
+    turned = np.where(marked[..., None] > 0, np.roll(truth.normals_world, 1, -1), truth.normals_world)
+    results, left_out = [], []
+    for known in (replace(truth, self_reflection=marked), truth):
+        results.append(score_view(frame, replace(truth, normals_world=turned), known, None, with_paper=False))
+    everywhere, outside = pool_normals(results[:1], left_out), pool_environment_normals(results[:1], left_out)
+    assert everywhere is not None and outside is not None
+    assert outside.mean_angular_error_deg == pytest.approx(0, abs=1e-6)
+    assert everywhere.mean_angular_error_deg > 10
+    assert not left_out
+    assert pool_environment_normals(results[1:], left_out) is None
+    assert [entry.name for entry in left_out] == ["normals_environment"]
+
+
 def test_what_cannot_be_computed_is_left_out_by_name(truth: Path) -> None:
-    """No error, so no calibration; 32 px resolve nothing; no weights, so no LPIPS."""
+    """No error, so no calibration; 32 px resolve nothing; no weights, so no LPIPS; nothing marks self-reflection."""
     names = {entry.name for entry in evaluate(truth).left_out}
     statistics = {"visibility_error_spearman", "visibility_error_auroc", "sparsification_area"}
-    assert names == {"lpips_alex", "lpips_vgg", "environment resolved", *statistics}
+    assert names == {"lpips_alex", "lpips_vgg", "environment resolved", "normals_environment", *statistics}
 
 
 def test_a_rotated_environment_has_the_analytic_loss(damaged_dataset: Path, tmp_path: Path) -> None:
