@@ -1,6 +1,7 @@
 """Two groups of scored predictions, several seeds or scenes each: means, spreads and paired differences."""
 
 import csv
+import functools
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -11,16 +12,16 @@ from jaxtyping import Float
 
 from shinypartial.errors import InputError
 from shinypartial.files import write_json, write_text
+from shinypartial.intervals import mean_interval
 from shinypartial.metrics.registry import Direction, Metric, metric
 from shinypartial.prediction import read_info
 from shinypartial.scores import Scores, read_scores, score_rows
 
 FORMAT, FORMAT_VERSION = "shinypartial-comparison", 1
+INTERVAL = "bootstrap-t"
 JSON, CSV = "comparison.json", "comparison.csv"
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
-#: Below this number of pairs the interval covers the truth in clearly less than the share that it states.
-FEW_PAIRS = 10
 #: What the terminal shows; the files hold every metric.
 SHOWN = (
     "environment.as_predicted.full.psnr_srgb",
@@ -45,7 +46,7 @@ class Run:
     seed: str
     scores: Scores
 
-    @property
+    @functools.cached_property
     def values(self) -> dict[str, float]:
         """Every number that was scored, by its path."""
         return {row.path: row.value for row in score_rows(self.scores) if row.value is not None}
@@ -62,7 +63,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """Mean of first − second over pairs, and its bootstrap interval; None with no pair, or fewer than two."""
+    """Mean of first − second over pairs, and its confidence interval; None with no pair, or fewer than two."""
 
     pairs: int
     mean: float | None
@@ -133,7 +134,6 @@ def compare(first: Sequence[Path], second: Sequence[Path], seed: int = 0, resamp
             found="none",
             remedy="Score both methods on the same datasets with the same seeds (`seed` in prediction.json's config).",
         )
-    draws = np.random.default_rng(seed).integers(len(keys), size=(resamples, len(keys)))
     paths = list(dict.fromkeys(path for group in groups for run in group.values() for path in run.values))
     return Comparison(
         protocol=protocols.pop(),
@@ -143,7 +143,7 @@ def compare(first: Sequence[Path], second: Sequence[Path], seed: int = 0, resamp
         confidence=CONFIDENCE,
         resamples=resamples,
         seed=seed,
-        metrics=tuple(_compared(path, groups[0], groups[1], keys, draws) for path in paths),
+        metrics=tuple(_compared(path, groups[0], groups[1], keys, seed, resamples) for path in paths),
     )
 
 
@@ -171,13 +171,13 @@ def _group(folders: Sequence[Path], name: str) -> dict[Key, Run]:
 
 
 def _compared(
-    path: str, first: Mapping[Key, Run], second: Mapping[Key, Run], keys: Sequence[Key], draws: np.ndarray
+    path: str, first: Mapping[Key, Run], second: Mapping[Key, Run], keys: Sequence[Key], seed: int, resamples: int
 ) -> ComparedMetric:
     values = [{key: run.values[path] for key, run in group.items() if path in run.values} for group in (first, second)]
     differences = np.array(
         [values[0][key] - values[1][key] if all(key in v for v in values) else np.nan for key in keys]
     )
-    found = paired_difference(differences, draws)
+    found = paired_difference(differences, seed, resamples)
     spreads = [_spread(list(group.values())) for group in values]
     return ComparedMetric(path, spreads[0], spreads[1], found, _verdict(found, metric(path.rpartition(".")[2])))
 
@@ -190,23 +190,19 @@ def _spread(values: Sequence[float]) -> Spread:
     )
 
 
-def paired_difference(differences: Float[np.ndarray, "P"], draws: np.ndarray) -> PairedDifference:
-    """Percentile bootstrap (Efron 1979) of the mean of paired differences; NaN marks a pair without this metric.
+def paired_difference(
+    differences: Float[np.ndarray, "P"], seed: int = 0, resamples: int = RESAMPLES
+) -> PairedDifference:
+    """Mean of paired differences and its bootstrap-t interval (`mean_interval`); NaN marks a pair without this metric.
 
-    `draws` holds the resampled pairs, a row each, shared by all metrics. The interval is the central 95 % of the
-    resampled means, so it always holds their mean; with few pairs it is too narrow rather than too wide.
+    Metrics of equally many pairs share the resamples.
     """
-    known = ~np.isnan(differences)
-    if not known.any():
-        return PairedDifference(0, None, None, None)
-    mean, pairs = float(differences[known].mean()), int(known.sum())
-    if pairs < 2:
-        return PairedDifference(pairs, mean, None, None)
-    counts = known[draws].sum(1)
-    sums = np.where(known, differences, 0.0)[draws].sum(1)
-    means = sums[counts > 0] / counts[counts > 0]
-    low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return PairedDifference(pairs, mean, min(float(low), mean), max(float(high), mean))
+    known = differences[~np.isnan(differences)]
+    mean = float(known.mean()) if len(known) else None
+    interval = mean_interval(known, CONFIDENCE, resamples, seed)
+    if interval is None:
+        return PairedDifference(len(known), mean, None, None)
+    return PairedDifference(len(known), mean, interval.low, interval.high)
 
 
 def _verdict(difference: PairedDifference, definition: Metric) -> str:
@@ -221,7 +217,8 @@ def comparison_lines(comparison: Comparison) -> list[str]:
     """The most telling metrics as a table for a terminal."""
     lines = [
         f"{len(comparison.first)} runs against {len(comparison.second)}, protocol {comparison.protocol}",
-        f"difference: first − second over pairs of one dataset and seed, and its {comparison.confidence:.0%} interval",
+        "difference: first − second over pairs of one dataset and seed, "
+        f"and its {comparison.confidence:.0%} {INTERVAL} interval",
     ]
     if comparison.unpaired:
         lines.append(f"without a partner: {', '.join(comparison.unpaired)}")
@@ -231,10 +228,6 @@ def comparison_lines(comparison: Comparison) -> list[str]:
     for row in rows:
         lines.append("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
     pairs = max(each.difference.pairs for each in comparison.metrics)
-    if 2 <= pairs < FEW_PAIRS:
-        lines.append(
-            f"  With {pairs} pairs the intervals are too narrow (docs/metrics.md): a verdict is a hint, no proof."
-        )
     if pairs < 2:
         lines.append("  One pair tells nothing about chance: score more seeds or scenes for an interval.")
     return lines
@@ -261,7 +254,7 @@ def write_comparison(folder: Path, comparison: Comparison) -> tuple[Path, Path]:
     """Write comparison.json and comparison.csv, every metric with unit and direction; return their paths."""
     rows = [_record(each) for each in comparison.metrics]
     content = asdict(comparison) | {"metrics": rows}
-    write_json(folder / JSON, {"format": FORMAT, "format_version": FORMAT_VERSION, **content})
+    write_json(folder / JSON, {"format": FORMAT, "format_version": FORMAT_VERSION, "interval": INTERVAL, **content})
     stream = io.StringIO()
     writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
     writer.writeheader()

@@ -88,29 +88,6 @@ def test_a_known_shift_is_recovered_and_its_sign_judged(scored: Path, tmp_path: 
     assert of(compare(*reversed(groups)), PSNR).verdict == "worse"
 
 
-def test_the_interval_covers_the_truth_about_as_often_as_it_says() -> None:
-    random = np.random.default_rng(0)
-    draws = random.integers(20, size=(500, 20))
-    found = [paired_difference(random.normal(0.3, 1.0, 20), draws) for _ in range(400)]
-    covered = np.mean(
-        [each.low <= 0.3 <= each.high for each in found if each.low is not None and each.high is not None]
-    )
-    # The percentile bootstrap of 20 pairs covers 92.4 % (3,000 trials) where it says 95 %; 400 trials spread by 1.3 %.
-    assert 0.88 < covered < 0.97
-
-
-def test_the_interval_agrees_with_scipy() -> None:
-    from scipy.stats import bootstrap
-
-    random = np.random.default_rng(1)
-    differences = random.normal(1.0, 2.0, 30)
-    ours = paired_difference(differences, random.integers(30, size=(20_000, 30)))
-    theirs = bootstrap((differences,), np.mean, n_resamples=20_000, method="percentile", random_state=2)
-    # Both resample by chance: the ends have a spread of 0.01.
-    assert ours.low == pytest.approx(theirs.confidence_interval.low, abs=0.05)
-    assert ours.high == pytest.approx(theirs.confidence_interval.high, abs=0.05)
-
-
 def test_the_same_seed_gives_the_same_numbers(scored: Path, tmp_path: Path) -> None:
     first = make_group(scored, tmp_path / "a", VALUES)
     second = make_group(scored, tmp_path / "b", VALUES[::-1])
@@ -156,10 +133,9 @@ def test_one_pair_has_a_difference_but_no_interval(scored: Path, tmp_path: Path)
 
 
 def test_a_metric_that_some_pairs_lack_is_compared_on_the_others() -> None:
-    draws = np.random.default_rng(0).integers(3, size=(1000, 3))
-    found = paired_difference(np.array([1.0, np.nan, 1.0]), draws)
+    found = paired_difference(np.array([1.0, np.nan, 1.0]))
     assert asdict(found) == {"pairs": 2, "mean": 1.0, "low": 1.0, "high": 1.0}
-    assert paired_difference(np.full(3, np.nan), draws).mean is None
+    assert paired_difference(np.full(3, np.nan)).mean is None
 
 
 def test_the_command_prints_a_table_and_writes_every_metric(
@@ -172,7 +148,6 @@ def test_the_command_prints_a_table_and_writes_every_metric(
     out = capsys.readouterr().out
     assert "render.psnr ↑" in out
     assert "+1.00 [+1.00, +1.00]" in out
-    assert "With 6 pairs the intervals are too narrow" in out
     content = json.loads((output / "comparison.json").read_text())
     with (output / "comparison.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
