@@ -76,6 +76,7 @@ def make_oracle(dataset: Path, output: Path) -> Oracle:
     start, data = time.monotonic(), open_dataset(dataset)
     _require_normals(data)
     claim_prediction(output)
+    (output / "test").mkdir(exist_ok=True)  # Marks the folder as begun, so that a run after a kill is not refused.
     solves = len(HEIGHTS) * len(ROBUST_SCALES)
     progress = Progress("oracle", total=len(data.train) + solves + len(data.test))
     rays = _read_rays(data, progress)
@@ -198,7 +199,8 @@ def _render(output: Path, frame: Frame, environment: Float[np.ndarray, "H W 3"])
     mask = (truth.alpha > 0) & (np.linalg.norm(normals, axis=-1) > 0.5)
     directions = reflect(ray_directions_world(frame.camera)[mask], normals[mask])
     radiance[mask] = sample_latlong(environment, directions) * truth.alpha[mask][:, None]
-    write_test_view(output, frame, View(radiance, truth.alpha, normals, truth.depth, True))
+    depth = np.zeros_like(truth.alpha) if truth.depth is None else truth.depth  # Plain datasets have none.
+    write_test_view(output, frame, View(radiance, truth.alpha, normals, depth, True))
 
 
 def _info(oracle: Oracle, data: Dataset) -> PredictionInfo:

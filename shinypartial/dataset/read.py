@@ -85,13 +85,14 @@ def _read_frames(root: Path, split: str) -> tuple[Frame, ...]:
         raise InputError(
             expected=f"a non-empty list `frames` in {path}", found="none", remedy="Restore the file of the dataset."
         )
-    _refuse_distortion(transforms, path)
-    first = _image_stem(root, frames[0], path)
-    width, height = _image_size(transforms, first)
-    return tuple(_read_frame(root, entry, transforms, width, height, path) for entry in frames)
+    refuse_distortion(transforms, path)
+    first = image_stem(root, frames[0], path)
+    width, height = image_size(transforms, first)
+    return tuple(read_entry(root, entry, transforms, width, height, path) for entry in frames)
 
 
-def _refuse_distortion(transforms: dict[str, Any], path: Path) -> None:
+def refuse_distortion(transforms: dict[str, Any], path: Path) -> None:
+    """Raise InputError when transforms describe a lens with distortion."""
     distorted = [name for name in DISTORTION_FIELDS if transforms.get(name)]
     if distorted:
         raise InputError(
@@ -101,7 +102,8 @@ def _refuse_distortion(transforms: dict[str, Any], path: Path) -> None:
         )
 
 
-def _image_stem(root: Path, entry: Any, path: Path) -> Path:
+def image_stem(root: Path, entry: Any, path: Path) -> Path:
+    """Where the images of a frame lie, without extension; `path` names the transforms in messages."""
     name = entry.get("file_path") if isinstance(entry, dict) else None
     if not isinstance(name, str):
         raise InputError(
@@ -113,7 +115,8 @@ def _image_stem(root: Path, entry: Any, path: Path) -> Path:
     return stem.with_suffix("") if stem.suffix.lower() in (".png", ".exr") else stem
 
 
-def _image_size(transforms: dict[str, Any], stem: Path) -> tuple[int, int]:
+def image_size(transforms: dict[str, Any], stem: Path) -> tuple[int, int]:
+    """Width and height in pixels: those of the transforms, else those of the picture."""
     if "w" in transforms and "h" in transforms:
         try:
             return int(transforms["w"]), int(transforms["h"])
@@ -127,10 +130,9 @@ def _image_size(transforms: dict[str, Any], stem: Path) -> tuple[int, int]:
     return image.shape[1], image.shape[0]
 
 
-def _read_frame(
-    root: Path, entry: dict[str, Any], transforms: dict[str, Any], width: int, height: int, path: Path
-) -> Frame:
-    stem = _image_stem(root, entry, path)
+def read_entry(root: Path, entry: Any, transforms: dict[str, Any], width: int, height: int, path: Path) -> Frame:
+    """The frame of an entry of `frames`; raises InputError for a pose that isn't rigid and for bad intrinsics."""
+    stem = image_stem(root, entry, path)
     name = f"{path.stem.removeprefix('transforms_')}/{stem.name}"
     try:
         pose = np.array(entry["transform_matrix"], dtype=np.float64)
@@ -162,13 +164,6 @@ def read_view(frame: Frame) -> View:
     Raises InputError when the image is missing, truncated, of the wrong size, without a mask, or holds NaN.
     """
     view = _read_exr_view(frame) if frame.exr.exists() else _read_png_view(frame)
-    expected = (frame.camera.height, frame.camera.width)
-    if view.alpha.shape != expected:
-        raise InputError(
-            expected=f"{expected[1]}×{expected[0]} pixels for {frame.name}, as its transforms say",
-            found=f"{view.alpha.shape[1]}×{view.alpha.shape[0]}",
-            remedy="Render the frame again or correct w and h.",
-        )
     arrays = {
         "radiance": view.radiance,
         "alpha": view.alpha,
@@ -202,6 +197,7 @@ def _read_exr_view(frame: Frame) -> View:
     if "A" not in channels:
         raise _missing_mask(frame, frame.exr)
     rgba = stack_channels(channels, COLOR_CHANNELS, frame.exr)
+    _check_size(frame, rgba)
     has_normals = all(name in channels for name in NORMAL_CHANNELS)
     normals = stack_channels(channels, NORMAL_CHANNELS, frame.exr) if has_normals else None
     depth = channels[DEPTH_CHANNEL].astype(np.float32) if DEPTH_CHANNEL in channels else None
@@ -218,6 +214,7 @@ def _read_exr_view(frame: Frame) -> View:
 
 def _read_png_view(frame: Frame) -> View:
     image = read_png(frame.png)
+    _check_size(frame, image)
     if image.shape[2] == 4:
         alpha = image[..., 3].astype(np.float32) / 255
     elif frame.alpha_png.exists():
@@ -228,10 +225,26 @@ def _read_png_view(frame: Frame) -> View:
     radiance = srgb_to_linear(color.astype(np.float32) / 255) * alpha[..., None]
     normals = None
     if frame.normal_png.exists():
-        decoded = _companion(frame, frame.normal_png)[..., :3].astype(np.float32) * (2 / 255) - 1
+        stored = _companion(frame, frame.normal_png)
+        if stored.shape[2] < 3:
+            raise InputError(
+                expected=f"three channels in {frame.normal_png}",
+                found="a gray picture",
+                remedy="Restore it, or remove it.",
+            )
+        decoded = stored[..., :3].astype(np.float32) * (2 / 255) - 1
         length = np.linalg.norm(decoded, axis=-1, keepdims=True)
         normals = np.where((length > 0.5) & (alpha[..., None] > 0), decoded / np.maximum(length, 1e-6), 0)
     return View(radiance, alpha, None if normals is None else normals.astype(np.float32), None, False)
+
+
+def _check_size(frame: Frame, image: np.ndarray) -> None:
+    if image.shape[:2] != (frame.camera.height, frame.camera.width):
+        raise InputError(
+            expected=f"{frame.camera.width}×{frame.camera.height} pixels for {frame.name}, as its transforms say",
+            found=f"{image.shape[1]}×{image.shape[0]}",
+            remedy="Render the frame again or correct w and h.",
+        )
 
 
 def _companion(frame: Frame, path: Path) -> UInt8[np.ndarray, "H W C"]:

@@ -19,6 +19,7 @@ from shinypartial.dataset.breaks import Break
 from shinypartial.dataset.card import card, citation, description
 from shinypartial.dataset.checksums import ListedFile, check_sealed, list_files, write_sealed_checksums
 from shinypartial.dataset.croissant import croissant
+from shinypartial.dataset.plain import is_plain
 from shinypartial.dataset.publication import (
     ARCHIVES,
     CARD,
@@ -142,9 +143,16 @@ def _open(root: Path, output: Path, progress: bool) -> _Source:
             found=f"{first}{more}",
             remedy=f"{broken[0].remedy} `shinypartial validate {root}` lists everything.",
         )
+    dataset = open_dataset(root)
+    if is_plain(root, dataset.manifest):
+        raise InputError(
+            expected=f"a rendered dataset in {root}",
+            found="the plain layout, without ground truth and with images of another origin",
+            remedy="Release what `shinypartial generate` made; of a subset publish the `shinypartial subset` command.",
+        )
     lines = (root / CHECKSUMS).read_text(encoding="utf-8").removesuffix("\n").split("\n")
     files = [ListedFile(name, digest) for digest, _, name in (line.partition("  ") for line in lines)]
-    return _Source(open_dataset(root), (*files, ListedFile(CHECKSUMS, sha256_of(root / CHECKSUMS))))
+    return _Source(dataset, (*files, ListedFile(CHECKSUMS, sha256_of(root / CHECKSUMS))))
 
 
 def _check_names(names: list[str]) -> None:

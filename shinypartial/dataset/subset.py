@@ -22,7 +22,15 @@ from shinypartial.dataset.read import open_dataset
 from shinypartial.dataset.schema import CHECKSUMS, SPLITS, Dataset, Frame
 from shinypartial.dataset.write import claim_folder, complete_dataset
 from shinypartial.errors import InputError
-from shinypartial.files import PARTIAL_PREFIX, read_json, remove_partial_files, sha256_of, whole_file, write_json
+from shinypartial.files import (
+    PARTIAL_PREFIX,
+    only_writer,
+    read_json,
+    remove_partial_files,
+    sha256_of,
+    whole_file,
+    write_json,
+)
 from shinypartial.progress import Progress
 from shinypartial.trajectory import Trajectory, unit_vectors
 
@@ -68,6 +76,8 @@ class Subset:
     selection: Selection
     copied: int
     """Number of files that were not there before."""
+    without_normals: tuple[str, ...] = ()
+    """New splits in which only some views had normals: theirs are left out, since scores need all or none."""
 
 
 def select(dataset: Dataset, options: SubsetOptions) -> Selection:
@@ -167,23 +177,25 @@ def make_subset(source: Path, root: Path, options: SubsetOptions, *, link: bool 
     dataset = open_dataset(source)
     selection = select(dataset, options)
     contents = {split: _renamed(dataset, split, getattr(selection, split)) for split in SPLITS}
+    without_normals = tuple(split for split in SPLITS if _has_some_normals(getattr(selection, split)))
     files = [pair for split in SPLITS for pair in _copies(root, split, getattr(selection, split))]
-    claim_folder(root, _recipe(dataset, selection, options), {"shinypartial": __version__})
-    missing = [(old, new) for old, new in files if not new.exists()]
-    if (root / CHECKSUMS).exists() and not missing:
-        return Subset(root, selection, 0)
-    (root / CHECKSUMS).unlink(missing_ok=True)
-    remove_partial_files(root)
-    progress = Progress("Linking" if link else "Copying", len(files), len(files) - len(missing))
-    for old, new in missing:
-        _place(old, new, link)
-        progress.advance()
-    for split in SPLITS:
-        write_json(root / f"transforms_{split}.json", contents[split])
-    plot_cameras(root / CAMERA_PLOT, selection.trajectory)
-    licenses = [{"asset": "images", "license": "that of the source", "source": f"dataset {dataset.name}"}]
-    complete_dataset(root, licenses, _statistics(selection))
-    return Subset(root, selection, len(missing))
+    with only_writer(root):
+        claim_folder(root, _recipe(dataset, selection, options), {"shinypartial": __version__})
+        missing = [(old, new) for old, new in files if not new.exists()]
+        if (root / CHECKSUMS).exists() and not missing:
+            return Subset(root, selection, 0, without_normals)
+        (root / CHECKSUMS).unlink(missing_ok=True)
+        remove_partial_files(root)
+        progress = Progress("Linking" if link else "Copying", len(files), len(files) - len(missing))
+        for old, new in missing:
+            _place(old, new, link)
+            progress.advance()
+        for split in SPLITS:
+            write_json(root / f"transforms_{split}.json", contents[split])
+        plot_cameras(root / CAMERA_PLOT, selection.trajectory)
+        licenses = [{"asset": "images", "license": "that of the source", "source": f"dataset {dataset.name}"}]
+        complete_dataset(root, licenses, _statistics(selection))
+    return Subset(root, selection, len(missing), without_normals)
 
 
 def _refuse_nesting(source: Path, root: Path) -> None:
@@ -224,27 +236,47 @@ def _renamed(dataset: Dataset, split: str, frames: Sequence[Frame]) -> dict[str,
     present = [name for name in SPLITS if dataset.split(name)]
     tables = {name: read_json(dataset.root / f"transforms_{name}.json", "the cameras") for name in present}
     shared = {name: {key: value for key, value in table.items() if key != "frames"} for name, table in tables.items()}
-    first = present[0]
-    for name, values in shared.items():
-        if values != shared[first]:
-            different = sorted(key for key in {*values, *shared[first]} if values.get(key) != shared[first].get(key))
-            raise InputError(
-                expected=f"both splits of {dataset.root} to share their intrinsics, since they are pooled",
-                found=f"a different {', '.join(different)} in {name} than in {first}",
-                remedy="Make the images of both splits with one camera, or split them by hand.",
-            )
+    _require_one_camera(dataset, shared)
     entries = {
-        frame.name: entry
+        frame.stem: entry
         for name in tables
         for frame, entry in zip(dataset.split(name), tables[name]["frames"], strict=True)
     }
-    renamed = [entries[frame.name] | {"file_path": f"./{split}/r_{i}"} for i, frame in enumerate(frames)]
-    return {**shared[first], "frames": renamed}
+    renamed = [entries[frame.stem] | {"file_path": f"./{split}/r_{i}"} for i, frame in enumerate(frames)]
+    return {**shared[present[0]], "frames": renamed}
+
+
+def _require_one_camera(dataset: Dataset, shared: dict[str, dict[str, Any]]) -> None:
+    """Splits are pooled, so their intrinsics must agree; fields that say nothing about them may differ."""
+    found = {}
+    for name in shared:
+        camera = dataset.split(name)[0].camera
+        found[name] = np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy])
+    first, last = found[next(iter(found))], found[list(found)[-1]]
+    if np.allclose(first, last, rtol=1e-6, atol=0):
+        return
+    values = list(shared.values())
+    keys = sorted(key for key in {*values[0], *values[-1]} if values[0].get(key) != values[-1].get(key))
+    text = ", ".join(f"{v[0]:g}×{v[1]:g} pixels with fx {v[2]:g} in {name}" for name, v in found.items())
+    raise InputError(
+        expected=f"both splits of {dataset.root} to share their intrinsics, since they are pooled",
+        found=text + (f" (different: {', '.join(keys)})" if keys else ""),
+        remedy="Make the images of both splits with one camera, or split them by hand.",
+    )
+
+
+def _has_some_normals(frames: Sequence[Frame]) -> bool:
+    """Whether frames of both kinds were pooled, such as test views with normals and training views without."""
+    return 0 < sum(frame.normal_png.exists() for frame in frames) < len(frames)
 
 
 def _copies(root: Path, split: str, frames: Sequence[Frame]) -> list[tuple[Path, Path]]:
-    """Source and destination of every image and companion (`r_0.png`, `r_0_normal.png`, `r_0_disp.tiff` …)."""
+    """Source and destination of every image and companion (`r_0.png`, `r_0_normal.png`, `r_0_disp.tiff` …).
+
+    Normals that only some of the frames have are left out.
+    """
     pairs = []
+    dropped = {frame.normal_png for frame in frames} if _has_some_normals(frames) else set()
     for i, frame in enumerate(frames):
         name = frame.stem.name
         here = sorted(frame.stem.parent.iterdir()) if frame.stem.parent.is_dir() else []
@@ -255,7 +287,7 @@ def _copies(root: Path, split: str, frames: Sequence[Frame]) -> list[tuple[Path,
                 found="no such file",
                 remedy="Restore it, or remove the frame from the transforms.",
             )
-        pairs += [(path, root / split / f"r_{i}{path.name[len(name) :]}") for path in files]
+        pairs += [(path, root / split / f"r_{i}{path.name[len(name) :]}") for path in files if path not in dropped]
     return pairs
 
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -11,6 +12,14 @@ from jaxtyping import Float
 from shinypartial.camera import Camera, check_pose, opengl_to_opencv
 from shinypartial.conventions import FACES
 from shinypartial.dataset.breaks import REMAKE, Break, break_of
+from shinypartial.dataset.plain import (
+    check_normals_of_split,
+    check_plain_frame,
+    is_plain,
+    read_plain_frames,
+    what_is_absent,
+)
+from shinypartial.dataset.read import open_dataset
 from shinypartial.dataset.schema import (
     CHECKSUMS,
     ENVIRONMENT_CUBE,
@@ -33,6 +42,7 @@ from shinypartial.sphere import latlong_to_cube
 
 RESTORE = "Restore the file from the released dataset, or generate the dataset again."
 CONTINUE = "Run the `shinypartial generate` that began the folder again: it continues where it stopped."
+SUBSET = "`shinypartial subset`"
 ANGLE_TOLERANCE_RAD = 1e-6
 #: The lat-long and the cube are each rounded to half precision (relative 5e-4).
 RADIANCE_TOLERANCE = 2e-3
@@ -41,7 +51,8 @@ RADIANCE_TOLERANCE = 2e-3
 def validate(root: Path, progress: bool = False) -> list[Break]:
     """Every promise that the folder breaks, warnings last; empty when it keeps them all.
 
-    Raises InputError when there is no such folder.
+    A folder in the plain layout (`plain.is_plain`) promises less: `unscored` says what it lacks. Raises InputError when
+    there is no such folder.
     """
     if not root.is_dir():
         raise InputError(
@@ -49,21 +60,46 @@ def validate(root: Path, progress: bool = False) -> list[Break]:
             found="a file" if root.exists() else "nothing there",
             remedy="Check the path, or make one: `shinypartial generate --scene vase`.",
         )
-    manifest, breaks = _check_manifest(root)
+    original = is_plain(root, {})
+    manifest, breaks = ({}, []) if original else _check_manifest(root)
+    plain = original or is_plain(root, manifest)
     frames = []
     for split in SPLITS:
-        found, problems = _check_transforms(root, split, manifest)
+        found, problems = (_check_plain_split if plain else _check_transforms)(root, split, manifest)
         frames += found
         breaks += problems
     counter = Progress("Validating", len(frames)) if progress and frames else None
     minor = manifest.get("format_minor", 0)
     complete = isinstance(minor, int) and minor >= 1
     for frame in frames:
-        breaks += check_frame(root, frame, self_reflection=complete)
+        if plain and not frame.exr.exists():
+            breaks += check_plain_frame(root, frame)
+        else:
+            breaks += check_frame(root, frame, self_reflection=complete)
         if counter:
             counter.advance()
-    breaks += [*_check_environment(root), *_check_licenses(root), *_check_checksums(root)]
+    if not plain or (root / ENVIRONMENT_LATLONG).exists():
+        breaks += _check_environment(root)
+    if not original:
+        breaks += [*_check_licenses(root), *_check_checksums(root)]
+    if plain:  # What made it, and so what makes it again.
+        breaks = [replace(each, remedy=each.remedy.replace("`shinypartial generate`", SUBSET)) for each in breaks]
     return sorted(breaks, key=lambda each: each.warning)
+
+
+def unscored(root: Path) -> str | None:
+    """One line on what a sound folder in the plain layout lacks and can't be scored on; None for a rendered dataset."""
+    dataset = open_dataset(root)
+    return what_is_absent(root, dataset.train, dataset.test) if is_plain(root, dataset.manifest) else None
+
+
+def _check_plain_split(root: Path, split: str, manifest: dict[str, Any]) -> tuple[list[Frame], list[Break]]:
+    frames, listed, breaks = read_plain_frames(root, split)
+    problems = [*_set_problems(frames, listed, split, manifest)]
+    if manifest:  # An original folder is photographed from all around.
+        problems += _hemisphere_problems(frames, manifest)
+    file = f"transforms_{split}.json"
+    return frames, [*breaks, *(Break(file, each, RESTORE) for each in problems), *check_normals_of_split(split, frames)]
 
 
 def _check_manifest(root: Path) -> tuple[dict[str, Any], list[Break]]:
@@ -109,13 +145,17 @@ def _check_transforms(root: Path, split: str, manifest: dict[str, Any]) -> tuple
             problems.append(f"frame {i}: {problem}")
         else:
             frames.append(_make_frame(root, entry, content))
-    names = [frame.name for frame in frames]
-    problems += [f"{name} is listed twice" for name in sorted({name for name in names if names.count(name) > 1})]
-    count = manifest.get("statistics", {}).get(split, len(entries))
-    if count != len(entries):
-        problems.append(f"expected {count} frames as {MANIFEST} says, found {len(entries)}")
-    problems += _hemisphere_problems(frames, manifest.get("recipe", {}))
+    problems += [*_set_problems(frames, len(entries), split, manifest), *_hemisphere_problems(frames, manifest)]
     return frames, [Break(file, problem, RESTORE) for problem in problems]
+
+
+def _set_problems(frames: list[Frame], listed: int, split: str, manifest: dict[str, Any]) -> Iterator[str]:
+    """What is wrong with the frames of a split together."""
+    names = [frame.name for frame in frames]
+    yield from (f"{name} is listed twice" for name in sorted({name for name in names if names.count(name) > 1}))
+    count = manifest.get("statistics", {}).get(split, listed)
+    if count != listed:
+        yield f"expected {count} frames as {MANIFEST} says, found {listed}"
 
 
 def _intrinsics_problems(content: dict[str, Any]) -> Iterator[str]:
@@ -155,10 +195,11 @@ def _make_frame(root: Path, entry: dict[str, Any], content: dict[str, Any]) -> F
     return Frame(path.as_posix(), camera, root / path)
 
 
-def _hemisphere_problems(frames: list[Frame], recipe: dict[str, Any]) -> Iterator[str]:
+def _hemisphere_problems(frames: list[Frame], manifest: dict[str, Any]) -> Iterator[str]:
     """Cameras must lie on one side of the target: that of the recipe's axis, or of their mean direction."""
     if not frames:
         return
+    recipe = manifest.get("recipe", {})
     camera = recipe.get("camera")
     target = camera.get("target", (0, 0, 0)) if isinstance(camera, dict) else (0, 0, 0)
     offsets = np.stack([frame.camera.position_world for frame in frames]) - _vector(target)

@@ -1,0 +1,215 @@
+"""What a plain folder promises: the layout of Shiny Blender and NeRF-synthetic, which holds 8-bit pictures and cameras.
+
+Original folders have no manifest; a subset of one has a manifest that says so. What isn't there is no break of the
+format, but can't be scored either.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from shinypartial.camera import ray_directions_world
+from shinypartial.conventions import SOLID_ALPHA
+from shinypartial.dataset.breaks import Break, break_of
+from shinypartial.dataset.read import image_size, image_stem, read_entry, read_view, refuse_distortion
+from shinypartial.dataset.schema import CHECKSUMS, ENVIRONMENT_LATLONG, LICENSES, MANIFEST, Frame, View
+from shinypartial.errors import InputError
+from shinypartial.files import read_json
+from shinypartial.images import read_png
+
+RESTORE = "Restore the file from the original dataset."
+DISPARITY_SUFFIX = "_disp.tiff"
+LEVEL_TOLERANCE = 1
+#: Rounding to 8 bits changes a length by up to √3/255; at creases a pixel holds the mean of several normals.
+UNIT_TOLERANCE = 0.05
+#: Interpolated normals may turn a little away from the ray.
+FACING_TOLERANCE = 0.1
+#: Creases and outlines are a small share; normals in another frame or encoding are wrong nearly everywhere.
+TOLERATED_SHARE = 0.1
+
+
+def is_plain(root: Path, manifest: dict[str, Any]) -> bool:
+    """Whether a folder has the plain layout: a subset by its manifest, else one without any file of a rendered set."""
+    if (root / MANIFEST).exists():
+        recipe = manifest.get("recipe")
+        return isinstance(recipe, dict) and "subset_of" in recipe
+    rendered = (CHECKSUMS, LICENSES, ENVIRONMENT_LATLONG.parent)
+    return (root / "transforms_train.json").exists() and not any((root / name).exists() for name in rendered)
+
+
+def read_plain_frames(root: Path, split: str) -> tuple[list[Frame], int, list[Break]]:
+    """The frames whose camera can be read, how many are listed, and what is wrong with `transforms_SPLIT.json`."""
+    file = f"transforms_{split}.json"
+    if split == "test" and not (root / file).exists():
+        return [], 0, []
+    try:
+        content = read_json(root / file, f"the cameras of the {split} split")
+        entries = content.get("frames") if isinstance(content, dict) else None
+        if not isinstance(entries, list) or not entries:
+            return [], 0, [Break(file, "`frames` is not a list with at least one frame", RESTORE)]
+        refuse_distortion(content, root / file)
+        width, height = _first_size(root, content, root / file)
+    except InputError as error:
+        return [], 0, [break_of(file, error, error.remedy)]
+    angle = content.get("camera_angle_x")
+    if "fl_x" not in content and isinstance(angle, int | float) and not 0 < angle < math.pi:
+        problem = f"expected `camera_angle_x` between 0 and π, in radians, found {angle}"
+        return [], 0, [Break(file, problem, RESTORE)]
+    frames, breaks = [], []
+    for entry in entries:
+        try:
+            frames.append(read_entry(root, entry, content, width, height, root / file))
+        except InputError as error:
+            breaks.append(break_of(file, error, error.remedy))
+    return frames, len(entries), breaks
+
+
+def _first_size(root: Path, content: dict[str, Any], path: Path) -> tuple[int, int]:
+    """Of the transforms, or of the first picture that can be read: the others are named one by one."""
+    failure = None
+    for entry in content["frames"]:
+        try:
+            return image_size(content, image_stem(root, entry, path))
+        except InputError as error:
+            failure = failure or error
+    assert failure is not None
+    raise failure
+
+
+def check_plain_frame(root: Path, frame: Frame) -> Iterator[Break]:
+    """Every broken promise of a frame without an EXR."""
+    name = _name(root, frame.png)
+    if not frame.png.is_file():
+        yield Break(name, "the file is missing", RESTORE)
+        return
+    try:
+        view = read_view(frame)
+    except InputError as error:
+        yield break_of(name, error, error.remedy)
+        return
+    inside = view.alpha > 0
+    if not inside.any():
+        yield Break(name, "the mask is empty: the object is not in the picture", "Leave the frame out.")
+    elif inside[[0, -1]].any() or inside[:, [0, -1]].any():
+        yield Break(name, "the object touches the border of the picture", "Accept it, or leave it out.", warning=True)
+    solid = view.alpha > SOLID_ALPHA
+    if frame.alpha_png.exists():
+        yield from _check_alpha(root, frame, view)
+    if frame.normal_png.exists() and solid.any():
+        yield from _check_normals(root, frame, solid)
+    disparity = frame.stem.with_name(frame.stem.name + DISPARITY_SUFFIX)
+    if disparity.exists():
+        yield from _check_disparity(_name(root, disparity), disparity, solid)
+
+
+def _name(root: Path, path: Path) -> str:
+    return (path.relative_to(root) if path.is_relative_to(root) else path).as_posix()
+
+
+def _check_alpha(root: Path, frame: Frame, view: View) -> Iterator[Break]:
+    name = _name(root, frame.alpha_png)
+    try:
+        levels = read_png(frame.alpha_png)[..., 0].astype(np.float64)
+    except InputError as error:
+        yield break_of(name, error, RESTORE)
+        return
+    if levels.shape != view.alpha.shape:
+        yield Break(name, f"{levels.shape[1]}×{levels.shape[0]} pixels, other than {frame.png.name}", RESTORE)
+        return
+    difference = np.abs(levels - 255.0 * view.alpha)
+    wrong = int((difference > LEVEL_TOLERANCE + 1e-3).sum())
+    if wrong:
+        problem = f"{wrong} pixels differ from the alpha of {frame.png.name} by up to {difference.max():.0f} of 255"
+        yield Break(name, problem, RESTORE)
+
+
+def _check_normals(root: Path, frame: Frame, solid: Bool[np.ndarray, "H W"]) -> Iterator[Break]:
+    """Unit world normals that face the camera, but at creases and outlines; `read_view` has judged the file."""
+    name = _name(root, frame.normal_png)
+    decoded: Float[np.ndarray, "P 3"] = read_png(frame.normal_png)[solid][:, :3] * (2 / 255) - 1
+    facing = (decoded * ray_directions_world(frame.camera)[solid]).sum(-1)
+    found = {
+        "normals that are not unit vectors after 2 · rgb / 255 − 1": np.abs(np.linalg.norm(decoded, axis=-1) - 1)
+        > UNIT_TOLERANCE,
+        "normals that face away from the camera: are they in the world's axes?": facing > FACING_TOLERANCE,
+    }
+    for what, wrong in found.items():
+        if wrong.mean() > TOLERATED_SHARE:
+            remedy = "Restore the file, or remove all of that split: normals are then not scored."
+            yield Break(name, f"{wrong.mean():.0%} of the object's pixels have {what}", remedy)
+
+
+def _check_disparity(name: str, path: Path, solid: Bool[np.ndarray, "H W"]) -> Iterator[Break]:
+    """Finite on the object, with one channel or several. Nothing here reads it otherwise."""
+    try:
+        values = _read_tiff(path)
+    except ImportError as error:
+        yield Break(name, f"can't be checked: {error}", "Nothing needs it; other readers may.", warning=True)
+        return
+    except InputError as error:
+        yield break_of(name, error, RESTORE)
+        return
+    if values.shape[:2] != solid.shape:
+        yield Break(name, f"an array of shape {values.shape}, other than the picture's size", RESTORE)
+        return
+    infinite = int((~np.isfinite(values[solid])).sum())
+    if infinite:
+        yield Break(name, f"{infinite} values on the object are NaN or infinite", RESTORE)
+
+
+def _read_tiff(path: Path) -> Float[np.ndarray, "H W *C"]:
+    """Pillow knows compressions, scikit-image floats of several channels; ImportError when a decoder is lacking."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as stored:
+            return np.asarray(stored, dtype=np.float64)
+    except Exception:
+        pass
+    import skimage.io
+
+    try:
+        return np.asarray(skimage.io.imread(path), dtype=np.float64)
+    except Exception as error:
+        if "imagecodecs" in str(error):
+            raise ImportError(str(error)) from None
+        raise InputError(expected=f"a complete TIFF at {path}", found=f"{error}", remedy=RESTORE) from None
+
+
+def check_normals_of_split(split: str, frames: Sequence[Frame]) -> Iterator[Break]:
+    """Scores need the normals of every view of a split or of none."""
+    lacking = [frame for frame in frames if not _has_normals(frame)]
+    if 0 < len(lacking) < len(frames):
+        remedy = f"Restore them, or remove every `*_normal.png` of {split}: normals are then not scored."
+        problem = f"{len(lacking)} of {len(frames)} views have no normals, {lacking[0].name} for one"
+        yield Break(split, problem, remedy)
+
+
+def _has_normals(frame: Frame) -> bool:
+    return frame.normal_png.exists() or frame.exr.exists()
+
+
+def what_is_absent(root: Path, train: Sequence[Frame], test: Sequence[Frame]) -> str | None:
+    """One line: what a plain folder lacks, and which scores it can't give for that reason; None when nothing."""
+    absent, unscored = [], []
+    if not (root / ENVIRONMENT_LATLONG).exists():
+        absent.append("ground-truth environment")
+        unscored += ["environment", "visibility"]
+    if not all(map(_has_normals, train)):
+        absent.append("normals of the training views")
+        unscored.append("coverage")
+    if not test:
+        absent.append("test views")
+        unscored += ["normals", "renders"]
+    elif not all(map(_has_normals, test)):
+        absent.append("normals of the test views")
+        unscored.append("normals")
+    return f"Plain layout without {_listed(absent)}: can't score {_listed(unscored)}." if absent else None
+
+
+def _listed(words: Sequence[str]) -> str:
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
