@@ -1,9 +1,10 @@
-"""Files appear whole or not at all: temporary names, renames, checksums, and the newest folder of a kind."""
+"""Files appear whole or not at all: temporary names, renames, one writer a folder, checksums, the newest of a kind."""
 
 import contextlib
 import hashlib
 import json
 import os
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,6 +37,63 @@ def remove_partial_files(root: Path) -> None:
     """Delete the temporary files of a process that was killed while it wrote below `root`."""
     for path in root.rglob(f"{PARTIAL_PREFIX}*"):
         path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Hold `folder`, made where it is missing, against every other run that writes to it.
+
+    The system releases the lock however the process ends. The folder itself is locked (flock), so that nothing is
+    added to it; where no folder can be (Windows, NFS), a file among the temporary ones stands for it, which only runs
+    on the same machine see. Raises InputError when another run holds the folder or a file is in its place.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(expected=f"a folder at {folder}", found="a file", remedy="Choose another --output.")
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        handle = _open_locked_folder(folder)
+    except BlockingIOError:
+        raise InputError(
+            expected=f"to be the only run that writes to {folder}",
+            found="another run that is writing there",
+            remedy="Wait until it ends, or choose another --output.",
+        ) from None
+    try:
+        yield
+    finally:
+        os.close(handle)
+
+
+def _open_locked_folder(folder: Path) -> int:
+    try:
+        return _open_locked(folder, os.O_RDONLY)
+    except BlockingIOError:
+        raise
+    except OSError:
+        user = os.getuid() if hasattr(os, "getuid") else 0
+        digest = hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16]
+        return _open_locked(Path(tempfile.gettempdir()) / f"shinypartial-{user}-{digest}.lock", os.O_RDWR | os.O_CREAT)
+
+
+def _open_locked(path: Path, flags: int) -> int:
+    """A descriptor that holds the lock until it is closed; BlockingIOError when another one does."""
+    handle = os.open(path, flags, 0o600)
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            try:
+                msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+            except PermissionError as error:
+                raise BlockingIOError(*error.args) from None
+        else:
+            import fcntl
+
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BaseException:
+        os.close(handle)
+        raise
+    return handle
 
 
 def write_text(path: Path, text: str) -> None:

@@ -4,9 +4,7 @@ The only module that joins the Blender room to the dataset room. A run that is k
 started again: files appear whole or not at all, and a frame that is there is not rendered twice.
 """
 
-import contextlib
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,8 +33,7 @@ from shinypartial.dataset.write import (
     write_transforms,
     write_view,
 )
-from shinypartial.errors import InputError
-from shinypartial.files import remove_partial_files
+from shinypartial.files import only_writer, remove_partial_files
 from shinypartial.images import read_exr_rgb
 from shinypartial.progress import Progress
 from shinypartial.scene import FileWorld, SceneSpec
@@ -66,8 +63,8 @@ def generate(spec: SceneSpec, root: Path) -> Generated:
     recipe = {**spec.recipe(), "hemisphere_axis": trajectory.hemisphere_axis.tolist()}
     if not _is_complete(root, every):
         check_blender()
-    claim_folder(root, recipe, _generator(), FORMAT_MINOR)
-    with _only_writer(root):
+    with only_writer(root):
+        claim_folder(root, recipe, _generator(), FORMAT_MINOR)
         if _is_complete(root, every):
             return Generated(root, 0, len(every))
         (root / CHECKSUMS).unlink(missing_ok=True)
@@ -100,29 +97,6 @@ def _generator() -> dict[str, Any]:
 def _is_complete(root: Path, frames: Sequence[Frame]) -> bool:
     """The checksum list is written last of all; a frame that was deleted since is made again."""
     return (root / CHECKSUMS).exists() and all(map(is_rendered, frames))
-
-
-@contextlib.contextmanager
-def _only_writer(root: Path) -> Iterator[None]:
-    """Hold a lock on the folder, which the system releases however the process ends (no lock on Windows)."""
-    try:
-        import fcntl
-    except ImportError:
-        yield
-        return
-    handle = os.open(root, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(
-                expected=f"to be the only one that writes to {root}",
-                found="another run that is writing there",
-                remedy="Wait until it ends, or choose another --output.",
-            ) from None
-        yield
-    finally:
-        os.close(handle)
 
 
 def _render_frames(spec: SceneSpec, frames: Sequence[Frame], total: int) -> None:

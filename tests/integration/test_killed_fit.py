@@ -66,3 +66,26 @@ def test_a_killed_fit_continues(tmp_path: Path, sphere_dataset: Dataset) -> None
     for name in ("environment.exr", "visibility.exr", "surfels.ply", "test/r_001.png"):
         assert (first / name).read_bytes() == (second / name).read_bytes(), name
     assert not list(tmp_path.rglob(".partial-*"))
+
+
+def test_two_fits_do_not_write_to_one_folder(tmp_path: Path, sphere_dataset: Dataset) -> None:
+    """The second is refused with one message and harms nothing; the first ends as if it had been alone."""
+    process = start(sphere_dataset, tmp_path, "one")
+    wait_for(tmp_path / "runs" / "one" / "checkpoint.pt", process)
+    process.send_signal(signal.SIGSTOP)
+    try:
+        # The prediction folder, then the run folder alone: another working folder could name the same prediction.
+        second = start(sphere_dataset, tmp_path, "one")
+        _, errors = second.communicate(timeout=120)
+        assert second.returncode == 2
+        assert "another run that is writing there" in errors
+        assert "Traceback" not in errors
+        third = start(sphere_dataset, tmp_path, "elsewhere/one")
+        _, errors = third.communicate(timeout=120)
+        assert third.returncode == 2
+        assert f"writes to {Path('runs/one')}" in errors
+    finally:
+        process.send_signal(signal.SIGCONT)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    assert read_info(tmp_path / "one")

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from shinypartial.errors import InputError
-from shinypartial.files import newest_folder, read_json, sha256_of, whole_file, write_json, write_text
+from shinypartial.files import newest_folder, only_writer, read_json, sha256_of, whole_file, write_json, write_text
 
 
 def test_a_finished_file_replaces_the_old_one_and_leaves_nothing_else(tmp_path: Path) -> None:
@@ -53,6 +53,95 @@ def test_a_killed_process_leaves_only_a_partial_file(tmp_path: Path) -> None:
     (left,) = tmp_path.iterdir()
     assert left.name.startswith(".partial-")
     assert left.suffix == ".exr", "Image writers choose their format by the suffix."
+
+
+HOLD = """
+import pathlib, sys, time
+from shinypartial.files import only_writer
+{before}
+with only_writer(pathlib.Path({folder!r})):
+    print('held', flush=True)
+    time.sleep(60)
+"""
+#: A file system that locks files but no folders, as NFS does.
+NO_FOLDER_LOCKS = """
+import fcntl, os, stat
+flock = fcntl.flock
+def refuse_folders(handle, operation):
+    if stat.S_ISDIR(os.fstat(handle).st_mode):
+        raise OSError(9, "Bad file descriptor")
+    flock(handle, operation)
+fcntl.flock = refuse_folders
+"""
+
+
+def hold(folder: Path, before: str = "") -> "subprocess.Popen[str]":
+    """A process of its own that holds the folder."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD.format(folder=str(folder), before=before)], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "held\n"
+    return process
+
+
+def take(folder: Path) -> None:
+    with only_writer(folder):
+        assert folder.is_dir()
+
+
+@pytest.mark.parametrize("file_system", ["any", "without folder locks"])
+def test_one_process_holds_a_folder_until_it_is_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file_system: str
+) -> None:
+    fcntl = pytest.importorskip("fcntl")
+    places = tmp_path / "places"
+    places.mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    before = ""
+    if file_system != "any":
+        before = NO_FOLDER_LOCKS
+        monkeypatch.setattr(fcntl, "flock", fcntl.flock)  # Restored afterwards.
+        exec(before, {})
+    folder = places / "new" / "dataset"
+    with hold(folder, before) as process:
+        with pytest.raises(InputError, match="another run that is writing there") as caught:
+            take(folder)
+        assert "Wait until it ends" in caught.value.remedy
+        take(places / "new" / "other")
+        process.send_signal(signal.SIGKILL)
+    take(folder)
+    take(folder)
+    assert list(folder.iterdir()) == [], "Nothing is left that a release or a list of checksums would hold."
+
+
+def test_a_failed_run_gives_its_folder_back(tmp_path: Path) -> None:
+    def fail() -> None:
+        with only_writer(tmp_path):
+            raise RuntimeError("stop")
+
+    with pytest.raises(RuntimeError):
+        fail()
+    take(tmp_path)
+
+
+def test_a_child_that_outlives_its_run_does_not_hold_the_folder(tmp_path: Path) -> None:
+    """Rendering processes don't inherit the lock."""
+    with only_writer(tmp_path):
+        child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    try:
+        take(tmp_path)
+    finally:
+        child.kill()
+        child.wait()
+
+
+def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match="a file"):
+        take(tmp_path / "file")
+    assert (tmp_path / "file").read_text() == "mine"
 
 
 def test_json_round_trip_is_exact(tmp_path: Path) -> None:
