@@ -24,6 +24,10 @@ class Fit:
     """Starting values of the configuration."""
     output: Path | None = None
     """Prediction folder; default predictions/DATASET-PRESET. The run folder has the same name below ./runs."""
+    snapshots: int = 0
+    """Keep this many moments of the fit: its end, half of the iterations, a quarter, and so on; see docs/chart.md."""
+    snapshot_seconds: tuple[float, ...] = ()
+    """Keep the moments after these seconds of fitting."""
     config: FitConfig = field(default_factory=FitConfig)
 
     def run(self) -> None:
@@ -31,7 +35,9 @@ class Fit:
         _prepare_threads()
         from panoless.export import export_prediction
         from panoless.fit import fit
+        from panoless.snapshots import marks_of
         from shinypartial.dataset.read import newest_dataset, open_dataset
+        from shinypartial.files import only_writer
         from shinypartial.prediction import claim_prediction
 
         root = self.dataset
@@ -41,10 +47,16 @@ class Fit:
         dataset = open_dataset(root)
         name = f"{dataset.name}-{self.config.preset}"
         prediction = self.output or Path("predictions") / name
-        claim_prediction(prediction)
-        state = fit(dataset, self.config, RUNS / prediction.resolve().name)
-        export_prediction(dataset, state, self.config, prediction)
+        run_folder = RUNS / prediction.resolve().name
+        marks = marks_of(self.snapshots, self.snapshot_seconds, self.config.iterations)
+        _refuse_run_folder(prediction, run_folder)
+        with only_writer(prediction):
+            claim_prediction(prediction)
+            state = fit(dataset, self.config, run_folder, marks)
+            export_prediction(dataset, state, self.config, prediction)
         print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
+        if marks:
+            print(f"Snapshots: panoless export {run_folder} --output {prediction} --snapshots")
 
 
 @dataclass(frozen=True)
@@ -55,14 +67,16 @@ class Export:
     """Run folder; without it the newest below ./runs."""
     output: Path | None = None
     """Prediction folder; default predictions/RUN."""
+    snapshots: bool = False
+    """Write the snapshots of the run, too, each as a prediction folder below PREDICTION/snapshots."""
 
     def run(self) -> None:
         """Read the checkpoint and export it."""
         _prepare_threads()
         from panoless.checkpoint import CHECKPOINT, DESCRIPTION, load_state, read_description
-        from panoless.export import export_prediction
+        from panoless.export import export_prediction, export_snapshots
         from shinypartial.dataset.read import open_dataset
-        from shinypartial.files import newest_folder
+        from shinypartial.files import newest_folder, only_writer
         from shinypartial.prediction import claim_prediction
 
         folder = self.run_folder or newest_folder(RUNS, DESCRIPTION, "a run", "Make one: `panoless fit`.")
@@ -77,9 +91,26 @@ class Export:
                 remedy="Run the same `panoless fit` command again: it continues where it stopped.",
             )
         prediction = self.output or Path("predictions") / folder.resolve().name
-        claim_prediction(prediction)
-        export_prediction(open_dataset(description.dataset), state, description.config, prediction)
+        _refuse_run_folder(prediction, folder)
+        with only_writer(prediction):
+            claim_prediction(prediction)
+            dataset = open_dataset(description.dataset)
+            export_prediction(dataset, state, description.config, prediction)
+            if self.snapshots:
+                written = export_snapshots(dataset, folder, description.config, prediction)
+                print(f"{len(written)} snapshots below {prediction}")
         print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
+        if self.snapshots:
+            print(f"Then: shinypartial evaluate {prediction} --snapshots")
+
+
+def _refuse_run_folder(prediction: Path, run_folder: Path) -> None:
+    if prediction.resolve() == run_folder.resolve():
+        raise InputError(
+            expected="a prediction folder apart from the run folder",
+            found=f"{prediction} for both",
+            remedy="Choose an --output that is not below ./runs.",
+        )
 
 
 def _prepare_threads() -> None:

@@ -1,5 +1,6 @@
 """A finished fit → the prediction folder that the evaluator reads, pictures of the decomposition, and a PLY."""
 
+import json
 import os
 import platform
 from dataclasses import asdict, dataclass
@@ -15,21 +16,29 @@ from panoless import __version__
 from panoless.checkpoint import FitState
 from panoless.config import FitConfig
 from panoless.cubemap import look_up
-from panoless.fit import normalization_of
+from panoless.fit import complete, normalization_of
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.rasterize import RasterCamera
 from panoless.kernels.reference.rasterize import rotation_matrices
 from panoless.shading import ALPHA_FLOOR, compose, reflection_directions_world, surface_buffers
+from panoless.snapshots import read_snapshot, snapshot_folders
 from panoless.surfels import Surfels
-from panoless.views import Normalization, raster_camera, unit_rays_camera
+from panoless.views import Normalization, load_views, raster_camera, unit_rays_camera
 from shinypartial.color import to_display
 from shinypartial.dataset.schema import Dataset, View
+from shinypartial.errors import InputError
 from shinypartial.files import remove_partial_files, whole_file
 from shinypartial.images import write_png
+from shinypartial.picture_sheet import write_picture_sheet
 from shinypartial.prediction import (
+    DECOMPOSITION,
     DESCRIPTION,
+    ENVIRONMENT,
+    SNAPSHOTS,
     PredictionInfo,
+    claim_prediction,
     dataset_hash,
+    read_info,
     write_environment_map,
     write_info,
     write_test_view,
@@ -88,10 +97,13 @@ def render(
         )
 
 
-def export_prediction(dataset: Dataset, state: FitState, config: FitConfig, folder: Path) -> None:
+def export_prediction(
+    dataset: Dataset, state: FitState, config: FitConfig, folder: Path, *, snapshot: bool = False
+) -> None:
     """Write environment, visibility, test views, pictures, PLY and, last, prediction.json.
 
-    An earlier prediction.json is removed first, so that it never describes a mixture; `test` marks the folder as begun.
+    `snapshot` says that the state is not the end of its fit, and states its iteration. An earlier prediction.json is
+    removed first, so that it never describes a mixture; `test` marks the folder as begun.
     """
     if state.final_environment is None or state.visibility is None:
         raise ValueError("only a finished fit can be exported")
@@ -120,8 +132,46 @@ def export_prediction(dataset: Dataset, state: FitState, config: FitConfig, fold
         parameter_counts=_parameter_counts(state, config),
         peak_memory_bytes=state.peak_memory_bytes,
         curves=state.curves,
+        primitives=state.surfels.count,
+        model_bytes=sum((folder / name).stat().st_size for name in (PLY_NAME, ENVIRONMENT)),
+        iteration=state.iteration if snapshot else None,
     )
     write_info(folder, info)
+
+
+def export_snapshots(dataset: Dataset, run: Path, config: FitConfig, prediction: Path) -> list[Path]:
+    """Complete every snapshot of a run as the end of a fit is completed, and export it to PREDICTION/snapshots.
+
+    Its `seconds` are those of the fit until the snapshot and those of solving its environment here. A snapshot that was
+    exported already is kept. Returns the folders; raises InputError when the run has none.
+    """
+    found = snapshot_folders(run)
+    if not found:
+        raise InputError(
+            expected=f"snapshots below {run}",
+            found="none",
+            remedy="Fit with `panoless fit --snapshots 6 --output NEW`.",
+        )
+    views = None
+    for source in found:
+        state, target = read_snapshot(source), prediction / SNAPSHOTS / source.name
+        if _is_exported(target, state, config, dataset):
+            continue
+        views = views or load_views(dataset, config.crop_margin_px)
+        complete(state, views, config)
+        claim_prediction(target)
+        export_prediction(dataset, state, config, target, snapshot=True)
+    return [prediction / SNAPSHOTS / source.name for source in found]
+
+
+def _is_exported(folder: Path, state: FitState, config: FitConfig, dataset: Dataset) -> bool:
+    """Whether the folder describes this very snapshot; equal seconds to the millisecond tell fits apart."""
+    if not (folder / DESCRIPTION).exists():
+        return False
+    info = read_info(folder)
+    same_fit = info.config == json.loads(json.dumps(asdict(config))) and info.dataset_hash == dataset_hash(dataset)
+    stages = {name: round(value, 3) for name, value in state.seconds.items()}
+    return same_fit and info.iteration == state.iteration and stages.items() <= info.seconds.items()
 
 
 def _write_test_views(dataset: Dataset, state: FitState, config: FitConfig, folder: Path) -> None:
@@ -142,11 +192,14 @@ def _write_test_views(dataset: Dataset, state: FitState, config: FitConfig, fold
         )
         write_test_view(folder, frame, view)
         if index == len(dataset.test) // 2:
-            _write_pictures(folder / PICTURES, parts)
+            pictures = _pictures(parts)
+            for name, picture in pictures.items():
+                write_png(folder / PICTURES / f"{name}.png", picture)
+            write_picture_sheet(folder / DECOMPOSITION, _titled(pictures, parts.alpha))
         progress.advance()
 
 
-def _write_pictures(folder: Path, parts: Decomposition) -> None:
+def _pictures(parts: Decomposition) -> dict[str, np.ndarray]:
     """The decomposition of one test view: render, specular, albedo, normals, depth and alpha."""
 
     def image(tensor: Tensor) -> np.ndarray:
@@ -156,7 +209,7 @@ def _write_pictures(folder: Path, parts: Decomposition) -> None:
     depth = parts.depth[covered]
     near, far = (float(depth.min()), float(depth.max())) if len(depth) else (0.0, 1.0)
     nearness = torch.where(covered, 1 - 0.9 * (parts.depth - near) / max(far - near, 1e-9), torch.zeros(()))
-    pictures = {
+    return {
         "1-render": to_display(image(parts.radiance)),
         "2-specular": to_display(image(parts.specular * parts.alpha)),
         "3-albedo": to_display(image(parts.albedo)),
@@ -166,8 +219,16 @@ def _write_pictures(folder: Path, parts: Decomposition) -> None:
         "5-depth-near-is-bright": np.rint(nearness.clamp(0, 1).numpy() * 255).astype(np.uint8),
         "6-alpha": np.rint(parts.alpha.clamp(0, 1).numpy() * 255).astype(np.uint8),
     }
-    for name, picture in pictures.items():
-        write_png(folder / f"{name}.png", picture)
+
+
+def _titled(pictures: dict[str, np.ndarray], alpha: Tensor) -> dict[str, np.ndarray]:
+    """The pictures around the object with a twelfth of margin, under their names without numbers."""
+    rows, columns = (torch.nonzero(alpha.amax(axis) > ALPHA_FLOOR)[:, 0] for axis in (1, 0))
+    if len(rows) == 0:
+        rows, columns = (torch.arange(size) for size in alpha.shape)
+    margin = max(len(rows), len(columns)) // 12
+    window = tuple(slice(max(0, int(x.min()) - margin), int(x.max()) + 1 + margin) for x in (rows, columns))
+    return {name.split("-", 1)[1].replace("-", " "): picture[window] for name, picture in pictures.items()}
 
 
 def cube_to_latlong(cube: Float[Tensor, "6 C L L"], height: int) -> Float[np.ndarray, "H 2*H C"]:
@@ -213,7 +274,6 @@ def _parameter_counts(state: FitState, config: FitConfig) -> dict[str, int]:
     per_surfel += 3 * config.albedo + 3 * config.surfels.curved + config.loss.roughness_weighted
     assert state.final_environment is not None
     return {
-        "surfels": state.surfels.count,
         "surfel parameters": per_surfel * state.surfels.count,
         "environment parameters": state.final_environment.numel(),
     }

@@ -65,11 +65,12 @@ def _horizontal_mark(level: float, share: float, logarithmic: bool) -> str:
     value = 10**level if logarithmic else level
     return (
         f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{place:.1f}" y2="{place:.1f}"/>'
-        f'<text x="{LEFT - 6}" y="{place + 4:.1f}" text-anchor="end">{_short(value)}</text>'
+        f'<text x="{LEFT - 6}" y="{place + 4:.1f}" text-anchor="end">{short_number(value)}</text>'
     )
 
 
-def _short(value: float) -> str:
+def short_number(value: float) -> str:
+    """Three digits, or all digits of a larger number below a million."""
     return f"{value:,.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
 
 

@@ -133,6 +133,8 @@ class Subset:
         kept = made.selection
         print(f"Around {describe(kept.axis)}: {len(kept.train)} training and {len(kept.test)} test views,")
         print(f"{len(kept.dropped)} left out, in {made.root}")
+        for split in made.without_normals:
+            print(f"No normals in {split}: only some of its views had any, and scores need all or none.")
         print(f"Next: panoless fit {made.root}")
 
 
@@ -147,7 +149,7 @@ class Validate:
         """Print every break; raise InputError when there is one."""
         from shinypartial.dataset.read import newest_dataset
         from shinypartial.dataset.release import is_release, validate_release
-        from shinypartial.dataset.validate import validate
+        from shinypartial.dataset.validate import unscored, validate
 
         folder = self.folder or _chosen("dataset", newest_dataset())
         breaks = (validate_release if is_release(folder) else validate)(folder, progress=True)
@@ -161,6 +163,9 @@ class Validate:
                 remedy="Follow the remedies, then validate again.",
             )
         print(f"{folder} keeps every promise of the format.")
+        lacking = None if is_release(folder) else unscored(folder)
+        if lacking:
+            print(lacking)
 
 
 @dataclass(frozen=True)
@@ -175,14 +180,26 @@ class Evaluate:
     """Score the benchmark's own protocol linear-v1, and paper-v1 too, which serves comparison with published tables."""
     oracle: Path | None = None
     """Scored folder of the dataset's bound; DATASET-oracle beside the prediction, where there is one, if not given."""
+    snapshots: bool = False
+    """Score the snapshots below the prediction, for `shinypartial chart`, and then the prediction."""
 
     def run(self) -> None:
         """Score and print the summary."""
         from shinypartial.evaluate import evaluate
-        from shinypartial.prediction import newest_prediction
+        from shinypartial.prediction import newest_prediction, snapshot_folders
         from shinypartial.report import summary_lines
 
         prediction = self.prediction or _chosen("prediction", newest_prediction())
+        snapshots = snapshot_folders(prediction) if self.snapshots else []
+        if self.snapshots and not snapshots:
+            raise InputError(
+                expected=f"snapshots below {prediction}",
+                found="none",
+                remedy="Fit with --snapshots, then export them: `panoless export --snapshots`.",
+            )
+        for each in snapshots:
+            print(f"Snapshot {each.name}")
+            evaluate(each, self.dataset, protocol=self.protocol, oracle=self.oracle)
         evaluate(prediction, self.dataset, protocol=self.protocol, oracle=self.oracle)
         print("\n".join(summary_lines(prediction)))
         print("Next: shinypartial report")
@@ -335,13 +352,41 @@ class Leaderboard:
         print(f"Leaderboard: {self.output / PAGE}")
 
 
+@dataclass(frozen=True)
+class Chart:
+    """Draw quality against fitting time and model size for the predictions of one dataset, with the Pareto front."""
+
+    predictions: tyro.conf.Positional[tuple[Path, ...]] = (Path("predictions"),)
+    """Scored prediction folders, or folders that hold them at any depth."""
+    output: Path = Path("chart")
+    """Folder to write chart.html, chart.csv and the SVG pictures into."""
+    dataset: str | None = None
+    """Name of the dataset, where there are predictions of several."""
+    hardware: str | None = None
+    """Words of the hardware to show, where predictions were made on several."""
+    size: Literal["parameters", "primitives", "bytes"] = "parameters"
+    """What the size of a model is."""
+
+    def run(self) -> None:
+        """Write page, pictures and table, and name what could not be drawn."""
+        from shinypartial.chart import PAGE, write_chart
+
+        drawn = write_chart(self.predictions, self.output, dataset=self.dataset, hardware=self.hardware, size=self.size)
+        runs = sum(len(point.folders) for point in drawn.points)
+        snapshots = sum(moment.iteration is not None for p in drawn.points for curve in p.curves for moment in curve)
+        print(f"{drawn.dataset}: {len(drawn.points)} points of {runs} predictions, {snapshots} snapshots")
+        for one in drawn.apart:
+            print(f"not drawn: {one.folder}: {one.reason}. {one.remedy}")
+        print(f"Chart: {self.output / PAGE}")
+
+
 def _chosen(what: str, folder: Path) -> Path:
     """Say which folder was taken because none was named."""
     print(f"Newest {what}: {folder}")
     return folder
 
 
-Command = Generate | Subset | Validate | Evaluate | Oracle | Compare | Weights | Report | Release | Leaderboard
+Command = Generate | Subset | Validate | Evaluate | Oracle | Compare | Weights | Report | Release | Leaderboard | Chart
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -14,15 +14,15 @@ from shinypartial.errors import InputError
 from shinypartial.files import write_text
 from shinypartial.metrics.registry import Direction
 from shinypartial.progress import format_seconds
-from shinypartial.ranking import Apart, Group, Leaderboard, Line, collect
+from shinypartial.ranking import HASH_DIGITS, Apart, Group, Leaderboard, Line, collect
 from shinypartial.report_style import STYLE
+from shinypartial.report_tables import apart_section
 from shinypartial.scores import PROTOCOL
 
 PAGE = "index.html"
 TABLE = "leaderboard.csv"
 DEFAULT_FOLDER = Path("leaderboard")
 GENERATOR = '<meta name="generator" content="shinypartial leaderboard">'
-HASH_DIGITS = 12
 
 TABLE_STYLE = """
 body { max-width: 1500px; }
@@ -175,11 +175,4 @@ def _cell(text: str, value: str, css: str) -> str:
 
 
 def _apart(apart: Iterable[Apart]) -> str:
-    rows = "".join(
-        f'<tr><th scope="row">{html.escape(one.folder)}</th><td class="text">{html.escape(one.reason)}.</td>'
-        f'<td class="text">{html.escape(one.remedy)}</td></tr>'
-        for one in apart
-    )
-    if not rows:
-        return ""
-    return f'<h2>Not compared</h2><div class="scroll"><table>{rows}</table></div>'
+    return apart_section("Not compared", [(one.folder, one.reason, one.remedy) for one in apart])

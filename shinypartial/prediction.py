@@ -4,6 +4,8 @@ PREDICTION/prediction.json            method, configuration, dataset hash, secon
 PREDICTION/environment.exr            lat-long, linear radiance, world frame of the dataset
 PREDICTION/visibility.exr             lat-long, channel Y in [0, 1]: how well each direction was observed
 PREDICTION/test/r_000.exr r_000.png   linear premultiplied RGBA, unit world normals, z-depth; and the picture
+PREDICTION/decomposition.jpg          optional: what a test view is made of
+PREDICTION/snapshots/000250           optional: earlier moments of the fit, each a prediction folder
 """
 
 from dataclasses import asdict, dataclass, field
@@ -23,16 +25,25 @@ FORMAT = "shinypartial-prediction"
 FORMAT_VERSION = 1
 DEFAULT_FOLDER = Path("predictions")
 DESCRIPTION = "prediction.json"
+#: Moments of a fit, each a prediction folder of its own, lie below the prediction in a folder of this name.
+SNAPSHOTS = "snapshots"
 #: The bound of a dataset lies beside the predictions made from it, under the dataset's name with this ending.
 ORACLE_SUFFIX = "-oracle"
 ENVIRONMENT = "environment.exr"
 VISIBILITY = "visibility.exr"
 VISIBILITY_CHANNEL = "Y"
+#: One picture of what a test view is made of, optional.
+DECOMPOSITION = "decomposition.jpg"
 
 
 @dataclass(frozen=True)
 class PredictionInfo:
-    """Who made the prediction and at what cost; `curves` are per-iteration training series, for the report only."""
+    """Who made the prediction and at what cost; `curves` are per-iteration training series, for the report only.
+
+    `seconds` are those of making the model; their sum is its time in leaderboards and charts. `primitives` is the
+    number of surfels, Gaussians, voxels or vertices, `model_bytes` the size of the files that a renderer needs,
+    `iteration` the number of finished steps of a snapshot; each is None where it is unknown or has no meaning.
+    """
 
     method: str
     dataset: str
@@ -43,6 +54,9 @@ class PredictionInfo:
     parameter_counts: dict[str, int]
     peak_memory_bytes: int
     curves: dict[str, list[float]] = field(default_factory=dict)
+    primitives: int | None = None
+    model_bytes: int | None = None
+    iteration: int | None = None
 
 
 def dataset_hash(dataset: Dataset) -> str:
@@ -55,6 +69,21 @@ def newest_prediction(parent: Path = DEFAULT_FOLDER) -> Path:
     """The prediction below `parent` that was written last; bounds are passed over."""
     remedy = "Make one: `panoless fit`, or name a folder."
     return newest_folder(parent, DESCRIPTION, "a prediction", remedy, unless_suffix=ORACLE_SUFFIX)
+
+
+def prediction_folders(root: Path) -> list[Path]:
+    """Every prediction at or below a folder, at any depth, without the snapshots of others."""
+    return sorted(path.parent for path in root.rglob(DESCRIPTION) if not _is_snapshot(path.parent))
+
+
+def snapshot_folders(prediction: Path) -> list[Path]:
+    """The complete snapshots of a prediction, in the order of their names."""
+    return sorted(path.parent for path in (prediction / SNAPSHOTS).glob(f"*/{DESCRIPTION}"))
+
+
+def _is_snapshot(folder: Path) -> bool:
+    parent = folder.resolve().parent
+    return parent.name == SNAPSHOTS and (parent.parent / DESCRIPTION).exists()
 
 
 def prediction_frame(root: Path, frame: Frame) -> Frame:
@@ -76,7 +105,8 @@ def claim_prediction(root: Path) -> None:
 
 def write_info(root: Path, info: PredictionInfo) -> None:
     """Write prediction.json; written last, it marks the folder as complete."""
-    write_json(root / DESCRIPTION, {"format": FORMAT, "format_version": FORMAT_VERSION, **asdict(info)})
+    stated = {name: value for name, value in asdict(info).items() if value is not None}
+    write_json(root / DESCRIPTION, {"format": FORMAT, "format_version": FORMAT_VERSION, **stated})
 
 
 def write_environment_map(root: Path, radiance: Float[np.ndarray, "H W 3"]) -> None:

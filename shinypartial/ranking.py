@@ -11,11 +11,14 @@ from pathlib import Path
 
 from shinypartial.errors import InputError
 from shinypartial.metrics.registry import Direction, Metric
-from shinypartial.prediction import DESCRIPTION, PredictionInfo, read_info
+from shinypartial.prediction import DESCRIPTION, PredictionInfo, prediction_folders, read_info
 from shinypartial.scores import PROTOCOL, SCORES, ScoreRow, Scores, read_scores, score_rows
 
 #: A prediction by this method is a bound to compare with; it stands first and takes no part in the comparison.
 BOUND = "oracle"
+
+#: Of a dataset's hash, as many digits are shown.
+HASH_DIGITS = 12
 
 #: Where a column's number lies in the scores, and what the column is called.
 COLUMNS = (
@@ -118,8 +121,8 @@ class Leaderboard:
 
 
 def collect(predictions: Path) -> Leaderboard:
-    """Read every prediction below a folder, at any depth, and sort what can be compared by dataset."""
-    folders = sorted(path.parent for path in predictions.rglob(DESCRIPTION))
+    """Read every prediction below a folder, at any depth but snapshots, and sort what can be compared by dataset."""
+    folders = prediction_folders(predictions)
     if not folders:
         raise InputError(
             expected=f"prediction folders below {predictions.resolve()}",
@@ -129,7 +132,7 @@ def collect(predictions: Path) -> Leaderboard:
     entries: list[Entry] = []
     apart: list[Apart] = []
     for folder in folders:
-        found = _read(folder, folder.relative_to(predictions).as_posix())
+        found = read_entry(folder, folder.relative_to(predictions).as_posix())
         if isinstance(found, Entry):
             entries.append(found)
         else:
@@ -139,7 +142,8 @@ def collect(predictions: Path) -> Leaderboard:
     return Leaderboard(tuple(groups), tuple(apart))
 
 
-def _read(folder: Path, name: str) -> Entry | Apart:
+def read_entry(folder: Path, name: str) -> Entry | Apart:
+    """A prediction under a name, or why it can't be compared; never an exception for what its files hold."""
     again = f"Evaluate it again: `shinypartial evaluate {folder}`."
     try:
         info = read_info(folder)
@@ -162,7 +166,9 @@ def _read(folder: Path, name: str) -> Entry | Apart:
 
 def _check_numbers(entry: Entry) -> None:
     """TypeError or ValueError unless every number is one: other hands may have written the files."""
-    numbers = [entry.seconds, entry.parameters, *(row.value for row in entry.rows if row.value is not None)]
+    optional = (entry.info.primitives, entry.info.model_bytes, entry.info.iteration)
+    stated = [number for number in optional if number is not None]
+    numbers = [entry.seconds, entry.parameters, *stated, *(row.value for row in entry.rows if row.value is not None)]
     if not all(math.isfinite(number) for number in numbers):
         raise ValueError("a number that is not finite")
     if not entry.hardware.isprintable():

@@ -30,7 +30,7 @@ from shinypartial.pictures import (
     Scale,
     ViewPictures,
 )
-from shinypartial.prediction import PredictionInfo, read_info
+from shinypartial.prediction import DECOMPOSITION, PredictionInfo, read_info
 from shinypartial.progress import format_seconds
 from shinypartial.report_style import STYLE
 from shinypartial.report_tables import Bounds, beside, bounds_by_path, metrics_section, paper_section
@@ -41,7 +41,7 @@ REPORT = "report.html"
 METHOD_PICTURES = "pictures"
 CURVE_ABSCISSA = "iteration"
 #: Longest side of inlined pictures; many method pictures get the smaller one, which keeps the page below 3 MB.
-LARGE_PX, SMALL_PX = 512, 320
+SHEET_PX, LARGE_PX, SMALL_PX = 1020, 512, 320
 FEW_PICTURES = 16
 JPEG_QUALITY = 88
 #: A PNG of up to this size is inlined losslessly.
@@ -251,13 +251,18 @@ def _view_series(scores: Scores) -> list[Series]:
 
 
 def _method_section(prediction: Path) -> str:
+    """The sheet of the decomposition, then single pictures, folded away where they would only repeat the sheet."""
+    sheet = _figure(prediction / DECOMPOSITION, "What the method makes of one test view.", size=SHEET_PX)
     paths = sorted((prediction / METHOD_PICTURES).glob("*.png"))
     if not paths:
-        return ""
+        return f"<h2>Decomposition</h2>{sheet}" if sheet else ""
     size = LARGE_PX if len(paths) <= FEW_PICTURES else SMALL_PX
     figures = "".join(_figure(path, path.stem.replace("_", " "), size=size) for path in paths)
     note = "Pictures that the method itself exported; the captions are the names of its files."
-    return f'<h2>Decomposition</h2><p class="dim">{note}</p><div class="gallery">{figures}</div>'
+    gallery = f'<p class="dim">{note}</p><div class="gallery">{figures}</div>'
+    if sheet:
+        gallery = f"{sheet}<details><summary>{len(paths)} single pictures</summary>{gallery}</details>"
+    return f"<h2>Decomposition</h2>{gallery}"
 
 
 def _figure(path: Path, caption: str, scale: Scale | None = None, size: int = LARGE_PX) -> str:
@@ -279,7 +284,7 @@ def _inline_picture(path: Path, longest_px: int) -> str:
             picture = opened.convert("RGB")
     except OSError as error:
         raise InputError(
-            expected=f"a complete PNG at {path}", found=str(error), remedy="Delete it, then evaluate again."
+            expected=f"a complete picture at {path}", found=str(error), remedy="Delete it, then evaluate again."
         ) from None
     picture.thumbnail((longest_px, longest_px), Image.Resampling.LANCZOS)
     lossless, lossy = io.BytesIO(), io.BytesIO()
@@ -323,8 +328,10 @@ def _cost_section(info: PredictionInfo) -> str:
     seconds = [(stage, f"{value:.1f} s") for stage, value in info.seconds.items()]
     memory = [("peak memory", f"{info.peak_memory_bytes / 2**20:,.0f} MiB")] if info.peak_memory_bytes else []
     hardware = [(name, _plain(value)) for name, value in _flatten(info.hardware)]
-    parameters = [(name, f"{count:,}") for name, count in info.parameter_counts.items()]
-    parts = [("Time by stage", seconds), ("Hardware", hardware + memory), ("Parameters", parameters)]
+    sizes = [("primitives", info.primitives), ("bytes of the exported model", info.model_bytes)]
+    sizes += list(info.parameter_counts.items())
+    size = [(name, f"{count:,}") for name, count in sizes if count is not None]
+    parts = [("Time by stage", seconds), ("Hardware", hardware + memory), ("Size", size)]
     blocks = "".join(f"<div><h3>{title}</h3>{_table(lines)}</div>" for title, lines in parts if lines)
     return f'<h2>Cost</h2><div class="maps">{blocks}</div>' if blocks else ""
 

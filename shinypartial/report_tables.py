@@ -109,3 +109,15 @@ def _region_table(rows: Sequence[ScoreRow], bounds: Bounds, place: str, heading:
         f"<h3>{html.escape(heading)}</h3>"
         f'<div class="scroll"><table><tr><th></th>{head}<th></th></tr>{"".join(lines)}</table></div>'
     )
+
+
+def apart_section(title: str, rows: Sequence[tuple[str, str, str]]) -> str:
+    """A table of what was left apart: folder, reason and remedy; empty without rows."""
+    if not rows:
+        return ""
+    body = "".join(
+        f'<tr><th scope="row">{html.escape(folder)}</th><td class="text">{html.escape(reason)}.</td>'
+        f'<td class="text">{html.escape(remedy)}</td></tr>'
+        for folder, reason, remedy in rows
+    )
+    return f'<h2>{html.escape(title)}</h2><div class="scroll"><table>{body}</table></div>'

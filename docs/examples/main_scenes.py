@@ -45,7 +45,7 @@ def method_row(folder: Path) -> dict[str, Any] | None:
         "seconds": sum(info.seconds.values()),
         "seconds_by_stage": info.seconds,
         "hardware": info.hardware,
-        "surfels": info.parameter_counts.get("surfels"),
+        "surfels": info.primitives,
     }
 
 

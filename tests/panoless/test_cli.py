@@ -101,3 +101,12 @@ def test_the_newest_folder_is_taken_where_none_is_named(
     first = next((tmp_path / "predictions").iterdir())
     for name in ("environment.exr", "visibility.exr", "surfels.ply", "test/r_000.png"):
         assert (first / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+
+
+def test_the_run_folder_is_no_place_for_the_prediction(
+    tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["fit", str(sphere_dataset.root), *TINY, "--output", "runs/mine"]) == 2
+    assert "apart from the run folder" in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()

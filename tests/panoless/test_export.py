@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from panoless.export import PICTURES, PLY_NAME, cube_to_latlong, export_prediction, render, write_ply
+from panoless.export import PICTURES, PLY_NAME, _titled, cube_to_latlong, export_prediction, render, write_ply
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.views import Normalization, raster_camera
 from shinypartial.dataset.read import read_view
 from shinypartial.errors import InputError
 from shinypartial.evaluate import evaluate
+from shinypartial.picture_sheet import MAX_BYTES
 from shinypartial.prediction import (
+    DECOMPOSITION,
     claim_prediction,
     dataset_hash,
     prediction_frame,
@@ -43,7 +45,11 @@ def test_the_readers_accept_the_prediction(prediction: Path, finished: FinishedF
     info = read_info(prediction)
     assert info.dataset_hash == dataset_hash(finished.dataset)
     assert info.config["surfels"]["count"] == finished.config.surfels.count
-    assert info.parameter_counts["surfels"] == finished.state.surfels.count
+    assert info.primitives == finished.state.surfels.count
+    files = (prediction / PLY_NAME, prediction / "environment.exr")
+    assert info.model_bytes == sum(path.stat().st_size for path in files)
+    assert info.iteration is None
+    assert sum(info.parameter_counts.values()) == 13 * finished.config.surfels.count + 6 * 3 * 24 * 24
     assert info.peak_memory_bytes > 1e7
     assert set(info.seconds) >= {"read views", "initialize", "optimize", "solve environment"}
     assert all(len(series) == len(info.curves["iteration"]) for series in info.curves.values())
@@ -76,6 +82,20 @@ def test_the_evaluator_scores_it(prediction: Path, finished: FinishedFit) -> Non
 def test_pictures_of_the_decomposition_are_there(prediction: Path) -> None:
     names = [path.name for path in sorted((prediction / PICTURES).iterdir())]
     assert [name[0] for name in names] == list("123456")
+    assert 5_000 < (prediction / DECOMPOSITION).stat().st_size < MAX_BYTES
+
+
+def test_the_sheet_shows_the_object_and_not_the_empty_picture() -> None:
+    """Pictures are cut to where there is alpha, whatever surrounds it; nothing at all is shown whole."""
+    rows, columns = slice(30, 42), slice(5, 17)
+    alpha = torch.zeros(80, 60)
+    alpha[rows, columns] = 1.0
+    pictures = {"1-a-b": (255 * alpha.numpy()).astype(np.uint8)}
+    (title, shown), *_ = _titled(pictures, alpha).items()
+    assert title == "a b"
+    assert shown.shape == (14, 14)
+    assert (shown > 0).sum() == 144
+    assert _titled(pictures, 0 * alpha)["a b"].shape == (80, 60)
 
 
 def test_nothing_half_written_stays(prediction: Path) -> None:

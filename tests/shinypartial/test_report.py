@@ -14,8 +14,9 @@ from shinypartial.errors import InputError
 from shinypartial.evaluate import evaluate
 from shinypartial.images import write_png
 from shinypartial.metrics import perceptual
+from shinypartial.picture_sheet import write_picture_sheet
 from shinypartial.pictures import NEUTRAL_GRAY, NORMAL_ERROR, VISIBILITY, colormap_colors, scalar_picture
-from shinypartial.prediction import read_info, write_info
+from shinypartial.prediction import DECOMPOSITION, read_info, write_info
 from shinypartial.report import summary_lines, write_report
 from shinypartial.scores import read_scores, score_rows
 from tests.support.truth_prediction import write_truth_prediction
@@ -105,6 +106,20 @@ def test_the_report_goes_where_it_is_told_and_is_reproducible(evaluated: Path, t
     output = tmp_path / "deep" / "page.html"
     assert write_report(evaluated, output) == output
     assert output.read_text(encoding="utf-8") == page
+
+
+def test_the_sheet_of_the_decomposition_comes_before_single_pictures(evaluated: Path, page: str) -> None:
+    assert "<details><summary>2 single" not in page
+    write_picture_sheet(evaluated / DECOMPOSITION, {"alpha": np.full((20, 30), 255, np.uint8)})
+    info = read_info(evaluated)
+    write_info(evaluated, replace(info, primitives=1234567, model_bytes=7654321))
+    with_sheet = write_report(evaluated).read_text(encoding="utf-8")
+    assert Page(with_sheet).figures == Page(page).figures + 1
+    assert with_sheet.index("one test view.") < with_sheet.index("2 single pictures") < with_sheet.index("r 000 albedo")
+    assert "1,234,567" in with_sheet
+    assert "7,654,321" in with_sheet
+    (evaluated / DECOMPOSITION).unlink()
+    write_info(evaluated, info)
 
 
 def test_a_report_without_scores_says_to_evaluate(tmp_path: Path, sphere_dataset: Dataset) -> None:
