@@ -15,8 +15,9 @@ from shinypartial.errors import InputError
 class SurfelConfig:
     """The set of surfels and how it starts."""
 
-    initial: Literal["hull", "random"] = "hull"
-    """`hull`: on the visual hull of the masks; `random`: uniformly in the normalized cube, as the paper's code does."""
+    initial: Literal["thin-plate", "hull", "random"] = "thin-plate"
+    """`thin-plate`: on the visual hull where outlines touch the object, continued smoothly where none does;
+    `hull`: on the visual hull of the masks; `random`: uniformly in the normalized cube, as the paper's code does."""
     count: int = 6000
     """Number of surfels at the start."""
     curved: bool = True

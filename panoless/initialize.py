@@ -1,7 +1,6 @@
-"""First surfels: on the visual hull of the masks, or at random as the paper's code starts."""
+"""First surfels: on the first surface of `hull`, or at random as the paper's code starts."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -9,89 +8,41 @@ from jaxtyping import Float
 from torch import Tensor
 
 from panoless.config import SurfelConfig
+from panoless.hull import carve_hull, completed_surface, hull_surface
 from panoless.surfels import Surfels
 from panoless.views import Views
-from shinypartial.errors import InputError
 
-HULL_HALF_SIDE = 1.1
-SURFACE_SMOOTHING_VOXELS = 1.5
-CURVATURE_SMOOTHING_VOXELS = 3.0
 OVERLAP = 0.8
 INITIAL_OPACITY_LOGIT = 2.2
 INITIAL_ROUGHNESS_LOGIT = -2.2
 RANDOM_OPACITY = 0.1
 
 
-@dataclass(frozen=True)
-class Hull:
-    """Signed distance (normalized units, negative inside) on a cubic grid of voxel centers, axes x, y, z."""
-
-    distance: Float[np.ndarray, "N N N"]
-    voxel: float
-
-    def to_index(self, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
-        """Grid coordinates of points."""
-        return (points + HULL_HALF_SIDE) / self.voxel
-
-
-def carve_hull(views: Views, resolution: int, votes: float) -> Hull:
-    """Visual hull: a voxel stays if at least `votes` of the views have it inside their mask.
-
-    Raises InputError when nothing stays, which means masks and poses contradict each other.
-    """
-    from scipy.ndimage import distance_transform_edt
-
-    line = torch.linspace(-HULL_HALF_SIDE, HULL_HALF_SIDE, resolution)
-    points = torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1).view(-1, 3)
-    allowed = math.floor((1 - votes) * len(views.train))
-    misses = torch.zeros(len(points), dtype=torch.int32)
-    alive = torch.arange(len(points))
-    for view in views.train:
-        camera, mask = view.camera, view.mask
-        seen = points[alive] @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        depth = seen[:, 2].clamp(min=1e-6)
-        column = (seen[:, 0] / depth * camera.fx + camera.cx).floor().long()
-        row = (seen[:, 1] / depth * camera.fy + camera.cy).floor().long()
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (seen[:, 2] > 0)
-        index = row.clamp(0, camera.height - 1) * camera.width + column.clamp(0, camera.width - 1)
-        misses[alive] += (~(inside & (mask.flatten()[index] >= 0.5))).int()
-        alive = alive[misses[alive] <= allowed]
-    if len(alive) < 8:
-        raise InputError(
-            expected="masks and poses that agree on an object",
-            found=f"no point in space that {votes:.0%} of the masks contain",
-            remedy="Check the axes of transform_matrix (OpenGL) and that masks mark the object, not the background.",
-        )
-    occupied = np.zeros(resolution**3, dtype=bool)
-    occupied[alive.numpy()] = True
-    occupied = np.pad(occupied.reshape(resolution, resolution, resolution)[1:-1, 1:-1, 1:-1], 1)
-    voxel = 2 * HULL_HALF_SIDE / (resolution - 1)
-    distance = distance_transform_edt(~occupied) - distance_transform_edt(occupied)
-    return Hull(distance.astype(np.float32) * voxel, voxel)
-
-
 def hull_surfels(views: Views, config: SurfelConfig, seed: int) -> Surfels:
-    """Surfels evenly over the part of the hull's surface that faces some camera, curved as the hull is."""
-    from scipy.ndimage import gaussian_filter
-    from skimage.measure import marching_cubes
+    """Surfels evenly over the part of the first surface that faces some camera, curved as it is.
 
+    `thin-plate` takes the completed hull, `hull` the hull itself.
+    """
     hull = carve_hull(views, config.hull_resolution, config.hull_votes)
-    smooth = gaussian_filter(hull.distance, SURFACE_SMOOTHING_VOXELS)
-    vertices, triangles, _, _ = marching_cubes(smooth, 0.0)
-    corners = (vertices * hull.voxel - HULL_HALF_SIDE)[triangles]
+    surface = completed_surface(hull, views) if config.initial == "thin-plate" else hull_surface(hull)
+    vertex_normals = surface.vertex_normals()
+    corners = surface.vertices[surface.triangles]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = _gradient_at(smooth, hull, corners.mean(1))
-    facing = _faces_some_camera(corners.mean(1), normals, views)
+    facing = _faces_some_camera(corners.mean(1), vertex_normals[surface.triangles].sum(1), views)
     areas = np.where(facing, np.linalg.norm(cross, axis=1) / 2, 0)
     rng = np.random.default_rng(seed)
     # Stratified over the cumulative area: as even as possible without a relaxation.
     picks = np.searchsorted(
         np.cumsum(areas), (np.arange(config.count) + rng.random(config.count)) * areas.sum() / config.count
     )
-    barycentric = rng.dirichlet([1.0, 1.0, 1.0], config.count)
-    points = (corners[np.minimum(picks, len(corners) - 1)] * barycentric[..., None]).sum(1)
-    frames = _tangent_frames(_gradient_at(smooth, hull, points))
-    curvatures = _shape_operators(gaussian_filter(hull.distance, CURVATURE_SMOOTHING_VOXELS), hull, points, frames)
+    faces = surface.triangles[np.minimum(picks, len(corners) - 1)]
+    shares = rng.dirichlet([1.0, 1.0, 1.0], config.count)
+    points, normals, tensors = (
+        np.einsum("kv,kv...->k...", shares, values[faces])
+        for values in (surface.vertices, vertex_normals, surface.shape_tensors())
+    )
+    frames = _tangent_frames(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
+    curvatures = _shape_operators(tensors, frames)
     scale = OVERLAP * math.sqrt(areas.sum() / config.count)
     return _surfels(points, frames, np.full((config.count, 2), scale), curvatures, INITIAL_OPACITY_LOGIT)
 
@@ -109,8 +60,9 @@ def random_surfels(config: SurfelConfig, seed: int) -> Surfels:
 
 
 def initial_surfels(views: Views, config: SurfelConfig, seed: int) -> Surfels:
-    """The surfels that a fit starts from."""
-    return hull_surfels(views, config, seed) if config.initial == "hull" else random_surfels(config, seed)
+    """The surfels that a fit starts from, on the device of the views."""
+    surfels = random_surfels(config, seed) if config.initial == "random" else hull_surfels(views, config, seed)
+    return surfels.to(views.train[0].mask.device)
 
 
 def _surfels(
@@ -138,23 +90,10 @@ def _surfels(
     )
 
 
-def _gradient_at(
-    field: Float[np.ndarray, "N N N"], hull: Hull, points: Float[np.ndarray, "P 3"]
-) -> Float[np.ndarray, "P 3"]:
-    """Unit gradient of a signed distance: the outward normal."""
-    from scipy.ndimage import map_coordinates
-
-    index = hull.to_index(points).T
-    gradient = np.stack([map_coordinates(part, index, order=1) for part in np.gradient(field, hull.voxel)], -1)
-    return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-9)
-
-
 def _faces_some_camera(points: Float[np.ndarray, "P 3"], normals: Float[np.ndarray, "P 3"], views: Views) -> np.ndarray:
     facing = np.zeros(len(points), dtype=bool)
     for view in views.train:
-        world_to_camera = view.camera.world_to_camera.numpy()
-        center = -world_to_camera[:3, :3].T @ world_to_camera[:3, 3]
-        facing |= ((center - points) * normals).sum(1) > 0
+        facing |= ((view.position - points) * normals).sum(1) > 0
     return facing
 
 
@@ -166,20 +105,9 @@ def _tangent_frames(normals: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3
 
 
 def _shape_operators(
-    field: Float[np.ndarray, "N N N"],
-    hull: Hull,
-    points: Float[np.ndarray, "K 3"],
-    frames: Float[np.ndarray, "K 3 3"],
+    tensors: Float[np.ndarray, "K 3 3"], frames: Float[np.ndarray, "K 3 3"]
 ) -> Float[np.ndarray, "K 3"]:
-    """(a, b, c) from the Hessian H of the signed distance: the normal changes by H δ along δ, hence a = −t_uᵀ H t_u."""
-    from scipy.ndimage import map_coordinates
-
-    index = hull.to_index(points).T
-    rows = [
-        [map_coordinates(second, index, order=1) for second in np.gradient(first, hull.voxel)]
-        for first in np.gradient(field, hull.voxel)
-    ]
-    hessian = np.moveaxis(np.array(rows), -1, 0)
+    """(a, b, c) in the tangent frame of S, dn = S dx: the normal field is n₀ − …, hence a = −t_uᵀ S t_u."""
     tangents = frames[:, :, :2]
-    shape = -np.einsum("kiu,kij,kjv->kuv", tangents, hessian, tangents)
+    shape = -np.einsum("kiu,kij,kjv->kuv", tangents, tensors, tangents)
     return np.stack([shape[:, 0, 0], (shape[:, 0, 1] + shape[:, 1, 0]) / 2, shape[:, 1, 1]], 1)

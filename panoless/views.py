@@ -41,6 +41,12 @@ class TrainView:
         """Rotates camera directions into the world: R of the pose."""
         return self.camera.world_to_camera[:3, :3].T
 
+    @property
+    def position(self) -> Float[np.ndarray, "3"]:
+        """Camera center in the normalized frame."""
+        world_to_camera = self.camera.world_to_camera.cpu().numpy().astype(np.float64)
+        return -world_to_camera[:3, :3].T @ world_to_camera[:3, 3]
+
 
 @dataclass(frozen=True)
 class Views:

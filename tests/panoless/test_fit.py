@@ -16,6 +16,7 @@ from panoless.cubemap import look_up
 from panoless.export import render
 from panoless.fit import Fitter, LossTerms, fit, new_state, normalization_of
 from panoless.kernels.cubemap import cubemap_directions
+from panoless.kernels.objective import Objective
 from panoless.surfels import Surfels
 from panoless.views import Views, load_views, raster_camera
 from shinypartial.camera import Camera
@@ -216,7 +217,13 @@ def test_every_epoch_sees_every_view_once(tmp_path: Path, views: Views) -> None:
 
 
 def test_a_loss_that_is_not_finite_stops_the_fit(tmp_path: Path, sphere_dataset: Dataset, monkeypatch) -> None:
-    monkeypatch.setattr(fit_module, "photometric_masked", lambda color, *_: color.sum() * float("nan"))
+    objective = fit_module.mirror_objective
+
+    def spoiled(*arguments) -> Objective:
+        found = objective(*arguments)
+        return replace(found, total=found.total * float("nan"))
+
+    monkeypatch.setattr(fit_module, "mirror_objective", spoiled)
     with pytest.raises(InputError, match="nan at iteration 0"):
         fit(sphere_dataset, tiny_config(iterations=5, count=60), tmp_path / "run")
     assert load_state(tmp_path / "run") is None

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from panoless.config import SurfelConfig
-from panoless.initialize import HULL_HALF_SIDE, carve_hull, initial_surfels
+from panoless.hull import HULL_HALF_SIDE
+from panoless.initialize import initial_surfels
 from panoless.kernels.reference.rasterize import rotation_matrices
 from panoless.surfels import Surfels
-from panoless.views import TrainView, Views
-from shinypartial.errors import InputError
+from panoless.views import Views
 
 CONFIG = SurfelConfig(count=800, hull_resolution=48)
 VOXEL = 2 * HULL_HALF_SIDE / 47
@@ -109,43 +109,6 @@ def test_random_surfels_fill_the_cube(views: Views) -> None:
     normals = rotation_matrices(surfels.quats)[:, :, 2]
     torch.testing.assert_close(normals.mean(0), torch.zeros(3), rtol=0, atol=0.06)
     assert float(surfels.opacities.min()) == pytest.approx(0.1)
-
-
-def masked(view: TrainView, pixel: tuple[int, int] | None) -> TrainView:
-    """A view whose mask is one pixel, or nothing."""
-    mask = torch.zeros_like(view.mask)
-    if pixel is not None:
-        mask[pixel] = 1
-    return replace(view, mask=mask)
-
-
-def test_masks_that_contradict_each_other_leave_no_hull(views: Views) -> None:
-    corners = tuple(masked(view, (0, 0) if i % 2 else (-1, -1)) for i, view in enumerate(views.train))
-    with pytest.raises(InputError, match="no point in space"):
-        initial_surfels(replace(views, train=corners), CONFIG, seed=0)
-
-
-def test_a_vote_forgives_one_wrong_mask(views: Views) -> None:
-    damaged = replace(views, train=(masked(views.train[0], None), *views.train[1:]))
-    whole = carve_hull(views, 32, votes=1.0).distance < 0
-    forgiving = carve_hull(damaged, 32, votes=0.9).distance < 0
-    assert whole.any()
-    assert forgiving[whole].all()
-    with pytest.raises(InputError, match="100% of the masks"):
-        carve_hull(damaged, 32, votes=1.0)
-
-
-def test_the_hull_is_a_signed_distance(views: Views) -> None:
-    hull = carve_hull(views, 48, votes=1.0)
-    points = np.stack(np.meshgrid(*[np.linspace(-HULL_HALF_SIDE, HULL_HALF_SIDE, 48)] * 3, indexing="ij"), -1)
-    center = -views.normalization.center / views.normalization.radius
-    truth = np.linalg.norm(points - center, axis=-1) - 1 / views.normalization.radius
-    # Along +X, where cameras bound the hull.
-    line = truth[24:, 23:25, 23:25]
-    np.testing.assert_allclose(hull.distance[24:, 23:25, 23:25], line, atol=3 * VOXEL)
-    np.testing.assert_allclose(
-        hull.to_index(points.reshape(-1, 3)).reshape(points.shape)[5, 7, 9], [5, 7, 9], atol=1e-6
-    )
 
 
 def test_select_and_named_keep_rows_together(hull: Surfels) -> None:

@@ -1,0 +1,181 @@
+"""How far the masks' contours are from the outline of a plane, in pixels, and what moves them: the plane's numbers and
+the outline's vertices.
+"""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from panoless.plane import Plane, pose_of
+from panoless.views import Views
+from shinypartial.conventions import PIXEL_CENTER
+
+CONTOUR_LEVEL = 0.5
+CORNER_DEG = 20.0
+CORNER_PX = 1.5
+"""The level set of pixel averages is round at corners: points this near to one say nothing about it."""
+NOISE_SCALE = 3.0
+"""The robust scale is at least this times the median distance, so that wrong poses leave all views a say."""
+PULL = 1e-3
+"""Weight of a vertex's place against the contour points of its side: along a straight side nothing else holds it."""
+
+
+@dataclass(frozen=True)
+class Contours:
+    """Contour points: rays of camera depth one, and how far a shift in space moves their pixel, times depth."""
+
+    view: Int[np.ndarray, "P"]
+    centers: Float[np.ndarray, "P 3"]
+    rays: Float[np.ndarray, "P 3"]
+    columns: Float[np.ndarray, "P 3"]
+    rows: Float[np.ndarray, "P 3"]
+
+    def every(self, stride: int) -> "Contours":
+        """Every stride-th point."""
+        return Contours(*(getattr(self, field.name)[::stride] for field in fields(self)))
+
+
+@dataclass(frozen=True)
+class Distances:
+    """Signed distances (pixels, outward) of contour points from the projected outline, and what they depend on."""
+
+    coordinates: Float[np.ndarray, "P 2"]
+    pixels: Float[np.ndarray, "P"]
+    by_plane: Float[np.ndarray, "P 4"]
+    """Derivatives by the normal along t_u and t_v, by the offset, and by the rim's height."""
+    edge: Int[np.ndarray, "P"]
+    along: Float[np.ndarray, "P"]
+    outward: Float[np.ndarray, "P 2"]
+    """Outward unit normals of the outline, times pixels per unit."""
+    valid: Bool[np.ndarray, "P"]
+    """In front of a camera that faces the mirror."""
+    corner: Bool[np.ndarray, "P"]
+
+
+def view_contours(views: Views) -> Contours:
+    """The longest closed or open contour of each mask."""
+    from skimage.measure import find_contours
+
+    parts = []
+    for index, view in enumerate(views.train):
+        found = find_contours(view.mask.numpy().astype(np.float64), CONTOUR_LEVEL)
+        if not found:
+            continue
+        pixels, camera = max(found, key=len)[:-1, ::-1] + PIXEL_CENTER, view.camera
+        rotation, center = pose_of(camera)
+        x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
+        rays = np.stack([x, y, np.ones_like(x)], 1) @ rotation
+        columns = camera.fx * (rotation[0] - x[:, None] * rotation[2])
+        rows = camera.fy * (rotation[1] - y[:, None] * rotation[2])
+        parts.append(Contours(np.full(len(x), index), np.tile(center, (len(x), 1)), rays, columns, rows))
+    if not parts:
+        return Contours(np.zeros(0, dtype=np.int64), *(np.zeros((0, 3)) for _ in range(4)))
+    return Contours(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Contours)))
+
+
+def carried(contours: Contours, plane: Plane) -> tuple[Float[np.ndarray, "P 2"], Bool[np.ndarray, "P"]]:
+    """Plane coordinates of the contour points, and whether their rays meet the mirror's front (zero where not)."""
+    slope, height = contours.rays @ plane.normal, contours.centers @ plane.normal - plane.offset
+    valid = (slope < -1e-6) & (height > 0)
+    points = contours.centers + np.where(valid, -height / np.where(valid, slope, -1.0), 0.0)[:, None] * contours.rays
+    coordinates = np.stack([points @ plane.tangent_u, points @ plane.tangent_v], 1)
+    return np.where(valid[:, None], coordinates, 0.0), valid
+
+
+def outline_distances(contours: Contours, plane: Plane) -> Distances:
+    """First-order pixel distances: the plane distance from an edge times |det J|/‖J τ‖, J = ∂pixel/∂coordinates.
+
+    A turn of the normal by a t_u + b t_v and a shift of the offset by c move the hit point by r (c − a p₁ − b p₂)/(n·r)
+    along its ray r. Where a camera at height H stands beyond an edge, the rim of height h hides the mirror up to
+    (ν·(camera − edge)) h/(H − h) inside of it, ν the outward normal.
+    """
+    coordinates, valid = carried(contours, plane)
+    edge, along = _nearest(coordinates, plane.outline)
+    corners = plane.outline
+    sides = np.roll(corners, -1, 0) - corners
+    lengths = np.linalg.norm(sides, axis=1)
+    tangents = sides / np.maximum(lengths, 1e-12)[:, None]
+    tangent, tangent_u, tangent_v = tangents[edge], plane.tangent_u, plane.tangent_v
+    slope = np.where(valid, contours.rays @ plane.normal, -1.0)
+    depth = np.where(valid, (plane.offset - contours.centers @ plane.normal) / slope, 1.0)
+    column_u, column_v = contours.columns @ tangent_u / depth, contours.columns @ tangent_v / depth
+    row_u, row_v = contours.rows @ tangent_u / depth, contours.rows @ tangent_v / depth
+    stretch = np.hypot(
+        column_u * tangent[:, 0] + column_v * tangent[:, 1], row_u * tangent[:, 0] + row_v * tangent[:, 1]
+    )
+    scale = np.abs(column_u * row_v - column_v * row_u) / np.maximum(stretch, 1e-12)
+    outward = scale[:, None] * np.stack([tangent[:, 1], -tangent[:, 0]], 1)
+    hit_moves = outward[:, 0] * (contours.rays @ tangent_u) + outward[:, 1] * (contours.rays @ tangent_v)
+    height = np.where(valid, contours.centers @ plane.normal - plane.offset, np.inf)
+    above = np.where(height > 2 * plane.rim_height, height - plane.rim_height, np.inf)
+    foot = corners[edge] + along[:, None] * sides[edge]
+    camera = np.stack([contours.centers @ tangent_u, contours.centers @ tangent_v], 1)
+    beyond = np.maximum((outward * (camera - foot)).sum(1), 0.0)
+    by_rim = np.where(np.isfinite(above), beyond / above, 0.0)
+    by_plane = (hit_moves / slope)[:, None] * np.concatenate([-coordinates, np.ones((len(edge), 1))], 1)
+    turns = np.einsum("ni,ni->n", tangents, np.roll(tangents, 1, 0)) < np.cos(np.radians(CORNER_DEG))
+    reach = stretch * lengths[edge]
+    return Distances(
+        coordinates=coordinates,
+        pixels=(outward * (coordinates - foot)).sum(1) + by_rim * plane.rim_height,
+        by_plane=np.concatenate([by_plane, by_rim[:, None]], 1),
+        edge=edge,
+        along=along,
+        outward=outward,
+        valid=valid,
+        corner=(turns[edge] & (along * reach < CORNER_PX))
+        | (np.roll(turns, -1)[edge] & ((1 - along) * reach < CORNER_PX)),
+    )
+
+
+def _nearest(
+    points: Float[np.ndarray, "P 2"], outline: Float[np.ndarray, "N 2"]
+) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"]]:
+    """The side nearest to each point, and where on it: 0 at its first vertex, 1 at its second."""
+    best = np.full(len(points), np.inf)
+    edge, along = np.zeros(len(points), dtype=np.int64), np.zeros(len(points))
+    for index, (start, side) in enumerate(zip(outline, np.roll(outline, -1, 0) - outline, strict=True)):
+        offset_x, offset_y = points[:, 0] - start[0], points[:, 1] - start[1]
+        share = ((offset_x * side[0] + offset_y * side[1]) / max(side @ side, 1e-18)).clip(0, 1)
+        squared = (offset_x - share * side[0]) ** 2 + (offset_y - share * side[1]) ** 2
+        nearer = squared < best
+        best[nearer], along[nearer], edge[nearer] = squared[nearer], share[nearer], index
+    return edge, along
+
+
+def robust_weights(distances: Distances, scale_px: float) -> Float[np.ndarray, "P"]:
+    """Geman–McClure weights (1 + e²/s²)⁻², where s is `scale_px` or, if larger, a multiple of the median |e|."""
+    typical = np.median(np.abs(distances.pixels[distances.valid])) if distances.valid.any() else 0.0
+    scale = max(scale_px, NOISE_SCALE * float(typical))
+    return (distances.valid & ~distances.corner) / (1 + (distances.pixels / scale) ** 2) ** 2
+
+
+def normal_equations(
+    contours: Contours, distances: Distances, scale_px: float, vertices: int, rim: bool
+) -> tuple[Float[np.ndarray, "V D"], Float[np.ndarray, "D D"]]:
+    """The gradient Σ J w e of each view and the matrix Jᵀ W J, over four numbers of the plane and two of each vertex.
+
+    Without `rim`, the rim's height has no influence and no gradient.
+    """
+    from scipy import sparse
+
+    count, weights = len(distances.edge), robust_weights(distances, scale_px)
+    ends = np.stack([distances.edge, (distances.edge + 1) % vertices], 1)
+    shares = np.stack([1 - distances.along, distances.along], 1)
+    values = -shares[:, :, None] * distances.outward[:, None, :]
+    columns = 4 + 2 * ends[:, :, None] + np.arange(2)
+    by_plane = distances.by_plane * [1, 1, 1, rim]
+    jacobian = sparse.csr_matrix(
+        (
+            np.concatenate([by_plane, values.reshape(count, 4)], 1).ravel(),
+            np.concatenate([np.tile(np.arange(4), (count, 1)), columns.reshape(count, 4)], 1).ravel(),
+            np.arange(count + 1) * 8,
+        ),
+        shape=(count, 4 + 2 * vertices),
+    )
+    matrix = (jacobian.T @ jacobian.multiply(weights[:, None]).tocsr()).toarray()
+    pull = PULL * weights.sum() / vertices * np.median((distances.outward**2).sum(1))
+    matrix += np.diag(np.append(np.full(4, 1e-9 * np.trace(matrix[:4, :4])), np.full(2 * vertices, pull)))
+    by_view = sparse.csr_matrix((weights * distances.pixels, (contours.view, np.arange(count))))
+    return (by_view @ jacobian).toarray(), matrix
