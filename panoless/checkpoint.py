@@ -54,12 +54,12 @@ def save_state(folder: Path, state: FitState) -> None:
 
 
 def load_state(folder: Path) -> FitState | None:
-    """Read the checkpoint, or None when there is none yet; InputError when it is damaged."""
+    """Read the checkpoint into main memory, or None when there is none yet; InputError when it is damaged."""
     path = folder / CHECKPOINT
     if not path.exists():
         return None
     try:
-        content = torch.load(path, weights_only=True)
+        content = torch.load(path, weights_only=True, map_location="cpu")
         return FitState(**{**content, "surfels": Surfels(**content["surfels"])})
     except Exception as error:
         raise InputError(

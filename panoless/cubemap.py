@@ -48,14 +48,14 @@ def solve_environment(rays: Sequence[Rays], resolution: int) -> Float[Tensor, "6
     which see the object itself or a wrong normal lose their vote. Each round starts from the weighted splat
     Eᵀ(w c)/Eᵀ(w) and sharpens it by conjugate gradients on the normal equations.
     """
-    weights = [torch.ones(len(batch.directions)) for batch in rays]
-    environment = torch.zeros(6, 3, resolution, resolution)
+    weights = [torch.ones_like(batch.radiance[:, 0]) for batch in rays]
+    environment = torch.zeros(6, 3, resolution, resolution, device=rays[0].directions.device if rays else None)
     for scale in ROBUST_SCALES:
         if scale is not None:
             for batch, weight in zip(rays, weights, strict=True):
                 weight.copy_(robust_weight(sample_cubemap(environment, batch.directions) - batch.radiance, scale))
-        total = _normal_product(torch.ones(6, 1, resolution, resolution), rays, weights)
-        right_side = _right_side(rays, weights, resolution)
+        total = _normal_product(torch.ones_like(environment[:, :1]), rays, weights)
+        right_side = _right_side(rays, weights, environment)
         splat = fill_unobserved(right_side / total.clamp(min=1e-9), total[:, 0])
         environment = _sharpen(splat, right_side, total, rays, weights)
     return environment.clamp(0, 1)
@@ -66,10 +66,13 @@ def robust_weight(error: Float[Tensor, "P 3"], scale: float) -> Float[Tensor, "P
     return (1 + error.square().sum(1) / scale**2) ** -2
 
 
-def _right_side(rays: Sequence[Rays], weights: Sequence[Tensor], resolution: int) -> Float[Tensor, "6 3 L L"]:
-    result = torch.zeros(6, 3, resolution, resolution)
+def _right_side(
+    rays: Sequence[Rays], weights: Sequence[Tensor], environment: Float[Tensor, "6 3 L L"]
+) -> Float[Tensor, "6 3 L L"]:
+    """Eᵀ(w c), of the size and on the device of a map."""
+    result = torch.zeros_like(environment)
     for batch, weight in zip(rays, weights, strict=True):
-        result += scatter_cubemap(batch.radiance * weight[:, None], batch.directions, resolution)
+        result += scatter_cubemap(batch.radiance * weight[:, None], batch.directions, environment.shape[-1])
     return result
 
 
@@ -131,6 +134,6 @@ def fill_unobserved(values: Float[Tensor, "6 C L L"], weight: Float[Tensor, "6 L
 
 def resample(environment: Float[Tensor, "6 C L L"], resolution: int) -> Float[Tensor, "6 C M M"]:
     """The map at the texel centers of another resolution, bilinear and seamless."""
-    directions = cubemap_directions(resolution).to(environment.dtype).reshape(-1, 3)
+    directions = cubemap_directions(resolution, dtype=environment.dtype, device=environment.device).reshape(-1, 3)
     sampled = sample_cubemap(environment, directions)
     return sampled.view(6, resolution, resolution, -1).permute(0, 3, 1, 2).contiguous()

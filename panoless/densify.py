@@ -27,9 +27,9 @@ class DensityStatistics:
     count: Float[Tensor, "K"]
 
     @classmethod
-    def empty(cls, count: int) -> "DensityStatistics":
+    def empty(cls, count: int, device: torch.device | None = None) -> "DensityStatistics":
         """Nothing seen yet."""
-        return cls(torch.zeros(count), torch.zeros(count))
+        return cls(torch.zeros(count, device=device), torch.zeros(count, device=device))
 
     def observe(self, screen_gradient: Float[Tensor, "K 2"], in_frustum: Tensor, image_width: int) -> None:
         """Add one step's gradient of the surfels that were rasterized."""
@@ -71,14 +71,14 @@ def grow_and_prune(
     splits = torch.nonzero(grows & (largest > config.dense_share))[:, 0]
     room = max(config.max_surfels - surfels.count, 0)
     clones, splits = clones[:room], splits[: max(room - len(clones), 0)]
-    stays = torch.ones(surfels.count, dtype=torch.bool)
+    stays = torch.ones_like(grows)
     stays[splits] = False
     kept = torch.nonzero(stays)[:, 0]
     children = splits.repeat(SPLIT_INTO)
     parts = (surfels.select(kept), surfels.select(clones), _split(surfels.select(children), generator))
     merged = Surfels(**{name: torch.cat([part.named()[name] for part in parts]) for name in surfels.named()})
     source = torch.cat([kept, clones, children])
-    unchanged = torch.arange(len(source)) < len(kept)
+    unchanged = torch.arange(len(source), device=source.device) < len(kept)
     alive = merged.scales.amax(1) < LARGEST_SCALE
     if prune_faint:
         alive &= merged.opacities >= config.prune_opacity
@@ -88,7 +88,7 @@ def grow_and_prune(
 
 
 def _split(children: Surfels, generator: torch.Generator) -> Surfels:
-    local = torch.randn(children.count, 2, generator=generator) * children.scales
+    local = torch.randn(children.count, 2, generator=generator).to(children.scales) * children.scales
     rotation = rotation_matrices(children.quats)
     offset = rotation[:, :, 0] * local[:, :1] + rotation[:, :, 1] * local[:, 1:]
     return replace(children, means=children.means + offset, log_scales=children.log_scales - math.log(SPLIT_SHRINK))

@@ -17,16 +17,13 @@ from panoless.config import FitConfig, check_config
 from panoless.cubemap import Rays, initial_environment, look_up, resample, solve_environment
 from panoless.densify import DensityStatistics, Edit, grow_and_prune, propagate_normals, reset_opacities
 from panoless.initialize import initial_surfels
-from panoless.losses import normal_consistency, photometric_masked, photometric_paper, silhouette
+from panoless.kernels.objective import MirrorView, ObjectiveTerms, mirror_objective
+from panoless.kernels.rasterize import Channels, RasterBuffers
+from panoless.losses import photometric_paper
 from panoless.optimizer import SurfelOptimizer
 from panoless.schedule import Schedule
-from panoless.shading import (
-    ALPHA_FLOOR,
-    SurfaceBuffers,
-    compose,
-    reflection_directions_world,
-    surface_buffers,
-)
+from panoless.shading import ALPHA_FLOOR, compose, rasterize_surfels, reflection_directions_world, tiles_of
+from panoless.snapshots import Marks, SnapshotKeeper, require_snapshots
 from panoless.surfels import Surfels
 from panoless.views import Normalization, TrainView, Views, load_views
 from panoless.visibility import (
@@ -35,8 +32,10 @@ from panoless.visibility import (
     visibility_from_agreement,
     visibility_from_evidence,
 )
+from shinypartial.conventions import SOLID_ALPHA
 from shinypartial.dataset.schema import Dataset
 from shinypartial.errors import InputError
+from shinypartial.files import only_writer
 from shinypartial.prediction import dataset_hash
 from shinypartial.progress import Progress
 
@@ -45,6 +44,7 @@ CURVE_EVERY = 10
 SOLID_SURFACE_ALPHA = 0.9
 INITIAL_RAYS = 1_000_000
 FINAL_RAYS = 8_000_000
+NO_MARKS = Marks()
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,9 @@ class Observed:
 class Fitter:
     """Runs the steps of a fit from a state to completion, saving as it goes."""
 
-    def __init__(self, views: Views, config: FitConfig, folder: Path, state: FitState) -> None:
+    def __init__(self, views: Views, config: FitConfig, folder: Path, state: FitState, marks: Marks = NO_MARKS) -> None:
         """Continue from `state`, which may be new."""
+        self.snapshots = SnapshotKeeper(folder, marks, state)
         self.views, self.config, self.folder, self.state = views, config, folder, state
         self.schedule = Schedule(config)
         self.optimizer = SurfelOptimizer(state.surfels, state.environment, config.rates)
@@ -93,6 +94,7 @@ class Fitter:
             with _timed(self.state, "optimize"):
                 terms = self._step(self.state.iteration)
             self.state.iteration += 1
+            self.snapshots.observe(self.state, self.optimizer.surfels, self.optimizer.environment)
             progress.advance(f"loss {terms.photometric:.4f}  {self.optimizer.surfels.count} surfels")
             if time.monotonic() - saved > CHECKPOINT_INTERVAL_S:
                 self._save()
@@ -104,14 +106,17 @@ class Fitter:
         view = self.views.train[self._view_index(iteration)]
         surfels = self.optimizer.surfels
         offsets = torch.zeros(surfels.count, 2, requires_grad=True) if self.config.density.enabled else None
-        buffers = surface_buffers(
-            surfels,
-            view.camera,
-            curved=self.config.surfels.curved,
-            depth_blend=self.config.loss.depth_blend,
-            screen_offsets=offsets,
-        )
-        terms, observed = self._loss(view, buffers, surfels, iteration)
+        # While only the environment learns, surfels need no gradient, unless density control counts it.
+        with torch.set_grad_enabled(self.schedule.geometry_moves(iteration) or offsets is not None):
+            raster = rasterize_surfels(
+                surfels,
+                view.camera,
+                curved=self.config.surfels.curved,
+                screen_offsets=offsets,
+                channels=self._channels(iteration),
+                active_tiles=self._active_tiles(view, iteration),
+            )
+        terms, observed = self._loss(view, raster, surfels, iteration)
         terms.total.backward()  # type: ignore[no-untyped-call]
         if not torch.isfinite(terms.total):
             raise InputError(
@@ -120,7 +125,7 @@ class Fitter:
                 remedy="Check the images for extreme values, or lower the rates (--config.rates.…).",
             )
         if offsets is not None and offsets.grad is not None:
-            self.statistics.observe(offsets.grad, buffers.in_frustum, view.camera.width)
+            self.statistics.observe(offsets.grad, raster.in_frustum, view.camera.width)
         self.optimizer.step(
             self.schedule.rate_factor(iteration),
             geometry=self.schedule.geometry_moves(iteration),
@@ -128,7 +133,7 @@ class Fitter:
         )
         if self.config.environment.activation == "clamp":
             self.optimizer.environment.data.clamp_(0, 1)
-        if self.config.visibility == "online":
+        if observed is not None:
             accumulate(self.state.evidence, observed.directions, observed.alpha, self.config.visibility_alpha)
         self._control_density(iteration)
         if iteration % CURVE_EVERY == 0:
@@ -147,53 +152,78 @@ class Fitter:
             number = (number * 1_000_003 + part + 1) % (1 << 62)
         return torch.Generator().manual_seed(number)
 
-    def _loss(
-        self, view: TrainView, buffers: SurfaceBuffers, surfels: Surfels, iteration: int
-    ) -> tuple[LossTerms, Observed]:
-        loss = self.config.loss
-        photometric, observed = (
-            self._masked(view, buffers)
-            if loss.photometric == "masked"
-            else self._composited(view, buffers, surfels, iteration)
+    def _terms(self, iteration: int) -> ObjectiveTerms:
+        """What acts in this iteration; geometric terms wait until the geometry moves."""
+        loss, moves = self.config.loss, self.schedule.geometry_moves(iteration)
+        masked = loss.photometric == "masked"
+        return ObjectiveTerms(
+            robust_scale=loss.robust_scale,
+            photometric=masked,
+            lambda_normal_consistency=loss.lambda_normal_consistency * moves,
+            consistency_everywhere=not masked,
+            lambda_silhouette=self.schedule.lambda_silhouette(iteration) * moves,
+            depth_blend=loss.depth_blend,
+            activation=self.config.environment.activation,
+            alpha_applied=self.config.alpha_applied,
         )
-        total = photometric
-        consistency = outline = 0.0
-        geometry = self.schedule.geometry_moves(iteration)
-        if loss.lambda_normal_consistency > 0 and geometry:
-            weight = view.mask if loss.photometric == "masked" else torch.ones_like(view.mask)
-            term = normal_consistency(buffers, view.camera, weight)
-            total = total + loss.lambda_normal_consistency * term
-            consistency = float(term.detach())
-        lambda_silhouette = self.schedule.lambda_silhouette(iteration)
-        if lambda_silhouette > 0 and geometry:
-            term = silhouette(buffers.alpha, view.mask)
-            total = total + lambda_silhouette * term
-            outline = float(term.detach())
-        if loss.lambda_distortion > 0 and geometry:
-            total = total + loss.lambda_distortion * buffers.distortion.mean()
-        return LossTerms(total, float(photometric.detach()), consistency, outline), observed
 
-    def _masked(self, view: TrainView, buffers: SurfaceBuffers) -> tuple[Tensor, Observed]:
+    def _channels(self, iteration: int) -> Channels:
+        """The images that some term of this iteration reads."""
+        moves = self.schedule.geometry_moves(iteration)
+        return Channels(
+            colors=self.config.albedo,
+            depth=self._terms(iteration).lambda_normal_consistency > 0,
+            distortion=self.config.loss.lambda_distortion > 0 and moves,
+        )
+
+    def _active_tiles(self, view: TrainView, iteration: int) -> Tensor | None:
+        """The tiles that some term of this iteration reads; None for all."""
+        terms = self._terms(iteration)
+        everywhere = not terms.photometric or terms.lambda_silhouette > 0 or self._channels(iteration).distortion
+        if everywhere:
+            return None
+        if terms.lambda_normal_consistency > 0:
+            return tiles_of(view.mask > 0, margin_px=1)
+        return tiles_of(view.mask > SOLID_ALPHA)
+
+    def _loss(
+        self, view: TrainView, raster: RasterBuffers, surfels: Surfels, iteration: int
+    ) -> tuple[LossTerms, Observed | None]:
+        terms = self._terms(iteration)
+        objective = mirror_objective(
+            raster.normals_camera,
+            raster.alpha,
+            raster.accumulated_depth,
+            raster.median_depth,
+            raster.colors if self.config.albedo else None,
+            self.optimizer.environment,
+            _mirror_view(view),
+            terms,
+        )
+        total, photometric = objective.total, objective.photometric
         pixels = view.solid
-        alpha = buffers.alpha.flatten()[pixels]
-        directions = _reflections(view, buffers, pixels)
-        specular = look_up(self.optimizer.environment, directions, self.config.environment.activation)
-        albedo = buffers.albedo.flatten(1)[:, pixels]
-        color = compose(albedo, specular.T, alpha, self.config.alpha_applied)
-        target = view.radiance.flatten(1)[:, pixels]
-        term = photometric_masked(color.T, target.T, self.config.loss.robust_scale)
-        return term, Observed(directions.detach(), alpha.detach())
+        if not terms.photometric:
+            pixels = torch.nonzero(raster.alpha.detach().flatten() > ALPHA_FLOOR)[:, 0]
+            composited = self._composited(view, raster, surfels, pixels, iteration)
+            total, photometric = total + composited, float(composited.detach())
+        if self._channels(iteration).distortion:
+            total = total + self.config.loss.lambda_distortion * raster.distortion.mean()
+        observed = None
+        if self.config.visibility == "online":
+            with torch.no_grad():
+                observed = Observed(_reflections(view, raster, pixels), raster.alpha.flatten()[pixels])
+        return LossTerms(total, photometric, objective.normal_consistency, objective.silhouette), observed
 
     def _composited(
-        self, view: TrainView, buffers: SurfaceBuffers, surfels: Surfels, iteration: int
-    ) -> tuple[Tensor, Observed]:
-        pixels = torch.nonzero(buffers.alpha.detach().flatten() > ALPHA_FLOOR)[:, 0]
+        self, view: TrainView, buffers: RasterBuffers, surfels: Surfels, pixels: Tensor, iteration: int
+    ) -> Tensor:
+        """Eq. 9 over the whole image, to which the given pixels add more than the background."""
         alpha = buffers.alpha.flatten()[pixels]
         directions = _reflections(view, buffers, pixels)
         specular = look_up(self.optimizer.environment, directions, self.config.environment.activation).T
         if self.config.loss.roughness_weighted:
             specular = specular * (1 - self._roughness(view, surfels).flatten()[pixels]).square()
-        color = compose(buffers.albedo.flatten(1)[:, pixels], specular, alpha, self.config.alpha_applied)
+        color = compose(buffers.colors.flatten(1)[:, pixels], specular, alpha, self.config.alpha_applied)
         if self.config.loss.random_background:
             background = torch.rand(3, 1, generator=self._generator(iteration, 1))
         else:
@@ -201,12 +231,12 @@ class Fitter:
         image = background.expand(3, buffers.alpha.numel()).clone()
         image[:, pixels] = color + (1 - alpha) * background
         target = view.radiance + (1 - view.mask) * background[:, :, None]
-        term = photometric_paper(image.view_as(target), target, self.config.loss.lambda_ssim)
-        return term, Observed(directions.detach(), alpha.detach())
+        return photometric_paper(image.view_as(target), target, self.config.loss.lambda_ssim)
 
     def _roughness(self, view: TrainView, surfels: Surfels) -> Float[Tensor, "H W"]:
         roughness = torch.sigmoid(surfels.roughness_logits)[:, None].expand(-1, 3).contiguous()
-        return surface_buffers(surfels, view.camera, curved=False, depth_blend=0.0, attribute=roughness).albedo[0]
+        channels = Channels(depth=False, distortion=False)
+        return rasterize_surfels(surfels, view.camera, curved=False, attribute=roughness, channels=channels).colors[0]
 
     def _control_density(self, iteration: int) -> None:
         surfels = self.optimizer.surfels
@@ -238,21 +268,9 @@ class Fitter:
             self.state.curves.setdefault(name, []).append(value)
 
     def _complete(self) -> None:
-        """Solve the environment for the converged geometry, and say how well each direction was observed."""
-        config, state = self.config, self.state
-        surfels = self.optimizer.surfels.detached()
-        with _timed(state, "solve environment"), torch.no_grad():
-            rays = list(observed_rays(self.views, surfels, config, FINAL_RAYS))
-            if config.environment.solve:
-                state.final_environment = solve_environment(rays, config.environment.solve_resolution)
-            else:
-                parameters = self.optimizer.environment.detach()
-                sigmoid = config.environment.activation == "sigmoid"
-                state.final_environment = torch.sigmoid(parameters) if sigmoid else parameters
-            if config.visibility == "online":
-                state.visibility = visibility_from_evidence(state.evidence)
-            else:
-                state.visibility = visibility_from_agreement(agreement(rays, state.final_environment))
+        self.state.surfels = self.optimizer.surfels.detached()
+        self.state.environment = self.optimizer.environment.detach()
+        complete(self.state, self.views, self.config)
 
     def _save(self) -> None:
         state = self.state
@@ -282,10 +300,17 @@ def _timed(state: FitState, stage: str) -> Iterator[None]:
         state.seconds[stage] = before + time.monotonic() - start
 
 
-def _reflections(view: TrainView, buffers: SurfaceBuffers, pixels: Tensor) -> Float[Tensor, "P 3"]:
+def _mirror_view(view: TrainView) -> MirrorView:
+    camera = view.camera
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    rotation = view.camera_to_world_rotation
+    return MirrorView(view.radiance, view.mask, view.rays_camera, rotation, *intrinsics, solid_alpha=SOLID_ALPHA)
+
+
+def _reflections(view: TrainView, buffers: RasterBuffers, pixels: Tensor) -> Float[Tensor, "P 3"]:
     """World directions that the given pixels (flat indices) of a view mirror."""
     return reflection_directions_world(
-        buffers.raster_normals_camera.flatten(1)[:, pixels],
+        buffers.normals_camera.flatten(1)[:, pixels],
         view.rays_camera.flatten(1)[:, pixels],
         view.camera_to_world_rotation,
     )
@@ -298,12 +323,33 @@ def observed_rays(views: Views, surfels: Surfels, config: FitConfig, max_rays: i
     """
     stride = math.ceil(sum(len(view.solid) for view in views.train) / max_rays)
     for index, view in enumerate(views.train):
-        buffers = surface_buffers(surfels, view.camera, curved=config.surfels.curved, depth_blend=0.0)
+        buffers = rasterize_surfels(
+            surfels,
+            view.camera,
+            curved=config.surfels.curved,
+            channels=Channels(colors=config.albedo, depth=False, distortion=False),
+            active_tiles=tiles_of(view.mask > SOLID_ALPHA),
+        )
         pixels = view.solid[index % stride :: stride]
         pixels = pixels[buffers.alpha.flatten()[pixels] > SOLID_SURFACE_ALPHA]
         directions = _reflections(view, buffers, pixels)
-        diffuse = buffers.albedo.flatten(1)[:, pixels]
+        diffuse = buffers.colors.flatten(1)[:, pixels]
         yield Rays(directions, (view.radiance.flatten(1)[:, pixels] - diffuse).T.contiguous())
+
+
+def complete(state: FitState, views: Views, config: FitConfig) -> None:
+    """Solve the environment for the geometry of a state, and say how well each direction was observed."""
+    with _timed(state, "solve environment"), torch.no_grad():
+        rays = list(observed_rays(views, state.surfels, config, FINAL_RAYS))
+        if config.environment.solve:
+            state.final_environment = solve_environment(rays, config.environment.solve_resolution)
+        else:
+            sigmoid = config.environment.activation == "sigmoid"
+            state.final_environment = torch.sigmoid(state.environment) if sigmoid else state.environment
+        if config.visibility == "online":
+            state.visibility = visibility_from_evidence(state.evidence)
+        else:
+            state.visibility = visibility_from_agreement(agreement(rays, state.final_environment))
 
 
 def new_state(views: Views, config: FitConfig) -> FitState:
@@ -328,21 +374,27 @@ def new_state(views: Views, config: FitConfig) -> FitState:
     )
 
 
-def fit(dataset: Dataset, config: FitConfig, folder: Path) -> FitState:
-    """Fit a dataset in a run folder; a killed fit continues from its last checkpoint, a finished one is returned."""
+def fit(dataset: Dataset, config: FitConfig, folder: Path, marks: Marks = NO_MARKS) -> FitState:
+    """Fit a dataset in a run folder, taking snapshots at the marks; a killed fit continues from its last checkpoint,
+    a finished one is returned.
+
+    Raises InputError when another fit is writing to the folder, or marks are given to a finished fit without snapshots.
+    """
     check_config(config)
-    claim_run(folder, dataset.root, dataset_hash(dataset), config)
-    state = load_state(folder)
-    if state is not None and state.final_environment is not None:
+    with only_writer(folder):
+        claim_run(folder, dataset.root, dataset_hash(dataset), config)
+        state = load_state(folder)
+        if state is not None and state.final_environment is not None:
+            require_snapshots(folder, marks)
+            return state
+        start = time.monotonic()
+        views = load_views(dataset, config.crop_margin_px)
+        loaded = time.monotonic()
+        if state is None:
+            state = new_state(views, config)
+            state.seconds = {"read views": loaded - start, "initialize": time.monotonic() - loaded}
+        Fitter(views, config, folder, state, marks).run()
         return state
-    start = time.monotonic()
-    views = load_views(dataset, config.crop_margin_px)
-    loaded = time.monotonic()
-    if state is None:
-        state = new_state(views, config)
-        state.seconds = {"read views": loaded - start, "initialize": time.monotonic() - loaded}
-    Fitter(views, config, folder, state).run()
-    return state
 
 
 def normalization_of(state: FitState) -> Normalization:

@@ -2,14 +2,24 @@
 
 from dataclasses import dataclass
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import max_pool2d
 
-from panoless.kernels.rasterize import RasterCamera, rasterize
+from panoless.kernels.constants import ALPHA_FLOOR, TILE
+from panoless.kernels.rasterize import ALL_CHANNELS, Channels, RasterBuffers, RasterCamera, rasterize
+from panoless.kernels.reference.objective import compose, reflection_directions_world, surface_depth
 from panoless.surfels import Surfels
 
-ALPHA_FLOOR = 1e-3
+__all__ = [
+    "ALPHA_FLOOR",
+    "SurfaceBuffers",
+    "compose",
+    "rasterize_surfels",
+    "reflection_directions_world",
+    "surface_buffers",
+    "tiles_of",
+]
 
 
 @dataclass(frozen=True)
@@ -30,17 +40,18 @@ class SurfaceBuffers:
     in_frustum: Tensor
 
 
-def surface_buffers(
+def rasterize_surfels(
     surfels: Surfels,
     camera: RasterCamera,
     *,
     curved: bool,
-    depth_blend: float,
     screen_offsets: Float[Tensor, "K 2"] | None = None,
     attribute: Float[Tensor, "K 3"] | None = None,
-) -> SurfaceBuffers:
-    """Rasterize; D_surf = (1 − λ_d) D_exp + λ_d D_med (Eq. 3). `attribute` replaces the albedo as ψ of Eq. 1."""
-    raster = rasterize(
+    channels: Channels = ALL_CHANNELS,
+    active_tiles: Bool[Tensor, "tile_rows tile_columns"] | None = None,
+) -> RasterBuffers:
+    """Rasterize the surfels' physical quantities. `attribute` replaces the albedo as ψ of Eq. 1."""
+    return rasterize(
         surfels.means,
         surfels.quats,
         surfels.scales,
@@ -49,45 +60,40 @@ def surface_buffers(
         surfels.curvatures if curved else None,
         camera,
         screen_offsets=screen_offsets,
+        channels=channels,
+        active_tiles=active_tiles,
     )
-    expected = raster.accumulated_depth / raster.alpha.clamp(min=ALPHA_FLOOR)
-    if depth_blend == 0.0:
-        surface = expected
-    else:
-        surface = (1 - depth_blend) * expected + depth_blend * raster.median_depth
+
+
+def tiles_of(pixels: Bool[Tensor, "H W"], margin_px: int = 0) -> Bool[Tensor, "tile_rows tile_columns"]:
+    """The tiles of the rasterizer that hold one of the pixels, or come within a margin of it."""
+    chosen = pixels[None].float()
+    if margin_px:
+        chosen = max_pool2d(chosen, 2 * margin_px + 1, stride=1, padding=margin_px)
+    return max_pool2d(chosen, TILE, ceil_mode=True)[0] > 0
+
+
+def surface_buffers(
+    surfels: Surfels,
+    camera: RasterCamera,
+    *,
+    curved: bool,
+    depth_blend: float,
+    screen_offsets: Float[Tensor, "K 2"] | None = None,
+    attribute: Float[Tensor, "K 3"] | None = None,
+    channels: Channels = ALL_CHANNELS,
+) -> SurfaceBuffers:
+    """Rasterize, and blend the depths to D_surf (Eq. 3). `attribute` replaces the albedo as ψ of Eq. 1."""
+    raster = rasterize_surfels(
+        surfels, camera, curved=curved, screen_offsets=screen_offsets, attribute=attribute, channels=channels
+    )
     return SurfaceBuffers(
         albedo=raster.colors,
         alpha=raster.alpha,
         raster_normals_camera=raster.normals_camera,
-        expected_depth=expected,
+        expected_depth=surface_depth(raster.accumulated_depth, raster.median_depth, raster.alpha, 0.0),
         median_depth=raster.median_depth,
-        surface_depth=surface,
+        surface_depth=surface_depth(raster.accumulated_depth, raster.median_depth, raster.alpha, depth_blend),
         distortion=raster.distortion,
         in_frustum=raster.in_frustum,
     )
-
-
-def reflection_directions_world(
-    raster_normals_camera: Float[Tensor, "3 P"],
-    rays_camera: Float[Tensor, "3 P"],
-    camera_to_world_rotation: Float[Tensor, "3 3"],
-) -> Float[Tensor, "P 3"]:
-    """ω_r = v − 2 (v·n) n (Eq. 5) for unit camera rays v and blended normals, which are renormalized here.
-
-    Computed in the camera frame and rotated once: reflection commutes with rotation.
-    """
-    normals = normalize(raster_normals_camera, dim=0, eps=1e-8)
-    along = (rays_camera * normals).sum(0, keepdim=True)
-    return (camera_to_world_rotation @ (rays_camera - 2 * along * normals)).T
-
-
-def compose(
-    albedo: Float[Tensor, "3 *S"], specular: Float[Tensor, "3 *S"], alpha: Float[Tensor, "*S"], alpha_applied: str
-) -> Float[Tensor, "3 *S"]:
-    """C = A + L_env (Eq. 8) under the matte α, without the background term (1 − α) b.
-
-    `paper`: (A + L)·α as Eq. 10 is written, although the blended A holds α already; `once`: A + L·α.
-    """
-    if alpha_applied == "paper":
-        return (albedo + specular) * alpha
-    return albedo + specular * alpha

@@ -48,6 +48,10 @@ class Surfels:
         """The surfels of an index or boolean mask."""
         return Surfels(**{name: value[index] for name, value in self.named().items()})
 
+    def to(self, device: torch.device) -> "Surfels":
+        """The same numbers on a device."""
+        return Surfels(**{name: value.to(device) for name, value in self.named().items()})
+
     def detached(self) -> "Surfels":
         """The same numbers without gradients."""
         return Surfels(**{name: value.detach() for name, value in self.named().items()})

@@ -44,7 +44,7 @@ def visibility_from_evidence(evidence: Float[Tensor, "6 L L"]) -> Float[Tensor, 
 
     Zero exactly where no ray fell.
     """
-    relative = cubemap_solid_angles(evidence.shape[-1]).to(evidence.dtype)
+    relative = cubemap_solid_angles(evidence.shape[-1]).to(evidence)
     density = torch.log1p(evidence / (relative / relative.mean()))
     observed = density[density > 0]
     if not len(observed):
@@ -55,8 +55,8 @@ def visibility_from_evidence(evidence: Float[Tensor, "6 L L"]) -> Float[Tensor, 
 def agreement(rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"]) -> Agreement:
     """Weigh each ray by (1 + ‖e‖²/s²)⁻², s = 0.05 (linear), and average its sRGB residual over the texels it meets."""
     resolution = environment.shape[-1]
-    votes = torch.zeros(6, resolution, resolution)
-    residual = torch.zeros(6, resolution, resolution)
+    votes = environment.new_zeros(6, resolution, resolution)
+    residual = torch.zeros_like(votes)
     for batch in rays:
         seen = sample_cubemap(environment, batch.directions)
         weight = robust_weight(seen - batch.radiance, VOTE_SCALE)
@@ -69,7 +69,7 @@ def agreement(rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"]) -> Ag
 
 
 def _srgb(radiance: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-    return torch.from_numpy(linear_to_srgb(radiance.clamp(0, 1).numpy()))
+    return torch.from_numpy(linear_to_srgb(radiance.clamp(0, 1).cpu().numpy())).to(radiance.device)
 
 
 def visibility_from_agreement(found: Agreement) -> Float[Tensor, "6 L L"]:
@@ -79,6 +79,6 @@ def visibility_from_agreement(found: Agreement) -> Float[Tensor, "6 L L"]:
     views only, yet orders directions by their actual error: rays disagree where normals are wrong, where the map is
     too coarse, and where the object sees itself.
     """
-    relative = cubemap_solid_angles(found.votes.shape[-1]).to(found.votes.dtype)
+    relative = cubemap_solid_angles(found.votes.shape[-1]).to(found.votes)
     votes = found.votes / (relative / relative.mean())
     return votes / (1 + votes) / (1 + found.disagreement / HALVING_DISAGREEMENT)

@@ -33,3 +33,21 @@ CAMERA_PLANE_MARGIN = 1e-3
 """A surfel whose disk comes this close (relative to its squared depth) to the plane of the camera is given the whole
 image as its box.
 """
+
+TILE = 16
+"""Edge in pixels of the tiles that `rasterize` can be told to leave out."""
+
+ALPHA_FLOOR = 1e-3
+"""Alpha by which the accumulated depth is divided at least; below it a pixel shows nothing."""
+
+SHORTEST_NORMAL = 1e-8
+"""Blended normals are divided by their length, but at least by this."""
+
+CHARBONNIER = 1e-2
+"""ε of the photometric term √(‖e‖² + ε²)."""
+
+ALPHA_MARGIN = 1e-4
+"""The cross-entropy of the silhouette takes alpha to lie this far inside (0, 1)."""
+
+SURFACE_ALPHA = 0.5
+"""Pixels with more alpha than this have a surface whose normals must be consistent."""

@@ -34,8 +34,13 @@ def sample_cubemap(
     """
     _check_cubemap(cubemap)
     _check_directions(directions)
-    if choose_backend(backend, cubemap=cubemap, directions=directions) == "reference":
+    chosen = choose_backend(backend, cubemap=cubemap, directions=directions)
+    if chosen == "reference":
         return reference.sample_cubemap(cubemap, directions)
+    if chosen == "gpu":
+        from panoless.kernels.gpu.cubemap import SampleCubemap as SampleCubemapGpu
+
+        return SampleCubemapGpu.apply(cubemap, directions)
     from panoless.kernels.cpu.cubemap import SampleCubemap
 
     return SampleCubemap.apply(cubemap, directions)
@@ -64,9 +69,13 @@ def scatter_cubemap(
             f"expected values (P, C), one row for each of the {len(directions)} directions; "
             f"found {tuple(values.shape)}."
         )
-    if choose_backend(backend, values=values, directions=directions) == "reference":
+    chosen = choose_backend(backend, values=values, directions=directions)
+    if chosen == "reference":
         return reference.scatter_cubemap(values, directions, resolution)
-    from panoless.kernels.cpu.cubemap import scatter_cubemap as scatter
+    if chosen == "gpu":
+        from panoless.kernels.gpu.cubemap import scatter_cubemap as scatter
+    else:
+        from panoless.kernels.cpu.cubemap import scatter_cubemap as scatter
 
     return scatter(values, directions, resolution)
 

@@ -24,8 +24,13 @@ def depth_normals(
     """
     if depth.ndim != 2:
         raise ValueError(f"expected a depth map (H, W); found {tuple(depth.shape)}.")
-    if choose_backend(backend, depth=depth) == "reference":
+    chosen = choose_backend(backend, depth=depth)
+    if chosen == "reference":
         return reference.depth_normals(depth, fx, fy, cx, cy)
+    if chosen == "gpu":
+        from panoless.kernels.gpu.image import DepthNormals as DepthNormalsGpu
+
+        return DepthNormalsGpu.apply(depth, fx, fy, cx, cy)
     from panoless.kernels.cpu.image import DepthNormals
 
     return DepthNormals.apply(depth, fx, fy, cx, cy)
@@ -55,8 +60,13 @@ def ssim(
             "expected a constant target; found one that requires a gradient. Detach it, or swap it with the image "
             "(SSIM is symmetric)."
         )
-    if choose_backend(backend, image=image, target=target) == "reference":
+    chosen = choose_backend(backend, image=image, target=target)
+    if chosen == "reference":
         return reference.ssim(image, target)
+    if chosen == "gpu":
+        from panoless.kernels.gpu.image import Ssim as SsimGpu
+
+        return SsimGpu.apply(image, target)
     from panoless.kernels.cpu.image import Ssim
 
     return Ssim.apply(image, target)

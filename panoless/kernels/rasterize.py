@@ -4,10 +4,12 @@ surfel.
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from panoless.kernels.backend import Backend, choose_backend
+from panoless.kernels.constants import TILE
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,19 @@ class RasterCamera:
     """
     far: float = 100.0
     """Far end of the distortion's scale, in scene units; nothing is culled by it."""
+
+
+@dataclass(frozen=True)
+class Channels:
+    """Which images a caller wants beside normals and alpha. The others cost nothing and come as zeros."""
+
+    colors: bool = True
+    depth: bool = True
+    """Accumulated and median depth."""
+    distortion: bool = True
+
+
+ALL_CHANNELS = Channels()
 
 
 @dataclass(frozen=True)
@@ -68,6 +83,8 @@ def rasterize(
     camera: RasterCamera,
     *,
     screen_offsets: Float[Tensor, "K 2"] | None = None,
+    channels: Channels = ALL_CHANNELS,
+    active_tiles: Bool[Tensor, "tile_rows tile_columns"] | None = None,
     backend: Backend = "auto",
 ) -> RasterBuffers:
     """Blend surfels front to back, ordered by the depth of their centers (ties by index).
@@ -90,8 +107,11 @@ def rasterize(
         camera: Where the picture is taken from.
         screen_offsets: Pixels by which each surfel's whole footprint is moved. Pass zeros that require a gradient to
             read the screen-space positional gradient that density control uses.
-        backend: "reference" (plain torch, any float type and device), "cpu" (Numba, float32 on the CPU) or "auto",
-            which takes "cpu" where it applies.
+        channels: Images that are wanted; the others are zero and pass no gradient.
+        active_tiles: Tiles of TILE×TILE pixels, from the upper left, that are wanted; None for all. In the others every
+            image is zero and passes no gradient. `in_frustum` does not depend on it.
+        backend: "reference" (plain torch, any float type and device), "cpu" (Numba, float32 on the CPU), "gpu"
+            (Triton, float32 on a GPU) or "auto", which takes the kernels of the tensors' device for float32.
 
     Returns:
         The images. Gradients flow from each of them to every tensor but the camera's; surfels with a value that is not
@@ -111,11 +131,58 @@ def rasterize(
     }
     given = {name: tensor for name, tensor in tensors.items() if tensor is not None}
     _check_shapes(given, camera)
-    if choose_backend(backend, **given) == "reference":
-        from panoless.kernels.reference.rasterize import rasterize_reference as implementation
+    _check_tiles(active_tiles, camera)
+    surfels = means, quats, scales, opacities, colors, curvatures, screen_offsets
+    chosen = choose_backend(backend, **given)
+    if chosen == "cpu":
+        from panoless.kernels.cpu.rasterize import rasterize_cpu
+
+        images = rasterize_cpu(*surfels, camera, channels, active_tiles)
     else:
-        from panoless.kernels.cpu.rasterize import rasterize_cpu as implementation
-    return RasterBuffers(*implementation(means, quats, scales, opacities, colors, curvatures, screen_offsets, camera))
+        if chosen == "gpu":
+            from panoless.kernels.gpu.rasterize import rasterize_gpu as implementation
+        else:
+            from panoless.kernels.reference.rasterize import rasterize_reference as implementation
+        images = _only_active(implementation(*surfels, camera), active_tiles)
+    return RasterBuffers(*_only_wanted(images, channels))
+
+
+def _only_wanted(images: tuple[Tensor, ...], channels: Channels) -> tuple[Tensor, ...]:
+    """Zeros, which take no memory, in place of the images of the channels that are not wanted."""
+    colors, normals, depth, alpha, median, distortion, in_frustum = images
+    zeros = torch.zeros((), dtype=alpha.dtype, device=alpha.device).expand(alpha.shape)
+    if not channels.colors:
+        colors = zeros.expand(3, -1, -1)
+    if not channels.depth:
+        depth = median = zeros
+    if not channels.distortion:
+        distortion = zeros
+    return colors, normals, depth, alpha, median, distortion, in_frustum
+
+
+def _only_active(images: tuple[Tensor, ...], active_tiles: Tensor | None) -> tuple[Tensor, ...]:
+    """Zeros in the tiles that are not active, for implementations that know no tiles."""
+    if active_tiles is None:
+        return images
+    *planes, in_frustum = images
+    height, width = planes[0].shape[-2:]
+    pixels = active_tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
+    pixels = pixels.to(planes[0].device)
+    return *(torch.where(pixels, plane, 0) for plane in planes), in_frustum
+
+
+def tile_shape(height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of tiles that an image has."""
+    return -(-height // TILE), -(-width // TILE)
+
+
+def _check_tiles(active_tiles: Tensor | None, camera: RasterCamera) -> None:
+    wanted = tile_shape(camera.height, camera.width)
+    if active_tiles is not None and (tuple(active_tiles.shape) != wanted or active_tiles.dtype != torch.bool):
+        raise ValueError(
+            f"expected active_tiles of shape {wanted}, boolean, for {camera.height}×{camera.width} pixels; "
+            f"found {tuple(active_tiles.shape)}, {active_tiles.dtype}."
+        )
 
 
 _WIDTHS = {"means": 3, "quats": 4, "scales": 2, "colors": 3, "curvatures": 3, "screen_offsets": 2}

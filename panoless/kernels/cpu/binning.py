@@ -51,18 +51,19 @@ def sort_by_depth(keys, order, spare_order, sorted_keys, spare_keys):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def count_entries(keys, tile_ranges, tiles_across, tile_starts, slot_starts):
-    """Count (tile, surfel) pairs; fill the prefix sums by tile and by surfel and return the longest tile list."""
+def count_entries(keys, tile_ranges, tiles_across, active, tile_starts, slot_starts):
+    """Count (active tile, surfel) pairs; fill their prefix sums by tile and by surfel; return the longest list."""
     tile_starts[:] = 0
     slots = 0
     for k in range(keys.size):
         slot_starts[k] = slots
         if keys[k] != np.uint32(rec.CULLED):
             left, right, top, bottom = tile_ranges[k]
-            slots += (right - left + 1) * (bottom - top + 1)
             for row in range(top, bottom + 1):
                 for tile in range(row * tiles_across + left, row * tiles_across + right + 1):
-                    tile_starts[tile + 1] += 1
+                    if active[tile]:
+                        tile_starts[tile + 1] += 1
+                        slots += 1
     slot_starts[keys.size] = slots
     longest = 0
     for tile in range(tile_starts.size - 1):
@@ -72,8 +73,8 @@ def count_entries(keys, tile_ranges, tiles_across, tile_starts, slot_starts):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def fill_tiles(order, drawn, tile_ranges, tiles_across, tile_starts, slot_starts, entry_surfels, entry_slots):
-    """Walk the surfels in depth order and append each to its tiles, so that every list comes out sorted."""
+def fill_tiles(order, drawn, tile_ranges, tiles_across, active, tile_starts, slot_starts, entry_surfels, entry_slots):
+    """Walk the surfels in depth order and append each to its active tiles, so that every list comes out sorted."""
     cursors = tile_starts[:-1].copy()
     for i in range(drawn):
         k = order[i]
@@ -81,8 +82,9 @@ def fill_tiles(order, drawn, tile_ranges, tiles_across, tile_starts, slot_starts
         left, right, top, bottom = tile_ranges[k]
         for row in range(top, bottom + 1):
             for tile in range(row * tiles_across + left, row * tiles_across + right + 1):
-                entry = cursors[tile]
-                cursors[tile] = entry + 1
-                entry_surfels[entry] = k
-                entry_slots[entry] = slot
-                slot += 1
+                if active[tile]:
+                    entry = cursors[tile]
+                    cursors[tile] = entry + 1
+                    entry_surfels[entry] = k
+                    entry_slots[entry] = slot
+                    slot += 1

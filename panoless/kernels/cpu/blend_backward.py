@@ -10,27 +10,43 @@ from numba import njit
 from panoless.kernels.cpu import records as rec
 from panoless.kernels.cpu.blend import (
     CAP,
+    CHUNK,
+    FRAGMENT_ALPHA,
+    FRAGMENT_RATIO,
+    FRAGMENT_SIZE,
+    FRAGMENT_U,
+    FRAGMENT_V,
     LOW_PASS_PRECISION,
     SAVED_M1,
     SAVED_M2,
     SAVED_MEDIAN,
-    SAVED_SIZE,
     STOP,
-    deal_blocks,
-    intersect,
-    uncapped_alpha,
+    depth_ratio,
+    find_fragment,
+    list_block,
 )
+from panoless.kernels.cpu.compilation import INLINED_LANE_CODE, LANE_CODE
 from panoless.kernels.cpu.simd import (
     LANES,
+    absolute,
     any_lane,
     lane_columns,
     lane_rows,
     lanes,
     minimum,
+    reciprocal,
     sum_each,
     where,
 )
-from panoless.kernels.cpu.simd_memory import fetch_add, load_block, load_lanes, store_lanes
+from panoless.kernels.cpu.simd_memory import fetch_add, load_block, load_lanes, store_lanes, thread_slot
+
+PULLED_PER_WEIGHT, PULLED_WEIGHT, PULLED_LOG_ALPHA, PULLED_TURN_U, PULLED_TURN_V = range(
+    FRAGMENT_SIZE, FRAGMENT_SIZE + 5
+)
+"""Further vectors of a fragment: gradient of its weight, the weight, gradient of the logarithm of alpha, and the
+normal's derivatives by u and v along the normal's gradient.
+"""
+PULLED_SIZE = FRAGMENT_SIZE + 5
 
 
 class Cotangent(NamedTuple):
@@ -56,30 +72,40 @@ class Cotangent(NamedTuple):
     median_entry: Any
 
 
-@njit(forceinline=True)
-def load_cotangent(outputs, gradients, saved, saved_at, offset, width, plane_size, inside):
+@njit(**INLINED_LANE_CODE)
+def load_cotangent(features, outputs, gradients, saved, saved_at, offset, width, plane_size, inside):
     """Load the gradients of a block's pixels and form what every fragment needs of them."""
-    m1 = load_lanes(saved, saved_at + SAVED_M1 * LANES)
-    m2 = load_lanes(saved, saved_at + SAVED_M2 * LANES)
-    red = load_block(gradients.colors, offset, width, inside)
-    green = load_block(gradients.colors, offset + plane_size, width, inside)
-    blue = load_block(gradients.colors, offset + 2 * plane_size, width, inside)
+    zero = lanes(0.0)
     normal_x = load_block(gradients.normals, offset, width, inside)
     normal_y = load_block(gradients.normals, offset + plane_size, width, inside)
     normal_z = load_block(gradients.normals, offset + 2 * plane_size, width, inside)
-    depth = load_block(gradients.depth, offset, width, inside)
-    opaque_gradient = load_block(gradients.alpha, offset, width, inside)
-    distortion = load_block(gradients.distortion, offset, width, inside)
-    opaque = load_block(outputs.alpha, offset, width, inside)
-    total = red * load_block(outputs.colors, offset, width, inside)
-    total += green * load_block(outputs.colors, offset + plane_size, width, inside)
-    total += blue * load_block(outputs.colors, offset + 2 * plane_size, width, inside)
-    total += normal_x * load_block(outputs.normals, offset, width, inside)
+    total = normal_x * load_block(outputs.normals, offset, width, inside)
     total += normal_y * load_block(outputs.normals, offset + plane_size, width, inside)
     total += normal_z * load_block(outputs.normals, offset + 2 * plane_size, width, inside)
-    total += depth * load_block(outputs.depth, offset, width, inside)
-    total += opaque_gradient * opaque
-    total += 2.0 * distortion * (opaque * m2 - m1 * m1)
+    constant = load_block(gradients.alpha, offset, width, inside)
+    opaque = load_block(outputs.alpha, offset, width, inside)
+    total += constant * opaque
+    red, green, blue, depth, median, median_entry, linear, quadratic = zero, zero, zero, zero, zero, zero, zero, zero
+    if len(features.colors):
+        red = load_block(gradients.colors, offset, width, inside)
+        green = load_block(gradients.colors, offset + plane_size, width, inside)
+        blue = load_block(gradients.colors, offset + 2 * plane_size, width, inside)
+        total += red * load_block(outputs.colors, offset, width, inside)
+        total += green * load_block(outputs.colors, offset + plane_size, width, inside)
+        total += blue * load_block(outputs.colors, offset + 2 * plane_size, width, inside)
+    if len(features.depth):
+        depth = load_block(gradients.depth, offset, width, inside)
+        median = load_block(gradients.median, offset, width, inside)
+        median_entry = load_lanes(saved, saved_at + SAVED_MEDIAN * LANES)
+        total += depth * load_block(outputs.depth, offset, width, inside)
+    if len(features.distortion):
+        distortion = load_block(gradients.distortion, offset, width, inside)
+        m1 = load_lanes(saved, saved_at + SAVED_M1 * LANES)
+        m2 = load_lanes(saved, saved_at + SAVED_M2 * LANES)
+        total += 2.0 * distortion * (opaque * m2 - m1 * m1)
+        constant += distortion * m2
+        linear = -2.0 * distortion * m1
+        quadratic = distortion * opaque
     return Cotangent(
         red,
         green,
@@ -88,123 +114,205 @@ def load_cotangent(outputs, gradients, saved, saved_at, offset, width, plane_siz
         normal_y,
         normal_z,
         depth,
-        load_block(gradients.median, offset, width, inside),
-        opaque_gradient + distortion * m2,
-        -2.0 * distortion * m1,
-        distortion * opaque,
+        median,
+        constant,
+        linear,
+        quadratic,
         total,
-        load_lanes(saved, saved_at + SAVED_MEDIAN * LANES),
+        median_entry,
     )
 
 
-@njit(forceinline=True)
-def blend_block_backward(curved, table, surfels, positions, length, x, y, inside, distance, reference, cotangent, rows):
-    """Add the block's share to the tile's gradient rows, one row a surfel."""
-    size = rows.shape[1]
-    transmittance = lanes(1.0)
-    alive = inside
-    behind = cotangent.total
-    for position in range(length):
-        entry = positions[position]
-        k = surfels[entry]
-        fragment = intersect(table, k, x, y)
-        covered = fragment.inside & alive
-        uncapped = uncapped_alpha(table, k, fragment.rho)
-        alpha = where(covered, minimum(uncapped, lanes(CAP)), 0.0)
+@njit(**INLINED_LANE_CODE)
+def asks_for_nothing(features, cotangent):
+    """Whether no pixel of a block has a gradient, so that its surfels get none from it."""
+    given = absolute(cotangent.normal_x) + absolute(cotangent.normal_y) + absolute(cotangent.normal_z)
+    given += absolute(cotangent.constant)
+    if len(features.colors):
+        given += absolute(cotangent.red) + absolute(cotangent.green) + absolute(cotangent.blue)
+    if len(features.depth):
+        given += absolute(cotangent.depth) + absolute(cotangent.median)
+    if len(features.distortion):
+        given += absolute(cotangent.linear) + absolute(cotangent.quadratic)
+    return not any_lane(~(given == 0.0))
+
+
+@njit(**INLINED_LANE_CODE)
+def find_chunk(features, table, surfels, positions, begin, end, x, y, distance, reference, cotangent, fragments):
+    """First pass over a chunk: its fragments, and what does not depend on what lies in front of them."""
+    for position in range(begin, end):
+        at = (position - begin) * PULLED_SIZE * LANES
+        k = surfels[positions[position]]
+        u, v = find_fragment(table, k, x, y, fragments, at)
+        per_weight = cotangent.constant + cotangent.normal_x * table[k, rec.NORMAL]
+        per_weight += cotangent.normal_y * table[k, rec.NORMAL + 1]
+        per_weight += cotangent.normal_z * table[k, rec.NORMAL + 2]
+        if len(features.colors):
+            per_weight += cotangent.red * table[k, rec.COLOR]
+            per_weight += cotangent.green * table[k, rec.COLOR + 1]
+            per_weight += cotangent.blue * table[k, rec.COLOR + 2]
+        if len(features.curved):
+            turn_u = cotangent.normal_x * table[k, rec.CURVED_U]
+            turn_u += cotangent.normal_y * table[k, rec.CURVED_U + 1] + cotangent.normal_z * table[k, rec.CURVED_U + 2]
+            turn_v = cotangent.normal_x * table[k, rec.CURVED_V]
+            turn_v += cotangent.normal_y * table[k, rec.CURVED_V + 1] + cotangent.normal_z * table[k, rec.CURVED_V + 2]
+            per_weight += turn_u * u + turn_v * v
+            store_lanes(fragments, at + PULLED_TURN_U * LANES, turn_u)
+            store_lanes(fragments, at + PULLED_TURN_V * LANES, turn_v)
+        if len(features.depth):
+            per_weight += cotangent.depth * (table[k, rec.DEPTH] * depth_ratio(fragments, at))
+        if len(features.distortion):
+            m = reference - (distance / table[k, rec.DEPTH]) / depth_ratio(fragments, at)
+            per_weight += (cotangent.linear + cotangent.quadratic * m) * m
+        store_lanes(fragments, at + PULLED_PER_WEIGHT * LANES, per_weight)
+
+
+@njit(**INLINED_LANE_CODE)
+def weigh_chunk(count, transmittance, alive, behind, fragments):
+    """Second pass, in order: weights, and gradients of the logarithm of alpha. Returns the state for the next chunk."""
+    for i in range(count):
+        at = i * PULLED_SIZE * LANES
+        uncapped = load_lanes(fragments, at + FRAGMENT_ALPHA * LANES)
+        per_weight = load_lanes(fragments, at + PULLED_PER_WEIGHT * LANES)
+        alpha = minimum(uncapped, lanes(CAP))
+        covered = (uncapped > 0.0) & alive
         after = transmittance - transmittance * alpha
         ending = covered & (after < STOP)
         alive &= ~ending
         covered &= ~ending
         weight = where(covered, alpha * transmittance, 0.0)
-        ratio = where(fragment.by_hit, fragment.inverse_w, 1.0)
-        z = table[k, rec.DEPTH] * ratio
-        inverse_z = where(fragment.by_hit, fragment.w, 1.0) * (np.float32(1) / table[k, rec.DEPTH])
-        m = reference - distance * inverse_z
-
-        per_weight = cotangent.constant + (cotangent.linear + cotangent.quadratic * m) * m + cotangent.depth * z
-        per_weight += cotangent.red * table[k, rec.COLOR]
-        per_weight += cotangent.green * table[k, rec.COLOR + 1]
-        per_weight += cotangent.blue * table[k, rec.COLOR + 2]
-        per_weight += cotangent.normal_x * table[k, rec.NORMAL]
-        per_weight += cotangent.normal_y * table[k, rec.NORMAL + 1]
-        per_weight += cotangent.normal_z * table[k, rec.NORMAL + 2]
-        if curved:
-            turn_u = cotangent.normal_x * table[k, rec.CURVED_U]
-            turn_u += cotangent.normal_y * table[k, rec.CURVED_U + 1] + cotangent.normal_z * table[k, rec.CURVED_U + 2]
-            turn_v = cotangent.normal_x * table[k, rec.CURVED_V]
-            turn_v += cotangent.normal_y * table[k, rec.CURVED_V + 1] + cotangent.normal_z * table[k, rec.CURVED_V + 2]
-            per_weight += where(fragment.by_hit, turn_u * fragment.u + turn_v * fragment.v, 0.0)
         behind -= weight * per_weight
-        grad_alpha = transmittance * per_weight - behind / (1.0 - alpha)
+        grad_alpha = transmittance * per_weight - behind * reciprocal(1.0 - alpha)
         log_alpha = where(covered & (uncapped < CAP), grad_alpha * alpha, 0.0)
-        grad_m = weight * (cotangent.linear + 2.0 * cotangent.quadratic * m)
-        grad_z = weight * cotangent.depth + grad_m * distance * inverse_z * inverse_z
-        grad_z += where(covered & (cotangent.median_entry == np.float32(entry)), cotangent.median, 0.0)
-
-        grad_u = -log_alpha * fragment.u
-        grad_v = -log_alpha * fragment.v
-        if curved:
-            grad_u += weight * turn_u
-            grad_v += weight * turn_v
-        from_w = where(fragment.by_hit, (grad_u * fragment.u + grad_v * fragment.v + grad_z * z) * ratio, 0.0)
-        grad_u = where(fragment.by_hit, grad_u * ratio, 0.0)
-        grad_v = where(fragment.by_hit, grad_v * ratio, 0.0)
-        pull = where(fragment.by_hit, 0.0, log_alpha * LOW_PASS_PRECISION)
-        flat_row = sum_each(
-            (
-                pull * fragment.dx
-                + (from_w * table[k, rec.A2] - grad_u * table[k, rec.A0] - grad_v * table[k, rec.A1]),
-                pull * fragment.dy
-                + (from_w * table[k, rec.B2] - grad_u * table[k, rec.B0] - grad_v * table[k, rec.B1]),
-                grad_u * fragment.dx,
-                grad_u * fragment.dy,
-                grad_v * fragment.dx,
-                grad_v * fragment.dy,
-                -from_w * fragment.dx,
-                -from_w * fragment.dy,
-                grad_z * ratio,
-                log_alpha,
-                weight * cotangent.red,
-                weight * cotangent.green,
-                weight * cotangent.blue,
-                weight * cotangent.normal_x,
-                weight * cotangent.normal_y,
-                weight * cotangent.normal_z,
-            )
-        )
-        store_lanes(rows, entry * size, load_lanes(rows, entry * size) + flat_row)
-        if curved:
-            along_u = where(fragment.by_hit, weight * fragment.u, 0.0)
-            along_v = where(fragment.by_hit, weight * fragment.v, 0.0)
-            curved_row = sum_each(
-                (
-                    along_u * cotangent.normal_x,
-                    along_u * cotangent.normal_y,
-                    along_u * cotangent.normal_z,
-                    along_v * cotangent.normal_x,
-                    along_v * cotangent.normal_y,
-                    along_v * cotangent.normal_z,
-                )
-            )
-            row_at = entry * size + rec.FLAT_GRADIENT_SIZE
-            store_lanes(rows, row_at, load_lanes(rows, row_at) + curved_row)
+        store_lanes(fragments, at + PULLED_WEIGHT * LANES, weight)
+        store_lanes(fragments, at + PULLED_LOG_ALPHA * LANES, log_alpha)
         transmittance = where(covered, after, transmittance)
+    return transmittance, alive, behind
+
+
+@njit(**INLINED_LANE_CODE)
+def pull_chunk(features, table, surfels, positions, begin, end, x, y, distance, reference, cotangent, fragments, rows):
+    """Third pass: add each fragment's share to its surfel's row."""
+    size = rows.shape[1]
+    for position in range(begin, end):
+        at = (position - begin) * PULLED_SIZE * LANES
+        entry = positions[position]
+        k = surfels[entry]
+        dx = x - table[k, rec.CENTER_X]
+        dy = y - table[k, rec.CENTER_Y]
+        u = load_lanes(fragments, at + FRAGMENT_U * LANES)
+        v = load_lanes(fragments, at + FRAGMENT_V * LANES)
+        hit_ratio = load_lanes(fragments, at + FRAGMENT_RATIO * LANES)
+        by_hit = hit_ratio > 0.0
+        ratio = where(by_hit, hit_ratio, 1.0)
+        weight = load_lanes(fragments, at + PULLED_WEIGHT * LANES)
+        log_alpha = load_lanes(fragments, at + PULLED_LOG_ALPHA * LANES)
+        grad_z = lanes(0.0)
+        z = table[k, rec.DEPTH] * ratio
+        if len(features.depth):
+            grad_z = weight * cotangent.depth
+            grad_z += where(cotangent.median_entry == np.float32(entry), cotangent.median, 0.0)
+        if len(features.distortion):
+            inverse_z = 1.0 / z
+            m = reference - distance * inverse_z
+            grad_m = weight * (cotangent.linear + 2.0 * cotangent.quadratic * m)
+            grad_z += grad_m * distance * inverse_z * inverse_z
+        grad_u = -log_alpha * u
+        grad_v = -log_alpha * v
+        if len(features.curved):
+            grad_u += weight * load_lanes(fragments, at + PULLED_TURN_U * LANES)
+            grad_v += weight * load_lanes(fragments, at + PULLED_TURN_V * LANES)
+        from_w = (grad_u * u + grad_v * v + grad_z * z) * hit_ratio
+        grad_u *= hit_ratio
+        grad_v *= hit_ratio
+        pull = where(by_hit, 0.0, log_alpha * LOW_PASS_PRECISION)
+        footprint = (
+            pull * dx + (from_w * table[k, rec.A2] - grad_u * table[k, rec.A0] - grad_v * table[k, rec.A1]),
+            pull * dy + (from_w * table[k, rec.B2] - grad_u * table[k, rec.B0] - grad_v * table[k, rec.B1]),
+            grad_u * dx,
+            grad_u * dy,
+            grad_v * dx,
+            grad_v * dy,
+            -from_w * dx,
+            -from_w * dy,
+            grad_z * ratio,
+            log_alpha,
+            weight * cotangent.normal_x,
+            weight * cotangent.normal_y,
+            weight * cotangent.normal_z,
+        )
+        color = (weight * cotangent.red, weight * cotangent.green, weight * cotangent.blue)
+        row_at = entry * size
+        if len(features.curved):
+            along_u = weight * u
+            along_v = weight * v
+            turned_u = (along_u * cotangent.normal_x, along_u * cotangent.normal_y, along_u * cotangent.normal_z)
+            turned_v = (along_v * cotangent.normal_x, along_v * cotangent.normal_y, along_v * cotangent.normal_z)
+            add_row(rows, row_at, footprint + turned_u)
+            if len(features.colors):
+                add_row(rows, row_at + LANES, turned_v + color)
+            else:
+                add_row(rows, row_at + LANES, turned_v)
+        elif len(features.colors):
+            add_row(rows, row_at, footprint + color)
+        else:
+            add_row(rows, row_at, footprint)
+
+
+@njit(**INLINED_LANE_CODE)
+def add_row(rows, at, values):
+    """Add the sum over the lanes of each value to sixteen consecutive numbers."""
+    store_lanes(rows, at, load_lanes(rows, at) + sum_each(values))
+
+
+@njit(**INLINED_LANE_CODE)
+def blend_block_backward(features, table, surfels, length, x, y, inside, distance, reference, cotangent, scratch):
+    """Add the block's share to the tile's gradient rows, one row a surfel."""
+    positions, fragments, rows = scratch
+    transmittance = lanes(1.0)
+    alive = inside
+    behind = cotangent.total
+    for begin in range(0, length, CHUNK):
+        end = min(begin + CHUNK, length)
+        find_chunk(features, table, surfels, positions, begin, end, x, y, distance, reference, cotangent, fragments)
+        transmittance, alive, behind = weigh_chunk(end - begin, transmittance, alive, behind, fragments)
+        pull_chunk(
+            features, table, surfels, positions, begin, end, x, y, distance, reference, cotangent, fragments, rows
+        )
         if not any_lane(alive):
             break
 
 
-@njit(forceinline=True)
-def blend_tiles_backward(
-    curved, counter, table, bins, camera_plane, outputs, gradients, saved, masks, entry_slots, slots
+@njit(**LANE_CODE)
+def blend_backward(
+    counter,
+    features,
+    table,
+    bins,
+    camera_plane,
+    outputs,
+    gradients,
+    saved,
+    masks,
+    entry_slots,
+    slots,
+    lists,
+    chunks,
+    row_scratch,
 ):
-    """Claim tiles from the counter and pull their pixels' gradients back to one row a (tile, surfel) pair."""
-    tile_starts, entry_surfels, longest = bins
+    """Pull the pixels' gradients back to one row a (tile, surfel) pair, until `counter` runs past the last tile.
+
+    `lists` and `chunks` are as in the forward pass; `row_scratch` has for each thread a row for each surfel of the
+    longest list: one vector for flat surfels, two for curved ones, of which `slots` keeps what is used.
+    """
+    tile_starts, entry_surfels = bins
     width, height, distance = camera_plane
     tiles_across = (width + rec.TILE - 1) // rec.TILE
     size = slots.shape[1]
-    lists = np.empty((LANES, longest), np.int32)
-    lengths = np.empty(LANES, np.int64)
-    rows = np.empty((longest + 1, size), np.float32)
+    thread = thread_slot(counter)
+    rows = row_scratch[thread]
+    row_size = rows.shape[1]
+    scratch = lists[thread], chunks[thread], rows
     while True:
         tile = fetch_add(counter, 1)
         if tile >= tile_starts.size - 1:
@@ -215,54 +323,39 @@ def blend_tiles_backward(
             continue
         left = (tile % tiles_across) * rec.TILE
         top = (tile // tiles_across) * rec.TILE
-        lengths[:] = 0
-        for entry in range(surfels.size):
-            deal_blocks(np.int64(masks[start + entry]), entry, lists, lengths)
         rows[: surfels.size] = 0
         reference = distance / table[surfels[0], rec.DEPTH]
         for block in range(LANES):
-            if lengths[block] == 0:
-                continue
             x = left + rec.BLOCK * (block % rec.BLOCK)
             y = top + rec.BLOCK * (block // rec.BLOCK)
+            if x >= width or y >= height:
+                continue
             column = lane_columns() + np.float32(x)
             row = lane_rows() + np.float32(y)
             inside = (column < np.float32(width)) & (row < np.float32(height))
-            saved_at = (tile * LANES + block) * SAVED_SIZE * LANES
+            saved_at = (tile * LANES + block) * saved.shape[2] * LANES
             cotangent = load_cotangent(
-                outputs, gradients, saved, saved_at, y * width + x, width, width * height, inside
+                features, outputs, gradients, saved, saved_at, y * width + x, width, width * height, inside
             )
+            if asks_for_nothing(features, cotangent):
+                continue
+            length = list_block(masks, start, surfels.size, block, scratch[0])
             blend_block_backward(
-                curved,
+                features,
                 table,
                 surfels,
-                lists[block],
-                lengths[block],
+                length,
                 column + 0.5,
                 row + 0.5,
                 inside,
                 distance,
                 reference,
                 cotangent,
-                rows,
+                scratch,
             )
         for entry in range(surfels.size):
             slot = entry_slots[start + entry]
-            store_lanes(slots, slot * size, load_lanes(rows, entry * size))
-            if curved:
+            store_lanes(slots, slot * size, load_lanes(rows, entry * row_size))
+            if len(features.curved):
                 rest = size - LANES
-                store_lanes(slots, slot * size + rest, load_lanes(rows, entry * size + rest))
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def blend_flat_backward(counter, table, bins, camera_plane, outputs, gradients, saved, masks, entry_slots, slots):
-    """Fill one gradient row a (tile, surfel) pair, tile by tile until `counter` runs past the last one."""
-    blend_tiles_backward(
-        False, counter, table, bins, camera_plane, outputs, gradients, saved, masks, entry_slots, slots
-    )
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def blend_curved_backward(counter, table, bins, camera_plane, outputs, gradients, saved, masks, entry_slots, slots):
-    """As `blend_flat_backward`, for surfels whose normal varies across them."""
-    blend_tiles_backward(True, counter, table, bins, camera_plane, outputs, gradients, saved, masks, entry_slots, slots)
+                store_lanes(slots, slot * size + rest, load_lanes(rows, entry * row_size + rest))

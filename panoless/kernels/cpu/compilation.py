@@ -1,4 +1,4 @@
-"""How kernels are compiled whose loops are plain scalar code for LLVM to vectorize."""
+"""How kernels are compiled."""
 
 VECTORIZED_LOOPS = {
     "nogil": True,
@@ -7,3 +7,14 @@ VECTORIZED_LOOPS = {
     # Everything of LLVM's fast math except `nnan` and `ninf`: inputs that are not finite must still compare as such.
     "fastmath": {"reassoc", "nsz", "arcp", "contract", "afn"},
 }
+"""Plain scalar loops that LLVM vectorizes."""
+
+LANE_CODE = {"nogil": True, "cache": True, "error_model": "numpy", "_nrt": False}
+"""Loops over `Lanes`, without Numba's reference counting.
+
+It counts at every call that was inlined, by atomic operations that took a quarter of the time of blending, and more
+where threads share a cache line. So such a function allocates nothing: scratch memory is an argument, a part a thread.
+"""
+
+INLINED_LANE_CODE = {"forceinline": True, "_nrt": False}
+"""Parts of `LANE_CODE` functions."""

@@ -7,6 +7,7 @@ from numba import njit
 
 from panoless.kernels.constants import ALPHA_MIN, CAMERA_PLANE_MARGIN, EDGE_ON_COSINE_MIN
 from panoless.kernels.cpu import records as rec
+from panoless.kernels.cpu.compilation import INLINED_LANE_CODE, LANE_CODE
 from panoless.kernels.cpu.simd import (
     LANES,
     absolute,
@@ -19,7 +20,7 @@ from panoless.kernels.cpu.simd import (
     square_root,
     where,
 )
-from panoless.kernels.cpu.simd_memory import fetch_add, load_strided, store_lanes, store_strided
+from panoless.kernels.cpu.simd_memory import fetch_add, load_strided, store_lanes, store_strided, thread_slot
 
 GROUPS_PER_CLAIM = 16
 THIN_ELLIPSE = np.float32(1e-4)
@@ -54,31 +55,31 @@ class UnitQuat(NamedTuple):
     inverse_norm: Any
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def cross(a, b):
     """Vector product of two triples."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def dot(a, b):
     """Scalar product of two triples."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def scaled(a, s):
     """A triple times a scalar or lanes."""
     return (a[0] * s, a[1] * s, a[2] * s)
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def added(a, b):
     """Sum of two triples."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def rotate(camera, a):
     """World to camera, directions."""
     return (
@@ -88,7 +89,7 @@ def rotate(camera, a):
     )
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def rotate_back(camera, a):
     """Camera to world, directions; also the adjoint of `rotate`."""
     return (
@@ -98,7 +99,7 @@ def rotate_back(camera, a):
     )
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def load_vector(array, first, active):
     """Rows first … first + 15 of a (K, 3) array."""
     start = 3 * first
@@ -109,7 +110,7 @@ def load_vector(array, first, active):
     )
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def store_vector(array, start, stride, active, vector):
     """Store a triple of lanes in three consecutive columns of a table."""
     store_strided(array, start, stride, active, vector[0])
@@ -117,7 +118,7 @@ def store_vector(array, start, stride, active, vector):
     store_strided(array, start + 2, stride, active, vector[2])
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def load_quat(quats, first, active):
     """Rows first … first + 15 of a (K, 4) array, normalized."""
     w = load_strided(quats, 4 * first, 4, active)
@@ -128,7 +129,7 @@ def load_quat(quats, first, active):
     return UnitQuat(w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm, inverse_norm)
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def surfel_frame(mean, q, camera):
     """Bring sixteen surfels to camera coordinates; the tangents and the normal are the columns of the rotation."""
     tangent_u = (1.0 - 2.0 * (q.y * q.y + q.z * q.z), 2.0 * (q.x * q.y + q.w * q.z), 2.0 * (q.x * q.z - q.w * q.y))
@@ -163,7 +164,7 @@ class Extent(NamedTuple):
     lean_v: Any
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def extent_along(axis, center, scaled_u, scaled_v, rho, inverse_plane):
     """The surfel's outline along one axis: the tangents' slopes against the viewing ray keep the formula free of
     cancellation.
@@ -176,13 +177,13 @@ def extent_along(axis, center, scaled_u, scaled_v, rho, inverse_plane):
     return Extent(middle, half_squared, lean_u, lean_v)
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def store_field(table, first, field, active, value):
     """Store one field of sixteen consecutive records."""
     store_strided(table, first * rec.RECORD_SIZE + field, rec.RECORD_SIZE, active, value)
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def store_outline(table, boxes, first, active, camera, center_xy, frame, scaled_u, scaled_v, rho):
     """Store the culling ellipse in the record and the exact bounding box, in pixels, in `boxes`."""
     fx = camera[rec.CAMERA_FX]
@@ -228,19 +229,19 @@ def store_outline(table, boxes, first, active, camera, center_xy, frame, scaled_
     store_lanes(boxes, 3 * LANES, box_bottom)
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def first_pixel(edge):
     """The first pixel whose center is not left of `edge`."""
     return np.int64(np.ceil(max(edge, np.float32(-1e6)) - np.float32(0.5)))
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def last_pixel(edge):
     """The last pixel whose center is not right of `edge`."""
     return np.int64(np.floor(min(edge, np.float32(1e6)) - np.float32(0.5)))
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def store_tiles(keys, tile_ranges, first, drawn_bits, boxes, depths, width, height):
     """Scalar end of the projection: pixels that the box covers, tiles that they lie in, and the sorting key."""
     for lane in range(LANES):
@@ -261,7 +262,7 @@ def store_tiles(keys, tile_ranges, first, drawn_bits, boxes, depths, width, heig
                 keys[k] = float_bits(depths[lane])
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def project_group(first, surfels, camera, width, height, curved, table, keys, tile_ranges, boxes, depths):
     """Project surfels first … first + 15: records, keys and tile ranges."""
     means, quats, scales, opacities, colors, curvatures, offsets = surfels
@@ -275,8 +276,9 @@ def project_group(first, surfels, camera, width, height, curved, table, keys, ti
     inverse_depth = 1.0 / depth
     x = frame.center[0] * inverse_depth * camera[rec.CAMERA_FX] + camera[rec.CAMERA_CX]
     y = frame.center[1] * inverse_depth * camera[rec.CAMERA_FY] + camera[rec.CAMERA_CY]
-    x += load_strided(offsets, 2 * first, 2, active)
-    y += load_strided(offsets, 2 * first + 1, 2, active)
+    if offsets.size:
+        x += load_strided(offsets, 2 * first, 2, active)
+        y += load_strided(offsets, 2 * first + 1, 2, active)
 
     hit = where(frame.edge_on, 0.0, depth / frame.normal_dot_center)
     per_x = hit / camera[rec.CAMERA_FX]
@@ -325,14 +327,16 @@ def project_group(first, surfels, camera, width, height, curved, table, keys, ti
     store_tiles(keys, tile_ranges, first, mask_bits(drawn), boxes, depths, width, height)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def project(counter, surfels, camera, width, height, curved, table, keys, tile_ranges):
-    """Fill records, sorting keys and tile ranges; several threads may run this on one `counter`, which starts at zero.
+@njit(**LANE_CODE)
+def project(counter, surfels, camera, width, height, curved, table, keys, tile_ranges, scratch):
+    """Fill records, sorting keys and tile ranges; several threads may run this on one `counter`.
 
-    `surfels` is (means, quats, scales, opacities, colors, curvatures, screen offsets), float32 and contiguous.
+    `surfels` is (means, quats, scales, opacities, colors, curvatures, screen offsets), float32 and contiguous; the last
+    may be empty. `scratch` has five rows of lanes for each thread.
     """
-    boxes = np.empty((4, LANES), np.float32)
-    depths = np.empty(LANES, np.float32)
+    rows = scratch[thread_slot(counter)]
+    boxes = rows[:4]
+    depths = rows[4]
     while True:
         begin = fetch_add(counter, GROUPS_PER_CLAIM * LANES)
         if begin >= keys.size:

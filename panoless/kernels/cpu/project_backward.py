@@ -4,6 +4,7 @@ import numpy as np
 from numba import njit
 
 from panoless.kernels.cpu import records as rec
+from panoless.kernels.cpu.compilation import INLINED_LANE_CODE, LANE_CODE
 from panoless.kernels.cpu.project import (
     GROUPS_PER_CLAIM,
     UnitQuat,
@@ -23,10 +24,17 @@ from panoless.kernels.cpu.simd import (
     lanes,
     where,
 )
-from panoless.kernels.cpu.simd_memory import fetch_add, load_lanes, load_strided, store_lanes, store_strided
+from panoless.kernels.cpu.simd_memory import (
+    fetch_add,
+    load_lanes,
+    load_strided,
+    store_lanes,
+    store_strided,
+    thread_slot,
+)
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def quat_gradient(q, tangent_u, tangent_v, normal):
     """From gradients of the rotation's columns (world axes) to that of the quaternion before it was normalized."""
     u0, u1, u2 = tangent_u
@@ -41,7 +49,7 @@ def quat_gradient(q, tangent_u, tangent_v, normal):
     return UnitQuat((w - q.w * radial) * s, (x - q.x * radial) * s, (y - q.y * radial) * s, (z - q.z * radial) * s, s)
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def sum_slots(slots, slot_starts, first, curved, sums, visible):
     """Add up each surfel's rows, one a tile, in a fixed order: the result does not depend on the number of threads."""
     size = slots.shape[1]
@@ -62,7 +70,7 @@ def sum_slots(slots, slot_starts, first, curved, sums, visible):
             store_lanes(sums, lane * size + size - LANES, high)
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def load_sums(sums, field, active):
     """Three consecutive columns of the summed rows; 0 where `active` fails."""
     size = sums.shape[1]
@@ -73,7 +81,7 @@ def load_sums(sums, field, active):
     )
 
 
-@njit(forceinline=True)
+@njit(**INLINED_LANE_CODE)
 def project_group_backward(first, count, surfels, camera, curved, sums, visible, gradients):
     """Chain the summed record gradients of sixteen surfels back to their parameters."""
     means, quats, scales, opacities, _, curvatures, _ = surfels
@@ -132,7 +140,8 @@ def project_group_backward(first, count, surfels, camera, curved, sums, visible,
         scale_gradient_v += b * vu + c * vv
         gradient_u = added(gradient_u, added(scaled(turned_u, scale_u * a), scaled(turned_v, scale_v * b)))
         gradient_v = added(gradient_v, added(scaled(turned_u, scale_u * b), scaled(turned_v, scale_v * c)))
-        store_vector(grad_curvatures, 3 * first, 3, drawn, curvature_gradient)
+        if grad_curvatures.size:
+            store_vector(grad_curvatures, 3 * first, 3, drawn, curvature_gradient)
 
     store_vector(grad_means, 3 * first, 3, drawn, rotate_back(camera, center_gradient))
     rotation = quat_gradient(
@@ -149,17 +158,24 @@ def project_group_backward(first, count, surfels, camera, curved, sums, visible,
     store_strided(grad_scales, 2 * first + 1, 2, drawn, scale_gradient_v)
     opacity = load_strided(opacities, first, 1, active)
     store_strided(grad_opacities, first, 1, drawn, load_strided(sums, rec.GRAD_OPACITY, size, drawn) / opacity)
-    store_vector(grad_colors, 3 * first, 3, drawn, load_sums(sums, rec.GRAD_COLOR, drawn))
-    store_strided(grad_offsets, 2 * first, 2, drawn, grad_x)
-    store_strided(grad_offsets, 2 * first + 1, 2, drawn, grad_y)
+    if grad_colors.size:
+        color_at = rec.GRAD_COLOR_CURVED if curved else rec.GRAD_COLOR_FLAT
+        store_vector(grad_colors, 3 * first, 3, drawn, load_sums(sums, color_at, drawn))
+    if grad_offsets.size:
+        store_strided(grad_offsets, 2 * first, 2, drawn, grad_x)
+        store_strided(grad_offsets, 2 * first + 1, 2, drawn, grad_y)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def project_backward(counter, surfels, camera, curved, slots, slot_starts, gradients):
-    """Fill the gradients of all visible surfels; those of culled surfels keep the zeros that they must come with."""
+@njit(**LANE_CODE)
+def project_backward(counter, surfels, camera, curved, slots, slot_starts, gradients, scratch):
+    """Fill the gradients of all visible surfels; those of culled surfels keep the zeros that they must come with.
+
+    Gradients that nobody wants are empty arrays. `scratch` has LANES + 1 rows of a gradient's size for each thread.
+    """
     count = slot_starts.size - 1
-    sums = np.empty((LANES, slots.shape[1]), np.float32)
-    visible = np.empty(LANES, np.float32)
+    rows = scratch[thread_slot(counter)]
+    sums = rows[:LANES]
+    visible = rows[LANES]
     while True:
         begin = fetch_add(counter, GROUPS_PER_CLAIM * LANES)
         if begin >= count:

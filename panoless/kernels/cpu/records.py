@@ -5,6 +5,8 @@ With (dx, dy) the pixel minus the projected center and w = HIT_CENTER + A2·dx +
 so that w = 0 marks every hit as invalid; otherwise HIT_CENTER is 1.
 """
 
+from panoless.kernels.constants import TILE as TILE
+
 CENTER_X, CENTER_Y = 0, 1
 A0, B0, A1, B1, A2, B2 = 2, 3, 4, 5, 6, 7
 DEPTH = 8
@@ -28,10 +30,11 @@ RECORD_SIZE = 32
 
 GRAD_OPACITY = 9
 """Gradient rows follow the record up to DEPTH; here stands Σ dL/dα·α, which is the opacity times its gradient."""
-GRAD_COLOR = 10
-GRAD_NORMAL = 13
-GRAD_CURVED_U = 16
-GRAD_CURVED_V = 19
+GRAD_NORMAL = 10
+GRAD_CURVED_U = 13
+GRAD_CURVED_V = 16
+GRAD_COLOR_FLAT = 13
+GRAD_COLOR_CURVED = 19
 FLAT_GRADIENT_SIZE = 16
 CURVED_GRADIENT_SIZE = 24
 
@@ -40,8 +43,7 @@ CAMERA_TRANSLATION = 9
 CAMERA_FX, CAMERA_FY, CAMERA_CX, CAMERA_CY, CAMERA_NEAR = 12, 13, 14, 15, 16
 CAMERA_SIZE = 17
 
-TILE = 16
-"""Edge of a tile in pixels; a tile is 4×4 blocks of 4×4 pixels."""
 BLOCK = 4
+"""Edge of a block in pixels; a tile is 4×4 blocks."""
 CULLED = 0xFFFFFFFF
 """Sorting key of a surfel that is not drawn; no depth has these bits."""

@@ -3,8 +3,8 @@
 LLVM's loop vectorizer gives up on small changes (a second accumulator array is enough), silently and at a cost of
 several times. Here a 4×4 block of pixels, or a group of sixteen surfels, is one value of type `Lanes`, lowered to the
 LLVM vector `<16 x float>`: one register with AVX-512, two with AVX2, four with NEON or SSE. Arithmetic and
-comparisons are the usual operators; a comparison gives a `LaneMask`, used through `where`, `&`, `|`, `~`, `any_lane`
-and `mask_bits`.
+comparisons are the usual operators; a comparison gives a `LaneMask`, used through `where`, `&`, `|`, `~`, `any_lane`,
+`lane_count` and `mask_bits`.
 
 Operators may be contracted (a·b + c as one rounding), reassociated and use reciprocal estimates, but NaN and infinity
 keep their meaning: a masked lane may hold either. Functions that use lanes must therefore not be compiled with
@@ -17,6 +17,7 @@ import operator
 
 import numpy as np
 from llvmlite import ir
+from llvmlite.binding import get_host_cpu_features
 from numba.core import cgutils, types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
@@ -222,13 +223,14 @@ def mask_bits(typingctx, mask):
 
 
 @intrinsic
-def lowest_bit(typingctx, bits):
-    """Return the index of the lowest set bit of an integer that is not zero."""
+def lane_count(typingctx, mask):
+    """Return in how many lanes the mask holds."""
 
     def build(context, builder, sig, args):
-        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
+        bits = builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), INT64)
+        return builder.ctpop(bits)
 
-    return types.int64(types.int64), build
+    return types.int64(mask_type), build
 
 
 def call_intrinsic(builder, name, result, arguments, **options):
@@ -252,7 +254,62 @@ def _unary_function(name, doc):
 
 square_root = _unary_function("sqrt", "Return the square root of each lane.")
 absolute = _unary_function("fabs", "Return the magnitude of each lane.")
-log2 = _unary_function("log2", "Return the base-2 logarithm of each lane.")
+round_down = _unary_function("floor", "Return the largest whole number that is not above each lane.")
+
+
+_LOG2_SERIES = tuple(2 / np.log(2) / power for power in (9, 7, 5, 3, 1))
+
+
+@intrinsic
+def log2(typingctx, value):
+    """Return the base-2 logarithm of each lane, positive and not denormal, to 10⁻⁷; anything else gives garbage.
+
+    log₂(2ᵉ m) = e + 2/ln 2 · artanh((m − 1)/(m + 1)), with m in [√½, √2) and the series up to the ninth power.
+    """
+
+    def build(context, builder, sig, args):
+        integers = lambda number: constant_vector([number] * LANES, INT32)  # noqa: E731
+        one = splat(builder, ir.Constant(FLOAT, 1.0))
+        bits = builder.bitcast(args[0], _INT_VECTOR)
+        shifted = builder.sub(bits, integers(0x3F3504F3))
+        exponent = builder.ashr(shifted, integers(23))
+        mantissa = builder.bitcast(builder.sub(bits, builder.shl(exponent, integers(23))), VECTOR)
+        above, below = builder.fadd(mantissa, one), builder.fsub(mantissa, one)
+        ratio = builder.fdiv(below, above, flags=_RELAXED)
+        square = builder.fmul(ratio, ratio, flags=_RELAXED)
+        series = constant_vector([np.float32(_LOG2_SERIES[0])] * LANES)
+        for coefficient in _LOG2_SERIES[1:]:
+            product = builder.fmul(series, square, flags=_RELAXED)
+            series = builder.fadd(product, constant_vector([np.float32(coefficient)] * LANES), flags=_RELAXED)
+        series = builder.fmul(series, ratio, flags=_RELAXED)
+        return builder.fadd(builder.sitofp(exponent, VECTOR), series, flags=_RELAXED)
+
+    return lanes_type(lanes_type), build
+
+
+def host_has(feature):
+    """Whether the processor that code is compiled for, which is this one, has a feature by LLVM's name for it."""
+    return bool(get_host_cpu_features().get(feature, False))
+
+
+@intrinsic
+def reciprocal(typingctx, value):
+    """Return 1 over each lane, to two units in the last place; not finite for 0 and for what is not finite.
+
+    With AVX-512 by an estimate of 14 bits and one Newton step: a third of the time of the division instruction.
+    """
+
+    def build(context, builder, sig, args):
+        one = splat(builder, ir.Constant(FLOAT, 1.0))
+        if not host_has("avx512f"):
+            return builder.fdiv(one, args[0], flags=_RELAXED)
+        everywhere = ir.Constant(ir.IntType(LANES), -1)
+        operands = [args[0], ir.Constant(VECTOR, None), everywhere]
+        estimate = call_intrinsic(builder, "llvm.x86.avx512.rcp14.ps.512", VECTOR, operands)
+        short = builder.fsub(one, builder.fmul(args[0], estimate, flags=_RELAXED), flags=_RELAXED)
+        return builder.fadd(estimate, builder.fmul(estimate, short, flags=_RELAXED), flags=_RELAXED)
+
+    return lanes_type(lanes_type), build
 
 
 @intrinsic
@@ -300,50 +357,40 @@ def exp2(typingctx, value):
     return lanes_type(lanes_type), build
 
 
-def _pairing(low, high):
-    """The two shuffles of one step of the transposing sum; groups of four lanes are numbered over both operands."""
-    return constant_vector(low, INT32), constant_vector(high, INT32)
-
-
-_GROUPS = range(0, LANES, 4)
-_SUM_STEPS = (
-    _pairing(
-        [i for g in _GROUPS for i in (g, g + 16, g + 1, g + 17)],
-        [i for g in _GROUPS for i in (g + 2, g + 18, g + 3, g + 19)],
-    ),
-    _pairing(
-        [i for g in _GROUPS for i in (g, g + 1, g + 16, g + 17)],
-        [i for g in _GROUPS for i in (g + 2, g + 3, g + 18, g + 19)],
-    ),
-    _pairing([*range(0, 8), *range(16, 24)], [*range(8, 16), *range(24, 32)]),
-    _pairing(
-        [i for g in (0, 8, 16, 24) for i in range(g, g + 4)],
-        [i for g in (4, 12, 20, 28) for i in range(g, g + 4)],
-    ),
-)
+def _step(stride):
+    """Shuffles of one step of the transposing sum: lanes whose `stride` bit is clear go on with the left operand,
+    the others with the right one; the second shuffle fetches the partner of each.
+    """
+    sides = [LANES if lane & stride else 0 for lane in range(LANES)]
+    own = [lane + side for lane, side in enumerate(sides)]
+    partner = [(lane ^ stride) + side for lane, side in enumerate(sides)]
+    return constant_vector(own, INT32), constant_vector(partner, INT32)
 
 
 @intrinsic
 def sum_each(typingctx, rows):
-    """Sum the lanes of each of up to sixteen values: lane i of the result is the sum of `rows[i]`.
+    """Sum the lanes of each of up to sixteen values: lane i of the result is the sum of `rows[i]`; lanes without a row
+    hold nothing of use.
 
-    A transposing reduction: fifteen pairs of shuffles instead of sixteen horizontal sums.
+    A transposing reduction of fifteen shuffles, blends and sums instead of sixteen horizontal sums. The blends matter:
+    they run beside the shuffles, for which there is one port.
     """
 
     def build(context, builder, sig, args):
         vectors = [builder.extract_value(args[0], i) for i in range(sig.args[0].count)]
-        zero = ir.Constant(VECTOR, None)
-        vectors += [zero] * (LANES - len(vectors))
-        for low, high in _SUM_STEPS:
-            pairs = zip(vectors[::2], vectors[1::2], strict=True)
+        stride = 1
+        while stride < LANES:
+            own, partner = _step(stride)
+            pairs = [(*vectors[i : i + 2], vectors[i])[:2] for i in range(0, len(vectors), 2)]
             vectors = [
-                zero
-                if left is zero and right is zero
-                else builder.fadd(
-                    builder.shuffle_vector(left, right, low), builder.shuffle_vector(left, right, high), flags=_RELAXED
+                builder.fadd(
+                    builder.shuffle_vector(left, right, own),
+                    builder.shuffle_vector(left, right, partner),
+                    flags=_RELAXED,
                 )
                 for left, right in pairs
             ]
+            stride *= 2
         return vectors[0]
 
     return lanes_type(rows), build

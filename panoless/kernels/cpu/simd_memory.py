@@ -12,12 +12,14 @@ from panoless.kernels.cpu.simd import (
     VECTOR,
     call_intrinsic,
     constant_vector,
+    host_has,
     lanes_type,
     mask_type,
     splat,
 )
 
 _ROW = ir.VectorType(FLOAT, 4)
+_WORD = ir.IntType(16)
 
 
 def _element_pointer(context, builder, array_type, array, offset):
@@ -46,6 +48,65 @@ def store_lanes(typingctx, array, offset, value):
         return context.get_dummy_value()
 
     return types.void(array, types.intp, lanes_type), build
+
+
+@intrinsic
+def load_some(typingctx, array, offset, active):
+    """Load the `active` ones of sixteen consecutive float32 of a C-contiguous array; the others are 0 and not read."""
+
+    def build(context, builder, sig, args):
+        pointer = _element_pointer(context, builder, sig.args[0], *args[:2])
+        operands = [builder.bitcast(pointer, VECTOR.as_pointer()), ir.Constant(INT32, 4), args[2]]
+        return call_intrinsic(builder, "llvm.masked.load.v16f32.p0", VECTOR, [*operands, ir.Constant(VECTOR, None)])
+
+    return lanes_type(array, types.intp, mask_type), build
+
+
+@intrinsic
+def store_some(typingctx, array, offset, active, value):
+    """Store the `active` ones of sixteen consecutive float32 of a C-contiguous array, from flat index `offset`."""
+
+    def build(context, builder, sig, args):
+        pointer = _element_pointer(context, builder, sig.args[0], *args[:2])
+        operands = [args[3], builder.bitcast(pointer, VECTOR.as_pointer()), ir.Constant(INT32, 4), args[2]]
+        call_intrinsic(builder, "llvm.masked.store.v16f32.p0", ir.VoidType(), operands)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, mask_type, lanes_type), build
+
+
+@intrinsic
+def load_at(typingctx, array, places, active):
+    """Load float32 elements of a C-contiguous array by flat index, a whole number below 2²⁴; 0 where not `active`."""
+
+    def build(context, builder, sig, args):
+        start = _element_pointer(context, builder, sig.args[0], args[0], ir.Constant(INT64, 0))
+        whole = builder.fptosi(args[1], ir.VectorType(INT32, LANES))
+        vector = ir.VectorType(INT64, LANES)
+        bytes_from_start = builder.shl(builder.sext(whole, vector), constant_vector([2] * LANES, INT64))
+        addresses = builder.add(splat(builder, builder.ptrtoint(start, INT64), vector), bytes_from_start)
+        pointers = builder.inttoptr(addresses, ir.VectorType(FLOAT.as_pointer(), LANES))
+        operands = [pointers, ir.Constant(INT32, 4), args[2], ir.Constant(VECTOR, None)]
+        return call_intrinsic(builder, "llvm.masked.gather.v16f32.v16p0", VECTOR, operands)
+
+    return lanes_type(array, lanes_type, mask_type), build
+
+
+@intrinsic
+def add_color(typingctx, array, offset, weight, red, green, blue):
+    """Add weight·(red, green, blue, 0) to four float32 of a C-contiguous array, from flat index `offset` on."""
+
+    def build(context, builder, sig, args):
+        pointer = builder.bitcast(_element_pointer(context, builder, sig.args[0], *args[:2]), _ROW.as_pointer())
+        color = ir.Constant(_ROW, None)
+        for channel in range(3):
+            color = builder.insert_element(color, args[3 + channel], ir.Constant(INT32, channel))
+        share = builder.fmul(color, splat(builder, args[2], _ROW), flags=("contract",))
+        total = builder.fadd(builder.load(pointer, align=4, typ=_ROW), share, flags=("contract",))
+        builder.store(total, pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, *[types.float32] * 4), build
 
 
 def _row_mask(builder, mask, row):
@@ -123,6 +184,45 @@ def store_strided(typingctx, array, first, stride, active, value):
 
 
 @intrinsic
+def load_bit(typingctx, array, offset, bit):
+    """Which of sixteen consecutive uint16 of a C-contiguous array, from flat index `offset`, have bit `bit` set."""
+
+    def build(context, builder, sig, args):
+        words = ir.VectorType(_WORD, LANES)
+        pointer = _element_pointer(context, builder, sig.args[0], *args[:2])
+        loaded = builder.load(builder.bitcast(pointer, words.as_pointer()), align=2, typ=words)
+        wanted = splat(builder, builder.shl(ir.Constant(_WORD, 1), builder.trunc(args[2], _WORD)), words)
+        return builder.icmp_unsigned("!=", builder.and_(loaded, wanted), ir.Constant(words, None))
+
+    return mask_type(array, types.intp, types.int64), build
+
+
+@intrinsic
+def store_chosen(typingctx, array, offset, first, mask):
+    """Store the int32 numbers first + lane of the lanes in `mask` one after another, from flat index `offset`.
+
+    Up to sixteen elements from there on may be overwritten, whatever the mask.
+    """
+
+    def build(context, builder, sig, args):
+        vector = ir.VectorType(INT32, LANES)
+        start = splat(builder, builder.trunc(args[2], INT32), vector)
+        numbers = builder.add(start, constant_vector(range(LANES), INT32))
+        pointer = _element_pointer(context, builder, sig.args[0], *args[:2])
+        if host_has("avx512f"):
+            # The store that compresses is slow on some processors; compressing in a register is not.
+            operands = [numbers, ir.Constant(vector, None), args[3]]
+            packed = call_intrinsic(builder, "llvm.x86.avx512.mask.compress.v16i32", vector, operands)
+            builder.store(packed, builder.bitcast(pointer, vector.as_pointer()), align=4)
+        else:
+            operands = [numbers, pointer, args[3]]
+            call_intrinsic(builder, "llvm.masked.compressstore.v16i32", ir.VoidType(), operands)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.int64, mask_type), build
+
+
+@intrinsic
 def fetch_add(typingctx, counter, amount):
     """Add `amount` to element 0 of an int64 array atomically and return the value before."""
 
@@ -131,3 +231,15 @@ def fetch_add(typingctx, counter, amount):
         return builder.atomic_rmw("add", pointer, args[1], "monotonic")
 
     return types.int64(counter, types.int64), build
+
+
+@intrinsic
+def thread_slot(typingctx, counter):
+    """Return a number of its own for each thread that works on `counter`, which `run_shared` made: 0, 1, …"""
+
+    def build(context, builder, sig, args):
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        pointer = builder.gep(data, [ir.Constant(INT64, 1)])
+        return builder.atomic_rmw("add", pointer, ir.Constant(INT64, 1), "monotonic")
+
+    return types.int64(counter), build

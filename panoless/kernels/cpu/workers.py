@@ -31,8 +31,12 @@ def _pool(helpers: int) -> ThreadPoolExecutor:
 
 
 def run_shared(kernel: Callable[..., None], *arguments: object) -> None:
-    """Run `kernel(counter, *arguments)` on every thread at once; `counter` is an int64 array that starts at zero."""
-    counter = np.zeros(1, np.int64)
+    """Run `kernel(counter, *arguments)` on every thread at once.
+
+    `counter` is an int64 array that starts at zero: first the tasks that were claimed, then the threads that asked for
+    a number of their own.
+    """
+    counter = np.zeros(2, np.int64)
     helpers = thread_count() - 1
     if helpers == 0:
         kernel(counter, *arguments)

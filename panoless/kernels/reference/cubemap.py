@@ -85,12 +85,16 @@ def project_to_face(
 
 def sample_cubemap(cubemap: Float[Tensor, "6 C L L"], directions: Float[Tensor, "P 3"]) -> Float[Tensor, "P C"]:
     """Definition of `panoless.kernels.cubemap.sample_cubemap`."""
+    taps, weights = bilinear_taps(directions, cubemap.shape[-1])
+    return (padded_texels(cubemap)[taps] * weights[..., None]).sum(1)
+
+
+def padded_texels(cubemap: Float[Tensor, "6 C L L"]) -> Float[Tensor, "N C"]:
+    """The texels of the padded faces, flat."""
     _, channels, resolution, _ = cubemap.shape
     padding = cubemap_padding(resolution, cubemap.device)
     texels = cubemap.movedim(1, -1).reshape(-1, channels)
-    texels = torch.cat([texels, texels[padding.corners].mean(1)])[padding.sources.reshape(-1)]
-    taps, weights = bilinear_taps(directions, resolution)
-    return (texels[taps] * weights[..., None]).sum(1)
+    return torch.cat([texels, texels[padding.corners].mean(1)])[padding.sources.reshape(-1)]
 
 
 def scatter_cubemap(
@@ -98,11 +102,17 @@ def scatter_cubemap(
 ) -> Float[Tensor, "6 C L L"]:
     """Definition of `panoless.kernels.cubemap.scatter_cubemap`."""
     channels = values.shape[1]
-    padding = cubemap_padding(resolution, values.device)
     taps, weights = bilinear_taps(directions, resolution)
-    padded = values.new_zeros(padding.sources.numel(), channels)
+    padded = values.new_zeros(6 * (resolution + 2) ** 2, channels)
     padded.index_add_(0, taps.reshape(-1), (weights[..., None] * values[:, None, :]).reshape(-1, channels))
-    texels = values.new_zeros(6 * resolution**2 + NUM_CORNERS, channels)
+    return fold_padding(padded, resolution)
+
+
+def fold_padding(padded: Float[Tensor, "N C"], resolution: int) -> Float[Tensor, "6 C L L"]:
+    """The adjoint of `padded_texels`: what lies in a ring goes to the texels that it shows."""
+    channels = padded.shape[1]
+    padding = cubemap_padding(resolution, padded.device)
+    texels = padded.new_zeros(6 * resolution**2 + NUM_CORNERS, channels)
     texels.index_add_(0, padding.sources.reshape(-1), padded)
     texels, corners = texels.split([6 * resolution**2, NUM_CORNERS])
     shares = (corners / 3).repeat_interleave(3, 0)

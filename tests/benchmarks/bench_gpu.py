@@ -1,0 +1,271 @@
+"""Time the GPU kernels, and gsplat beside them where it is installed: `python -m tests.benchmarks.bench_gpu`.
+
+The scene is the vase of `bench_rasterize`. First the images and gradients of the Triton kernels are compared with the
+CPU's, because a wrong kernel may be as fast as it likes; then the rasterizer is timed alone, in other tile shapes
+(`--sweep`), and in whole steps of a fit. `--device cpu` runs the same lines on the CPU, for comparison.
+"""
+
+import argparse
+import json
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from panoless.kernels.rasterize import RasterBuffers, RasterCamera, rasterize
+from tests.benchmarks.bench_rasterize import CASES, Vase, calibrated_vase, vase_camera
+from tests.support.surfel_scenes import IMAGES
+
+SHAPES = ((8, 1, 8), (8, 1, 16), (8, 1, 32), (8, 2, 16), (16, 1, 16), (16, 2, 16), (16, 4, 16))
+"""Edge of a tile, warps, surfels between two looks at whether a tile is finished."""
+KINDS = ((False, "flat"), (True, "curved"))
+BATCHES = 7
+BATCH_SECONDS = 0.3
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the result: medians, wall milliseconds."""
+
+    what: str
+    pixels: int
+    surfels: int
+    forward_ms: float | None
+    """None where the forward is not timed alone."""
+    step_ms: float
+
+
+def milliseconds(device: torch.device, work: Callable[[], None]) -> float:
+    """Median over batches of the wall time of one call, the device idle before and after each batch."""
+
+    def batch(repeats: int) -> float:
+        _wait(device)
+        start = time.perf_counter()
+        for _ in range(repeats):
+            work()
+        _wait(device)
+        return (time.perf_counter() - start) / repeats
+
+    batch(3)
+    repeats = max(1, round(BATCH_SECONDS / batch(3)))
+    return 1e3 * statistics.median(batch(repeats) for _ in range(BATCHES))
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def placed(surfels: Vase, device: torch.device) -> Vase:
+    """Leaves on a device."""
+    return Vase(**{f.name: getattr(surfels, f.name).detach().to(device).requires_grad_() for f in fields(surfels)})
+
+
+def drawn(surfels: Vase, camera: RasterCamera, curved: bool) -> RasterBuffers:
+    """Rasterize with the kernels of the surfels' device."""
+    curvatures = surfels.curvatures if curved else None
+    return rasterize(
+        surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.colors, curvatures, camera
+    )
+
+
+def cotangents(camera: RasterCamera, device: torch.device) -> dict[str, Tensor]:
+    """Random gradients of all images."""
+    generator = torch.Generator().manual_seed(1)
+    image = (camera.height, camera.width)
+    shapes = {name: (3, *image) if name in IMAGES[:2] else image for name in IMAGES}
+    return {name: torch.randn(shape, generator=generator).to(device) for name, shape in shapes.items()}
+
+
+def pulled(surfels: Vase, camera: RasterCamera, curved: bool, weights: dict[str, Tensor]) -> tuple[Tensor | None, ...]:
+    """Gradients of Σ weights · images to all parameters."""
+    buffers = drawn(surfels, camera, curved)
+    images = [getattr(buffers, name) for name in weights]
+    leaves = [getattr(surfels, f.name) for f in fields(surfels)]
+    return torch.autograd.grad(images, leaves, list(weights.values()), allow_unused=True)
+
+
+def largest_disagreement(surfels: Vase, camera: RasterCamera, device: torch.device) -> float:
+    """Largest difference of any image or gradient from the CPU kernels', over its own largest value.
+
+    The median depth is left out: where transmittances lie within rounding of one half, it jumps.
+    """
+    results = []
+    for place in (torch.device("cpu"), device):
+        here = placed(surfels, place)
+        weights = cotangents(camera, place)
+        del weights["median_depth"]
+        buffers = drawn(here, camera, True)
+        found = [getattr(buffers, name) for name in weights] + list(pulled(here, camera, True, weights))
+        results.append([tensor.detach().double().cpu() for tensor in found if tensor is not None])
+    return max(float((a - b).abs().max() / a.abs().max()) for a, b in zip(*results, strict=True))
+
+
+def time_rasterizer(surfels: Vase, camera: RasterCamera, device: torch.device, curved: bool, what: str) -> Row:
+    """Forward alone, and forward with backward from all images to all parameters."""
+    here, weights = placed(surfels, device), cotangents(camera, device)
+    camera = replace(camera, world_to_camera=camera.world_to_camera.to(device))
+
+    def forward() -> None:
+        with torch.no_grad():
+            drawn(here, camera, curved)
+
+    def step() -> None:
+        pulled(here, camera, curved, weights)
+
+    return Row(what, camera.width, len(here.means), milliseconds(device, forward), milliseconds(device, step))
+
+
+def time_gsplat(surfels: Vase, camera: RasterCamera, device: torch.device) -> Row | None:
+    """The same surfels, flat, by gsplat: color, depth, normals and distortion; None where it is not installed.
+
+    It also makes normals of the depth in torch; its median and accumulated depths are those of the surfels' centers.
+    """
+    try:
+        from gsplat import rasterization_2dgs
+    except ImportError:
+        return None
+    here = placed(surfels, device)
+    flat = torch.cat([here.scales, torch.ones_like(here.scales[:, :1])], 1).detach().requires_grad_()
+    leaves = [here.means, here.quats, flat, here.opacities, here.colors]
+    intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]], device=device)
+
+    def images() -> list[Tensor]:
+        colors, alphas, normals, _, distortion, median, _ = rasterization_2dgs(
+            *leaves,
+            camera.world_to_camera.to(device)[None].float(),
+            intrinsics[None],
+            camera.width,
+            camera.height,
+            near_plane=camera.near,
+            far_plane=camera.far,
+            packed=False,
+            render_mode="RGB+D",
+            distloss=True,
+        )
+        return [colors, alphas, normals, distortion, median]
+
+    weights = [torch.randn_like(image) for image in images()]
+
+    def forward() -> None:
+        with torch.no_grad():
+            images()
+
+    def step() -> None:
+        torch.autograd.grad(images(), leaves, weights, allow_unused=True)
+
+    times = milliseconds(device, forward), milliseconds(device, step)
+    return Row("gsplat rasterization_2dgs", camera.width, len(here.means), *times)
+
+
+def time_fit(surfels: Vase, camera: RasterCamera, device: torch.device) -> Row:
+    """Whole steps of a fit of the default preset on one view: lookup, losses, backward and Adam."""
+    from panoless.checkpoint import FitState
+    from panoless.config import FitConfig
+    from panoless.fit import Fitter
+    from panoless.surfels import Surfels
+    from panoless.views import Normalization, TrainView, Views, unit_rays_camera
+
+    with torch.no_grad():
+        picture = drawn(placed(surfels, device), camera, True)
+    mask = (picture.alpha > 0.5).float()
+    view = TrainView(
+        camera=replace(camera, world_to_camera=camera.world_to_camera.to(device)),
+        radiance=(picture.colors * mask).clamp(0, 1),
+        mask=mask,
+        rays_camera=unit_rays_camera(camera).to(device),
+        solid=torch.nonzero(mask.flatten())[:, 0],
+    )
+    here = placed(surfels, device)
+    count, config = len(here.means), FitConfig()
+    parameters = Surfels(
+        means=here.means,
+        quats=here.quats,
+        log_scales=here.scales.log(),
+        opacity_logits=here.opacities.logit(),
+        albedo=torch.zeros_like(here.means),
+        curvatures=here.curvatures,
+        roughness_logits=torch.zeros_like(here.opacities),
+    ).detached()
+    length = config.environment.resolution
+    state = FitState(
+        surfels=parameters,
+        environment=torch.full((6, 3, length, length), 0.5, device=device),
+        iteration=0,
+        optimizer={},
+        gradient_sum=torch.zeros(count, device=device),
+        gradient_count=torch.zeros(count, device=device),
+        evidence=torch.zeros(6, length, length, device=device),
+        center=[0.0, 0.0, 0.0],
+        radius=1.0,
+    )
+    views = Views((view,), Normalization(torch.zeros(3).numpy(), 1.0), camera.near)
+    with tempfile.TemporaryDirectory() as folder:
+        fitter = Fitter(views, config, Path(folder), state)
+        warm = round(config.environment.warmup * config.iterations) + 1
+
+        def step() -> None:
+            fitter._step(warm)
+
+        return Row("step of a fit", camera.width, count, None, milliseconds(device, step))
+
+
+def sweep(surfels: Vase, camera: RasterCamera, device: torch.device) -> list[Row]:
+    """The rasterizer in other shapes of its tile kernels."""
+    from panoless.kernels.gpu import launch
+
+    rows, usual = [], launch.TILES
+    try:
+        for tile, warps, chunk in SHAPES:
+            launch.TILES = launch.TileLaunch(tile, warps, chunk)
+            rows.append(time_rasterizer(surfels, camera, device, True, f"tile {tile}, {warps} warps, chunk {chunk}"))
+    finally:
+        launch.TILES = usual
+    return rows
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure every case and print a table; 0 also where there is no GPU to measure."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
+    parser.add_argument("--sweep", action="store_true", help="time other tile shapes, too")
+    parser.add_argument("--cases", type=int, default=len(CASES), help="how many cases, smallest first")
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    options = parser.parse_args(arguments)
+    if options.device == "cuda" and not torch.cuda.is_available():
+        print(f"Skipped: torch {torch.__version__} sees no GPU. `--device cpu` times the CPU kernels.", file=sys.stderr)
+        return 0
+    device = torch.device(options.device)
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"CPU, {torch.get_num_threads()} threads"
+    print(f"{name}, torch {torch.__version__}")
+    print("what                            pixels surfels | forward  | with backward")
+    rows: list[Row] = []
+    for pixels, count in CASES[: options.cases]:
+        camera = vase_camera(pixels)
+        surfels, _, _ = calibrated_vase(count, camera)
+        if device.type == "cuda":
+            apart = largest_disagreement(surfels, camera, device)
+            print(f"{pixels} px, {count} surfels: largest relative difference from the CPU kernels {apart:.1e}")
+        rows += [time_rasterizer(surfels, camera, device, curved, what) for curved, what in KINDS]
+        if device.type == "cuda":
+            rows += sweep(surfels, camera, device) if options.sweep else []
+            peer = time_gsplat(surfels, camera, device)
+            rows += [peer] if peer else []
+        rows.append(time_fit(surfels, camera, device))
+    for row in rows:
+        rate = f"{1e3 / row.step_ms:8.1f}/s"
+        forward = "       –" if row.forward_ms is None else f"{row.forward_ms:8.3f}"
+        print(f"{row.what:32} {row.pixels:4}² {row.surfels:6} | {forward} | {row.step_ms:8.3f} ms {rate}")
+    if options.json:
+        options.json.write_text(json.dumps({"device": name, "rows": [asdict(row) for row in rows]}, indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
