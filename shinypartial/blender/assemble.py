@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from shinypartial.blender.geometry import make_mesh
-from shinypartial.blender.materials import DEPTH_PASS, environment_texture, make_room_material
+from shinypartial.blender.materials import environment_texture, make_room_material
 from shinypartial.blender.objects import mesh_of, place_objects
+from shinypartial.blender.output import add_passes, set_file
 from shinypartial.blender.runtime import choose_device, studio_light
 from shinypartial.blender.self_reflection import assemble_probe
 from shinypartial.errors import InputError
@@ -78,21 +79,14 @@ def _set_sampling(scene: Any, render: Render) -> None:
 
 
 def _set_output(scene: Any, render: Render) -> None:
-    """Square image and linear passes in one uncompressed float EXR; the view transform doesn't touch those."""
+    """Square image, and linear passes in one file."""
     scene.display_settings.display_device = "sRGB"
     scene.view_settings.view_transform = "Standard"
     scene.render.resolution_x = scene.render.resolution_y = render.resolution
     scene.render.resolution_percentage = 100
     scene.render.pixel_aspect_x = scene.render.pixel_aspect_y = 1
-    scene.render.use_compositing = scene.render.use_sequencer = False
-    image = scene.render.image_settings
-    image.media_type = "MULTI_LAYER_IMAGE"  # Must come first: it decides which formats are allowed.
-    image.file_format = "OPEN_EXR_MULTILAYER"
-    image.color_depth, image.exr_codec = "32", "NONE"
-    layer = scene.view_layers[0]
-    layer.use_pass_normal = True
-    depth = layer.aovs.add()
-    depth.name, depth.type = DEPTH_PASS, "VALUE"
+    set_file(scene)
+    add_passes(scene)
 
 
 def _surround(bpy: Any, scene: Any, spec: SceneSpec) -> None:

@@ -30,18 +30,35 @@ def add_depth_pass(material: Any) -> None:
     links.new(nodes.new("ShaderNodeCameraData").outputs["View Z Depth"], depth.inputs["Value"])
 
 
+def is_perfect_mirror(spec: Material | None) -> bool:
+    """Whether all light is reflected in one direction, unchanged."""
+    return spec is not None and spec.base_color == (1.0, 1.0, 1.0) and spec.metallic == 1 and spec.roughness == 0
+
+
 def make_probe_material(bpy: Any) -> Any:
     """A perfect mirror to the camera and a light of radiance 1 to every reflected ray."""
     material, nodes, links = _empty(bpy, "probe")
-    mirror, light = nodes.new("ShaderNodeBsdfGlossy"), nodes.new("ShaderNodeEmission")
-    mirror.inputs["Roughness"].default_value = 0
-    mirror.inputs["Color"].default_value = (1, 1, 1, 1)
+    mirror, light = _mirror_and_light(nodes, 1.0)
     choice = nodes.new("ShaderNodeMixShader")
     links.new(nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"], choice.inputs[0])
     links.new(light.outputs["Emission"], choice.inputs[1])
     links.new(mirror.outputs["BSDF"], choice.inputs[2])
     links.new(choice.outputs["Shader"], nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
     material.cycles.emission_sampling = "NONE"  # Reflected rays find it by themselves.
+    return material
+
+
+def make_mark_material(bpy: Any, radiance: float) -> Any:
+    """A light of that radiance, and to the camera a perfect mirror beside."""
+    material, nodes, links = _empty(bpy, "mark")
+    mirror, light = _mirror_and_light(nodes, radiance)
+    choice, both = nodes.new("ShaderNodeMixShader"), nodes.new("ShaderNodeAddShader")
+    links.new(nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"], choice.inputs[0])
+    links.new(mirror.outputs["BSDF"], choice.inputs[2])
+    links.new(light.outputs["Emission"], both.inputs[0])
+    links.new(choice.outputs["Shader"], both.inputs[1])
+    links.new(both.outputs["Shader"], nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
+    material.cycles.emission_sampling = "NONE"
     return material
 
 
@@ -62,6 +79,16 @@ def environment_texture(nodes: Any, image: Any) -> Any:
     texture.image = image
     texture.projection, texture.interpolation = "EQUIRECTANGULAR", "Linear"
     return texture
+
+
+def _mirror_and_light(nodes: Any, radiance: float) -> tuple[Any, Any]:
+    """Nodes of a perfect mirror and of a white light."""
+    mirror, light = nodes.new("ShaderNodeBsdfGlossy"), nodes.new("ShaderNodeEmission")
+    mirror.inputs["Roughness"].default_value = 0
+    mirror.inputs["Color"].default_value = (1, 1, 1, 1)
+    light.inputs["Color"].default_value = (1, 1, 1, 1)
+    light.inputs["Strength"].default_value = radiance
+    return mirror, light
 
 
 def _empty(bpy: Any, name: str) -> tuple[Any, Any, Any]:

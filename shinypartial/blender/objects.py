@@ -27,14 +27,20 @@ def place_objects(bpy: Any, scene: Any, spec: SceneSpec) -> None:
             each.name = f"{PROP} {i}"
         body.name = BODY
     else:
-        parts = spec.object.parts if isinstance(spec.object, Assembly) else (Part(spec.object),)
-        _link(bpy, scene, BODY, parts, spec)
+        _link(bpy, scene, BODY, parts_of(spec), spec)
     for i, part in enumerate(spec.props):
         _link(bpy, scene, f"{PROP} of the recipe {i}", (part,), spec)
     for each in props_of(scene):
         each.is_holdout = True
     for slot in scene.objects[BODY].material_slots:
         add_depth_pass(slot.material)
+
+
+def parts_of(spec: SceneSpec) -> tuple[Part, ...]:
+    """Parts of a recipe's object, each of which has one material; none of a user's file."""
+    if isinstance(spec.object, BlendFile):
+        return ()
+    return spec.object.parts if isinstance(spec.object, Assembly) else (Part(spec.object),)
 
 
 def props_of(scene: Any) -> list[Any]:

@@ -8,8 +8,10 @@ from jaxtyping import Float
 
 from shinypartial.camera import Camera, project
 
-#: Pixels kept around the projected vertices, for rounding in Blender's border.
+#: Pixels kept around the projected vertices.
 MARGIN_PX = 2
+#: Added to borders, so that rounding errors don't cost a pixel.
+TRUNCATED_PX = 0.1
 SMALLEST_DEPTH = 1e-6
 
 
@@ -44,9 +46,10 @@ def set_border(scene: Any, region: Region, camera: Camera) -> None:
     """Let Blender render that region alone; the image keeps its size and is zero outside."""
     render = scene.render
     render.use_border, render.use_crop_to_border = True, False
-    render.border_min_x, render.border_max_x = region.left / camera.width, region.right / camera.width
-    # Blender counts from the bottom.
-    render.border_min_y, render.border_max_y = 1 - region.bottom / camera.height, 1 - region.top / camera.height
+    # Blender truncates to whole pixels, from the bottom.
+    render.border_min_x, render.border_max_x = ((x + TRUNCATED_PX) / camera.width for x in (region.left, region.right))
+    low, high = camera.height - region.bottom, camera.height - region.top
+    render.border_min_y, render.border_max_y = ((y + TRUNCATED_PX) / camera.height for y in (low, high))
 
 
 def world_vertices(bpy: Any, body: Any) -> Float[np.ndarray, "P 3"]:

@@ -1,6 +1,11 @@
-"""Render views of an assembled scene and hand back their passes as arrays."""
+"""Render views of an assembled scene and hand back their passes as arrays.
+
+Where the object mirrors perfectly, paths through a grid of points tell what smooth pixels show (`directions`,
+`footprint`), and only the others are path traced (`picked`). Any other object is path traced as a whole.
+"""
 
 import contextlib
+import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -8,21 +13,40 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from shinypartial.blender.assemble import assemble
-from shinypartial.blender.materials import DEPTH_PASS
-from shinypartial.blender.objects import BODY
-from shinypartial.blender.region import image_region, set_border, world_vertices
+from shinypartial.blender.assemble import BOUNCES, assemble, world_radiance
+from shinypartial.blender.directions import (
+    GRID,
+    MISSED,
+    MirrorPaths,
+    assemble_directions,
+    mirrors_enough,
+    render_directions,
+)
+from shinypartial.blender.footprint import FarWorld, SmoothLight, smooth_light
+from shinypartial.blender.objects import BODY, props_of
+from shinypartial.blender.passes import (
+    ALPHA_CHANNEL,
+    COLOR_CHANNELS,
+    DEPTH_CHANNEL,
+    NORMAL_CHANNELS,
+    PASSES,
+    Passes,
+    read_passes,
+    stacked,
+)
+from shinypartial.blender.picked import assemble_picked, nearest_depth, render_picked
+from shinypartial.blender.region import SMALLEST_DEPTH, Region, image_region, set_border, world_vertices
 from shinypartial.blender.runtime import import_blender, interrupts_deferred, quiet, set_threads
 from shinypartial.blender.self_reflection import render_probe
 from shinypartial.camera import Camera, opencv_to_opengl
 from shinypartial.errors import InputError
 from shinypartial.scene import BlendFile, SceneSpec
 
-DEPTH_CHANNEL = f"{DEPTH_PASS}.X"
-PASSES = (*(f"Combined.{name}" for name in "RGBA"), *(f"Normal.{name}" for name in "XYZ"), DEPTH_CHANNEL)
-PROBE_PASSES = ("Combined.R",)
+PROBE_PASSES = (COLOR_CHANNELS[0],)
+#: With more samples every pixel is path traced, which has no limit but time.
+MOST_SAMPLES_OF_MIRRORS = 512
 
 
 @dataclass(frozen=True)
@@ -50,42 +74,92 @@ class Renderer:
     device: str
     blender_version: str
     body_vertices_world: Float[np.ndarray, "P 3"]
+    mirror: "_Mirror | None"
+    """What a perfectly mirroring object is rendered with; None where every pixel is path traced."""
 
     def render(self, camera: Camera) -> RenderedView:
         """Render one view from a camera with the recipe's lens and resolution."""
-        scene = self.bpy.context.scene
-        path, probe = self.scratch / "view.exr", self.scratch / "probe.exr"
-        scene.camera.matrix_world = opencv_to_opengl(camera.camera_to_world).T.tolist()
-        scene.render.filepath = str(path)
+        self.bpy.context.scene.camera.matrix_world = opencv_to_opengl(camera.camera_to_world).T.tolist()
         region = image_region(camera, self.body_vertices_world)
-        for each in self.bpy.data.scenes:
-            set_border(each, region, camera)
         try:
             with interrupts_deferred(), quiet():
-                self.bpy.ops.render.render(write_still=True)
-                render_probe(self.bpy, probe)
+                if self.mirror and (depth := nearest_depth(camera, self.mirror.vertices_world)) > SMALLEST_DEPTH:
+                    return self._reflected(self.mirror, camera, region, depth)
+                return self._path_traced(camera, region)
         except RuntimeError as error:
             raise InputError(
                 expected=f"Blender to render a view and to write it to {self.scratch}",
                 found=" ".join(str(error).split()),
                 remedy="Free some space there or set TMPDIR to another folder, then run the same command again.",
             ) from None
-        return _from_passes(_read_passes(path, PASSES), _read_passes(probe, PROBE_PASSES))
+
+    def _path_traced(self, camera: Camera, region: Region) -> RenderedView:
+        """Every pixel of the region alike, and the probe of self-reflection."""
+        scene = self.bpy.context.scene
+        path, probe = self.scratch / "view.exr", self.scratch / "probe.exr"
+        for each in self.bpy.data.scenes:
+            set_border(each, region, camera)
+        scene.render.filepath = str(path)
+        self.bpy.ops.render.render(write_still=True)
+        render_probe(self.bpy, probe)
+        meets_scene = read_passes(probe, PROBE_PASSES)[PROBE_PASSES[0]] > 0.5
+        return _from_passes(read_passes(path, PASSES), meets_scene)
+
+    def _reflected(self, mirror: "_Mirror", camera: Camera, region: Region, depth: float) -> RenderedView:
+        """Smooth pixels from their paths, path tracing in the others."""
+        paths = render_directions(self.bpy, self.scratch / "directions.exr", region, camera)
+        light = smooth_light(mirror.world, paths, mirror.threads)
+        passes = {name: np.zeros((camera.height, camera.width), np.float32) for name in PASSES}
+        inside = slice(region.top, region.bottom), slice(region.left, region.right)
+        for name, channel in _smooth_passes(light, paths).items():
+            passes[name][inside] = channel
+        unsure = np.zeros((camera.height, camera.width), bool)
+        unsure[inside] = _near_the_object(paths) & ~light.smooth
+        if unsure.any():
+            picked = render_picked(self.bpy, self.scratch / "picked.exr", unsure, depth)
+            for name in PASSES:
+                passes[name][unsure] = picked[name]
+        meets_scene = np.zeros(unsure.shape, bool)
+        meets_scene[inside] = paths.meets_scene[GRID // 2 :: GRID, GRID // 2 :: GRID]
+        return _from_passes(passes, meets_scene)
+
+
+@dataclass(frozen=True)
+class _Mirror:
+    """The far world, and the vertices of everything before the camera."""
+
+    world: FarWorld
+    vertices_world: Float[np.ndarray, "P 3"]
+    threads: int
 
 
 @contextlib.contextmanager
-def open_renderer(spec: SceneSpec, *, threads: int | None = None, folder: Path | None = None) -> Iterator[Renderer]:
+def open_renderer(
+    spec: SceneSpec, *, threads: int | None = None, folder: Path | None = None, path_traced: bool = False
+) -> Iterator[Renderer]:
     """Assemble the scene; its passes go through a temporary folder, inside `folder`, that is removed at the end.
 
-    Cycles uses as many `threads` on the CPU, or one for every core.
+    Cycles uses as many `threads` on the CPU, or one for every core. Every pixel is path traced where `path_traced` asks
+    for it, or where samples are many, or the object is no perfect mirror in a far world.
     """
     bpy = import_blender()
     with tempfile.TemporaryDirectory(prefix="shinypartial-", dir=folder) as scratch:
         with interrupts_deferred(), quiet():
             device = assemble(bpy, spec)
-            set_threads(bpy, threads)
             vertices = _body_vertices(bpy, spec)
-        yield Renderer(bpy, Path(scratch), device, bpy.app.version_string, vertices)
+            mirror = None
+            if not path_traced and spec.render.samples <= MOST_SAMPLES_OF_MIRRORS and mirrors_enough(bpy, spec):
+                mirror = _prepare_mirror(bpy, spec, vertices, threads or os.cpu_count() or 1)
+            set_threads(bpy, threads)
+        yield Renderer(bpy, Path(scratch), device, bpy.app.version_string, vertices, mirror)
+
+
+def _prepare_mirror(bpy: Any, spec: SceneSpec, body: Float[np.ndarray, "P 3"], threads: int) -> _Mirror:
+    """Add the two scenes that a perfect mirror needs."""
+    props = [world_vertices(bpy, each) for each in props_of(bpy.context.scene)]
+    assemble_directions(bpy, spec, BOUNCES)
+    assemble_picked(bpy, spec.camera)
+    return _Mirror(FarWorld(world_radiance(spec.world, spec.render.exposure)), np.concatenate([body, *props]), threads)
 
 
 def _body_vertices(bpy: Any, spec: SceneSpec) -> Float[np.ndarray, "P 3"]:
@@ -95,47 +169,41 @@ def _body_vertices(bpy: Any, spec: SceneSpec) -> Float[np.ndarray, "P 3"]:
     return world_vertices(bpy, bpy.context.scene.objects[BODY])
 
 
-def _read_passes(path: Path, expected: tuple[str, ...]) -> dict[str, Float[np.ndarray, "H W"]]:
-    """Every channel of every part, by the name that follows the view layer's."""
-    import OpenEXR
-
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            passes = {
-                name.partition(".")[2]: channel.pixels.astype(np.float32)
-                for part in file.parts
-                for name, channel in part.channels.items()
-            }
-    except Exception as error:
-        raise _unreadable(path, str(error).strip()) from None
-    missing = sorted(set(expected) - passes.keys())
-    if missing:  # Where a part is cut off, OpenEXR warns and leaves it out.
-        raise _unreadable(path, f"no {', '.join(missing)}")
-    return passes
+def _smooth_passes(light: SmoothLight, paths: MirrorPaths) -> Passes:
+    """Passes of the smooth pixels, which the object covers; zero in the others."""
+    channels = {
+        DEPTH_CHANNEL: paths.depth,
+        **dict(zip(NORMAL_CHANNELS, np.moveaxis(paths.normals_world, -1, 0), strict=True)),
+    }
+    means = {name: np.where(light.smooth, _pixels(channel).mean((1, 3)), 0) for name, channel in channels.items()}
+    colors = dict(zip(COLOR_CHANNELS, np.moveaxis(light.radiance, -1, 0), strict=True))
+    return {**means, **colors, ALPHA_CHANNEL: light.smooth.astype(np.float32)}
 
 
-def _unreadable(path: Path, found: str) -> InputError:
-    return InputError(
-        expected=f"every pass that Blender writes to {path}",
-        found=f"an incomplete file ({found})",
-        remedy="Free some space there or set TMPDIR to another folder, then run the same command again.",
-    )
+def _near_the_object(paths: MirrorPaths) -> Bool[np.ndarray, "h w"]:
+    """Pixels in which a path meets the object, and those next to them."""
+    from scipy.ndimage import binary_dilation
+
+    seen = _pixels(paths.bounces != MISSED).any((1, 3))
+    return binary_dilation(seen, np.ones((3, 3), bool))
 
 
-def _from_passes(
-    passes: dict[str, Float[np.ndarray, "H W"]], probe: dict[str, Float[np.ndarray, "H W"]]
-) -> RenderedView:
+def _pixels(points: Any) -> Any:
+    """The two axes of a grid of points as (row, row within, column, column within) of pixels."""
+    height, width = points.shape
+    return points.reshape(height // GRID, GRID, width // GRID, GRID)
+
+
+def _from_passes(passes: Passes, meets_scene: Bool[np.ndarray, "H W"]) -> RenderedView:
     """Normals and depth are averages over the pixel, zero where it misses: divide by alpha, or renormalize."""
-    alpha = np.clip(passes["Combined.A"], 0, 1)
+    alpha = np.clip(passes[ALPHA_CHANNEL], 0, 1)
     inside = alpha > 0
-    radiance = np.stack([passes[f"Combined.{name}"] for name in "RGB"], -1)
-    normals = np.stack([passes[f"Normal.{name}"] for name in "XYZ"], -1)
+    normals = stacked(passes, NORMAL_CHANNELS)
     length = np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), np.finfo(np.float32).tiny)
-    depth = passes[DEPTH_CHANNEL] / np.where(inside, alpha, 1)
     return RenderedView(
-        np.where(inside[..., None], radiance, 0),
+        np.where(inside[..., None], stacked(passes, COLOR_CHANNELS), 0),
         alpha,
         np.where(inside[..., None], normals / length, 0),
-        np.where(inside, depth, 0),
-        np.where(inside, (probe[PROBE_PASSES[0]] > 0.5).astype(np.float32), 0),
+        np.where(inside, passes[DEPTH_CHANNEL] / np.where(inside, alpha, 1), 0),
+        np.where(inside, meets_scene, 0).astype(np.float32),
     )

@@ -5,10 +5,9 @@ from typing import Any
 
 from shinypartial.blender.materials import make_probe_material
 from shinypartial.blender.objects import BODY, props_of
+from shinypartial.blender.output import set_file, set_single_sample
 
 PROBE = "probe"
-#: The narrowest filter that Cycles has: the ray goes through the pixel's center.
-CENTER_FILTER_WIDTH = 0.01
 
 
 def assemble_probe(bpy: Any) -> None:
@@ -42,20 +41,7 @@ def render_probe(bpy: Any, path: Path) -> None:
 
 
 def _set_sampling(main: Any, probe: Any) -> None:
-    probe.render.engine = main.render.engine
-    ours, theirs = probe.cycles, main.cycles
-    ours.device = theirs.device
-    ours.samples, ours.seed = 1, theirs.seed
-    ours.use_adaptive_sampling = ours.use_denoising = False
-    ours.max_bounces = ours.glossy_bounces = 1
-    ours.diffuse_bounces = 0
-    ours.pixel_filter_type, ours.filter_width = "BOX", CENTER_FILTER_WIDTH
-    probe.render.film_transparent = True
-    probe.render.use_persistent_data = True
+    set_single_sample(probe, main, bounces=1)
     probe.render.resolution_x = main.render.resolution_x
     probe.render.resolution_y = main.render.resolution_y
-    probe.render.use_compositing = probe.render.use_sequencer = False
-    image = probe.render.image_settings
-    image.media_type = "MULTI_LAYER_IMAGE"
-    image.file_format = "OPEN_EXR_MULTILAYER"
-    image.color_depth, image.exr_codec = "16", "NONE"
+    set_file(probe, bits=16)

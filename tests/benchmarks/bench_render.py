@@ -1,8 +1,10 @@
 """Time rendering against Blender's own settings: `python -m tests.benchmarks.bench_render --json out.json`.
 
-Equal error: both are compared with 1,024 samples of their own pixel filter, as the root mean square of linear light
-clipped to [0, 1] over the object; the fewest samples of ours that come out no worse than 128 of Blender's are timed.
-Times of the two alternate, so that other load on the machine meets both; compare ratios, not seconds.
+Equal error: the root mean square of linear light clipped to [0, 1] over the object, each side against path tracing
+with 1,024 samples of its own pixel filter. With two references A and B of different seeds, the mean of (x − A)(x − B)
+has no share of their noise. The fewest samples of ours that come out no worse than 128 of Blender's are timed:
+Blender's side without reading its file, ours from the camera to the arrays of a view. Times of the two alternate, so
+that other load on the machine meets both; compare ratios, not seconds.
 """
 
 import argparse
@@ -18,42 +20,57 @@ from typing import Any
 import numpy as np
 
 from shinypartial.blender.crew import CrewPlan, open_crew
+from shinypartial.blender.passes import ALPHA_CHANNEL, COLOR_CHANNELS, PASSES, read_passes, stacked
+from shinypartial.blender.picked import PICKED
 from shinypartial.blender.region import Region, image_region, set_border
 from shinypartial.blender.render import RenderedView, Renderer, open_renderer
 from shinypartial.blender.runtime import quiet
 from shinypartial.camera import Camera, opencv_to_opengl
-from shinypartial.scene import SceneSpec, load_scene, override
+from shinypartial.scene import SceneSpec, load_scene, override, scene_names
 from shinypartial.trajectory import plan_cameras
 
 PLAIN_SAMPLES = 128
 REFERENCE_SAMPLES = 1024
-OUR_SAMPLES = (16, 32, 64, 128)
-REFERENCE_SEED = 77
+OUR_SAMPLES = (16, 32, 48, 64, 96, 128, 192, 256)
+REFERENCE_SEEDS = 77, 78
+SEEDS = 0, 1
 REPEATS = 3
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What the two sides set differently."""
+    """A side's path tracing of the whole view; ours crops it, and Blender's where only its pixels matter."""
 
     samples: int
     plain: bool
     seed: int = 0
+    cropped: bool = False
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Root mean squares over views and seeds; noise is that of one reference."""
+
+    plain: float
+    ours: dict[int, float]
+    plain_reference_noise: float
+    our_reference_noise: float
 
 
 @dataclass(frozen=True)
 class SceneResult:
-    """One scene; times are seconds of `bpy.ops.render.render` and its file, medians.
+    """One scene; times are seconds a frame, medians.
 
     Where even the most samples of ours come out worse, these are timed, and the speed-up is none at equal error.
     """
 
     scene: str
+    is_mirror: bool
     resolution: int
     error_resolution: int
+    views: int
     covered: float
-    plain_error: float
-    our_errors: dict[int, float]
+    errors: Errors
     our_samples: int
     equal_error_reached: bool
     plain_s: float
@@ -86,21 +103,22 @@ class MemoryResult:
 
 
 def apply(renderer: Renderer, camera: Camera, settings: Settings) -> None:
-    """Set everything up for one view."""
+    """Set everything up for path tracing one view."""
     scene = renderer.bpy.context.scene
     cycles, world = scene.cycles, scene.world.cycles
     cycles.samples, cycles.seed = settings.samples, settings.seed
     cycles.pixel_filter_type = "BLACKMAN_HARRIS" if settings.plain else "BOX"
     cycles.filter_width = 1.5 if settings.plain else 1.0
     world.sampling_method = "AUTOMATIC" if settings.plain else "MANUAL"
-    whole = Region(0, 0, camera.width, camera.height)
-    set_border(scene, whole if settings.plain else image_region(camera, renderer.body_vertices_world), camera)
+    whole = settings.plain and not settings.cropped
+    region = image_region(camera, renderer.body_vertices_world)
+    set_border(scene, Region(0, 0, camera.width, camera.height) if whole else region, camera)
     scene.camera.matrix_world = opencv_to_opengl(camera.camera_to_world).T.tolist()
     scene.render.filepath = str(renderer.scratch / "timed.exr")
 
 
 def render(renderer: Renderer, camera: Camera, settings: Settings) -> float:
-    """Seconds to render and write one view."""
+    """Seconds to path trace and write one view."""
     apply(renderer, camera, settings)
     begin = time.perf_counter()
     with quiet():
@@ -108,15 +126,22 @@ def render(renderer: Renderer, camera: Camera, settings: Settings) -> float:
     return time.perf_counter() - begin
 
 
+def render_ours(renderer: Renderer, camera: Camera, samples: int, seed: int = 0) -> tuple[float, RenderedView]:
+    """Seconds from the camera to the view as a dataset's frames are made, and the view."""
+    apply(renderer, camera, Settings(samples, False, seed))
+    if renderer.mirror:
+        cycles = renderer.bpy.data.scenes[PICKED].cycles
+        cycles.samples, cycles.seed = samples, seed
+    begin = time.perf_counter()
+    view = renderer.render(camera)
+    return time.perf_counter() - begin, view
+
+
 def clipped(renderer: Renderer, camera: Camera, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
     """Clipped linear light and the object's mask."""
-    import OpenEXR
-
     render(renderer, camera, settings)
-    with OpenEXR.File(str(renderer.scratch / "timed.exr"), separate_channels=True) as file:
-        planes = {name.partition(".")[2]: c.pixels for part in file.parts for name, c in part.channels.items()}
-    light = np.stack([planes[f"Combined.{name}"] for name in "RGB"], -1)
-    return np.clip(light, 0, 1), planes["Combined.A"] > 0
+    passes = read_passes(renderer.scratch / "timed.exr", PASSES)
+    return np.clip(stacked(passes, COLOR_CHANNELS), 0, 1), passes[ALPHA_CHANNEL] > 0
 
 
 def middle_cameras(spec: SceneSpec, count: int) -> list[Camera]:
@@ -125,52 +150,79 @@ def middle_cameras(spec: SceneSpec, count: int) -> list[Camera]:
     return [every[(2 * i + 1) * len(every) // (2 * count)] for i in range(count)]
 
 
-def errors(spec: SceneSpec, count: int) -> tuple[float, dict[int, float]]:
+class References:
+    """Two path-traced images of different seeds."""
+
+    def __init__(self, renderer: Renderer, camera: Camera, plain: bool) -> None:
+        settings = [Settings(REFERENCE_SAMPLES, plain, seed, cropped=True) for seed in REFERENCE_SEEDS]
+        (self.a, self.mask), (self.b, _) = (clipped(renderer, camera, each) for each in settings)
+
+    @property
+    def noise(self) -> float:
+        """Mean square noise of one of them."""
+        return float(((self.a - self.b)[self.mask] ** 2).mean()) / 2
+
+    def error(self, light: np.ndarray) -> float:
+        """Mean square error of clipped light, without the references' own."""
+        return float(((light - self.a) * (light - self.b))[self.mask].mean())
+
+
+def measure_errors(spec: SceneSpec, views: int) -> Errors:
     """The error of Blender's settings and of ours, by samples."""
+    noise: tuple[list[float], list[float]] = [], []
     plain: list[float] = []
     ours: dict[int, list[float]] = {samples: [] for samples in OUR_SAMPLES}
     with open_renderer(spec) as renderer:
-        for camera in middle_cameras(spec, count):
-            for is_plain, tried in ((True, (PLAIN_SAMPLES,)), (False, OUR_SAMPLES)):
-                truth, mask = clipped(renderer, camera, Settings(REFERENCE_SAMPLES, is_plain, REFERENCE_SEED))
-                for samples in tried:
-                    light, _ = clipped(renderer, camera, Settings(samples, is_plain))
-                    error = float(np.sqrt(((light - truth)[mask] ** 2).mean()))
-                    (plain if is_plain else ours[samples]).append(error)
-    return statistics.fmean(plain), {samples: statistics.fmean(values) for samples, values in ours.items()}
+        for camera in middle_cameras(spec, views):
+            theirs, own = References(renderer, camera, True), References(renderer, camera, False)
+            noise[0].append(theirs.noise)
+            noise[1].append(own.noise)
+            for seed in SEEDS:
+                light, _ = clipped(renderer, camera, Settings(PLAIN_SAMPLES, True, seed, cropped=True))
+                plain.append(theirs.error(light))
+                for samples, found in ours.items():
+                    _, view = render_ours(renderer, camera, samples, seed)
+                    found.append(own.error(np.clip(view.radiance, 0, 1)))
+
+    def root(squares: list[float]) -> float:
+        return float(np.sqrt(max(statistics.fmean(squares), 0)))
+
+    by_samples = {samples: root(squares) for samples, squares in ours.items()}
+    return Errors(root(plain), by_samples, root(noise[0]), root(noise[1]))
 
 
 def measure_scene(name: str, resolution: int, error_resolution: int, views: int) -> SceneResult:
     """Errors at one resolution, times at another."""
-    plain_error, our_errors = errors(override(load_scene(name), resolution=error_resolution), views)
-    enough = [samples for samples in OUR_SAMPLES if our_errors[samples] <= plain_error]
+    errors = measure_errors(override(load_scene(name), resolution=error_resolution), views)
+    enough = [samples for samples in OUR_SAMPLES if errors.ours[samples] <= errors.plain]
     chosen = enough[0] if enough else OUR_SAMPLES[-1]
     spec = override(load_scene(name), resolution=resolution)
     camera = middle_cameras(spec, 1)[0]
-    sides = Settings(PLAIN_SAMPLES, True), Settings(chosen, False)
-    times: list[list[float]] = [[], []]
+    times: tuple[list[float], list[float]] = [], []
     with open_renderer(spec) as renderer:
-        for side in sides:
-            render(renderer, camera, Settings(1, side.plain))
         for _ in range(REPEATS):
-            for side, taken in zip(sides, times, strict=True):
-                taken.append(render(renderer, camera, side))
-        covered = float((clipped(renderer, camera, Settings(1, False))[1]).mean())
+            # Data is kept between frames, but the other side's settings have undone some of it.
+            render(renderer, camera, Settings(1, True))
+            times[0].append(render(renderer, camera, Settings(PLAIN_SAMPLES, True)))
+            render_ours(renderer, camera, 1)
+            taken, view = render_ours(renderer, camera, chosen)
+            times[1].append(taken)
+        is_mirror = renderer.mirror is not None
     plain_s, ours_s = (statistics.median(taken) for taken in times)
-    spread = sorted(round(a / b, 2) for a, b in zip(*times, strict=True))
     return SceneResult(
         scene=name,
+        is_mirror=is_mirror,
         resolution=resolution,
         error_resolution=error_resolution,
-        covered=covered,
-        plain_error=plain_error,
-        our_errors=our_errors,
+        views=views,
+        covered=float((view.alpha > 0).mean()),
+        errors=errors,
         our_samples=chosen,
         equal_error_reached=bool(enough),
         plain_s=plain_s,
         ours_s=ours_s,
         speedup=plain_s / ours_s,
-        speedup_spread=spread,
+        speedup_spread=sorted(round(a / b, 2) for a, b in zip(*times, strict=True)),
     )
 
 
@@ -234,12 +286,12 @@ def main() -> None:
     """Measure what is asked for and write one JSON file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, required=True)
-    parser.add_argument("--scene", nargs="*", default=["vase"])
+    parser.add_argument("--scene", nargs="*", default=list(scene_names()))
     parser.add_argument("--resolution", type=int, default=800)
     parser.add_argument("--error-resolution", type=int, default=200, help="where references are affordable")
     parser.add_argument("--views", type=int, default=2, help="for the error")
-    parser.add_argument("--frames", type=int, default=12, help="to compare divisions of the cores; 0 to leave out")
-    parser.add_argument("--memory-frames", type=int, default=300, help="0 to leave out")
+    parser.add_argument("--frames", type=int, default=0, help="to compare divisions of the cores; 12 are enough")
+    parser.add_argument("--memory-frames", type=int, default=0, help="to watch memory; 300 are enough")
     options = parser.parse_args()
     result: dict[str, Any] = {"cores": os.cpu_count(), "load_before": os.getloadavg()}
 

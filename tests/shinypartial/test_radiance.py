@@ -54,7 +54,8 @@ def render_middle(spec: SceneSpec) -> Rendered:
     camera = cameras[len(cameras) // 2]
     with open_renderer(spec) as renderer:
         view = renderer.render(camera)
-        renderer.bpy.data.objects["object"].visible_glossy = False
+        for each in renderer.bpy.data.objects:
+            each.visible_glossy = False
         alone = renderer.render(camera)
     return Rendered(spec, camera, view, np.abs(view.radiance - alone.radiance).max(-1) > 1e-4)
 
