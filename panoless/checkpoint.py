@@ -6,10 +6,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from panoless.config import FitConfig, config_from_dict
+from panoless.plane import Plane
 from panoless.surfels import Surfels
 from shinypartial.errors import InputError
 from shinypartial.files import PARTIAL_PREFIX, read_json, remove_partial_files, whole_file, write_json
@@ -40,12 +42,25 @@ class FitState:
     seconds: dict[str, float] = field(default_factory=dict)
     curves: dict[str, list[float]] = field(default_factory=dict)
     peak_memory_bytes: int = 0
+    plane: Plane | None = None
+    """The plane of the outline, where there is one."""
+    flat: bool = False
+    """Whether that plane is the geometry; there are no surfels then."""
+    rung: str = ""
+    """Which rung of the ladder was taken, and why."""
+
+    @property
+    def geometry(self) -> Surfels | Plane:
+        """What mirrors the environment."""
+        return self.plane if self.flat and self.plane is not None else self.surfels
 
 
 def save_state(folder: Path, state: FitState) -> None:
     """Write the checkpoint whole or not at all."""
     content = {**vars(state), "surfels": {name: value.detach() for name, value in state.surfels.named().items()}}
     content["environment"] = state.environment.detach()
+    if state.plane is not None:
+        content["plane"] = {name: np.asarray(value).tolist() for name, value in vars(state.plane).items()}
     # Through memory, because torch reports a full disk as an internal error of its own.
     buffer = io.BytesIO()
     torch.save(content, buffer)
@@ -60,6 +75,10 @@ def load_state(folder: Path) -> FitState | None:
         return None
     try:
         content = torch.load(path, weights_only=True, map_location="cpu")
+        if content["plane"] is not None:
+            listed: dict[str, Any] = content["plane"]
+            arrays: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in listed.items()}
+            content["plane"] = Plane(**arrays)
         return FitState(**{**content, "surfels": Surfels(**content["surfels"])})
     except Exception as error:
         raise InputError(

@@ -6,7 +6,9 @@ Durations are shares of `iterations`, so every schedule scales with the length o
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import tyro
 
 from shinypartial.errors import InputError
 
@@ -40,8 +42,8 @@ class EnvironmentConfig:
     """Share of the iterations in which only the environment learns, before the geometry moves."""
     solve: bool = True
     """Start and end with the closed-form robust least-squares map instead of what gradient descent left."""
-    solve_resolution: int = 128
-    """Texels along a face side of the closed-form map that is exported."""
+    solve_resolution: int = 0
+    """Texels along a face side of the closed-form map that is exported; 0 lets held-out views choose 64, 128 or 256."""
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,8 @@ class FitConfig:
     """Number of optimization steps (one view each)."""
     seed: int = 0
     """Seed of the initial surfels and of the order of views."""
+    model: Annotated[Literal["auto", "plane", "surfels"], tyro.conf.arg(prefix_name=False)] = "auto"
+    """`auto`: the simplest that explains held-out views; `plane`: three numbers and an outline; `surfels`: curved."""
     albedo: bool = False
     """Learn a diffuse term A (Eq. 8); a perfect mirror has none."""
     alpha_applied: Literal["once", "paper"] = "once"
@@ -143,6 +147,7 @@ class FitConfig:
 
 _PAPER = FitConfig(
     preset="paper",
+    model="surfels",
     iterations=45_000,
     albedo=True,
     alpha_applied="paper",
@@ -209,7 +214,7 @@ _COUNTS = {
     "surfels.count": 1,
     "surfels.hull_resolution": 8,
     "environment.resolution": 2,
-    "environment.solve_resolution": 1,
+    "environment.solve_resolution": 0,
     "density.max_surfels": 1,
     "crop_margin_px": -1,
 }

@@ -13,16 +13,25 @@ from panoless.kernels.cubemap import cubemap_directions, sample_cubemap, scatter
 
 INITIAL_LOGIT = 5.0
 ROBUST_SCALES = (None, 0.3, 0.15, 0.08, 0.05)
+REFINING_SCALES = (0.08, 0.05)
 CONJUGATE_GRADIENT_STEPS = 6
 CONFIDENT_WEIGHT = 1.0
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Observations of the environment: unit world directions and the linear radiance seen along them."""
+    """Observations of the environment: unit world directions and the linear radiance seen along them.
+
+    `trust` says how far each is believed beforehand, in [0, 1]; None: all alike.
+    """
 
     directions: Float[Tensor, "P 3"]
     radiance: Float[Tensor, "P 3"]
+    trust: Float[Tensor, "P"] | None = None
+
+    def initial_weight(self) -> Float[Tensor, "P"]:
+        """The trust, or ones."""
+        return torch.ones_like(self.radiance[:, 0]) if self.trust is None else self.trust.clone()
 
 
 def initial_environment(config: EnvironmentConfig, generator: torch.Generator) -> Float[Tensor, "6 3 L L"]:
@@ -41,19 +50,26 @@ def look_up(
     return torch.sigmoid(value) if activation == "sigmoid" else value
 
 
-def solve_environment(rays: Sequence[Rays], resolution: int) -> Float[Tensor, "6 3 L L"]:
-    """Robust least squares of the map for fixed geometry: min_E Σ w ‖E(ω) − c‖², gaps filled smoothly.
+def solve_environment(
+    rays: Sequence[Rays], resolution: int, start: Float[Tensor, "6 3 M M"] | None = None
+) -> Float[Tensor, "6 3 L L"]:
+    """Robust least squares of the map for fixed geometry: min_E Σ t w ‖E(ω) − c‖², gaps filled smoothly.
 
-    Rounds of iteratively re-weighted least squares with Geman–McClure weights w = 1/(1 + ‖e‖²/s²)², so that pixels
-    which see the object itself or a wrong normal lose their vote. Each round starts from the weighted splat
-    Eᵀ(w c)/Eᵀ(w) and sharpens it by conjugate gradients on the normal equations.
+    Rounds of iteratively re-weighted least squares with the rays' trust t and Geman–McClure weights
+    w = 1/(1 + ‖e‖²/s²)², so that pixels which see the object itself or a wrong normal lose their vote. Each round
+    starts from the weighted splat Eᵀ(t w c)/Eᵀ(t w) and sharpens it by conjugate gradients on the normal equations.
+    From a `start`, a map of the same rays at any resolution, only the last scales are needed.
     """
-    weights = [torch.ones_like(batch.radiance[:, 0]) for batch in rays]
-    environment = torch.zeros(6, 3, resolution, resolution, device=rays[0].directions.device if rays else None)
-    for scale in ROBUST_SCALES:
+    weights = [batch.initial_weight() for batch in rays]
+    device = rays[0].directions.device if rays else None
+    environment = torch.zeros(6, 3, resolution, resolution, device=device)
+    if start is not None:
+        environment = resample(start, resolution)
+    for scale in ROBUST_SCALES if start is None else REFINING_SCALES:
         if scale is not None:
             for batch, weight in zip(rays, weights, strict=True):
-                weight.copy_(robust_weight(sample_cubemap(environment, batch.directions) - batch.radiance, scale))
+                error = sample_cubemap(environment, batch.directions) - batch.radiance
+                weight.copy_(batch.initial_weight() * robust_weight(error, scale))
         total = _normal_product(torch.ones_like(environment[:, :1]), rays, weights)
         right_side = _right_side(rays, weights, environment)
         splat = fill_unobserved(right_side / total.clamp(min=1e-9), total[:, 0])

@@ -16,10 +16,11 @@ from panoless import __version__
 from panoless.checkpoint import FitState
 from panoless.config import FitConfig
 from panoless.cubemap import look_up
-from panoless.fit import complete, normalization_of
+from panoless.fit import clear_views, complete, normalization_of
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.rasterize import RasterCamera
 from panoless.kernels.reference.rasterize import rotation_matrices
+from panoless.plane import Plane, plane_buffers
 from panoless.shading import ALPHA_FLOOR, compose, reflection_directions_world, surface_buffers
 from panoless.snapshots import read_snapshot, snapshot_folders
 from panoless.surfels import Surfels
@@ -48,6 +49,7 @@ from shinypartial.progress import Progress
 from shinypartial.sphere import latlong_directions
 
 PLY_NAME = "surfels.ply"
+PLANE_PLY_NAME = "plane.ply"
 PICTURES = "pictures"
 SUPERSAMPLING = 2
 SH_DEGREE_0 = 0.28209479177387814
@@ -69,7 +71,7 @@ class Decomposition:
 
 
 def render(
-    surfels: Surfels,
+    geometry: Surfels | Plane,
     environment: Float[Tensor, "6 3 L L"],
     camera: RasterCamera,
     normalization: Normalization,
@@ -77,7 +79,11 @@ def render(
 ) -> Decomposition:
     """Render one camera with the final environment (radiance, not logits)."""
     with torch.no_grad():
-        buffers = surface_buffers(surfels, camera, curved=config.surfels.curved, depth_blend=config.loss.depth_blend)
+        if isinstance(geometry, Plane):
+            buffers = plane_buffers(geometry, camera)
+        else:
+            curved, depth_blend = config.surfels.curved, config.loss.depth_blend
+            buffers = surface_buffers(geometry, camera, curved=curved, depth_blend=depth_blend)
         rotation = camera.world_to_camera[:3, :3].T
         pixels = torch.nonzero(buffers.alpha.flatten() > ALPHA_FLOOR)[:, 0]
         normals_camera = buffers.raster_normals_camera.flatten(1)[:, pixels]
@@ -114,7 +120,11 @@ def export_prediction(
     height = 2 * environment.shape[-1]
     write_environment_map(folder, cube_to_latlong(environment, height))
     write_visibility(folder, cube_to_latlong(state.visibility[:, None], height)[..., 0].clip(0, 1))
-    write_ply(folder / PLY_NAME, state.surfels, normalization_of(state))
+    geometry = state.geometry
+    if isinstance(geometry, Surfels):
+        write_ply(folder / PLY_NAME, geometry, normalization_of(state))
+    else:
+        write_plane_ply(folder / PLANE_PLY_NAME, geometry, normalization_of(state))
     _write_test_views(dataset, state, config, folder)
     info = PredictionInfo(
         method=f"panoless {__version__} ({config.preset})",
@@ -132,8 +142,9 @@ def export_prediction(
         parameter_counts=_parameter_counts(state, config),
         peak_memory_bytes=state.peak_memory_bytes,
         curves=state.curves,
-        primitives=state.surfels.count,
-        model_bytes=sum((folder / name).stat().st_size for name in (PLY_NAME, ENVIRONMENT)),
+        primitives=1 if state.flat else state.surfels.count,
+        model_bytes=sum((folder / name).stat().st_size for name in (_ply_name(state), ENVIRONMENT)),
+        model=state.rung or None,
         iteration=state.iteration if snapshot else None,
     )
     write_info(folder, info)
@@ -157,7 +168,7 @@ def export_snapshots(dataset: Dataset, run: Path, config: FitConfig, prediction:
         state, target = read_snapshot(source), prediction / SNAPSHOTS / source.name
         if _is_exported(target, state, config, dataset):
             continue
-        views = views or load_views(dataset, config.crop_margin_px)
+        views = views or clear_views(load_views(dataset, config.crop_margin_px), state)
         complete(state, views, config)
         claim_prediction(target)
         export_prediction(dataset, state, config, target, snapshot=True)
@@ -182,7 +193,7 @@ def _write_test_views(dataset: Dataset, state: FitState, config: FitConfig, fold
     for index, frame in enumerate(dataset.test):
         distance = np.linalg.norm(frame.camera.position_world - normalization.center) / normalization.radius
         camera = raster_camera(frame.camera, normalization, 0.1 * float(distance))
-        parts = render(state.surfels, environment, camera, normalization, config)
+        parts = render(state.geometry, environment, camera, normalization, config)
         view = View(
             radiance=parts.radiance.permute(1, 2, 0).numpy(),
             alpha=parts.alpha.numpy(),
@@ -264,15 +275,35 @@ def write_ply(path: Path, surfels: Surfels, normalization: Normalization) -> Non
         temporary.write_bytes(header.encode("ascii") + table.tobytes())
 
 
+def write_plane_ply(path: Path, plane: Plane, normalization: Normalization) -> None:
+    """Write the plane in world units as an ASCII PLY of one polygon."""
+    corners = plane.points(plane.outline) * normalization.radius + normalization.center
+    lines = ["ply", "format ascii 1.0", f"element vertex {len(corners)}"]
+    lines += [f"property float {axis}" for axis in "xyz"]
+    lines += ["element face 1", "property list uchar int vertex_indices", "end_header"]
+    lines += [" ".join(f"{value:.9g}" for value in corner) for corner in corners]
+    lines.append(" ".join(map(str, [len(corners), *range(len(corners))])))
+    with whole_file(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def _ply_name(state: FitState) -> str:
+    return PLANE_PLY_NAME if state.flat else PLY_NAME
+
+
 def _columns(names: str | tuple[str, ...], matrix: Tensor) -> dict[str, np.ndarray]:
     return {name: matrix[:, index].numpy() for index, name in enumerate(names)}
 
 
 def _parameter_counts(state: FitState, config: FitConfig) -> dict[str, int]:
     """Numbers that the fit may choose, by what they belong to."""
+    assert state.final_environment is not None
+    if isinstance(state.geometry, Plane):
+        # Normal and offset; the outline's vertices; the rim.
+        numbers = 3 + state.geometry.outline.size + (state.geometry.rim_height > 0)
+        return {"plane parameters": numbers, "environment parameters": state.final_environment.numel()}
     per_surfel = 3 + 4 + 2 + 1
     per_surfel += 3 * config.albedo + 3 * config.surfels.curved + config.loss.roughness_weighted
-    assert state.final_environment is not None
     return {
         "surfel parameters": per_surfel * state.surfels.count,
         "environment parameters": state.final_environment.numel(),

@@ -1,11 +1,11 @@
 """The fit: views in, surfels and environment out. It never sees a score."""
 
-import math
 import resource
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -14,15 +14,17 @@ from torch import Tensor
 
 from panoless.checkpoint import FitState, claim_run, load_state, save_state
 from panoless.config import FitConfig, check_config
-from panoless.cubemap import Rays, initial_environment, look_up, resample, solve_environment
+from panoless.cubemap import initial_environment, look_up, resample, solve_environment
 from panoless.densify import DensityStatistics, Edit, grow_and_prune, propagate_normals, reset_opacities
-from panoless.initialize import initial_surfels
+from panoless.initialize import initial_surfels, surfels_on_plane
 from panoless.kernels.objective import MirrorView, ObjectiveTerms, mirror_objective
 from panoless.kernels.rasterize import Channels, RasterBuffers
+from panoless.ladder import choose_rung, without_mirrored_frame
 from panoless.losses import photometric_paper
+from panoless.observation import FINAL_RAYS, observed_rays, reflections, solved_environment
 from panoless.optimizer import SurfelOptimizer
 from panoless.schedule import Schedule
-from panoless.shading import ALPHA_FLOOR, compose, rasterize_surfels, reflection_directions_world, tiles_of
+from panoless.shading import ALPHA_FLOOR, compose, rasterize_surfels, tiles_of
 from panoless.snapshots import Marks, SnapshotKeeper, require_snapshots
 from panoless.surfels import Surfels
 from panoless.views import Normalization, TrainView, Views, load_views
@@ -41,9 +43,7 @@ from shinypartial.progress import Progress
 
 CHECKPOINT_INTERVAL_S = 20.0
 CURVE_EVERY = 10
-SOLID_SURFACE_ALPHA = 0.9
 INITIAL_RAYS = 1_000_000
-FINAL_RAYS = 8_000_000
 NO_MARKS = Marks()
 
 
@@ -70,9 +70,9 @@ class Fitter:
 
     def __init__(self, views: Views, config: FitConfig, folder: Path, state: FitState, marks: Marks = NO_MARKS) -> None:
         """Continue from `state`, which may be new."""
-        self.snapshots = SnapshotKeeper(folder, marks, state)
-        self.views, self.config, self.folder, self.state = views, config, folder, state
+        self.views, self.config, self.folder, self.state, self.marks = views, config, folder, state, marks
         self.schedule = Schedule(config)
+        self._epoch, self._order = -1, list[int]()
         self.optimizer = SurfelOptimizer(state.surfels, state.environment, config.rates)
         if state.optimizer:
             self.optimizer.load_state_dict(state.optimizer)
@@ -88,13 +88,14 @@ class Fitter:
 
     def run(self) -> None:
         """Optimize to the last iteration and complete the state."""
+        snapshots = SnapshotKeeper(self.folder, self.marks, self.state)
         progress = Progress("fitting", self.config.iterations, self.state.iteration)
         saved = time.monotonic()
         while self.state.iteration < self.config.iterations:
             with _timed(self.state, "optimize"):
                 terms = self._step(self.state.iteration)
             self.state.iteration += 1
-            self.snapshots.observe(self.state, self.optimizer.surfels, self.optimizer.environment)
+            snapshots.observe(self.state, self.optimizer.surfels, self.optimizer.environment)
             progress.advance(f"loss {terms.photometric:.4f}  {self.optimizer.surfels.count} surfels")
             if time.monotonic() - saved > CHECKPOINT_INTERVAL_S:
                 self._save()
@@ -143,7 +144,10 @@ class Fitter:
     def _view_index(self, iteration: int) -> int:
         """Every epoch visits all views once, in an order that depends on seed and epoch only."""
         epoch, position = divmod(iteration, len(self.views.train))
-        return int(torch.randperm(len(self.views.train), generator=self._generator(epoch))[position])
+        if self._epoch != epoch:
+            self._epoch = epoch
+            self._order = torch.randperm(len(self.views.train), generator=self._generator(epoch)).tolist()
+        return self._order[position]
 
     def _generator(self, *salt: int) -> torch.Generator:
         """Randomness that depends only on the seed and the place in the fit, so a resumed fit repeats it."""
@@ -211,7 +215,7 @@ class Fitter:
         observed = None
         if self.config.visibility == "online":
             with torch.no_grad():
-                observed = Observed(_reflections(view, raster, pixels), raster.alpha.flatten()[pixels])
+                observed = Observed(reflections(view, raster.normals_camera, pixels), raster.alpha.flatten()[pixels])
         return LossTerms(total, photometric, objective.normal_consistency, objective.silhouette), observed
 
     def _composited(
@@ -219,7 +223,7 @@ class Fitter:
     ) -> Tensor:
         """Eq. 9 over the whole image, to which the given pixels add more than the background."""
         alpha = buffers.alpha.flatten()[pixels]
-        directions = _reflections(view, buffers, pixels)
+        directions = reflections(view, buffers.normals_camera, pixels)
         specular = look_up(self.optimizer.environment, directions, self.config.environment.activation).T
         if self.config.loss.roughness_weighted:
             specular = specular * (1 - self._roughness(view, surfels).flatten()[pixels]).square()
@@ -307,43 +311,13 @@ def _mirror_view(view: TrainView) -> MirrorView:
     return MirrorView(view.radiance, view.mask, view.rays_camera, rotation, *intrinsics, solid_alpha=SOLID_ALPHA)
 
 
-def _reflections(view: TrainView, buffers: RasterBuffers, pixels: Tensor) -> Float[Tensor, "P 3"]:
-    """World directions that the given pixels (flat indices) of a view mirror."""
-    return reflection_directions_world(
-        buffers.normals_camera.flatten(1)[:, pixels],
-        view.rays_camera.flatten(1)[:, pixels],
-        view.camera_to_world_rotation,
-    )
-
-
-def observed_rays(views: Views, surfels: Surfels, config: FitConfig, max_rays: int) -> Iterator[Rays]:
-    """Reflection directions and radiance of pixels that lie wholly on mask and surface, a batch a view.
-
-    When the views hold more than `max_rays` such pixels, every k-th is taken, beginning elsewhere in each view.
-    """
-    stride = math.ceil(sum(len(view.solid) for view in views.train) / max_rays)
-    for index, view in enumerate(views.train):
-        buffers = rasterize_surfels(
-            surfels,
-            view.camera,
-            curved=config.surfels.curved,
-            channels=Channels(colors=config.albedo, depth=False, distortion=False),
-            active_tiles=tiles_of(view.mask > SOLID_ALPHA),
-        )
-        pixels = view.solid[index % stride :: stride]
-        pixels = pixels[buffers.alpha.flatten()[pixels] > SOLID_SURFACE_ALPHA]
-        directions = _reflections(view, buffers, pixels)
-        diffuse = buffers.colors.flatten(1)[:, pixels]
-        yield Rays(directions, (view.radiance.flatten(1)[:, pixels] - diffuse).T.contiguous())
-
-
 def complete(state: FitState, views: Views, config: FitConfig) -> None:
     """Solve the environment for the geometry of a state, and say how well each direction was observed."""
     with _timed(state, "solve environment"), torch.no_grad():
-        rays = list(observed_rays(views, state.surfels, config, FINAL_RAYS))
         if config.environment.solve:
-            state.final_environment = solve_environment(rays, config.environment.solve_resolution)
+            state.final_environment, rays = solved_environment(views, state.geometry, config)
         else:
+            rays = list(observed_rays(views, state.geometry, config, FINAL_RAYS))
             sigmoid = config.environment.activation == "sigmoid"
             state.final_environment = torch.sigmoid(state.environment) if sigmoid else state.environment
         if config.visibility == "online":
@@ -352,9 +326,9 @@ def complete(state: FitState, views: Views, config: FitConfig) -> None:
             state.visibility = visibility_from_agreement(agreement(rays, state.final_environment))
 
 
-def new_state(views: Views, config: FitConfig) -> FitState:
-    """The state before the first step: initial surfels, and the environment that fits them best."""
-    surfels = initial_surfels(views, config.surfels, config.seed)
+def new_state(views: Views, config: FitConfig, surfels: Surfels | None = None) -> FitState:
+    """The state before the first step: initial surfels, unless given, and the environment that fits them best."""
+    surfels = initial_surfels(views, config.surfels, config.seed) if surfels is None else surfels
     environment = initial_environment(config.environment, torch.Generator().manual_seed(config.seed))
     if config.environment.solve and config.environment.activation == "clamp":
         with torch.no_grad():
@@ -391,10 +365,44 @@ def fit(dataset: Dataset, config: FitConfig, folder: Path, marks: Marks = NO_MAR
         views = load_views(dataset, config.crop_margin_px)
         loaded = time.monotonic()
         if state is None:
-            state = new_state(views, config)
+            state = _first_state(views, config)
             state.seconds = {"read views": loaded - start, "initialize": time.monotonic() - loaded}
-        Fitter(views, config, folder, state, marks).run()
+            print(f"Model: {state.rung}", file=sys.stderr)
+        views = clear_views(views, state)
+        if state.flat:
+            complete(state, views, config)
+            save_state(folder, state)
+        else:
+            Fitter(views, config, folder, state, marks).run()
         return state
+
+
+def _first_state(views: Views, config: FitConfig) -> FitState:
+    """The state before the first step, on the rung of the ladder that the scene needs."""
+    rung = choose_rung(views, config, _trial)
+    if rung.plane is None:
+        state = new_state(views, config)
+    else:
+        start = surfels_on_plane(rung.plane, config.surfels.count if rung.model == "surfels" else 1, config.seed)
+        state = new_state(without_mirrored_frame(views, rung.plane), config, start)
+    state.plane, state.flat, state.rung = rung.plane, rung.model == "plane", f"{rung.model} ({rung.reason})"
+    return state
+
+
+def clear_views(views: Views, state: FitState) -> Views:
+    """The views without the pixels that mirror the frame of a planar outline, if that is what a state found."""
+    return views if state.plane is None else without_mirrored_frame(views, state.plane)
+
+
+def _trial(views: Views, config: FitConfig, start: Surfels) -> Surfels:
+    """Surfels after a fifth of the configured steps, in memory only."""
+    shortened = replace(config, iterations=max(config.iterations // 5, 1))
+    fitter = Fitter(views, shortened, Path(), new_state(views, shortened, start))
+    progress = Progress("comparing models", shortened.iterations)
+    for iteration in range(shortened.iterations):
+        fitter._step(iteration)
+        progress.advance()
+    return fitter.optimizer.surfels.detached()
 
 
 def normalization_of(state: FitState) -> Normalization:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from panoless.config import SurfelConfig
 from panoless.hull import carve_hull, completed_surface, hull_surface
+from panoless.plane import Plane
 from panoless.surfels import Surfels
 from panoless.views import Views
 
@@ -45,6 +46,25 @@ def hull_surfels(views: Views, config: SurfelConfig, seed: int) -> Surfels:
     curvatures = _shape_operators(tensors, frames)
     scale = OVERLAP * math.sqrt(areas.sum() / config.count)
     return _surfels(points, frames, np.full((config.count, 2), scale), curvatures, INITIAL_OPACITY_LOGIT)
+
+
+def surfels_on_plane(plane: Plane, count: int, seed: int) -> Surfels:
+    """Flat surfels evenly within the outline of a plane: about `count`, on a hexagonal grid shifted by the seed."""
+    from skimage.measure import points_in_poly
+
+    low, extent = plane.outline.min(0), np.ptp(plane.outline, 0)
+    x, y = plane.outline.T
+    area = abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
+    across = math.sqrt(area / count / math.sin(math.pi / 3))
+    up = across * math.sin(math.pi / 3)
+    shift = np.random.default_rng(seed).random(2) - 1
+    row, column = np.indices((math.ceil(extent[1] / up) + 2, math.ceil(extent[0] / across) + 2)).reshape(2, -1)
+    grid = low + np.stack([(column + row % 2 / 2 + shift[0]) * across, (row + shift[1]) * up], 1)
+    points = plane.points(grid[points_in_poly(grid, plane.outline)])
+    frame = np.stack([plane.tangent_u, plane.tangent_v, plane.normal], 1)
+    frames = np.broadcast_to(frame, (len(points), 3, 3))
+    scales = np.full((len(points), 2), OVERLAP * math.sqrt(area / count))
+    return _surfels(points, frames, scales, np.zeros((len(points), 3)), INITIAL_OPACITY_LOGIT)
 
 
 def random_surfels(config: SurfelConfig, seed: int) -> Surfels:

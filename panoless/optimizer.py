@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from panoless.config import RateConfig
+from panoless.kernels.adam import AdamTensor, adam_step
 from panoless.surfels import Surfels
 
 BETAS = (0.9, 0.99)
@@ -26,7 +27,7 @@ class SurfelOptimizer:
             {"params": [value.detach().clone().requires_grad_()], "lr": base[name], "name": name, "base": base[name]}
             for name, value in named.items()
         ]
-        self._adam = torch.optim.Adam(groups, betas=BETAS, eps=EPSILON, fused=True)
+        self._adam = torch.optim.Adam(groups, betas=BETAS, eps=EPSILON)
 
     def _groups(self) -> dict[str, dict[str, Any]]:
         return {group["name"]: group for group in self._adam.param_groups}
@@ -47,8 +48,25 @@ class SurfelOptimizer:
             group["lr"] = group["base"] * factor
             if name in frozen or (name != ENVIRONMENT and not geometry):
                 group["params"][0].grad = None
-        self._adam.step()
+        self._move()
         self._adam.zero_grad(set_to_none=True)
+
+    @torch.no_grad()
+    def _move(self) -> None:
+        """Adam on every parameter that has a gradient; torch's own optimizer holds rates and state."""
+        tensors = []
+        for group in self._adam.param_groups:
+            parameter = group["params"][0]
+            if parameter.grad is None:
+                continue
+            state = self._adam.state[parameter]
+            if not state:
+                state["step"] = torch.zeros(())
+                state.update({name: torch.zeros_like(parameter) for name in MOMENTS})
+            state["step"] += 1
+            mean, square = (state[name] for name in MOMENTS)
+            tensors.append(AdamTensor(parameter, parameter.grad, mean, square, group["lr"], int(state["step"])))
+        adam_step(tensors, BETAS, EPSILON)
 
     def edit_surfels(self, surfels: Surfels, source: Tensor, keep_moments: Tensor) -> None:
         """Take `surfels`; row i inherits the moments of old row `source[i]` where `keep_moments[i]`, else zeros."""

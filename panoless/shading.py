@@ -81,12 +81,9 @@ def surface_buffers(
     depth_blend: float,
     screen_offsets: Float[Tensor, "K 2"] | None = None,
     attribute: Float[Tensor, "K 3"] | None = None,
-    channels: Channels = ALL_CHANNELS,
 ) -> SurfaceBuffers:
     """Rasterize, and blend the depths to D_surf (Eq. 3). `attribute` replaces the albedo as ψ of Eq. 1."""
-    raster = rasterize_surfels(
-        surfels, camera, curved=curved, screen_offsets=screen_offsets, attribute=attribute, channels=channels
-    )
+    raster = rasterize_surfels(surfels, camera, curved=curved, screen_offsets=screen_offsets, attribute=attribute)
     return SurfaceBuffers(
         albedo=raster.colors,
         alpha=raster.alpha,

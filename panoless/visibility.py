@@ -53,13 +53,13 @@ def visibility_from_evidence(evidence: Float[Tensor, "6 L L"]) -> Float[Tensor, 
 
 
 def agreement(rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"]) -> Agreement:
-    """Weigh each ray by (1 + ‖e‖²/s²)⁻², s = 0.05 (linear), and average its sRGB residual over the texels it meets."""
+    """Weigh each ray by t (1 + ‖e‖²/s²)⁻², t its trust and s = 0.05 (linear); average its sRGB residual by texel."""
     resolution = environment.shape[-1]
     votes = environment.new_zeros(6, resolution, resolution)
     residual = torch.zeros_like(votes)
     for batch in rays:
         seen = sample_cubemap(environment, batch.directions)
-        weight = robust_weight(seen - batch.radiance, VOTE_SCALE)
+        weight = batch.initial_weight() * robust_weight(seen - batch.radiance, VOTE_SCALE)
         difference = (_srgb(seen) - _srgb(batch.radiance)).abs().mean(1)
         both = torch.stack([weight, weight * difference], 1)
         summed = scatter_cubemap(both, batch.directions, resolution)

@@ -40,9 +40,10 @@ DECOMPOSITION = "decomposition.jpg"
 class PredictionInfo:
     """Who made the prediction and at what cost; `curves` are per-iteration training series, for the report only.
 
-    `seconds` are those of making the model; their sum is its time in leaderboards and charts. `primitives` is the
-    number of surfels, Gaussians, voxels or vertices, `model_bytes` the size of the files that a renderer needs,
-    `iteration` the number of finished steps of a snapshot; each is None where it is unknown or has no meaning.
+    `seconds` are those of making the model; their sum is its time in leaderboards and charts. `model` says what kind of
+    model was chosen and why, `primitives` is the number of surfels, Gaussians, voxels or vertices, `model_bytes` the
+    size of the files that a renderer needs, `iteration` the number of finished steps of a snapshot; each is None where
+    it is unknown or has no meaning.
     """
 
     method: str
@@ -54,6 +55,7 @@ class PredictionInfo:
     parameter_counts: dict[str, int]
     peak_memory_bytes: int
     curves: dict[str, list[float]] = field(default_factory=dict)
+    model: str | None = None
     primitives: int | None = None
     model_bytes: int | None = None
     iteration: int | None = None

@@ -343,6 +343,7 @@ def _provenance_section(info: PredictionInfo, scores: Scores) -> str:
         ("dataset hash (prediction)", info.dataset_hash),
         ("protocol", scores.protocol),
         ("method", info.method),
+        *([("model", info.model)] if info.model else []),
     ]
     config = [(name, _plain(value)) for name, value in _flatten(info.config)]
     details = f"<details><summary>Configuration, {len(config)} entries</summary>{_table(config)}</details>"

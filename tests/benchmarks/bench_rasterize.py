@@ -1,7 +1,8 @@
-"""Time the CPU rasterizer on a synthetic vase: `python tests/benchmarks/bench_rasterize.py --json out.json`.
+"""Time the CPU rasterizer on a synthetic vase: `python -m tests.benchmarks.bench_rasterize --json out.json`.
 
 The vase covers about 40 % of the image, with about twelve surfels that contribute to a covered pixel; every image
-receives a gradient and every parameter wants one. A pair is a surfel that contributes to a pixel.
+receives a gradient and every parameter wants one. A pair is a surfel that is evaluated for a pixel; the number of
+instructions in the two loops bounds pairs a second and core, whatever the share of them that contributes.
 """
 
 import argparse
@@ -17,9 +18,13 @@ import torch
 from torch import Tensor
 
 from panoless.kernels.rasterize import RasterCamera, rasterize
+from tests.benchmarks.lane_counts import count_lanes
 
 CASES = ((200, 5_000), (400, 20_000), (800, 50_000))
 PAIRS_PER_COVERED_PIXEL = 12.0
+FORWARD_BOUND = 2.7e9
+BACKWARD_BOUND = 0.86e9
+"""Pairs a second and core that the instruction count of the loops allows at 4 GHz, two vector instructions a cycle."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +53,13 @@ class Timing:
     forward_min_ms: float
     step_median_ms: float
     step_min_ms: float
-    step_pairs_per_second: float
+    contributing_share: float
+    """Of the pairs that are evaluated."""
+    contributing_share_without_culling: float
+    forward_pairs_per_second_and_core: float
+    backward_pairs_per_second_and_core: float
+    forward_share_of_bound: float
+    backward_share_of_bound: float
 
 
 def vase(count: int, size: float) -> Vase:
@@ -171,20 +182,29 @@ def measure(pixels: int, count: int, repeats: int) -> list[Timing]:
             return middle - start, time.perf_counter() - start
 
         forward, step = wall_times(work, repeats)
-        step_median = statistics.median(step)
+        counts = count_lanes((*leaves[:5], leaves[5] if curved else None), camera)
+        threads = torch.get_num_threads()
+        forward_median, step_median = statistics.median(forward), statistics.median(step)
+        forward_rate = counts.evaluated / (1e-3 * forward_median * threads)
+        backward_rate = counts.evaluated / (1e-3 * (step_median - forward_median) * threads)
         timings.append(
             Timing(
                 pixels=pixels,
                 surfels=count,
                 curved=curved,
-                threads=torch.get_num_threads(),
+                threads=threads,
                 coverage=coverage,
                 pairs_per_covered_pixel=pairs,
-                forward_median_ms=statistics.median(forward),
+                forward_median_ms=forward_median,
                 forward_min_ms=min(forward),
                 step_median_ms=step_median,
                 step_min_ms=min(step),
-                step_pairs_per_second=coverage * pixels**2 * pairs / (1e-3 * step_median),
+                contributing_share=counts.share,
+                contributing_share_without_culling=counts.share_without_culling,
+                forward_pairs_per_second_and_core=forward_rate,
+                backward_pairs_per_second_and_core=backward_rate,
+                forward_share_of_bound=forward_rate / FORWARD_BOUND,
+                backward_share_of_bound=backward_rate / BACKWARD_BOUND,
             )
         )
     return timings
@@ -198,7 +218,10 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=21)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
-    print("pixels surfels curved | forward median/min ms | forward+backward | pairs/s | coverage, pairs a pixel")
+    print(
+        "pixels surfels curved | forward median/min ms | forward+backward | G pairs/s/core forward, backward (of bound)"
+        " | contributing: culled, not culled | coverage, contributing a pixel"
+    )
     timings = []
     for pixels, count in CASES:
         for timing in measure(pixels, count, arguments.repeats):
@@ -206,7 +229,10 @@ def main() -> None:
             print(
                 f"{timing.pixels:6d} {timing.surfels:7d} {timing.curved!s:>6} | "
                 f"{timing.forward_median_ms:7.2f} / {timing.forward_min_ms:7.2f} | "
-                f"{timing.step_median_ms:7.2f} / {timing.step_min_ms:7.2f} | {timing.step_pairs_per_second:.2e} | "
+                f"{timing.step_median_ms:7.2f} / {timing.step_min_ms:7.2f} | "
+                f"{timing.forward_pairs_per_second_and_core / 1e9:.2f} ({timing.forward_share_of_bound:.2f}), "
+                f"{timing.backward_pairs_per_second_and_core / 1e9:.2f} ({timing.backward_share_of_bound:.2f}) | "
+                f"{timing.contributing_share:.2f}, {timing.contributing_share_without_culling:.2f} | "
                 f"{timing.coverage:.2f}, {timing.pairs_per_covered_pixel:.1f}",
                 flush=True,
             )

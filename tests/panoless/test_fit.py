@@ -197,6 +197,27 @@ def test_geometry_rests_while_the_environment_warms_up(tmp_path: Path, sphere_da
     assert not torch.equal(first.environment, state.environment)
 
 
+@pytest.mark.parametrize("lambda_normal_consistency", [0.0, 0.05])
+def test_pixels_that_no_term_reads_change_nothing(
+    tmp_path: Path, sphere_dataset: Dataset, lambda_normal_consistency: float
+) -> None:
+    """Without a silhouette term, tiles beside the object are left out: every step is the same to the last bit."""
+    config = replace(tiny_config(iterations=12, count=120), crop_margin_px=-1)
+    loss = replace(config.loss, lambda_silhouette=0.0, lambda_normal_consistency=lambda_normal_consistency)
+    config = replace(config, loss=loss)
+    view = load_views(sphere_dataset, config.crop_margin_px).train[0]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Fitter, "_active_tiles", lambda *_: None)
+        everywhere = fit(sphere_dataset, config, tmp_path / "everywhere")
+    only_needed = fit(sphere_dataset, config, tmp_path / "needed")
+    assert_same(only_needed, everywhere)
+    fitter = Fitter(load_views(sphere_dataset, config.crop_margin_px), config, tmp_path, only_needed)
+    tiles = fitter._active_tiles(view, 10)
+    assert tiles is not None
+    assert tiles.any()
+    assert not tiles.all() or tiles.numel() <= 4
+
+
 def test_another_seed_is_another_fit(tmp_path: Path, sphere_dataset: Dataset) -> None:
     config = tiny_config(iterations=5, count=60)
     first, again, other = (

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from panoless.config import RateConfig
-from panoless.optimizer import SurfelOptimizer
+from panoless.kernels.adam import AdamTensor, adam_step
+from panoless.optimizer import BETAS, EPSILON, SurfelOptimizer
 from tests.support.mirror_sphere import sphere_surfels
 
 RATES = RateConfig()
@@ -81,3 +82,27 @@ def test_a_restored_optimizer_takes_the_same_step() -> None:
         optimizer.step(0.5, geometry=True, frozen=frozenset({"albedo"}))
     for name, value in snapshot(first).items():
         assert torch.equal(value, snapshot(second)[name]), name
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_steps_are_those_of_torch(backend: str) -> None:
+    """Tensors of several sizes and rates, gradients over many decades, against `torch.optim.Adam`."""
+    generator = torch.Generator().manual_seed(0)
+    rates, shapes = (0.1, 1e-3, 1.0), ((7,), (40_000,), (3, 5, 2))
+    values = [torch.randn(shape, generator=generator) for shape in shapes]
+    leaves = [value.clone().requires_grad_() for value in values]
+    groups = [{"params": [leaf], "lr": rate} for leaf, rate in zip(leaves, rates, strict=True)]
+    expected = torch.optim.Adam(groups, betas=BETAS, eps=EPSILON)
+    moments = [(torch.zeros_like(value), torch.zeros_like(value)) for value in values]
+    for step in range(1, 6):
+        gradients = [
+            torch.randn(s, generator=generator) * 10.0 ** torch.randint(-9, 3, s, generator=generator) for s in shapes
+        ]
+        for leaf, gradient in zip(leaves, gradients, strict=True):
+            leaf.grad = gradient.clone()
+        expected.step()
+        columns = zip(values, gradients, moments, rates, strict=True)
+        tensors = [AdamTensor(value, gradient, *pair, rate, step) for value, gradient, pair, rate in columns]
+        adam_step(tensors, BETAS, EPSILON, backend=backend)
+        for value, leaf in zip(values, leaves, strict=True):
+            torch.testing.assert_close(value, leaf.detach(), rtol=1e-5, atol=1e-6)

@@ -10,9 +10,9 @@ import torch
 from panoless import fit as fit_module
 from panoless.checkpoint import FitState, load_state
 from panoless.cli import main
-from panoless.cubemap import solve_environment
 from panoless.export import export_prediction, export_snapshots
-from panoless.fit import FINAL_RAYS, Fitter, LossTerms, fit, observed_rays
+from panoless.fit import Fitter, LossTerms, fit
+from panoless.observation import solved_environment
 from panoless.snapshots import Marks, SnapshotKeeper, marks_of, read_snapshot, snapshot_folders
 from panoless.views import load_views
 from shinypartial.dataset.schema import Dataset
@@ -127,8 +127,7 @@ def test_a_snapshot_is_solved_like_an_end(run: Path, sphere_dataset: Dataset) ->
     """Its environment is the closed-form map of its own geometry, not that of the finished fit."""
     state, views = read_snapshot(snapshot_folders(run)[0]), load_views(sphere_dataset, CONFIG.crop_margin_px)
     with torch.no_grad():
-        rays = list(observed_rays(views, state.surfels, CONFIG, FINAL_RAYS))
-        expected = solve_environment(rays, CONFIG.environment.solve_resolution)
+        expected, _ = solved_environment(views, state.surfels, CONFIG)
     fit_module.complete(state, views, CONFIG)
     assert state.final_environment is not None
     assert torch.equal(state.final_environment, expected)

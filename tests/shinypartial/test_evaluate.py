@@ -83,7 +83,8 @@ def test_normals_where_the_object_sees_itself_count_in_one_group_and_not_in_the_
     for known in (replace(truth, self_reflection=marked), truth):
         results.append(score_view(frame, replace(truth, normals_world=turned), known, None, with_paper=False))
     everywhere, outside = pool_normals(results[:1], left_out), pool_environment_normals(results[:1], left_out)
-    assert everywhere is not None and outside is not None
+    assert everywhere is not None
+    assert outside is not None
     assert outside.mean_angular_error_deg == pytest.approx(0, abs=1e-6)
     assert everywhere.mean_angular_error_deg > 10
     assert not left_out

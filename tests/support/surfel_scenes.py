@@ -41,8 +41,8 @@ class SurfelScene:
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return SurfelScene(**{**values, **changes})
 
-    def render(self, backend: Backend) -> RasterBuffers:
-        """Rasterize with one backend."""
+    def render(self, backend: Backend, **options) -> RasterBuffers:
+        """Rasterize with one backend; `options` are those of `rasterize`."""
         return rasterize(
             self.means,
             self.quats,
@@ -53,6 +53,7 @@ class SurfelScene:
             self.camera,
             screen_offsets=self.screen_offsets,
             backend=backend,
+            **options,
         )
 
 

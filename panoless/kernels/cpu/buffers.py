@@ -8,6 +8,7 @@ and results are safe as long as anyone can see them.
 import math
 import threading
 import weakref
+from bisect import bisect_left, insort
 
 import numpy as np
 
@@ -16,14 +17,24 @@ _KEEP = 64
 
 _ALIGNMENT = 64
 
-_free: list[np.ndarray] = []
+_Buffer = tuple[int, int, np.ndarray]
+"""Bytes that fit, their aligned address, and the memory."""
+
+_free: list[_Buffer] = []
+"""Sorted by size; addresses differ, so that two buffers never compare their memory."""
 _lock = threading.RLock()
 
 
-def _give_back(memory: np.ndarray) -> None:
+def _new_buffer(size: int) -> _Buffer:
+    room = size + size // 8
+    memory = np.empty(room + _ALIGNMENT, np.uint8)
+    address = memory.ctypes.data
+    return room, address + -address % _ALIGNMENT, memory
+
+
+def _give_back(buffer: _Buffer) -> None:
     with _lock:
-        _free.append(memory)
-        _free.sort(key=lambda buffer: buffer.size)
+        insort(_free, buffer)
         if len(_free) > _KEEP:
             del _free[0]
 
@@ -31,10 +42,9 @@ def _give_back(memory: np.ndarray) -> None:
 class _Lease:
     """The owner at the end of an array's chain of bases; when it goes, nobody can see the memory any more."""
 
-    def __init__(self, memory: np.ndarray, size: int):
-        address = memory.ctypes.data + -memory.ctypes.data % _ALIGNMENT
-        self.__array_interface__ = {"version": 3, "shape": (size,), "typestr": "|u1", "data": (address, False)}
-        weakref.finalize(self, _give_back, memory).atexit = False
+    def __init__(self, buffer: _Buffer, size: int):
+        self.__array_interface__ = {"version": 3, "shape": (size,), "typestr": "|u1", "data": (buffer[1], False)}
+        weakref.finalize(self, _give_back, buffer).atexit = False
 
 
 def take(shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
@@ -43,8 +53,8 @@ def take(shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
     if size == 0:
         return np.empty(shape, dtype)
     with _lock:
-        index = next((i for i, buffer in enumerate(_free) if size + _ALIGNMENT <= buffer.size <= 2 * size + 4096), None)
-        memory = None if index is None else _free.pop(index)
-    if memory is None:
-        memory = np.empty(size + size // 8 + _ALIGNMENT, np.uint8)
-    return np.asarray(_Lease(memory, size)).view(dtype).reshape(shape)
+        index = bisect_left(_free, (size,))
+        found = index < len(_free) and _free[index][0] <= 2 * size + 4096
+        buffer = _free.pop(index) if found else None
+    lease = _Lease(buffer or _new_buffer(size), size)
+    return np.asarray(lease).view(dtype).reshape(shape)

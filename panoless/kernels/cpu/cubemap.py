@@ -40,7 +40,7 @@ class SampleCubemap(torch.autograd.Function):
         padding = cubemap_padding(resolution, torch.device("cpu"))
         texture = cubemap.new_empty(6, resolution + 2, resolution + 2, channels)
         faces = cubemap.detach().contiguous().numpy()
-        run_shared(pad_faces, faces, padding.sources.numpy(), padding.corners.numpy(), texture.numpy())
+        run_shared(_pad, faces, padding.sources.numpy(), padding.corners.numpy(), texture.numpy())
         directions = directions.detach().contiguous()
         values = directions.new_empty(len(directions), channels)
         rays = _flat(directions), _flat(values)
@@ -76,8 +76,8 @@ def scatter_cubemap(
     flat_buffers = buffers.reshape(len(buffers), -1)
     run_shared(_scatter, _flat(values), _flat(directions), flat_buffers, resolution, (0,) * channels)
     cubemap = values.new_empty(6, channels, resolution, resolution)
-    run_shared(add_up, buffers, cubemap.numpy())
-    fold_rings(buffers, padding.sources.numpy(), padding.corners.numpy(), cubemap.numpy())
+    run_shared(_add_up, buffers, cubemap.numpy())
+    _fold_rings(buffers, padding.sources.numpy(), padding.corners.numpy(), cubemap.numpy())
     return cubemap
 
 
@@ -94,7 +94,7 @@ def _scatter_buffers(
 
 
 @njit(**VECTORIZED_LOOPS)
-def pad_faces(counter, cubemap, sources, corners, texture):
+def _pad(counter, cubemap, sources, corners, texture):
     """Copy the faces, channels last, with their ring of neighbors."""
     _, channels, resolution, _ = cubemap.shape
     last = resolution + 1
@@ -222,10 +222,9 @@ def _deposit(values, stride, cells, places, buffer, unrolled):
 
 
 @njit(**VECTORIZED_LOOPS)
-def add_up(counter, buffers, cubemap):
-    """Sum the inner parts of the buffers, in their order, channels first, as many as the cubemap has."""
-    count, _, padded, _, _ = buffers.shape
-    channels = cubemap.shape[1]
+def _add_up(counter, buffers, cubemap):
+    """Sum the inner parts of the buffers, in their order, channels first."""
+    count, _, padded, _, channels = buffers.shape
     resolution = padded - 2
     while True:
         first = fetch_add(counter, LINES_PER_CLAIM)
@@ -243,10 +242,9 @@ def add_up(counter, buffers, cubemap):
 
 
 @njit(**VECTORIZED_LOOPS)
-def fold_rings(buffers, sources, corners, cubemap):
+def _fold_rings(buffers, sources, corners, cubemap):
     """Add what was deposited in the ring around each face to the texels that it shows."""
-    count, _, padded, _, _ = buffers.shape
-    channels = cubemap.shape[1]
+    count, _, padded, _, channels = buffers.shape
     for face in range(6):
         for row in range(padded):
             for column in range(0, padded, padded - 1 if 0 < row < padded - 1 else 1):

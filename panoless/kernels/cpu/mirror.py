@@ -144,14 +144,12 @@ class Look(NamedTuple):
 
 
 @njit(**INLINED_LANE_CODE)
-def look(texture, cell, stride, channel):
-    """Interpolate one channel of the padded faces (channels last)."""
-    at = 3.0 * cell.index + f32(channel)
-    below = f32(3 * stride)
-    a = load_at(texture, at, cell.usable)
-    b = load_at(texture, at + 3.0, cell.usable)
-    c = load_at(texture, at + below, cell.usable)
-    d = load_at(texture, at + below + 3.0, cell.usable)
+def look(texture, cell, stride):
+    """Interpolate one channel of the padded faces."""
+    a = load_at(texture, cell.index, cell.usable)
+    b = load_at(texture, cell.index + 1.0, cell.usable)
+    c = load_at(texture, cell.index + f32(stride), cell.usable)
+    d = load_at(texture, cell.index + f32(stride + 1), cell.usable)
     upper = b - a
     lower = d - c
     by_right = upper + cell.down * (lower - upper)
@@ -211,9 +209,9 @@ def shade_group(first, active, solid, alpha, images, rotation, texture, numbers,
     along = dot(ray, unit)
     mirrored = (ray[0] - 2.0 * along * unit[0], ray[1] - 2.0 * along * unit[1], ray[2] - 2.0 * along * unit[2])
     cell = locate(rotate(rotation, mirrored), numbers.resolution, solid)
-    red = look(texture, cell, stride, 0)
-    green = look(texture, cell, stride, 1)
-    blue = look(texture, cell, stride, 2)
+    red = look(texture[0], cell, stride)
+    green = look(texture[1], cell, stride)
+    blue = look(texture[2], cell, stride)
     seen = (red.value, green.value, blue.value)
     slope = (lanes(1.0), lanes(1.0), lanes(1.0))
     if numbers.sigmoid:

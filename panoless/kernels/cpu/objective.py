@@ -13,10 +13,9 @@ from torch import Tensor
 
 from panoless.kernels.cpu import consistency, mirror
 from panoless.kernels.cpu.buffers import take
-from panoless.kernels.cpu.cubemap import add_up, fold_rings, pad_faces
+from panoless.kernels.cpu.faces import CHANNELS, collect_faces, fold_ring, ring_of, show_ring, spread_faces
 from panoless.kernels.cpu.simd import LANES
 from panoless.kernels.cpu.workers import run_shared, thread_count
-from panoless.kernels.reference.cubemap import cubemap_padding
 
 f32 = np.float32
 _NOTHING = np.zeros(0, f32)
@@ -79,11 +78,13 @@ def _shade(images, environment, view, terms, gradients: Gradients, geometry: boo
     """Photometric and silhouette terms; fills the gradients of normals, alpha, albedo and environment."""
     resolution, pixels = environment.shape[-1], images.alpha.size
     solid_alpha = f32(view.solid_alpha if terms.photometric else np.inf)
-    padding = cubemap_padding(resolution, torch.device("cpu"))
-    sources, corners = padding.sources.numpy(), padding.corners.numpy()
-    texture = take((6, resolution + 2, resolution + 2, 3))
+    padded, area, ring = (6, resolution + 2, resolution + 2), resolution**2, ring_of(resolution)
+    texture = take((CHANNELS, *padded))
+    flat_texture = texture.reshape(CHANNELS, -1)
     if terms.photometric:
-        run_shared(pad_faces, environment.detach().contiguous().numpy(), sources, corners, texture)
+        cubemap = environment.detach().contiguous().numpy()
+        run_shared(spread_faces, cubemap, texture)
+        show_ring(cubemap.reshape(-1), ring, area, flat_texture)
     solid = int(np.count_nonzero(images.mask > solid_alpha))
     numbers = mirror.ShadingNumbers(
         resolution=resolution,
@@ -99,13 +100,13 @@ def _shade(images, environment, view, terms, gradients: Gradients, geometry: boo
     sums = take((-(-pixels // mirror.PIXELS_PER_CLAIM), LANES))
     written = mirror.PixelGradients(*(g.reshape(-1) for g in (gradients.normals, gradients.alpha, gradients.albedo)))
     rotation = view.camera_to_world_rotation.contiguous().numpy().astype(f32).reshape(-1)
-    run_shared(mirror.shade_pixels, images, rotation, texture.reshape(-1), numbers, written, kept, sums)
+    run_shared(mirror.shade_pixels, images, rotation, flat_texture, numbers, written, kept, sums)
     if gradients.environment.size:
-        faces = take((1, 6, resolution + 2, resolution + 2, 4))
+        faces = take((*padded, 4))
         lists = take((thread_count(), LANES), np.int32)
-        run_shared(mirror.scatter_rays, kept, pixels, resolution + 2, faces[0], lists)
-        run_shared(add_up, faces, gradients.environment)
-        fold_rings(faces, sources, corners, gradients.environment)
+        run_shared(mirror.scatter_rays, kept, pixels, resolution + 2, faces, lists)
+        run_shared(collect_faces, faces, gradients.environment)
+        fold_ring(faces.reshape(-1, 4), ring, area, gradients.environment.reshape(-1))
     photometric, bits = sums[:, : mirror.PIXEL_SUMS].sum(0, dtype=np.float64).tolist()
     return photometric, bits * LN_2 / pixels if terms.lambda_silhouette > 0 else 0.0
 

@@ -163,7 +163,8 @@ class _Rasterize(torch.autograd.Function):
             take((thread_count(), CHUNK * PULLED_SIZE, LANES)),
             rows,
         )
-        needed = ctx.needs_input_grad[-_PARAMETERS:]
+        needed = list(ctx.needs_input_grad[-_PARAMETERS:])
+        needed[_COLORS] &= bool(saved.features.colors)
         gradients = _zero_gradients(parameters, needed)
         run_shared(
             project_backward,
@@ -201,7 +202,8 @@ def _cotangent_planes(cotangents, outputs: Planes) -> Planes:
     return Planes(*planes)
 
 
-_OPTIONAL_GRADIENTS = {4, 5, 6}
+_COLORS = 4
+_OPTIONAL_GRADIENTS = {_COLORS, 5, 6}
 """Places of colors, curvatures and screen offsets, whose gradients the kernel leaves out where nobody needs them."""
 
 

@@ -2,13 +2,14 @@
 
 import dataclasses
 import inspect
+import itertools
 import math
 
 import numpy as np
 import pytest
 import torch
 
-from panoless.kernels.rasterize import RasterBuffers, rasterize
+from panoless.kernels.rasterize import Channels, RasterBuffers, rasterize, tile_shape
 from tests.support.loops import LoopImages, rasterize_loops
 from tests.support.surfel_scenes import (
     IMAGES,
@@ -183,6 +184,81 @@ def test_backends_cull_the_same_surfels(count: int):
     found = [rendered(scene, backend).in_frustum for backend in BACKENDS]
     assert found[0].equal(found[1])
     assert 0 < found[0].sum() < count
+
+
+CHOICES = [Channels(*wanted) for wanted in itertools.product((True, False), repeat=3)]
+IMAGES_OF = {
+    "colors": ("colors",),
+    "depth": ("accumulated_depth", "median_depth"),
+    "distortion": ("distortion",),
+}
+
+
+def weighted_gradients(scene: SurfelScene, names: list[str], backend: str, **options) -> dict[str, torch.Tensor]:
+    """Gradients of a random linear function of the named images."""
+    leaves = scene.cast(FLOAT_TYPE[backend])
+    buffers = leaves.render(backend, **options)
+    generator = torch.Generator().manual_seed(7)
+    image = (scene.camera.height, scene.camera.width)
+    weights = {
+        name: torch.randn(*((3, *image) if name in IMAGES[:2] else image), generator=generator) for name in IMAGES
+    }
+    sum((getattr(buffers, name) * weights[name]).sum() for name in names).backward()
+    return {
+        name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in leaves.parameters().items()
+    }
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("channels", CHOICES)
+@pytest.mark.parametrize("curved", [False, True])
+def test_channels_that_are_not_wanted_change_nothing_else(curved: bool, channels: Channels, backend: str):
+    """They are zero; the other images and their gradients are those of the full computation."""
+    scene = random_scene(20, 21, curved, tilted_camera())
+    whole = rendered(scene, backend)
+    buffers = scene.cast(FLOAT_TYPE[backend]).render(backend, channels=channels)
+    unwanted = {image for name, images in IMAGES_OF.items() if not getattr(channels, name) for image in images}
+    for image in IMAGES:
+        expected = torch.zeros_like(getattr(whole, image)) if image in unwanted else getattr(whole, image)
+        assert (getattr(buffers, image) - expected).abs().max() < 1e-6 * max(1.0, expected.abs().max().item()), image
+    wanted = [image for image in IMAGES if image not in unwanted]
+    expected_gradients = weighted_gradients(scene, wanted, backend)
+    for name, gradient in weighted_gradients(scene, wanted, backend, channels=channels).items():
+        scale = expected_gradients[name].abs().max().item()
+        # The order of float32 operations may differ between variants of the kernel.
+        assert (gradient - expected_gradients[name]).abs().max() <= 1e-4 * scale, name
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("seed", range(3))
+def test_tiles_that_are_not_active_change_nothing_in_the_others(seed: int, backend: str):
+    """Images are the full ones where tiles are active and zero elsewhere; so are losses and gradients."""
+    camera = dataclasses.replace(tilted_camera(width=75, height=50), fx=60.0, fy=66.0)
+    scene = random_scene(40, seed, True, camera)
+    active = torch.rand(tile_shape(50, 75), generator=torch.Generator().manual_seed(seed)) < 0.5
+    pixels = active.repeat_interleave(16, 0).repeat_interleave(16, 1)[:50, :75]
+    whole = rendered(scene, backend)
+    buffers = scene.cast(FLOAT_TYPE[backend]).render(backend, active_tiles=active)
+    assert buffers.in_frustum.equal(whole.in_frustum)
+    for image in IMAGES:
+        assert torch.equal(getattr(buffers, image), torch.where(pixels, getattr(whole, image), 0)), image
+
+    def gradients(active_tiles: torch.Tensor | None) -> dict[str, torch.Tensor]:
+        leaves = scene.cast(FLOAT_TYPE[backend])
+        images = leaves.render(backend, active_tiles=active_tiles)
+        sum((getattr(images, image).square() * pixels).sum() for image in IMAGES).backward()
+        return {name: leaf.grad for name, leaf in leaves.parameters().items()}
+
+    expected = gradients(None)
+    for name, gradient in gradients(active).items():
+        # Sums over tiles are taken in the same order, without the zeros between.
+        assert (gradient - expected[name]).abs().max() <= 1e-6 * expected[name].abs().max(), name
+
+
+def test_tiles_of_another_image_are_refused():
+    scene = random_scene(3, 1, False, tilted_camera()).cast(torch.float32)
+    with pytest.raises(ValueError, match="expected active_tiles of shape"):
+        scene.render("cpu", active_tiles=torch.ones(1, 1, dtype=torch.bool))
 
 
 def test_reference_in_chunks_gives_the_same_images(monkeypatch):

@@ -1,0 +1,48 @@
+"""One step of Adam (Kingma and Ba 2015) on many tensors at once."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from panoless.kernels.backend import Backend, choose_backend
+
+
+@dataclass(frozen=True)
+class AdamTensor:
+    """A parameter with its gradient, its running moments, its rate and the number of steps including this one."""
+
+    parameter: Float[Tensor, "*S"]
+    gradient: Float[Tensor, "*S"]
+    mean: Float[Tensor, "*S"]
+    square: Float[Tensor, "*S"]
+    rate: float
+    steps: int
+
+
+@torch.no_grad()
+def adam_step(
+    tensors: list[AdamTensor], betas: tuple[float, float], epsilon: float, *, backend: Backend = "auto"
+) -> None:
+    """Move every parameter, in place, by −rate · m̂/(√v̂ + ε).
+
+    m ← β₁ m + (1 − β₁) g and v ← β₂ v + (1 − β₂) g², also in place; m̂ = m/(1 − β₁ᵗ), v̂ = v/(1 − β₂ᵗ) after t steps.
+    As `torch.optim.Adam` without weight decay. Raises ValueError for mixed dtypes or devices.
+    """
+    if not tensors:
+        return
+    kinds = {f"{field} {i}": getattr(each, field) for i, each in enumerate(tensors) for field in _TENSORS}
+    if choose_backend(backend, **kinds) == "cpu" and all(tensor.is_contiguous() for tensor in kinds.values()):
+        from panoless.kernels.cpu.adam import adam_step_cpu
+
+        adam_step_cpu(tensors, betas, epsilon)
+        return
+    for each in tensors:
+        each.mean.lerp_(each.gradient, 1 - betas[0])
+        each.square.mul_(betas[1]).addcmul_(each.gradient, each.gradient, value=1 - betas[1])
+        spread = (each.square / (1 - betas[1] ** each.steps)).sqrt() + epsilon
+        each.parameter.addcdiv_(each.mean, spread, value=-each.rate / (1 - betas[0] ** each.steps))
+
+
+_TENSORS = ("parameter", "gradient", "mean", "square")

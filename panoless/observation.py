@@ -1,0 +1,182 @@
+"""What the training views observed of the environment by way of a geometry: rays, and how far each is to be trusted."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from panoless.config import FitConfig
+from panoless.cubemap import Rays, robust_weight, solve_environment
+from panoless.kernels.cubemap import sample_cubemap
+from panoless.kernels.rasterize import Channels, RasterBuffers
+from panoless.plane import Plane, plane_buffers
+from panoless.shading import ALPHA_FLOOR, rasterize_surfels, reflection_directions_world, tiles_of
+from panoless.surfels import Surfels
+from panoless.views import TrainView, Views
+from shinypartial.conventions import SOLID_ALPHA
+
+SOLID_SURFACE_ALPHA = 0.9
+FINAL_RAYS = 8_000_000
+#: Enough to find out whom to trust and how fine a map is worth it.
+TRIAL_RAYS = 1_000_000
+TRIAL_RESOLUTION = 128
+RESOLUTIONS = (64, 128, 256)
+HELD_OUT_EVERY = 5
+#: A finer map has to lower the held-out error by this share.
+LEAST_GAIN = 0.02
+TRUST_SCALE = 0.15
+#: Pixels' worth of an opinion that every surfel starts with, so that one that is hardly seen is hardly believed.
+PRIOR_PIXELS, PRIOR_TRUST = 1.0, 0.2
+TRUST_POWER = 4
+
+Geometry = Surfels | Plane
+
+
+def observed_rays(
+    views: Views,
+    geometry: Geometry,
+    config: FitConfig,
+    max_rays: int,
+    trust: Float[Tensor, "K"] | None = None,
+) -> Iterator[Rays]:
+    """Reflection directions and radiance of pixels that lie wholly on mask and surface, a batch a view.
+
+    When the views hold more than `max_rays` such pixels, every k-th is taken, beginning elsewhere in each view. With
+    the `trust` of each surfel a ray has that of what it meets, blended, to the fourth power.
+    """
+    stride = math.ceil(sum(len(view.solid) for view in views.train) / max_rays)
+    for index, view in enumerate(views.train):
+        pixels = view.solid[index % stride :: stride]
+        if isinstance(geometry, Plane):
+            yield _plane_rays(view, geometry, pixels)
+            continue
+        rays, pixels = _surfel_rays(view, geometry, config, pixels)
+        if trust is not None:
+            rays = replace(rays, trust=_blended(view, geometry, trust)[pixels].clamp(0, 1) ** TRUST_POWER)
+        yield rays
+
+
+def reflections(view: TrainView, normals_camera: Float[Tensor, "3 H W"], pixels: Tensor) -> Float[Tensor, "P 3"]:
+    """World directions that the given pixels (flat indices) of a view mirror."""
+    return reflection_directions_world(
+        normals_camera.flatten(1)[:, pixels],
+        view.rays_camera.flatten(1)[:, pixels],
+        view.camera_to_world_rotation,
+    )
+
+
+def solved_environment(
+    views: Views, geometry: Geometry, config: FitConfig
+) -> tuple[Float[Tensor, "6 3 L L"], list[Rays]]:
+    """The closed-form map of the training views for a geometry, and the rays that it was solved from.
+
+    A trial map says which surfels to trust, and held-out views how fine the map should be, unless the configuration
+    does; then all rays are solved.
+    """
+    trial = list(observed_rays(views, geometry, config, TRIAL_RAYS))
+    resolution = config.environment.solve_resolution
+    coarse = solve_environment(trial, resolution or TRIAL_RESOLUTION)
+    trust = None
+    if isinstance(geometry, Surfels):
+        trust = surfel_trust(views, geometry, config, coarse)
+        trial = list(observed_rays(views, geometry, config, TRIAL_RAYS, trust))
+        coarse = solve_environment(trial, resolution or TRIAL_RESOLUTION)
+    resolution = resolution or finest_resolution(trial, coarse)
+    rays = list(observed_rays(views, geometry, config, FINAL_RAYS, trust))
+    return solve_environment(rays, resolution, coarse), rays
+
+
+def surfel_trust(
+    views: Views, surfels: Surfels, config: FitConfig, environment: Float[Tensor, "6 3 L L"]
+) -> Float[Tensor, "K"]:
+    """Share of the pixels that a surfel makes up, over all views, whose radiance agrees with a map; in [0, 1].
+
+    A surfel whose normal is wrong disagrees in most views although its rays agree with each other in one; a pixel alone
+    cannot tell. Agreement is the Geman–McClure weight of the residual; a pixel counts for a surfel by its share in the
+    blend, which is the derivative of the blended image.
+    """
+    agreeing, total = torch.zeros_like(surfels.means[:, 0]), torch.zeros_like(surfels.means[:, 0])
+    for view in views.train:
+        rays, pixels = _surfel_rays(view, surfels, config, view.solid)
+        error = sample_cubemap(environment, rays.directions) - rays.radiance
+        shares = torch.zeros(surfels.count, 3, device=surfels.means.device, requires_grad=True)
+        with torch.enable_grad():
+            buffers = _rasterize_attribute(view, surfels.detached(), shares)
+        votes = torch.zeros_like(buffers.colors).flatten(1)
+        votes[0, pixels], votes[1, pixels] = robust_weight(error, TRUST_SCALE), 1.0
+        (gradient,) = torch.autograd.grad(buffers.colors, shares, votes.view_as(buffers.colors))
+        agreeing += gradient[:, 0]
+        total += gradient[:, 1]
+    return (agreeing + PRIOR_TRUST * PRIOR_PIXELS) / (total + PRIOR_PIXELS)
+
+
+def finest_resolution(rays: Sequence[Rays], start: Float[Tensor, "6 3 L L"]) -> int:
+    """Texels along a face side: the first of 64, 128, 256 that held-out views explain as well as the next.
+
+    Every fifth view is held out. Their error is the mean of ‖e‖²/(‖e‖² + s²), s = 0.1, weighted by trust: rays that see
+    the object itself count alike for all resolutions.
+    """
+    held_out = rays[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY]
+    solved = [batch for i, batch in enumerate(rays) if i % HELD_OUT_EVERY != HELD_OUT_EVERY // 2]
+    if not held_out or not solved:
+        return RESOLUTIONS[0]
+    best, error = RESOLUTIONS[0], math.inf
+    for resolution in RESOLUTIONS:
+        found = prediction_error(held_out, solve_environment(solved, resolution, start))
+        if found > (1 - LEAST_GAIN) * error:
+            break
+        best, error = resolution, found
+    return best
+
+
+def prediction_error(rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"], scale: float = 0.1) -> float:
+    """Mean of ‖e‖²/(‖e‖² + s²) over rays, weighted by trust: 0 where a map explains them, 1 where nothing fits."""
+    summed, weights = 0.0, 0.0
+    for batch in rays:
+        squared = (sample_cubemap(environment, batch.directions) - batch.radiance).square().sum(1)
+        weight = batch.initial_weight()
+        summed += float((weight * squared / (squared + scale**2)).sum())
+        weights += float(weight.sum())
+    return summed / max(weights, 1e-9)
+
+
+def _surfel_rays(view: TrainView, surfels: Surfels, config: FitConfig, pixels: Tensor) -> tuple[Rays, Tensor]:
+    """Rays of those of the given pixels that surfels cover, and which pixels these are."""
+    buffers = rasterize_surfels(
+        surfels,
+        view.camera,
+        curved=config.surfels.curved,
+        channels=Channels(colors=config.albedo, depth=False, distortion=False),
+        active_tiles=tiles_of(view.mask > SOLID_ALPHA),
+    )
+    pixels = pixels[buffers.alpha.flatten()[pixels] > SOLID_SURFACE_ALPHA]
+    diffuse = buffers.colors.flatten(1)[:, pixels]
+    radiance = (view.radiance.flatten(1)[:, pixels] - diffuse).T.contiguous()
+    return Rays(reflections(view, buffers.normals_camera, pixels), radiance), pixels
+
+
+def _plane_rays(view: TrainView, plane: Plane, pixels: Tensor) -> Rays:
+    buffers = plane_buffers(plane, view.camera)
+    pixels = pixels[buffers.alpha.flatten()[pixels] > SOLID_SURFACE_ALPHA]
+    directions = reflections(view, buffers.raster_normals_camera, pixels)
+    return Rays(directions, view.radiance.flatten(1)[:, pixels].T.contiguous())
+
+
+def _blended(view: TrainView, surfels: Surfels, values: Float[Tensor, "K"]) -> Float[Tensor, "P"]:
+    """A value of each surfel as each pixel sees it: blended, over alpha."""
+    buffers = _rasterize_attribute(view, surfels, values[:, None].expand(-1, 3).contiguous())
+    return (buffers.colors[0] / buffers.alpha.clamp(min=ALPHA_FLOOR)).flatten()
+
+
+def _rasterize_attribute(view: TrainView, surfels: Surfels, attribute: Float[Tensor, "K 3"]) -> RasterBuffers:
+    return rasterize_surfels(
+        surfels,
+        view.camera,
+        curved=False,
+        attribute=attribute,
+        channels=Channels(depth=False, distortion=False),
+        active_tiles=tiles_of(view.mask > SOLID_ALPHA),
+    )
