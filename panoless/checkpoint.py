@@ -2,7 +2,7 @@
 
 import io
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +53,12 @@ class FitState:
     def geometry(self) -> Surfels | Plane:
         """What mirrors the environment."""
         return self.plane if self.flat and self.plane is not None else self.surfels
+
+    def to(self, device: torch.device) -> "FitState":
+        """The same state on a device; the optimizer's part follows its parameters when it is loaded."""
+        moved: dict[str, Any] = {"surfels": self.surfels.to(device)}
+        moved |= {name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **moved)
 
 
 def save_state(folder: Path, state: FitState) -> None:

@@ -28,13 +28,15 @@ class Fit:
     """Keep this many moments of the fit: its end, half of the iterations, a quarter, and so on; see docs/chart.md."""
     snapshot_seconds: tuple[float, ...] = ()
     """Keep the moments after these seconds of fitting."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where the fit computes; `cuda` (NVIDIA or AMD) needs a GPU, torch for it and Triton; see docs/gpu.md."""
     config: FitConfig = field(default_factory=FitConfig)
 
     def run(self) -> None:
         """Load, fit, export and say what to do next."""
         _prepare_threads()
         from panoless.export import export_prediction
-        from panoless.fit import fit
+        from panoless.fit import find_device, fit
         from panoless.snapshots import marks_of
         from shinypartial.dataset.read import newest_dataset, open_dataset
         from shinypartial.files import only_writer
@@ -48,14 +50,15 @@ class Fit:
         name = f"{dataset.name}-{self.config.preset}"
         prediction = self.output or Path("predictions") / name
         run_folder = RUNS / prediction.resolve().name
+        device = find_device(self.device)
         marks = marks_of(self.snapshots, self.snapshot_seconds, self.config.iterations)
         _refuse_run_folder(prediction, run_folder)
         with only_writer(prediction):
             claim_prediction(prediction)
-            state = fit(dataset, self.config, run_folder, marks)
+            state = fit(dataset, self.config, run_folder, marks, device)
             export_prediction(dataset, state, self.config, prediction)
         print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
-        if marks:
+        if marks and not state.flat:
             print(f"Snapshots: panoless export {run_folder} --output {prediction} --snapshots")
 
 

@@ -42,6 +42,8 @@ class EnvironmentConfig:
     """Share of the iterations in which only the environment learns, before the geometry moves."""
     solve: bool = True
     """Start and end with the closed-form robust least-squares map instead of what gradient descent left."""
+    rays: int = 8_000_000
+    """Most rays that the closed-form map is solved from; an eighth of them tells which surfels to trust."""
     solve_resolution: int = 0
     """Texels along a face side of the closed-form map that is exported; 0 lets held-out views choose 64, 128 or 256."""
 
@@ -132,6 +134,8 @@ class FitConfig:
     """Learn a diffuse term A (Eq. 8); a perfect mirror has none."""
     alpha_applied: Literal["once", "paper"] = "once"
     """`paper`: (A + L)·α as Eq. 10 is written, though A is blended already; `once`: A + L·α."""
+    downscale: int = 1
+    """Average the training images over blocks of this many pixels a side."""
     crop_margin_px: int = 12
     """Work on the mask's bounding box with this margin; −1 works on whole images."""
     visibility: Literal["final", "online"] = "final"
@@ -174,7 +178,20 @@ _PAPER = FitConfig(
 )
 
 PRESETS: dict[str, FitConfig] = {
+    "fast": FitConfig(
+        preset="fast",
+        iterations=300,
+        downscale=2,
+        surfels=SurfelConfig(count=3000, hull_resolution=64),
+        environment=EnvironmentConfig(resolution=64, rays=2_000_000),
+    ),
     "default": FitConfig(),
+    "best": FitConfig(
+        preset="best",
+        iterations=8000,
+        surfels=SurfelConfig(count=12_000, hull_resolution=128),
+        environment=EnvironmentConfig(resolution=256),
+    ),
     "paper": _PAPER,
     "paper-rho-weighted": replace(
         _PAPER, preset="paper-rho-weighted", loss=replace(_PAPER.loss, roughness_weighted=True)
@@ -217,6 +234,8 @@ _COUNTS = {
     "environment.solve_resolution": 0,
     "density.max_surfels": 1,
     "crop_margin_px": -1,
+    "downscale": 1,
+    "environment.rays": 8,
 }
 """Smallest values of whole numbers; a hull of fewer voxels has no inside to speak of."""
 

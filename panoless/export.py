@@ -122,8 +122,10 @@ def export_prediction(
     write_visibility(folder, cube_to_latlong(state.visibility[:, None], height)[..., 0].clip(0, 1))
     geometry = state.geometry
     if isinstance(geometry, Surfels):
+        (folder / PLANE_PLY_NAME).unlink(missing_ok=True)
         write_ply(folder / PLY_NAME, geometry, normalization_of(state))
     else:
+        (folder / PLY_NAME).unlink(missing_ok=True)
         write_plane_ply(folder / PLANE_PLY_NAME, geometry, normalization_of(state))
     _write_test_views(dataset, state, config, folder)
     info = PredictionInfo(
@@ -168,7 +170,7 @@ def export_snapshots(dataset: Dataset, run: Path, config: FitConfig, prediction:
         state, target = read_snapshot(source), prediction / SNAPSHOTS / source.name
         if _is_exported(target, state, config, dataset):
             continue
-        views = views or clear_views(load_views(dataset, config.crop_margin_px), state)
+        views = views or clear_views(load_views(dataset, config.crop_margin_px, config.downscale), state)
         complete(state, views, config)
         claim_prediction(target)
         export_prediction(dataset, state, config, target, snapshot=True)

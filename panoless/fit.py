@@ -17,11 +17,12 @@ from panoless.config import FitConfig, check_config
 from panoless.cubemap import initial_environment, look_up, resample, solve_environment
 from panoless.densify import DensityStatistics, Edit, grow_and_prune, propagate_normals, reset_opacities
 from panoless.initialize import initial_surfels, surfels_on_plane
+from panoless.kernels.backend import gpu_kernels_installed
 from panoless.kernels.objective import MirrorView, ObjectiveTerms, mirror_objective
 from panoless.kernels.rasterize import Channels, RasterBuffers
 from panoless.ladder import choose_rung, without_mirrored_frame
 from panoless.losses import photometric_paper
-from panoless.observation import FINAL_RAYS, observed_rays, reflections, solved_environment
+from panoless.observation import observed_rays, reflections, solved_environment
 from panoless.optimizer import SurfelOptimizer
 from panoless.schedule import Schedule
 from panoless.shading import ALPHA_FLOOR, compose, rasterize_surfels, tiles_of
@@ -45,6 +46,7 @@ CHECKPOINT_INTERVAL_S = 20.0
 CURVE_EVERY = 10
 INITIAL_RAYS = 1_000_000
 NO_MARKS = Marks()
+MAIN_MEMORY = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,9 @@ class Fitter:
     def _step(self, iteration: int) -> LossTerms:
         view = self.views.train[self._view_index(iteration)]
         surfels = self.optimizer.surfels
-        offsets = torch.zeros(surfels.count, 2, requires_grad=True) if self.config.density.enabled else None
+        offsets = None
+        if self.config.density.enabled:
+            offsets = torch.zeros_like(surfels.means[:, :2], requires_grad=True)
         # While only the environment learns, surfels need no gradient, unless density control counts it.
         with torch.set_grad_enabled(self.schedule.geometry_moves(iteration) or offsets is not None):
             raster = rasterize_surfels(
@@ -229,9 +233,9 @@ class Fitter:
             specular = specular * (1 - self._roughness(view, surfels).flatten()[pixels]).square()
         color = compose(buffers.colors.flatten(1)[:, pixels], specular, alpha, self.config.alpha_applied)
         if self.config.loss.random_background:
-            background = torch.rand(3, 1, generator=self._generator(iteration, 1))
+            background = torch.rand(3, 1, generator=self._generator(iteration, 1)).to(view.radiance)
         else:
-            background = torch.zeros(3, 1)
+            background = view.radiance.new_zeros(3, 1)
         image = background.expand(3, buffers.alpha.numel()).clone()
         image[:, pixels] = color + (1 - alpha) * background
         target = view.radiance + (1 - view.mask) * background[:, :, None]
@@ -249,7 +253,7 @@ class Fitter:
             prune_faint = self.schedule.opacities_recovered(iteration)
             edit = grow_and_prune(surfels, self.statistics, self.config.density, generator, prune_faint=prune_faint)
             self._apply(edit)
-            self.statistics = DensityStatistics.empty(self.optimizer.surfels.count)
+            self.statistics = DensityStatistics.empty(self.optimizer.surfels.count, surfels.means.device)
         if self.schedule.opacity_reset(iteration):
             self._apply(_whole(reset_opacities(self.optimizer.surfels)))
         elif self.schedule.propagation(iteration):
@@ -282,16 +286,19 @@ class Fitter:
         state.environment = self.optimizer.environment.detach()
         state.optimizer = self.optimizer.state_dict()
         state.gradient_sum, state.gradient_count = self.statistics.gradient_sum, self.statistics.count
-        state.peak_memory_bytes = max(
-            state.peak_memory_bytes, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-        )
+        _note_peak_memory(state)
         save_state(self.folder, state)
+
+
+def _note_peak_memory(state: FitState) -> None:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    state.peak_memory_bytes = max(state.peak_memory_bytes, peak)
 
 
 def _whole(surfels: Surfels) -> Edit:
     """An edit that changes values in place: all rows stay, all moments restart."""
-    everything = torch.arange(surfels.count)
-    return Edit(surfels, everything, torch.zeros(surfels.count, dtype=torch.bool))
+    everything = torch.arange(surfels.count, device=surfels.means.device)
+    return Edit(surfels, everything, torch.zeros_like(everything, dtype=torch.bool))
 
 
 @contextmanager
@@ -314,13 +321,14 @@ def _mirror_view(view: TrainView) -> MirrorView:
 def complete(state: FitState, views: Views, config: FitConfig) -> None:
     """Solve the environment for the geometry of a state, and say how well each direction was observed."""
     with _timed(state, "solve environment"), torch.no_grad():
-        if config.environment.solve:
+        # No steps are taken with a plane, so there is no other map of it.
+        if config.environment.solve or state.flat:
             state.final_environment, rays = solved_environment(views, state.geometry, config)
         else:
-            rays = list(observed_rays(views, state.geometry, config, FINAL_RAYS))
+            rays = list(observed_rays(views, state.geometry, config, config.environment.rays))
             sigmoid = config.environment.activation == "sigmoid"
             state.final_environment = torch.sigmoid(state.environment) if sigmoid else state.environment
-        if config.visibility == "online":
+        if config.visibility == "online" and not state.flat:
             state.visibility = visibility_from_evidence(state.evidence)
         else:
             state.visibility = visibility_from_agreement(agreement(rays, state.final_environment))
@@ -328,8 +336,9 @@ def complete(state: FitState, views: Views, config: FitConfig) -> None:
 
 def new_state(views: Views, config: FitConfig, surfels: Surfels | None = None) -> FitState:
     """The state before the first step: initial surfels, unless given, and the environment that fits them best."""
-    surfels = initial_surfels(views, config.surfels, config.seed) if surfels is None else surfels
-    environment = initial_environment(config.environment, torch.Generator().manual_seed(config.seed))
+    device = views.train[0].mask.device
+    surfels = initial_surfels(views, config.surfels, config.seed) if surfels is None else surfels.to(device)
+    environment = initial_environment(config.environment, torch.Generator().manual_seed(config.seed)).to(device)
     if config.environment.solve and config.environment.activation == "clamp":
         with torch.no_grad():
             rays = list(observed_rays(views, surfels, config, INITIAL_RAYS))
@@ -340,41 +349,62 @@ def new_state(views: Views, config: FitConfig, surfels: Surfels | None = None) -
         environment=environment,
         iteration=0,
         optimizer={},
-        gradient_sum=torch.zeros(surfels.count),
-        gradient_count=torch.zeros(surfels.count),
-        evidence=torch.zeros(6, length, length),
+        gradient_sum=torch.zeros_like(surfels.opacity_logits),
+        gradient_count=torch.zeros_like(surfels.opacity_logits),
+        evidence=environment.new_zeros(6, length, length),
         center=[float(x) for x in views.normalization.center],
         radius=views.normalization.radius,
     )
 
 
-def fit(dataset: Dataset, config: FitConfig, folder: Path, marks: Marks = NO_MARKS) -> FitState:
+def fit(
+    dataset: Dataset, config: FitConfig, folder: Path, marks: Marks = NO_MARKS, device: torch.device = MAIN_MEMORY
+) -> FitState:
     """Fit a dataset in a run folder, taking snapshots at the marks; a killed fit continues from its last checkpoint,
     a finished one is returned.
 
-    Raises InputError when another fit is writing to the folder, or marks are given to a finished fit without snapshots.
+    The views, the surfels and the environment are placed on `device` once and stay there; the state that is returned
+    lies in main memory. Raises InputError when another fit is writing to the folder, or marks are given to a finished
+    fit without snapshots.
     """
     check_config(config)
     with only_writer(folder):
         claim_run(folder, dataset.root, dataset_hash(dataset), config)
         state = load_state(folder)
         if state is not None and state.final_environment is not None:
-            require_snapshots(folder, marks)
+            if not state.flat:
+                require_snapshots(folder, marks)
             return state
         start = time.monotonic()
-        views = load_views(dataset, config.crop_margin_px)
+        views = load_views(dataset, config.crop_margin_px, config.downscale).to(device)
         loaded = time.monotonic()
         if state is None:
             state = _first_state(views, config)
             state.seconds = {"read views": loaded - start, "initialize": time.monotonic() - loaded}
             print(f"Model: {state.rung}", file=sys.stderr)
-        views = clear_views(views, state)
+        views, state = clear_views(views, state), state.to(device)
         if state.flat:
             complete(state, views, config)
+            _note_peak_memory(state)
             save_state(folder, state)
         else:
             Fitter(views, config, folder, state, marks).run()
-        return state
+        return state.to(MAIN_MEMORY)
+
+
+def find_device(name: str) -> torch.device:
+    """The device "cpu" or "cuda"; InputError when it can't be used."""
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError(
+            expected="a GPU that torch can use, for --device cuda",
+            found=f"torch {torch.__version__}, which sees none",
+            remedy="Install torch for your GPU, or leave --device out.",
+        )
+    if name == "cuda" and not gpu_kernels_installed():
+        raise InputError(
+            expected="Triton, for --device cuda", found="none", remedy="Install it: pip install 'panoless[gpu]'."
+        )
+    return torch.device(name)
 
 
 def _first_state(views: Views, config: FitConfig) -> FitState:

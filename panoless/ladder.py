@@ -16,7 +16,6 @@ from panoless.cubemap import solve_environment
 from panoless.initialize import surfels_on_plane
 from panoless.observation import (
     HELD_OUT_EVERY,
-    TRIAL_RAYS,
     TRIAL_RESOLUTION,
     Geometry,
     observed_rays,
@@ -36,6 +35,10 @@ UNOBSTRUCTED_SHARE = 0.99
 #: The next rung has to lower the held-out error by this share, and by two standard errors of the paired differences.
 LEAST_GAIN = 0.05
 STANDARD_ERRORS = 2.0
+COMPARED_RAYS = 1_000_000
+#: A plane that leaves more of the held-out views unexplained is no mirror of theirs, even if a short trial of surfels
+#: does no better. Right planes leave a twentieth.
+LARGEST_ERROR = 0.3
 
 Trial = Callable[[Views, FitConfig, Surfels], Surfels]
 """Fits surfels to views for a while, from the given start."""
@@ -55,8 +58,8 @@ def choose_rung(views: Views, config: FitConfig, trial: Trial) -> Rung:
 
     A plane is refused when it misses the outlines. Else surfels that start on it are fitted to four fifths of the
     views, and the plane stays unless they explain the others better: by 5 % of the mean ‖e‖²/(‖e‖² + s²) and by two
-    standard errors of the paired differences. `config.model` overrides. Raises InputError when a plane is asked for
-    and can't be fitted.
+    standard errors of the paired differences. A plane with an error above 0.3 goes anyway. `config.model` overrides.
+    Raises InputError when a plane is asked for and can't be fitted.
     """
     if config.model == "surfels":
         return Rung("surfels", "asked for")
@@ -77,7 +80,7 @@ def choose_rung(views: Views, config: FitConfig, trial: Trial) -> Rung:
     gain = flat - bent
     noise = STANDARD_ERRORS * float(gain.std(ddof=1)) / len(gain) ** 0.5 if len(gain) > 1 else np.inf
     compared = f"{outline}; held-out error {flat.mean():.4f} flat, {bent.mean():.4f} with surfels"
-    if gain.mean() > max(noise, LEAST_GAIN * flat.mean()):
+    if flat.mean() > LARGEST_ERROR or gain.mean() > max(noise, LEAST_GAIN * flat.mean()):
         return Rung("surfels", f"{compared}: bent", found.plane)
     return Rung("plane", f"{compared}: no better", found.plane)
 
@@ -104,7 +107,9 @@ def _held_out_errors(views: Views, config: FitConfig, plane: Plane, trial: Trial
     errors = []
     for geometry in geometries:
         with torch.no_grad():
-            environment = solve_environment(list(observed_rays(solved, geometry, config, TRIAL_RAYS)), TRIAL_RESOLUTION)
-            rays = observed_rays(tested, geometry, config, TRIAL_RAYS)
+            environment = solve_environment(
+                list(observed_rays(solved, geometry, config, COMPARED_RAYS)), TRIAL_RESOLUTION
+            )
+            rays = observed_rays(tested, geometry, config, COMPARED_RAYS)
             errors.append(np.array([prediction_error([batch], environment) for batch in rays]))
     return errors[0], errors[1]

@@ -19,9 +19,9 @@ from panoless.views import TrainView, Views
 from shinypartial.conventions import SOLID_ALPHA
 
 SOLID_SURFACE_ALPHA = 0.9
-FINAL_RAYS = 8_000_000
-#: Enough to find out whom to trust and how fine a map is worth it.
-TRIAL_RAYS = 1_000_000
+#: Share of the rays that is enough to find out whom to trust and how fine a map is worth it.
+TRIAL_SHARE = 1 / 8
+TRUST_VIEWS = 40
 TRIAL_RESOLUTION = 128
 RESOLUTIONS = (64, 128, 256)
 HELD_OUT_EVERY = 5
@@ -47,7 +47,7 @@ def observed_rays(
     When the views hold more than `max_rays` such pixels, every k-th is taken, beginning elsewhere in each view. With
     the `trust` of each surfel a ray has that of what it meets, blended, to the fourth power.
     """
-    stride = math.ceil(sum(len(view.solid) for view in views.train) / max_rays)
+    stride = max(1, math.ceil(sum(len(view.solid) for view in views.train) / max_rays))
     for index, view in enumerate(views.train):
         pixels = view.solid[index % stride :: stride]
         if isinstance(geometry, Plane):
@@ -76,30 +76,31 @@ def solved_environment(
     A trial map says which surfels to trust, and held-out views how fine the map should be, unless the configuration
     does; then all rays are solved.
     """
-    trial = list(observed_rays(views, geometry, config, TRIAL_RAYS))
+    few = math.ceil(TRIAL_SHARE * config.environment.rays)
+    trial = list(observed_rays(views, geometry, config, few))
     resolution = config.environment.solve_resolution
     coarse = solve_environment(trial, resolution or TRIAL_RESOLUTION)
     trust = None
     if isinstance(geometry, Surfels):
         trust = surfel_trust(views, geometry, config, coarse)
-        trial = list(observed_rays(views, geometry, config, TRIAL_RAYS, trust))
+        trial = list(observed_rays(views, geometry, config, few, trust))
         coarse = solve_environment(trial, resolution or TRIAL_RESOLUTION)
     resolution = resolution or finest_resolution(trial, coarse)
-    rays = list(observed_rays(views, geometry, config, FINAL_RAYS, trust))
+    rays = list(observed_rays(views, geometry, config, config.environment.rays, trust))
     return solve_environment(rays, resolution, coarse), rays
 
 
 def surfel_trust(
     views: Views, surfels: Surfels, config: FitConfig, environment: Float[Tensor, "6 3 L L"]
 ) -> Float[Tensor, "K"]:
-    """Share of the pixels that a surfel makes up, over all views, whose radiance agrees with a map; in [0, 1].
+    """Share of the pixels that a surfel makes up, over some forty views, whose radiance agrees with a map; in [0, 1].
 
     A surfel whose normal is wrong disagrees in most views although its rays agree with each other in one; a pixel alone
     cannot tell. Agreement is the Geman–McClure weight of the residual; a pixel counts for a surfel by its share in the
     blend, which is the derivative of the blended image.
     """
     agreeing, total = torch.zeros_like(surfels.means[:, 0]), torch.zeros_like(surfels.means[:, 0])
-    for view in views.train:
+    for view in views.train[:: math.ceil(len(views.train) / TRUST_VIEWS)]:
         rays, pixels = _surfel_rays(view, surfels, config, view.solid)
         error = sample_cubemap(environment, rays.directions) - rays.radiance
         shares = torch.zeros(surfels.count, 3, device=surfels.means.device, requires_grad=True)
@@ -133,14 +134,16 @@ def finest_resolution(rays: Sequence[Rays], start: Float[Tensor, "6 3 L L"]) -> 
 
 
 def prediction_error(rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"], scale: float = 0.1) -> float:
-    """Mean of ‖e‖²/(‖e‖² + s²) over rays, weighted by trust: 0 where a map explains them, 1 where nothing fits."""
+    """Mean of ‖e‖²/(‖e‖² + s²) over rays, weighted by trust: 0 where a map explains them, 1 where nothing fits
+    or there are none.
+    """
     summed, weights = 0.0, 0.0
     for batch in rays:
         squared = (sample_cubemap(environment, batch.directions) - batch.radiance).square().sum(1)
         weight = batch.initial_weight()
         summed += float((weight * squared / (squared + scale**2)).sum())
         weights += float(weight.sum())
-    return summed / max(weights, 1e-9)
+    return summed / weights if weights > 0 else 1.0
 
 
 def _surfel_rays(view: TrainView, surfels: Surfels, config: FitConfig, pixels: Tensor) -> tuple[Rays, Tensor]:

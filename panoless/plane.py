@@ -43,7 +43,7 @@ class Plane:
 
 def pose_of(camera: RasterCamera) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
     """Rotation from the normalized frame to the camera, and the camera's center in that frame, in float64."""
-    matrix = camera.world_to_camera.numpy().astype(np.float64)
+    matrix = camera.world_to_camera.cpu().numpy().astype(np.float64)
     return matrix[:3, :3], -matrix[:3, :3].T @ matrix[:3, 3]
 
 
@@ -58,7 +58,8 @@ def plane_buffers(plane: Plane, camera: RasterCamera) -> SurfaceBuffers:
     rotation, center = pose_of(camera)
     height_above = float(plane.normal @ center) - plane.offset
     if height_above <= 0:
-        return _buffers(np.zeros((camera.height, camera.width)), np.zeros((camera.height, camera.width)), np.zeros(3))
+        nothing = np.zeros((camera.height, camera.width))
+        return _buffers(nothing, nothing, np.zeros(3), camera)
     corners = (plane.points(plane.outline) - center) @ rotation.T
     normal = rotation @ plane.normal
     alpha = _projected_coverage(corners, camera)
@@ -69,7 +70,7 @@ def plane_buffers(plane: Plane, camera: RasterCamera) -> SurfaceBuffers:
     slope = -(normal[0] * x + (normal[1] * y + normal[2])[:, None])
     nearest, farthest = max(corners[:, 2].min(), camera.near), max(corners[:, 2].max(), camera.near)
     depth = np.where(slope > 0, height_above / np.maximum(slope, 1e-12), farthest).clip(nearest, farthest)
-    return _buffers(alpha, depth * (alpha > 0), normal)
+    return _buffers(alpha, depth * (alpha > 0), normal, camera)
 
 
 def unobstructed(plane: Plane, camera: RasterCamera) -> Float[Tensor, "H W"]:
@@ -80,27 +81,34 @@ def unobstructed(plane: Plane, camera: RasterCamera) -> Float[Tensor, "H W"]:
     """
     rotation, center = pose_of(camera)
     if plane.rim_height <= 0 or plane.normal @ center <= plane.offset:
-        return torch.ones(camera.height, camera.width)
+        return camera.world_to_camera.new_ones(camera.height, camera.width)
     outline = (plane.points(plane.outline) - center) @ rotation.T
     image = _projected_coverage(outline - plane.rim_height * (rotation @ plane.normal), camera)
-    return torch.from_numpy(np.where(_projected_coverage(outline, camera) > 0, image, 1.0)).float()
+    return _tensor(np.where(_projected_coverage(outline, camera) > 0, image, 1.0), camera)
 
 
 def _buffers(
-    alpha: Float[np.ndarray, "H W"], depth: Float[np.ndarray, "H W"], normal_camera: Float[np.ndarray, "3"]
+    alpha: Float[np.ndarray, "H W"],
+    depth: Float[np.ndarray, "H W"],
+    normal_camera: Float[np.ndarray, "3"],
+    camera: RasterCamera,
 ) -> SurfaceBuffers:
-    covered = torch.from_numpy(alpha).float()
-    distance = torch.from_numpy(depth).float()
+    covered, distance = _tensor(alpha, camera), _tensor(depth, camera)
     return SurfaceBuffers(
-        albedo=torch.zeros(3, *covered.shape),
+        albedo=covered.new_zeros(3, *covered.shape),
         alpha=covered,
-        raster_normals_camera=torch.from_numpy(normal_camera).float()[:, None, None] * covered,
+        raster_normals_camera=_tensor(normal_camera, camera)[:, None, None] * covered,
         expected_depth=distance,
         median_depth=distance,
         surface_depth=distance,
         distortion=torch.zeros_like(covered),
         in_frustum=(covered > 0).any()[None],
     )
+
+
+def _tensor(values: Float[np.ndarray, "*S"], camera: RasterCamera) -> Float[Tensor, "*S"]:
+    """In float32, on the device of a camera."""
+    return torch.from_numpy(values).float().to(camera.world_to_camera.device)
 
 
 def _projected_coverage(corners_camera: Float[np.ndarray, "N 3"], camera: RasterCamera) -> Float[np.ndarray, "H W"]:

@@ -59,7 +59,7 @@ def view_contours(views: Views) -> Contours:
 
     parts = []
     for index, view in enumerate(views.train):
-        found = find_contours(view.mask.numpy().astype(np.float64), CONTOUR_LEVEL)
+        found = find_contours(view.mask.cpu().numpy().astype(np.float64), CONTOUR_LEVEL)
         if not found:
             continue
         pixels, camera = max(found, key=len)[:-1, ::-1] + PIXEL_CENTER, view.camera

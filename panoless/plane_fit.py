@@ -186,7 +186,7 @@ def _votes(
         depth = np.maximum(seen[:, 2], camera.near)
         x = seen[:, 0] / depth * camera.fx + camera.cx - PIXEL_CENTER
         y = seen[:, 1] / depth * camera.fy + camera.cy - PIXEL_CENTER
-        inside = map_coordinates(view.mask.numpy(), [y, x], order=1, cval=0.0) * (seen[:, 2] > camera.near)
+        inside = map_coordinates(view.mask.cpu().numpy(), [y, x], order=1, cval=0.0) * (seen[:, 2] > camera.near)
         result[index] = inside.reshape(len(u), len(v))
     return result
 

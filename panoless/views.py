@@ -1,7 +1,7 @@
 """Dataset folder → training views: cropped tensors with cameras in a normalized frame."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from panoless.kernels.rasterize import RasterCamera
 from shinypartial.camera import Camera
 from shinypartial.conventions import PIXEL_CENTER, SOLID_ALPHA
 from shinypartial.dataset.read import read_view
-from shinypartial.dataset.schema import Dataset, Frame
+from shinypartial.dataset.schema import Dataset
 from shinypartial.errors import InputError
 from shinypartial.progress import Progress
 
@@ -36,6 +36,16 @@ class TrainView:
     solid: Float[Tensor, "P"] | Tensor
     """Flat indices of the pixels that lie wholly on the object."""
 
+    def to(self, device: torch.device) -> "TrainView":
+        """The same view on a device."""
+        return TrainView(
+            camera=replace(self.camera, world_to_camera=self.camera.world_to_camera.to(device)),
+            radiance=self.radiance.to(device),
+            mask=self.mask.to(device),
+            rays_camera=self.rays_camera.to(device),
+            solid=self.solid.to(device),
+        )
+
     @property
     def camera_to_world_rotation(self) -> Float[Tensor, "3 3"]:
         """Rotates camera directions into the world: R of the pose."""
@@ -57,11 +67,18 @@ class Views:
     near: float
     """Near plane in normalized units: a tenth of the smallest camera distance."""
 
+    def to(self, device: torch.device) -> "Views":
+        """The same views on a device."""
+        return replace(self, train=tuple(view.to(device) for view in self.train))
 
-def load_views(dataset: Dataset, crop_margin_px: int) -> Views:
-    """Read the training split; raises InputError for unreadable images and for masks that are all empty."""
+
+def load_views(dataset: Dataset, crop_margin_px: int, downscale: int = 1) -> Views:
+    """Read the training split, averaged over blocks of `downscale` pixels a side.
+
+    Raises InputError for unreadable images and for masks that are all empty.
+    """
     progress = Progress("reading views", len(dataset.train))
-    loaded: list[tuple[Frame, np.ndarray, np.ndarray]] = []
+    loaded: list[tuple[Camera, np.ndarray, np.ndarray]] = []
     for frame in dataset.train:
         view = read_view(frame)
         if not (view.alpha >= 0.5).any():
@@ -70,19 +87,27 @@ def load_views(dataset: Dataset, crop_margin_px: int) -> Views:
                 found="an empty mask",
                 remedy="Correct the mask, or remove the frame from transforms_train.json.",
             )
-        loaded.append((frame, np.clip(view.radiance, 0, 1), np.clip(view.alpha, 0, 1)))
+        radiance, alpha = (_block_means(np.clip(image, 0, 1), downscale) for image in (view.radiance, view.alpha))
+        loaded.append((frame.camera.downscaled(downscale), radiance, alpha))
         progress.advance()
-    normalization = estimate_normalization([(frame.camera, alpha) for frame, _, alpha in loaded])
+    normalization = estimate_normalization([(camera, alpha) for camera, _, alpha in loaded])
     distances = [
-        np.linalg.norm(frame.camera.position_world - normalization.center) / normalization.radius
-        for frame, _, _ in loaded
+        np.linalg.norm(camera.position_world - normalization.center) / normalization.radius for camera, _, _ in loaded
     ]
     near = 0.1 * float(min(distances))
     views = tuple(
-        _make_view(frame.camera, radiance, alpha, normalization, near, crop_margin_px)
-        for frame, radiance, alpha in loaded
+        _make_view(camera, radiance, alpha, normalization, near, crop_margin_px) for camera, radiance, alpha in loaded
     )
     return Views(views, normalization, near)
+
+
+def _block_means(image: Float[np.ndarray, "H W *C"], side: int) -> Float[np.ndarray, "h w *C"]:
+    """Means over squares of `side` pixels; what is left over at the right and at the bottom is cut off."""
+    if side == 1:
+        return image
+    height, width = (size // side for size in image.shape[:2])
+    whole = image[: height * side, : width * side]
+    return whole.reshape(height, side, width, side, *image.shape[2:]).mean((1, 3))
 
 
 def raster_camera(camera: Camera, normalization: Normalization, near: float) -> RasterCamera:

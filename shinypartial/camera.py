@@ -33,6 +33,11 @@ class Camera:
         """Inverse of the rigid pose."""
         return np.linalg.inv(self.camera_to_world)
 
+    def downscaled(self, side: int) -> "Camera":
+        """The same camera with pixels as large as blocks of `side` × `side`, without what fills no block."""
+        fx, fy, cx, cy = (value / side for value in (self.fx, self.fy, self.cx, self.cy))
+        return Camera(self.camera_to_world, fx, fy, cx, cy, self.width // side, self.height // side)
+
 
 def opengl_to_opencv(camera_to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """Turn a pose with OpenGL camera axes into one with OpenCV axes."""

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -17,6 +18,7 @@ from panoless.checkpoint import (
 )
 from panoless.config import PRESETS
 from shinypartial.errors import InputError
+from tests.support.mirror_plane import L_SHAPE, plane_of
 from tests.support.mirror_sphere import sphere_surfels
 
 CONFIG = PRESETS["default"]
@@ -57,6 +59,21 @@ def test_a_state_survives_the_disk(tmp_path: Path, final: bool) -> None:
     assert (loaded.final_environment is not None) == final
     if final:
         assert torch.equal(loaded.final_environment, state.final_environment)
+
+
+@pytest.mark.parametrize("flat", [True, False], ids=["plane", "bent from a plane"])
+def test_a_plane_survives_the_disk(tmp_path: Path, flat: bool) -> None:
+    """To the last bit, with the outline's corners and why it was taken; it is the geometry only when it is flat."""
+    plane = plane_of(L_SHAPE, rim_height=0.1 / 3, offset=1 / 7)
+    save_state(tmp_path, replace(some_state(True), plane=plane, flat=flat, rung="plane (asked for)"))
+    loaded = load_state(tmp_path)
+    assert loaded is not None
+    assert loaded.plane is not None
+    for name, value in vars(plane).items():
+        np.testing.assert_array_equal(getattr(loaded.plane, name), value)
+    assert isinstance(loaded.plane.offset, float)
+    assert loaded.rung == "plane (asked for)"
+    assert loaded.geometry is (loaded.plane if flat else loaded.surfels)
 
 
 def test_before_the_first_checkpoint_there_is_none(tmp_path: Path) -> None:

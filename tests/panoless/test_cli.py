@@ -62,6 +62,7 @@ BAD_USAGE = {
     "unknown option": ["fit", "--config.loss.lambda-magic", "1"],
     "not a number": ["fit", "--config.iterations", "many"],
     "not whole": ["fit", "--config.surfels.count", "1.5"],
+    "not a model": ["fit", "--model", "cube"],
     "not a choice": ["fit", "--config.environment.activation", "tanh"],
 }
 
@@ -72,6 +73,37 @@ def test_bad_usage_exits_with_2(arguments: list[str], capsys: pytest.CaptureFixt
     out, err = capsys.readouterr()
     assert "Traceback" not in out + err
     assert out + err
+
+
+def test_a_wrong_model_is_answered_with_the_right_ones(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fit", "--model", "cube"]) == 2
+    out, err = capsys.readouterr()
+    for name in ("cube", "--model", "auto", "plane", "surfels"):
+        assert name in out + err
+
+
+@pytest.mark.parametrize(("preset", "model"), [("default", "auto"), ("paper", "surfels")])
+def test_the_model_is_that_of_the_preset_unless_named(
+    preset: str, model: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = help_text(["fit", "--preset", preset], capsys, monkeypatch)
+    assert re.search(rf"--model \{{auto,plane,surfels\}}[^)]*\(default: {model}\)", text)
+    text = help_text(["fit", "--preset", preset, "--model", "plane"], capsys, monkeypatch)
+    assert "--model {auto,plane,surfels}" in text
+
+
+def test_a_model_that_is_asked_for_is_taken_and_saved(
+    tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Even a plane for a sphere; the run says so, and so does the prediction."""
+    monkeypatch.chdir(tmp_path)
+    for model in ("plane", "surfels"):
+        assert main(["fit", str(sphere_dataset.root), *TINY, "--model", model, "--output", model]) == 0
+        assert f"Model: {model} (asked for" in capsys.readouterr().err
+        content = json.loads((tmp_path / model / "prediction.json").read_text())
+        assert content["config"]["model"] == model
+        assert content["model"].startswith(f"{model} (asked for")
+        assert (tmp_path / model / "plane.ply").exists() == (model == "plane")
 
 
 def test_options_reach_the_fit_and_are_saved(

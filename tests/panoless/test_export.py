@@ -9,10 +9,22 @@ import numpy as np
 import pytest
 import torch
 
-from panoless.export import PICTURES, PLY_NAME, _titled, cube_to_latlong, export_prediction, render, write_ply
+from panoless.checkpoint import FitState
+from panoless.export import (
+    PICTURES,
+    PLANE_PLY_NAME,
+    PLY_NAME,
+    _titled,
+    cube_to_latlong,
+    export_prediction,
+    render,
+    write_plane_ply,
+    write_ply,
+)
+from panoless.initialize import surfels_on_plane
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.views import Normalization, raster_camera
-from shinypartial.dataset.read import read_view
+from shinypartial.dataset.read import open_dataset, read_view
 from shinypartial.errors import InputError
 from shinypartial.evaluate import evaluate
 from shinypartial.picture_sheet import MAX_BYTES
@@ -27,6 +39,7 @@ from shinypartial.prediction import (
 )
 from shinypartial.sphere import latlong_directions
 from tests.panoless.conftest import FinishedFit
+from tests.support.mirror_plane import L_SHAPE, RECTANGLE, make_plane_dataset, plane_of
 from tests.support.mirror_sphere import clipped_environment, sphere_surfels, tiny_config
 from tests.support.synthetic_dataset import render_sphere, sphere_cameras
 
@@ -224,3 +237,94 @@ def test_only_a_finished_fit_is_exported(tmp_path: Path, finished: FinishedFit) 
 
 def test_the_info_is_strict_json(prediction: Path) -> None:
     json.loads((prediction / "prediction.json").read_text(), parse_constant=lambda name: pytest.fail(name))
+
+
+RUNG = "plane (a plane explains the outlines to 0.05 px)"
+
+
+@pytest.fixture(scope="module")
+def plane_prediction(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The exact flat mirror and the exact environment, in a frame of twice the world's unit, exported; its dataset."""
+    plane, radius, center = plane_of(RECTANGLE, offset=0.07), 2.0, np.array([0.3, -0.2, 0.1])
+    dataset = make_plane_dataset(tmp_path_factory.mktemp("datasets") / "plane", plane, train=3)
+    offset = (plane.offset - float(plane.normal @ center)) / radius
+    shift = np.array([plane.tangent_u @ center, plane.tangent_v @ center])
+    placed = replace(plane, offset=offset, outline=(plane.outline - shift) / radius)
+    environment = clipped_environment(cubemap_directions(64)).permute(0, 3, 1, 2).contiguous()
+    state = FitState(
+        surfels=surfels_on_plane(placed, 1, seed=0),
+        environment=environment,
+        iteration=0,
+        optimizer={},
+        gradient_sum=torch.zeros(1),
+        gradient_count=torch.zeros(1),
+        evidence=torch.zeros(6, 64, 64),
+        center=center.tolist(),
+        radius=radius,
+        final_environment=environment,
+        visibility=torch.ones(6, 64, 64),
+        plane=placed,
+        flat=True,
+        rung=RUNG,
+    )
+    folder = tmp_path_factory.mktemp("predictions") / "plane"
+    claim_prediction(folder)
+    (folder / "test").mkdir()
+    (folder / PLY_NAME).write_text("of an earlier fit with surfels")
+    export_prediction(dataset, state, tiny_config(), folder)
+    return folder, dataset.root
+
+
+def test_an_exact_plane_scores_perfect_normals(plane_prediction: tuple[Path, Path]) -> None:
+    scores = evaluate(*plane_prediction)
+    assert scores.normals is not None
+    assert scores.normals.median_angular_error_deg < 0.01
+
+
+def test_a_plane_renders_the_traced_views(plane_prediction: tuple[Path, Path]) -> None:
+    """Alpha as traced with 36 points a pixel; depth and radiance of the mirror, in world units."""
+    folder, root = plane_prediction
+    for frame in open_dataset(root).test:
+        found, truth = read_view(prediction_frame(folder, frame)), read_view(frame)
+        np.testing.assert_allclose(found.alpha, truth.alpha, atol=0.08)
+        whole = truth.alpha == 1
+        assert whole.mean() > 0.1
+        assert found.depth is not None
+        assert truth.depth is not None
+        np.testing.assert_allclose(found.depth[whole], truth.depth[whole], atol=1e-4)
+        # Bilinear lookups in texels of 1.4°, and a sun clipped at 1.
+        difference = np.abs(found.radiance - truth.radiance.clip(0, 1))[whole]
+        assert difference.mean() < 3e-3
+
+
+def test_a_plane_is_described_as_what_it_is(plane_prediction: tuple[Path, Path]) -> None:
+    """Three numbers and four corners; one primitive; the reason in words; no surfels of an earlier fit beside it."""
+    folder, _ = plane_prediction
+    info = read_info(folder)
+    assert info.model == RUNG
+    assert info.primitives == 1
+    assert info.parameter_counts == {"plane parameters": 3 + 8, "environment parameters": 6 * 3 * 64 * 64}
+    assert info.model_bytes == sum((folder / name).stat().st_size for name in (PLANE_PLY_NAME, "environment.exr"))
+    assert not (folder / PLY_NAME).exists()
+
+
+def test_surfels_say_why_there_is_no_plane(prediction: Path) -> None:
+    model = read_info(prediction).model
+    assert model is not None
+    assert model.startswith("surfels (no plane explains the outlines")
+    assert not (prediction / PLANE_PLY_NAME).exists()
+
+
+def test_the_ply_of_a_plane_is_its_outline_in_world_units(tmp_path: Path) -> None:
+    plane, radius, center = plane_of(L_SHAPE), 2.0, np.array([10.0, -20.0, 30.0])
+    write_plane_ply(tmp_path / "p.ply", plane, Normalization(center, radius))
+    lines = (tmp_path / "p.ply").read_text(encoding="ascii").splitlines()
+    body = lines[lines.index("end_header") + 1 :]
+    assert "element vertex 6" in lines
+    assert "element face 1" in lines
+    corners = np.array([[float(value) for value in line.split()] for line in body[:6]])
+    expected = [
+        center + radius * (plane.offset * plane.normal + u * plane.tangent_u + v * plane.tangent_v) for u, v in L_SHAPE
+    ]
+    np.testing.assert_allclose(corners, expected, atol=1e-6)
+    assert body[6:] == ["6 0 1 2 3 4 5"]

@@ -1,6 +1,5 @@
 """One plane from silhouettes: coverage is area, depth lies on the plane, and outlines alone give the normal."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,79 +7,25 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from matplotlib.path import Path as PolygonPath
 
-from panoless.kernels.rasterize import RasterCamera
 from panoless.plane import Plane, plane_buffers, polygon_coverage, pose_of, unobstructed
 from panoless.plane_fit import MAX_VERTICES, PlaneFit, fit_plane
-from panoless.views import Normalization, TrainView, Views, unit_rays_camera
-from shinypartial.camera import look_at
+from panoless.views import Views
 from shinypartial.errors import InputError
-
-SIZE_PX = 96
-SUBPIXELS = 6
-NORMAL = np.array([0.3, -0.9, 0.2]) / np.linalg.norm([0.3, -0.9, 0.2])
-L_SHAPE = np.array([[-0.6, -0.5], [0.6, -0.5], [0.6, 0.1], [0.0, 0.1], [0.0, 0.5], [-0.6, 0.5]])
-RECTANGLE = np.array([[-0.65, -0.5], [0.65, -0.5], [0.65, 0.5], [-0.65, 0.5]])
-
-
-def plane_of(outline: Float[np.ndarray, "N 2"], rim_height: float = 0.0, offset: float = 0.07) -> Plane:
-    tangent_u = np.cross([0.0, 0.0, 1.0], NORMAL)
-    tangent_u /= np.linalg.norm(tangent_u)
-    return Plane(NORMAL, offset, tangent_u, np.cross(NORMAL, tangent_u), outline, rim_height)
-
-
-def camera_at(position: Float[np.ndarray, "3"], size: int = SIZE_PX) -> RasterCamera:
-    """Looks at the origin and holds the unit ball."""
-    world_to_camera = torch.from_numpy(np.linalg.inv(look_at(position, np.zeros(3)))).float()
-    focal = 0.45 * size * float(np.linalg.norm(position))
-    return RasterCamera(world_to_camera, focal, focal, size / 2, size / 2, size, size, 0.3, 150.0)
-
-
-def arc(count: int, half_angle_deg: float = 35.0) -> list[RasterCamera]:
-    """Around a direction 15° off the normal, up and down in turn."""
-    cameras = []
-    for index, azimuth in enumerate(np.radians(np.linspace(-half_angle_deg, half_angle_deg, count))):
-        elevation = math.radians((-18.0, 5.0, 20.0)[index % 3])
-        across = math.cos(elevation)
-        position = np.array([across * math.sin(azimuth), -across * math.cos(azimuth), math.sin(elevation)])
-        cameras.append(camera_at(3.0 * position))
-    return cameras
-
-
-def seen(plane: Plane, camera: RasterCamera, subpixels: int = SUBPIXELS) -> Bool[np.ndarray, "H W"]:
-    """Whether rays through points of a fine grid in each pixel meet the mirror, by a test of points in polygons."""
-    rotation, center = pose_of(camera)
-    x = ((np.arange(camera.width * subpixels) + 0.5) / subpixels - camera.cx) / camera.fx
-    y = ((np.arange(camera.height * subpixels) + 0.5) / subpixels - camera.cy) / camera.fy
-    rays = np.stack([*np.meshgrid(x, y), np.ones((len(y), len(x)))], -1).reshape(-1, 3) @ rotation
-    inside = np.ones(len(rays), dtype=bool)
-    for height in {0.0, plane.rim_height}:
-        depth = (plane.offset + height - center @ plane.normal) / (rays @ plane.normal)
-        hit = center + depth[:, None] * rays
-        coordinates = np.stack([hit @ plane.tangent_u, hit @ plane.tangent_v], 1)
-        inside &= PolygonPath(plane.outline).contains_points(coordinates) & (depth > 0)
-    return inside.reshape(len(y), len(x))
-
-
-def train_view(camera: RasterCamera, mask: Float[np.ndarray, "H W"]) -> TrainView:
-    tensor = torch.from_numpy(mask).float()
-    return TrainView(
-        camera,
-        torch.zeros(3, *mask.shape),
-        tensor,
-        unit_rays_camera(camera),
-        torch.nonzero(tensor.flatten() > 0.99)[:, 0],
-    )
-
-
-def mirror_views(plane: Plane, cameras: list[RasterCamera]) -> Views:
-    views = []
-    for camera in cameras:
-        fine = seen(plane, camera).reshape(camera.height, SUBPIXELS, camera.width, SUBPIXELS)
-        views.append(train_view(camera, fine.mean((1, 3))))
-    return Views(tuple(views), Normalization(np.zeros(3), 1.0), 0.3)
+from tests.support.mirror_plane import (
+    L_SHAPE,
+    NORMAL,
+    RECTANGLE,
+    SIZE_PX,
+    arc,
+    camera_at,
+    mirror_views,
+    plane_of,
+    seen,
+    train_view,
+)
 
 
 def angle_deg(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> float:

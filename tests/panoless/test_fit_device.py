@@ -1,0 +1,97 @@
+"""A fit places its data on a device once and keeps them there, proved with a device that is not there."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from panoless import cubemap
+from panoless import fit as fit_module
+from panoless.config import FitConfig
+from panoless.fit import find_device, fit
+from panoless.kernels import backend
+from panoless.plane import plane_buffers, unobstructed
+from shinypartial.dataset.schema import Dataset
+from shinypartial.errors import InputError
+from tests.support.mirror_plane import RECTANGLE, arc, make_plane_dataset, plane_of
+from tests.support.mirror_sphere import tiny_config
+from tests.support.second_device import second_device
+
+
+@pytest.fixture
+def definition_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both devices compute by the definition, in few rounds."""
+    monkeypatch.setattr(backend, "_fastest", lambda dtype, device: "reference")
+    monkeypatch.setattr(cubemap, "ROBUST_SCALES", (None,))
+    monkeypatch.setattr(cubemap, "REFINING_SCALES", (0.05,))
+    monkeypatch.setattr(cubemap, "CONJUGATE_GRADIENT_STEPS", 1)
+
+
+def shortest_config(preset: str) -> FitConfig:
+    """Every path of a preset in a few steps."""
+    config = tiny_config(preset, iterations=5, count=20)
+    density = replace(config.density, start=0.0, every=0.2, reset_every=0.5, propagate_every=0.34, gradient_threshold=0)
+    return replace(
+        config,
+        model="surfels",
+        downscale=2,
+        density=density,
+        surfels=replace(config.surfels, hull_resolution=16),
+        environment=replace(config.environment, resolution=4, solve_resolution=4),
+    )
+
+
+@pytest.mark.parametrize("preset", ["default", "paper", "paper-rho-weighted"])
+def test_a_fit_on_another_device_mixes_nothing_and_ends_the_same(
+    preset: str, tmp_path: Path, sphere_dataset: Dataset, definition_only: None
+) -> None:
+    config, dataset = shortest_config(preset), replace(sphere_dataset, train=sphere_dataset.train[:2])
+    here = fit(dataset, config, tmp_path / "here")
+    with second_device() as device:
+        there = fit(dataset, config, tmp_path / "there", device=device)
+    assert there.surfels.means.device.type == "cpu"
+    for name, value in here.surfels.named().items():
+        torch.testing.assert_close(there.surfels.named()[name], value)
+    torch.testing.assert_close(there.final_environment, here.final_environment)
+    torch.testing.assert_close(there.visibility, here.visibility)
+    for name, series in here.curves.items():
+        assert there.curves[name] == pytest.approx(series), name
+
+
+def test_the_ladder_on_another_device_takes_the_same_rung(tmp_path: Path, definition_only: None) -> None:
+    dataset = make_plane_dataset(tmp_path / "plane", plane_of(RECTANGLE), size=48, train=4, test=1)
+    config = replace(shortest_config("default"), model="auto")
+    here = fit(dataset, config, tmp_path / "here")
+    with second_device() as device:
+        there = fit(dataset, config, tmp_path / "there", device=device)
+    assert here.plane is not None
+    assert there.rung == here.rung
+    torch.testing.assert_close(there.final_environment, here.final_environment)
+    torch.testing.assert_close(there.visibility, here.visibility)
+
+
+@pytest.mark.parametrize("rim_height", [0.0, 0.1])
+def test_a_plane_is_seen_on_the_device_of_the_camera(rim_height: float) -> None:
+    plane, camera = plane_of(RECTANGLE, rim_height), arc(1, size=24)[0]
+    behind = replace(plane, normal=-plane.normal, offset=-plane.offset)
+    for each in (plane, behind):
+        here, clear = plane_buffers(each, camera), unobstructed(each, camera)
+        with second_device() as device:
+            moved = replace(camera, world_to_camera=camera.world_to_camera.to(device))
+            there = {**vars(plane_buffers(each, moved)), "unobstructed": unobstructed(each, moved)}
+            assert {value.device for value in there.values()} == {device}
+            there = {name: value.to("cpu") for name, value in there.items()}
+        for name, value in {**vars(here), "unobstructed": clear}.items():
+            torch.testing.assert_close(there[name], value, msg=name)
+
+
+def test_what_is_missing_for_a_gpu_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert find_device("cpu").type == "cpu"
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(InputError, match="a GPU that torch can use"):
+        find_device("cuda")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(fit_module, "gpu_kernels_installed", lambda: False)
+    with pytest.raises(InputError, match="Triton"):
+        find_device("cuda")

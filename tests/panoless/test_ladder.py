@@ -1,0 +1,153 @@
+"""The rung of a scene: the outline refuses a plane, held-out views tell a bent mirror from a flat one."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from panoless.config import FitConfig
+from panoless.fit import _trial, fit
+from panoless.initialize import surfels_on_plane
+from panoless.ladder import choose_rung, without_mirrored_frame
+from panoless.plane import Plane, unobstructed
+from panoless.snapshots import Marks
+from panoless.surfels import Surfels
+from panoless.views import Views
+from shinypartial.dataset.schema import Dataset
+from shinypartial.errors import InputError
+from tests.support.mirror_plane import NORMAL, RECTANGLE, arc, make_plane_dataset, plane_of, reflecting_views
+from tests.support.mirror_sphere import tiny_config
+
+CONFIG = tiny_config(iterations=200, count=200)
+SIZE_PX = 64
+
+
+def framed(rim_height: float, bend: float = 0.0) -> Views:
+    return reflecting_views(plane_of(RECTANGLE, rim_height), arc(12, size=SIZE_PX), bend)
+
+
+def no_trial(views: Views, config: FitConfig, start: Surfels) -> Surfels:
+    pytest.fail("nothing was to be fitted")
+
+
+def as_started(views: Views, config: FitConfig, start: Surfels) -> Surfels:
+    return start
+
+
+def dome(plane: Plane, bend: float, count: int) -> Surfels:
+    """Surfels on a plane with the normals n + bend·(p₁ t_u + p₂ t_v) of the traced dome."""
+    from scipy.spatial.transform import Rotation
+
+    flat = surfels_on_plane(plane, count, seed=0)
+    points = flat.means.double().numpy()
+    tangents = np.stack([plane.tangent_u, plane.tangent_v])
+    normals = plane.normal + bend * (points @ tangents.T) @ tangents
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    first = plane.tangent_u - (normals @ plane.tangent_u)[:, None] * normals
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    frames = np.stack([first, np.cross(normals, first), normals], 2)
+    quats = torch.from_numpy(Rotation.from_matrix(frames).as_quat()[:, [3, 0, 1, 2]]).float()
+    curvatures = torch.tensor([-bend, 0.0, -bend]).expand(flat.count, 3).clone()
+    return replace(flat, quats=quats, curvatures=curvatures)
+
+
+@pytest.mark.parametrize("rim_height", [0.0, 0.1])
+@pytest.mark.parametrize("bend", [0.0, 0.1])
+def test_a_flat_mirror_takes_the_plane_and_a_bent_one_in_the_same_outline_does_not(
+    rim_height: float, bend: float
+) -> None:
+    """A dome whose normals turn by 4° at most has the same masks; a frame that mirrors itself misleads neither."""
+    rung = choose_rung(framed(rim_height, bend), CONFIG, _trial)
+    assert rung.model == ("plane" if bend == 0 else "surfels")
+    assert rung.reason.endswith("no better" if bend == 0 else "bent")
+    assert rung.plane is not None
+    assert rung.plane.normal @ NORMAL > np.cos(np.radians(0.2))
+
+
+def test_right_surfels_beat_the_plane_of_a_bent_mirror() -> None:
+    """With the traced dome's own normals, however far they turn, here by 11°."""
+    rung = choose_rung(framed(0.0, 0.3), CONFIG, lambda *_: dome(plane_of(RECTANGLE), 0.3, 800))
+    assert rung.model == "surfels"
+
+
+def test_surfels_that_explain_as_much_do_not_beat_the_plane() -> None:
+    """Flat surfels on the plane say the same as the plane does, on a flat mirror and on a bent one."""
+    for bend in (0.0, 0.3):
+        assert choose_rung(framed(0.0, bend), CONFIG, as_started).model == "plane"
+
+
+def test_surfels_that_cover_nothing_do_not_beat_the_plane() -> None:
+    """What nobody sees explains nothing."""
+
+    def vanished(views: Views, config: FitConfig, start: Surfels) -> Surfels:
+        return replace(start, opacity_logits=start.opacity_logits - 20)
+
+    assert choose_rung(framed(0.0), CONFIG, vanished).model == "plane"
+
+
+def test_a_sphere_is_refused_by_its_outline(views: Views) -> None:
+    """Before anything is fitted; the reason says how far away the plane is."""
+    rung = choose_rung(views, CONFIG, no_trial)
+    assert rung.model == "surfels"
+    assert rung.plane is None
+    assert rung.reason.startswith("no plane explains the outlines: ")
+
+
+def test_the_configuration_overrides_both_ways(views: Views) -> None:
+    """Surfels for a flat mirror, a plane for a bent one and even for a sphere; nothing is compared."""
+    chosen = {model: replace(CONFIG, model=model) for model in ("plane", "surfels")}
+    rung = choose_rung(framed(0.0), chosen["surfels"], no_trial)
+    assert (rung.model, rung.reason, rung.plane) == ("surfels", "asked for", None)
+    for shown in (framed(0.0, 0.3), views):
+        rung = choose_rung(shown, chosen["plane"], no_trial)
+        assert rung.model == "plane"
+        assert rung.reason.startswith("asked for")
+        assert rung.plane is not None
+
+
+def test_two_views_determine_no_plane() -> None:
+    """That is a reason for surfels, and an error only for who asks for a plane."""
+    views = framed(0.0)
+    two = replace(views, train=views.train[:2])
+    rung = choose_rung(two, CONFIG, no_trial)
+    assert (rung.model, rung.plane) == ("surfels", None)
+    with pytest.raises(InputError, match="at least 3 distinct places"):
+        choose_rung(two, replace(CONFIG, model="plane"), no_trial)
+
+
+def test_what_mirrors_the_frame_is_left_out() -> None:
+    """Exactly the solid pixels that see the environment stay: all without a rim, fewer with a rim."""
+    for rim_height in (0.0, 0.1):
+        plane, views = plane_of(RECTANGLE, rim_height), framed(rim_height)
+        cleared = without_mirrored_frame(views, plane)
+        before, after = (sum(len(view.solid) for view in each.train) for each in (views, cleared))
+        assert after == before if rim_height == 0 else 0.5 * before < after < before
+        for view, clear in zip(views.train, cleared.train, strict=True):
+            free = set(torch.nonzero(unobstructed(plane, view.camera).flatten() > 0.99)[:, 0].tolist())
+            assert set(clear.solid.tolist()) == set(view.solid.tolist()) & free
+            assert torch.equal(clear.mask, view.mask)
+
+
+@pytest.fixture(scope="module")
+def plane_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return make_plane_dataset(tmp_path_factory.mktemp("datasets") / "plane", plane_of(RECTANGLE))
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_a_plane_has_a_solved_map_whatever_the_preset(tmp_path: Path, plane_dataset: Dataset, preset: str) -> None:
+    """No steps are taken with it, so what gradient descent left or accumulated online would say nothing."""
+    config = replace(tiny_config(preset, iterations=4, count=40), model="plane")
+    state = fit(plane_dataset, config, tmp_path / "run")
+    assert state.flat
+    assert state.rung.startswith("plane (asked for")
+    assert state.final_environment is not None
+    assert state.visibility is not None
+    assert state.peak_memory_bytes > 1e7
+    seen = state.visibility > 0.5 * float(state.visibility.max())
+    assert 0.005 < float(seen.float().mean()) < 0.5
+    # 0.45 + 0.35 ω and a sun; random logits would be uniform in [0, 1].
+    assert 0.05 < float(state.final_environment.permute(0, 2, 3, 1)[seen].mean()) < 0.95
+    again = fit(plane_dataset, config, tmp_path / "run", Marks(iterations=frozenset({2})))
+    assert again.flat
