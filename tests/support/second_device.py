@@ -81,10 +81,11 @@ def _computed(function, arguments, options):
     plain = tree_map(lambda item: item.numbers if isinstance(item, SecondDeviceTensor) else item, (arguments, options))
     result = function(*plain[0], **plain[1])
     originals = {id(tensor.numbers): tensor for tensor in there}
+    return tree_map(lambda item: _wrapped(item, originals), result) if placed else result
 
-    def wrapped(item):
-        if not isinstance(item, torch.Tensor) or isinstance(item, SecondDeviceTensor):
-            return item
-        return originals.get(id(item)) if id(item) in originals else SecondDeviceTensor(item)
 
-    return tree_map(wrapped, result) if placed else result
+def _wrapped(item, originals):
+    """A plain tensor on the second device; one that was there before stays the same object."""
+    if not isinstance(item, torch.Tensor) or isinstance(item, SecondDeviceTensor):
+        return item
+    return originals[id(item)] if id(item) in originals else SecondDeviceTensor(item)
