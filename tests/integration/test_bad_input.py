@@ -200,7 +200,7 @@ def test_a_run_of_another_configuration(workplace: Path, sphere_dataset: Dataset
 BAD_VALUES = {
     "no surfels": "--config.surfels.count 0",
     "no texels": "--config.environment.resolution 0",
-    "no texels in the end": "--config.environment.solve-resolution 0",
+    "no texels in the end": "--config.environment.solve-resolution -1",
     "a hull of nothing": "--config.surfels.hull-resolution 1",
     "fewer than no iterations": "--config.iterations -1",
     "more than all votes": "--config.surfels.hull-votes 1.5",

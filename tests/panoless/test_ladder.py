@@ -73,9 +73,15 @@ def test_right_surfels_beat_the_plane_of_a_bent_mirror() -> None:
 
 
 def test_surfels_that_explain_as_much_do_not_beat_the_plane() -> None:
-    """Flat surfels on the plane say the same as the plane does, on a flat mirror and on a bent one."""
-    for bend in (0.0, 0.3):
-        assert choose_rung(framed(0.0, bend), CONFIG, as_started).model == "plane"
+    """Flat surfels on the plane say the same as the plane does."""
+    assert choose_rung(framed(0.0), CONFIG, as_started).model == "plane"
+
+
+def test_a_plane_that_explains_nothing_goes_even_if_the_trial_does_no_better() -> None:
+    """A bent mirror in a flat outline, and surfels that did not learn to bend: the plane is wrong all the same."""
+    rung = choose_rung(framed(0.0, 0.3), CONFIG, as_started)
+    assert rung.model == "surfels"
+    assert rung.plane is not None
 
 
 def test_surfels_that_cover_nothing_do_not_beat_the_plane() -> None:
