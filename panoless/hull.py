@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from panoless.views import TrainView, Views
+from panoless.views import TrainView, Views, pose_of
 from shinypartial.errors import InputError
 
 if TYPE_CHECKING:
@@ -179,14 +179,14 @@ def _seen_from(
     from scipy.ndimage import distance_transform_edt, map_coordinates
 
     camera, inside = view.camera, view.mask.cpu().numpy() >= 0.5
-    world_to_camera = camera.world_to_camera.cpu().numpy().astype(np.float64)
-    points = surface.vertices @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    rotation, center = pose_of(camera)
+    points = (surface.vertices - center) @ rotation.T
     column = points[:, 0] / points[:, 2] * camera.fx + camera.cx
     row = points[:, 1] / points[:, 2] * camera.fy + camera.cy
     # Pixel centers lie half a pixel from the edge between two pixels.
     distance = np.where(inside, distance_transform_edt(inside) - 0.5, 0.5 - distance_transform_edt(~inside))
     margin = map_coordinates(distance, [row - 0.5, column - 0.5], order=1, mode="nearest")
-    toward = _unit(view.position - surface.vertices)
+    toward = _unit(center - surface.vertices)
     return margin * points[:, 2] / camera.fx, np.arcsin(np.clip((toward * normals).sum(1), -1, 1))
 
 

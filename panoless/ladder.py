@@ -15,11 +15,11 @@ from panoless.config import FitConfig
 from panoless.cubemap import solve_environment
 from panoless.initialize import surfels_on_plane
 from panoless.observation import (
-    HELD_OUT_EVERY,
     TRIAL_RESOLUTION,
     Geometry,
     observed_rays,
     prediction_error,
+    split_held_out,
 )
 from panoless.plane import Plane, unobstructed
 from panoless.plane_fit import fit_plane
@@ -97,11 +97,10 @@ def without_mirrored_frame(views: Views, plane: Plane) -> Views:
 
 def _held_out_errors(views: Views, config: FitConfig, plane: Plane, trial: Trial) -> tuple[np.ndarray, np.ndarray]:
     """Errors of held-out views, one a view, for the plane and for surfels that started on it."""
-    held_out = views.train[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY]
-    if not held_out or len(views.train) <= len(held_out):
+    kept, held_out = split_held_out(views.train)
+    if not kept or not held_out:
         return np.zeros(1), np.zeros(1)
-    kept = tuple(view for i, view in enumerate(views.train) if i % HELD_OUT_EVERY != HELD_OUT_EVERY // 2)
-    solved, tested = replace(views, train=kept), replace(views, train=held_out)
+    solved, tested = replace(views, train=tuple(kept)), replace(views, train=tuple(held_out))
     start = surfels_on_plane(plane, config.surfels.count, config.seed)
     geometries: tuple[Geometry, Geometry] = (plane, trial(solved, config, start))
     errors = []

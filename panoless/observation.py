@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float
@@ -33,6 +34,7 @@ PRIOR_PIXELS, PRIOR_TRUST = 1.0, 0.2
 TRUST_POWER = 4
 
 Geometry = Surfels | Plane
+Each = TypeVar("Each")
 
 
 def observed_rays(
@@ -120,8 +122,7 @@ def finest_resolution(rays: Sequence[Rays], start: Float[Tensor, "6 3 L L"]) -> 
     Every fifth view is held out. Their error is the mean of ‖e‖²/(‖e‖² + s²), s = 0.1, weighted by trust: rays that see
     the object itself count alike for all resolutions.
     """
-    held_out = rays[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY]
-    solved = [batch for i, batch in enumerate(rays) if i % HELD_OUT_EVERY != HELD_OUT_EVERY // 2]
+    solved, held_out = split_held_out(rays)
     if not held_out or not solved:
         return RESOLUTIONS[0]
     best, error = RESOLUTIONS[0], math.inf
@@ -131,6 +132,12 @@ def finest_resolution(rays: Sequence[Rays], start: Float[Tensor, "6 3 L L"]) -> 
             break
         best, error = resolution, found
     return best
+
+
+def split_held_out(views: Sequence[Each]) -> tuple[list[Each], list[Each]]:
+    """Things that stand for the views: four fifths to solve from, and every fifth to predict."""
+    phase = HELD_OUT_EVERY // 2
+    return [view for i, view in enumerate(views) if i % HELD_OUT_EVERY != phase], list(views[phase::HELD_OUT_EVERY])
 
 
 def prediction_error(rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"], scale: float = 0.1) -> float:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from panoless.kernels.rasterize import RasterCamera
 from panoless.shading import SurfaceBuffers
+from panoless.views import pose_of
 from shinypartial.conventions import PIXEL_CENTER
 
 LEAST_ALPHA = 1e-6
@@ -39,12 +40,6 @@ class Plane:
     def points(self, coordinates: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P 3"]:
         """Plane coordinates to points in space."""
         return self.offset * self.normal + coordinates @ np.stack([self.tangent_u, self.tangent_v])
-
-
-def pose_of(camera: RasterCamera) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """Rotation from the normalized frame to the camera, and the camera's center in that frame, in float64."""
-    matrix = camera.world_to_camera.cpu().numpy().astype(np.float64)
-    return matrix[:3, :3], -matrix[:3, :3].T @ matrix[:3, 3]
 
 
 def plane_buffers(plane: Plane, camera: RasterCamera) -> SurfaceBuffers:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from panoless.plane import Plane, pose_of
-from panoless.views import Views
+from panoless.plane import Plane
+from panoless.views import Views, pose_of
 from shinypartial.conventions import PIXEL_CENTER
 
 CONTOUR_LEVEL = 0.5

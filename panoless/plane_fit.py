@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from panoless.plane import Plane, plane_buffers, pose_of
+from panoless.plane import Plane, plane_buffers
 from panoless.plane_contours import (
     CORNER_DEG,
     Contours,
@@ -22,7 +22,7 @@ from panoless.plane_contours import (
     robust_weights,
     view_contours,
 )
-from panoless.views import TrainView, Views
+from panoless.views import TrainView, Views, pose_of
 from shinypartial.conventions import PIXEL_CENTER
 from shinypartial.errors import InputError
 
@@ -136,7 +136,7 @@ def _too_few_views(found: int) -> InputError:
 
 def _starts(views: Views) -> list[Plane]:
     """The best few of many planes through the object that face as many cameras as a plane can."""
-    centers = np.stack([pose_of(view.camera)[1] for view in views.train])
+    centers = np.stack([view.position for view in views.train])
     centers /= np.linalg.norm(centers, axis=1, keepdims=True)
     index = np.arange(START_DIRECTIONS) + 0.5
     height, azimuth = 1 - 2 * index / START_DIRECTIONS, np.pi * (1 + 5**0.5) * index

@@ -54,8 +54,7 @@ class TrainView:
     @property
     def position(self) -> Float[np.ndarray, "3"]:
         """Camera center in the normalized frame."""
-        world_to_camera = self.camera.world_to_camera.cpu().numpy().astype(np.float64)
-        return -world_to_camera[:3, :3].T @ world_to_camera[:3, 3]
+        return pose_of(self.camera)[1]
 
 
 @dataclass(frozen=True)
@@ -118,6 +117,12 @@ def raster_camera(camera: Camera, normalization: Normalization, near: float) -> 
     return RasterCamera(
         world_to_camera, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, near, 500 * near
     )
+
+
+def pose_of(camera: RasterCamera) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+    """Rotation from the normalized frame to the camera, and the camera's center in that frame, in float64."""
+    matrix = camera.world_to_camera.cpu().numpy().astype(np.float64)
+    return matrix[:3, :3], -matrix[:3, :3].T @ matrix[:3, 3]
 
 
 def unit_rays_camera(camera: RasterCamera) -> Float[Tensor, "3 H W"]:

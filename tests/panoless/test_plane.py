@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from jaxtyping import Float
 from matplotlib.path import Path as PolygonPath
 
-from panoless.plane import Plane, plane_buffers, polygon_coverage, pose_of, unobstructed
+from panoless.plane import Plane, plane_buffers, polygon_coverage, unobstructed
 from panoless.plane_fit import MAX_VERTICES, PlaneFit, fit_plane
-from panoless.views import Views
+from panoless.views import Views, pose_of
 from shinypartial.errors import InputError
 from tests.support.mirror_plane import (
     L_SHAPE,

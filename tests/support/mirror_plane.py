@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 from matplotlib.path import Path as PolygonPath
 
 from panoless.kernels.rasterize import RasterCamera
-from panoless.plane import Plane, pose_of
-from panoless.views import Normalization, TrainView, Views, unit_rays_camera
+from panoless.plane import Plane
+from panoless.views import Normalization, TrainView, Views, pose_of, unit_rays_camera
 from shinypartial.camera import Camera, look_at
 from shinypartial.conventions import SOLID_ALPHA
 from shinypartial.dataset.read import open_dataset
