@@ -84,8 +84,8 @@ def mirror_objective(
 
     - photometric: the mean over solid pixels of w·√(‖e‖² + ε²), e = C − radiance. C = A + L·α (`once`) or (A + L)·α
       (`paper`), A the albedo (None for none) and L the environment, through its activation, in the direction
-      ω = v − 2 (v·n) n (Eq. 5) of the normalized blended normal n, v the unit ray through the pixel's center. The weight w = (1 + ‖e‖²/s²)⁻² is held constant in
-      the gradient.
+      ω = v − 2 (v·n) n (Eq. 5), v the unit ray through the pixel's center and n the normalized blended normal. The
+      weight w = (1 + ‖e‖²/s²)⁻² is held constant in the gradient.
     - consistency: the mean over pixels, weighted by the mask or everywhere, of 1 − n·n_surf (Eq. 12), where alpha is
       above ½ and the surface depth D = (1 − λ_d) accumulated/alpha + λ_d median (Eq. 3) has a normal.
     - silhouette: the mean binary cross-entropy of alpha and mask over all pixels (Eq. 13).
