@@ -143,7 +143,8 @@ def _announce_compilation() -> None:
             if not self.made:
                 self.made = True
                 clear = "\r\x1b[2K" if sys.stderr.isatty() else ""
-                print(f"{clear}Compiling kernels for this machine; later runs find them on disk …", file=sys.stderr)
+                note = "some 20 seconds in all if none is there yet; later runs find them on disk"
+                print(f"{clear}Compiling kernels for this machine: {note} …", file=sys.stderr)
 
         def on_end(self, event: object) -> None:
             pass
