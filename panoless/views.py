@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from panoless.kernels.rasterize import RasterCamera
+from panoless.light import USUAL, Light
 from shinypartial.camera import Camera
 from shinypartial.conventions import PIXEL_CENTER, SOLID_ALPHA
 from shinypartial.dataset.read import read_view
@@ -27,7 +28,10 @@ class Normalization:
 
 @dataclass(frozen=True)
 class TrainView:
-    """One cropped training view. Radiance is linear, premultiplied, clipped to [0, 1]; rays are unit, camera frame."""
+    """One cropped training view. Radiance is linear, premultiplied, clipped to [0, 1]; rays are unit, camera frame.
+
+    Under another `Light` than the usual one its encoding stands in place of radiance.
+    """
 
     camera: RasterCamera
     radiance: Float[Tensor, "3 H W"]
@@ -71,8 +75,8 @@ class Views:
         return replace(self, train=tuple(view.to(device) for view in self.train))
 
 
-def load_views(dataset: Dataset, crop_margin_px: int, downscale: int = 1) -> Views:
-    """Read the training split, averaged over blocks of `downscale` pixels a side.
+def load_views(dataset: Dataset, crop_margin_px: int, downscale: int = 1, light: Light = USUAL) -> Views:
+    """Read the training split, averaged over blocks of `downscale` pixels a side, in the encoding of a light.
 
     Raises InputError for unreadable images and for masks that are all empty.
     """
@@ -86,7 +90,8 @@ def load_views(dataset: Dataset, crop_margin_px: int, downscale: int = 1) -> Vie
                 found="an empty mask",
                 remedy="Correct the mask, or remove the frame from transforms_train.json.",
             )
-        radiance, alpha = (_block_means(np.clip(image, 0, 1), downscale) for image in (view.radiance, view.alpha))
+        radiance = light.encoded(_block_means(light.clipped(frame, view), downscale))
+        alpha = _block_means(np.clip(view.alpha, 0, 1), downscale)
         loaded.append((frame.camera.downscaled(downscale), radiance, alpha))
         progress.advance()
     normalization = estimate_normalization([(camera, alpha) for camera, _, alpha in loaded])
