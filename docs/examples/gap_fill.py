@@ -1,8 +1,8 @@
 """Compare fills of unobserved directions: hide from known environments what real training views do not observe.
 
-The rays of ground-truth normals of every EVERY-th training view of a dataset say which texels of a cubemap are known. Each
-environment, turned about the vertical by 0°, 90°, 180° and 270°, is known there and hidden elsewhere, filled in six
-ways, and compared where no ray fell: PSNR of linear light clipped to [0, 1], weighted by solid angle.
+The rays of ground-truth normals of every EVERY-th training view of a dataset say which texels of a cubemap are known.
+Each environment, turned about the vertical by 0°, 90°, 180° and 270°, is known there and hidden elsewhere, filled in
+six ways, and compared where no ray fell: PSNR of linear light clipped to [0, 1], weighted by solid angle.
 
 Usage: python docs/examples/gap_fill.py OUTPUT.json EVERY DATASET… ENVIRONMENT.exr…
 """
