@@ -23,6 +23,7 @@ from panoless.kernels.backend import gpu_kernels_installed
 from panoless.kernels.objective import mirror_objective
 from panoless.kernels.rasterize import Channels, RasterBuffers
 from panoless.ladder import choose_rung, without_mirrored_frame
+from panoless.light import light_of
 from panoless.losses import photometric_paper
 from panoless.observation import observed_rays, reflections, solved_environment
 from panoless.optimizer import SurfelOptimizer
@@ -77,6 +78,7 @@ class Fitter:
         self.schedule = Schedule(config)
         self._epoch, self._order = -1, list[int]()
         self._phases = dict[tuple[bool, float], Phase]()
+        self._brightest = max(1.0, *(float(view.radiance.max()) for view in views.train))
         self.optimizer = SurfelOptimizer(state.surfels, state.environment, config.rates)
         if state.optimizer:
             self.optimizer.load_state_dict(state.optimizer)
@@ -139,7 +141,7 @@ class Fitter:
             self.schedule.rate_factor(iteration),
             geometry=phase.geometry_moves,
             frozen=self._frozen,
-            environment_bounds=(0, 1) if self.config.environment.activation == "clamp" else UNBOUNDED,
+            environment_bounds=(0, self._brightest) if self.config.environment.activation == "clamp" else UNBOUNDED,
         )
         if observed is not None:
             accumulate(self.state.evidence, observed.directions, observed.alpha, self.config.visibility_alpha)
@@ -307,6 +309,7 @@ def complete(state: FitState, views: Views, config: FitConfig) -> None:
             state.visibility = visibility_from_evidence(state.evidence)
         else:
             state.visibility = visibility_from_agreement(agreement(rays, state.final_environment))
+        state.final_environment = light_of(config).decoded(state.final_environment)
 
 
 def new_state(views: Views, config: FitConfig, surfels: Surfels | None = None) -> FitState:
@@ -351,7 +354,7 @@ def fit(
                 require_snapshots(folder, marks)
             return state
         start = time.monotonic()
-        views = load_views(dataset, config.crop_margin_px, config.downscale).to(device)
+        views = load_views(dataset, config.crop_margin_px, config.downscale, light_of(config)).to(device)
         loaded = time.monotonic()
         if state is None:
             state = _first_state(views, config)

@@ -13,6 +13,7 @@ from torch import Tensor
 from panoless.kernels.objective import MirrorView
 from panoless.kernels.rasterize import RasterCamera, tiles_of
 from panoless.kernels.reference.objective import unit_rays
+from panoless.light import USUAL, Light
 from shinypartial.camera import Camera
 from shinypartial.conventions import SOLID_ALPHA
 from shinypartial.dataset.read import read_view
@@ -31,7 +32,7 @@ class Normalization:
 
 @dataclass(frozen=True)
 class Photograph:
-    """A picture around its object, in world coordinates. Radiance is linear, premultiplied, clipped to [0, 1]."""
+    """A picture around its object, in world coordinates. Radiance is as in `TrainView`."""
 
     camera: Camera
     radiance: Float[Tensor, "3 H W"]
@@ -40,7 +41,10 @@ class Photograph:
 
 @dataclass(frozen=True)
 class TrainView:
-    """One cropped training view. Radiance is linear, premultiplied, clipped to [0, 1]."""
+    """One cropped training view. Radiance is linear, premultiplied, clipped to [0, 1].
+
+    Under another `Light` than the usual one its encoding stands in place of radiance.
+    """
 
     camera: RasterCamera
     radiance: Float[Tensor, "3 H W"]
@@ -104,8 +108,8 @@ class Views:
         return replace(self, train=tuple(view.to(device) for view in self.train))
 
 
-def load_views(dataset: Dataset, crop_margin_px: int, downscale: int = 1) -> Views:
-    """Read the training split, averaged over blocks of `downscale` pixels a side.
+def load_views(dataset: Dataset, crop_margin_px: int, downscale: int = 1, light: Light = USUAL) -> Views:
+    """Read the training split, averaged over blocks of `downscale` pixels a side, in the encoding of a light.
 
     Raises InputError for unreadable images and for masks that are all empty.
     """
@@ -119,7 +123,8 @@ def load_views(dataset: Dataset, crop_margin_px: int, downscale: int = 1) -> Vie
                 found="an empty mask",
                 remedy="Correct the mask, or remove the frame from transforms_train.json.",
             )
-        radiance, alpha = (_block_means(np.clip(image, 0, 1), downscale) for image in (view.radiance, view.alpha))
+        radiance = light.encoded(_block_means(light.clipped(frame, view), downscale))
+        alpha = _block_means(np.clip(view.alpha, 0, 1), downscale)
         photographs.append(cropped(frame.camera.downscaled(downscale), radiance, alpha, crop_margin_px))
         progress.advance()
     return views_of(photographs)
