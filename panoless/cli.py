@@ -58,7 +58,7 @@ class Fit:
             state = fit(dataset, self.config, run_folder, marks, device)
             export_prediction(dataset, state, self.config, prediction)
         print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
-        if marks and not state.flat:
+        if marks and not state.stepless:
             print(f"Snapshots: panoless export {run_folder} --output {prediction} --snapshots")
 
 
