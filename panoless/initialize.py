@@ -91,7 +91,7 @@ def surfels_on_lathe(lathe: Lathe, count: int) -> Surfels:
     local = np.stack([radius[ring] * cos, radius[ring] * sin, height[ring]], 1)
     meridian = np.stack([along_radius * cos, along_radius * sin, along_axis], 1)
     azimuth = np.stack([-sin, cos, zero], 1)
-    frames = np.stack([azimuth, -meridian, np.cross(azimuth, -meridian)], 2)
+    frames = np.stack([azimuth, meridian, np.cross(azimuth, meridian)], 2)
     frames = np.einsum("ji,kjl->kil", lathe.frame, frames)
     # n = n₀ − S·(x − x₀): the normal turns with the profile, and by n_ρ/ρ around the axis.
     curvatures = np.stack([-along_axis / np.maximum(radius[ring], width / 2), zero, -bend[ring]], 1)

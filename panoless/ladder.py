@@ -60,9 +60,10 @@ class Rung:
 def choose_rung(views: Views, config: FitConfig, trial: Trial) -> Rung:
     """The rung of a scene.
 
-    A plane is refused when it misses the outlines, and so is a surface of revolution then. Else surfels that start on it are fitted to four fifths of the
-    views, and the plane stays unless they explain the others better: by 5 % of the mean ‖e‖²/(‖e‖² + s²) and by two
-    standard errors of the paired differences. A plane with an error above 0.3 goes anyway. `config.model` overrides.
+    A plane is refused when it misses the outlines, and after it a surface of revolution by the same measure. Else
+    surfels that start on the plane, or on the surface of revolution, are fitted to four fifths of the views, and it
+    stays unless they explain the others better: by 5 % of the mean ‖e‖²/(‖e‖² + s²) and by two standard errors of the
+    paired differences. A plane with an error above 0.3 goes anyway. `config.model` overrides.
     Raises InputError when a plane is asked for and can't be fitted.
     """
     if config.model == "surfels":

@@ -24,6 +24,7 @@ CREASE_RAD = math.radians(35.0)
 SUBPIXELS = 4
 BOUNCES = 6
 """What is mirrored more often is not followed."""
+BOX_AROUND = 64
 LEAVING = 1e-4
 """A mirrored ray starts this far from the surface, in scene units."""
 
@@ -51,8 +52,8 @@ class Lathe:
     """A mirror of revolution: x = o + ρ cos φ e₁ + ρ sin φ e₂ + h e₃ for all φ and all (ρ, h) on the profile.
 
     e₃ is the unit axis and o a point on it, in the normalized frame. The profile is a polyline of (ρ, h), ρ ≥ 0, that
-    begins on the axis at the bottom, goes up the outside to the vertex `rim` and down inside. It ends on the axis, or at
-    the rim when the wall has no thickness and mirrors on both faces. Normals (sin θ, −cos θ), θ the direction of the
+    begins on the axis at the bottom, goes up the outside to the vertex `rim` and down inside. It ends on the axis, or
+    at the rim when the wall has no thickness and mirrors on both faces. Normals (sin θ, −cos θ), θ the direction of the
     profile, are interpolated along it, except over edges of 35° and more.
     """
 
@@ -70,7 +71,7 @@ class Lathe:
         return np.stack([first, np.cross(self.axis, first), self.axis])
 
     @cached_property
-    def angles(self) -> Float[np.ndarray, "N-1 2"]:
+    def angles(self) -> Float[np.ndarray, "S 2"]:
         """Direction of the profile (rad) at both ends of every side."""
         steps = np.diff(self.profile, axis=0)
         own = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
@@ -148,7 +149,8 @@ def lathe_buffers(lathe: Lathe, camera: RasterCamera) -> SurfaceBuffers:
     neighbors disagree. Where only the center misses, depth and normal are those of a neighbor. The three depths agree.
     """
     shape, everything = (camera.height, camera.width), np.arange(camera.height * camera.width)
-    hits = lathe.hits(*pixel_rays(camera, everything))
+    hits = _hits_within(lathe, camera, everything)
+    rays = pixel_rays(camera, everything)[1]
     met = hits.met.reshape(shape)
     alpha = met.astype(np.float64)
     padded = np.pad(met, 1, mode="edge")
@@ -158,12 +160,12 @@ def lathe_buffers(lathe: Lathe, camera: RasterCamera) -> SurfaceBuffers:
     for i in range(SUBPIXELS):
         for j in range(SUBPIXELS):
             fine = lathe.hits(*pixel_rays(camera, mixed, ((i + 0.5) / SUBPIXELS, (j + 0.5) / SUBPIXELS)))
-            facing = _facing(fine.normals, pixel_rays(camera, mixed)[1])
+            facing = _facing(fine.normals, rays[mixed])
             share, normal = share + fine.met, normal + facing
             depth += np.where(fine.met, fine.distance, 0.0)
     alpha.ravel()[mixed] = share / SUBPIXELS**2
     z = np.where(hits.met, hits.distance, 0.0)
-    normals = _facing(hits.normals, pixel_rays(camera, everything)[1])
+    normals = _facing(hits.normals, rays)
     missed = ~hits.met[mixed] & (share > 0)
     z[mixed[missed]] = (depth / np.maximum(share, 1))[missed]
     normals[mixed[missed]] = (normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12))[missed]
@@ -185,6 +187,27 @@ def lathe_buffers(lathe: Lathe, camera: RasterCamera) -> SurfaceBuffers:
     )
 
 
+def _hits_within(lathe: Lathe, camera: RasterCamera, pixels: Int[np.ndarray, "P"]) -> Hits:
+    """Hits of the rays through pixels, traced only within the box of the projected rings."""
+    rotation, center = pose_of(camera)
+    corners = (lathe.rings(BOX_AROUND).reshape(-1, 3) - center) @ rotation.T
+    row, column = np.divmod(pixels, camera.width)
+    traced = np.ones(len(pixels), dtype=bool)
+    if corners[:, 2].min() > 0:
+        margin = 2 + (1 / np.cos(np.pi / BOX_AROUND) - 1) * max(camera.width, camera.height)
+        for place, axis, focal, middle in ((column, 0, camera.fx, camera.cx), (row, 1, camera.fy, camera.cy)):
+            seen = corners[:, axis] / corners[:, 2] * focal + middle
+            traced &= (place > seen.min() - margin) & (place < seen.max() + margin)
+    found = lathe.hits(*pixel_rays(camera, pixels[traced]))
+    count = len(pixels)
+    whole = Hits(
+        np.full(count, np.inf), np.full(count, -1), np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3))
+    )
+    for name, values in vars(whole).items():
+        values[traced] = getattr(found, name)
+    return whole
+
+
 _NEIGHBORS = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
 
 
@@ -194,7 +217,7 @@ def _facing(normals: Float[np.ndarray, "P 3"], rays: Float[np.ndarray, "P 3"]) -
 
 @dataclass(frozen=True)
 class Escapes:
-    """Where rays go that are mirrored until they meet nothing more. Directions are unit; zero where they never leave."""
+    """Where mirrored rays go when they meet nothing more. Directions are unit; zero where they never leave."""
 
     directions: Float[np.ndarray, "P 3"]
     bounces: Int[np.ndarray, "P"]

@@ -1,4 +1,4 @@
-"""A surface of revolution from photographs: outside from outlines, inside by hypotheses, all refined by what it mirrors."""
+"""A surface of revolution from photographs: outside by outlines, inside by search, then all by what it mirrors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +19,7 @@ from panoless.lathe_contours import (
     refine_outer,
     touches,
 )
+from panoless.lathe_inside import searched_inside
 from panoless.lathe_photometric import Round, observations, photometric_step, solved_map
 from panoless.lathe_profile import resampled
 from panoless.views import Views
@@ -91,7 +92,8 @@ def refine_lathe(views: Views, start: Lathe) -> Lathe:
         lathe, environment = _round(views, contours, lathe, each, None, pixel)
         progress.advance()
     assert environment is not None
-    lathe = best_inside(views, lathe, environment, insides(lathe, pixel))
+    candidates = [*insides(lathe, pixel), searched_inside(views, lathe, environment, pixel)]
+    lathe = best_inside(views, lathe, environment, candidates)
     for each in FINE_ROUNDS:
         lathe, environment = _round(views, contours, lathe, each, environment, pixel)
         progress.advance()
