@@ -94,7 +94,8 @@ def load_state(folder: Path) -> FitState | None:
         return None
     try:
         content = torch.load(path, weights_only=True, map_location="cpu")
-        for name, kind in (("plane", Plane), ("lathe", Lathe)):
+        kinds: dict[str, Any] = {"plane": Plane, "lathe": Lathe}
+        for name, kind in kinds.items():
             if content[name] is not None:
                 listed: dict[str, Any] = content[name]
                 content[name] = kind(**{k: np.array(v) if isinstance(v, list) else v for k, v in listed.items()})

@@ -275,6 +275,8 @@ def refine_outer(rays: ContourRays, start: Lathe) -> Lathe | None:
 
 def _refined(rays: ContourRays, start: Lathe, cell: float, scales_px: Sequence[float]) -> Lathe | None:
     lathe = outer_lathe(rays, start, cell)
-    for scale in scales_px if lathe is not None else ():
+    if lathe is None:
+        return None
+    for scale in scales_px:
         lathe = resampled(contour_step(rays, lathe, cell, scale, 2 * cell), cell)
     return lathe

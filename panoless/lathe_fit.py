@@ -28,6 +28,7 @@ from shinypartial.progress import Progress
 LARGEST_START_COST = 0.6
 """Mean of e²/(e² + s²), s = 2 px, over a coarse fit: above, no axis is near."""
 SCORED_VIEWS = 16
+LEAST_VIEWS = 6
 COARSE_ROUNDS = (Round(64, 0.3, 3.0), Round(128, 0.3, 2.0))
 FINE_ROUNDS = (
     Round(128, 0.2, 1.5),
@@ -58,7 +59,7 @@ class LatheFit:
 def fit_lathe(views: Views) -> LatheFit | None:
     """Axis and outer profile that explain the masks best; None when none comes near."""
     rays = contour_rays(views)
-    if not len(rays.view):
+    if len(np.unique(rays.view)) < LEAST_VIEWS:
         return None
     pixel = float(np.median(rays.pixel))
     start = fit_outer(rays, axis_starts(views))
