@@ -9,6 +9,7 @@ from torch import Tensor
 
 from panoless.config import SurfelConfig
 from panoless.hull import carve_hull, completed_surface, hull_surface
+from panoless.lathe import Lathe
 from panoless.plane import Plane
 from panoless.surfels import Surfels
 from panoless.views import Views
@@ -65,6 +66,38 @@ def surfels_on_plane(plane: Plane, count: int, seed: int) -> Surfels:
     frames = np.broadcast_to(frame, (len(points), 3, 3))
     scales = np.full((len(points), 2), OVERLAP * math.sqrt(area / count))
     return _surfels(points, frames, scales, np.zeros((len(points), 3)), INITIAL_OPACITY_LOGIT)
+
+
+def surfels_on_lathe(lathe: Lathe, count: int) -> Surfels:
+    """About `count` surfels in rings around a lathe, curved as it is: half as long along the profile as around."""
+    profile, ends = lathe.profile, lathe.angles
+    steps = np.diff(lathe.arc_lengths)
+    areas = math.pi * steps * (profile[:-1, 0] + profile[1:, 0])
+    # A ring of radius ρ and width w holds 2πρ/2w surfels.
+    width = math.sqrt(areas.sum() / count / 2)
+    rings = max(round(lathe.arc_lengths[-1] / width), 1)
+    place = (np.arange(rings) + 0.5) * lathe.arc_lengths[-1] / rings
+    side = np.clip(np.searchsorted(lathe.arc_lengths, place) - 1, 0, len(steps) - 1)
+    along = (place - lathe.arc_lengths[side]) / np.maximum(steps[side], 1e-12)
+    radius, height = (profile[side] + along[:, None] * (profile[side + 1] - profile[side])).T
+    angle = ends[side, 0] + along * (ends[side, 1] - ends[side, 0])
+    bend = (ends[side, 1] - ends[side, 0]) / np.maximum(steps[side], 1e-12)
+    around = np.maximum(np.round(math.pi * radius / width), 3).astype(np.int64)
+    ring = np.repeat(np.arange(rings), around)
+    first = np.cumsum(around) - around
+    turn = 2 * math.pi * (np.arange(len(ring)) - first[ring] + ring % 2 / 2) / around[ring]
+    cos, sin, zero = np.cos(turn), np.sin(turn), np.zeros(len(ring))
+    along_radius, along_axis = np.cos(angle[ring]), np.sin(angle[ring])
+    local = np.stack([radius[ring] * cos, radius[ring] * sin, height[ring]], 1)
+    meridian = np.stack([along_radius * cos, along_radius * sin, along_axis], 1)
+    azimuth = np.stack([-sin, cos, zero], 1)
+    frames = np.stack([azimuth, meridian, np.cross(azimuth, meridian)], 2)
+    frames = np.einsum("ji,kjl->kil", lathe.frame, frames)
+    # n = n₀ − S·(x − x₀): the normal turns with the profile, and by n_ρ/ρ around the axis.
+    curvatures = np.stack([-along_axis / np.maximum(radius[ring], width / 2), zero, -bend[ring]], 1)
+    spacing = np.stack([2 * math.pi * radius[ring] / around[ring], np.full(len(ring), width)], 1)
+    scales = OVERLAP * np.maximum(spacing, 1e-6)
+    return _surfels(lathe.origin + local @ lathe.frame, frames, scales, curvatures, INITIAL_OPACITY_LOGIT)
 
 
 def random_surfels(config: SurfelConfig, seed: int) -> Surfels:
