@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from panoless.carving import HULL_HALF_SIDE
 from panoless.config import SurfelConfig
-from panoless.hull import HULL_HALF_SIDE
 from panoless.initialize import initial_surfels, surfels_on_plane
 from panoless.kernels.reference.rasterize import rotation_matrices
 from panoless.surfels import Surfels
