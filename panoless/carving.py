@@ -28,8 +28,8 @@ COARSE_RESOLUTION = 48
 #: |h| of a voxel through whose refined cells the surface may pass: its half diagonal with something to spare.
 BAND_VOXELS = 1.5
 POINTS_AT_ONCE = 1 << 18
-#: Rays through outlines tell whether the views agree, by how far from the hull they pass, on average, each gap counting up
-#: to a limit. Leaving out views is worth it when it closes gaps by more than a quarter of a pixel.
+#: Rays through outlines tell whether the views agree, by how far from the hull they pass on average (up to a limit).
+#: Leaving out views is worth it when it closes gaps by more than a quarter of a pixel.
 TESTED_RAYS = 4000
 STEPS_ALONG_RAY = 128
 LARGEST_GAP_PX = 10.0
@@ -150,10 +150,10 @@ def largest_distances(
 def carve_hull(views: Views, resolution: int, votes: float) -> Hull:
     """Visual hull of as many views as agree, but at least the share `votes` of them, on about `resolution`³ points.
 
-    Where m views may be wrong, the hull function is the (m + 1)-th largest distance. Each m that is not needed makes the
-    hull larger than it is; m is the least with which rays through the outlines come as near to the hull as with the
-    greatest: a wrong view cuts the hull away from the rays of the others. Raises InputError when nothing stays, which
-    means masks and poses contradict each other.
+    Where m views may be wrong, the hull function is the (m + 1)-th largest distance, and the hull larger than that of
+    all views. A wrong view cuts the hull away from the rays of the others; m is the least with which rays through the
+    outlines come as near to the hull as with the greatest. Raises InputError when nothing stays, which means masks
+    and poses contradict each other.
     """
     outlines = [outline_of(view) for view in views.train]
     pixel = float(np.median([outline.pixel for outline in outlines]))

@@ -27,6 +27,8 @@ LEAST_TRUST = 0.01
 TRUST_FLOOR = 1e-7
 #: The thin plate smooths the trusted hull over this length.
 PLATE_LENGTH_PX = 5.0
+#: Of sharper images than this, a grid shows the shape no finer.
+MOST_PIXELS_A_VOXEL = 4.5
 #: Views compared for a contact: from directions and at heights over the tangent plane within about these angles.
 NEIGHBOR_VIEW_RAD = math.radians(12)
 NEIGHBOR_HEIGHT_RAD = math.radians(8)
@@ -106,10 +108,11 @@ def completed_surface(hull: Hull, views: Views) -> Surface:
     while it is solved again; what is left outside is moved onto the hull.
     """
     surface = hull_surface(hull)
-    trust = outline_contact(surface, views).trust(TOLERANCE_PX * hull.pixel) + TRUST_FLOOR
+    pixel = max(hull.pixel, hull.voxel / MOST_PIXELS_A_VOXEL)
+    trust = outline_contact(surface, views).trust(TOLERANCE_PX * pixel) + TRUST_FLOOR
     target, plate = surface.vertices, surface
     for _ in range(OBSTACLE_ROUNDS):
-        plate = thin_plate(surface, trust, PLATE_LENGTH_PX * hull.pixel, target)
+        plate = thin_plate(surface, trust, PLATE_LENGTH_PX * pixel, target)
         inside = _moved_inside(hull, plate.vertices)
         out = np.linalg.norm(inside - plate.vertices, axis=1) > OBSTACLE_PX * hull.pixel
         trust, target = np.where(out, np.maximum(trust, OBSTACLE_TRUST), trust), np.where(out[:, None], inside, target)
@@ -167,8 +170,9 @@ def thin_plate(
 ) -> Surface:
     """Vertices x that minimize Σ A t ‖x − x₀‖² + ℓ⁴ Σ A ‖Δx‖², the bending of a plate through the trusted ones.
 
-    x₀ are the targets, or else the given vertices, A vertex areas, t the trust, Δ the cotangent Laplacian of the mesh. Where t is 1, details shorter than
-    ℓ are smoothed; where it is 0, the plate continues its surroundings' position and slope.
+    x₀ are the targets, or else the given vertices; A are vertex areas, t the trust, Δ the cotangent Laplacian of the
+    given mesh. Where t is 1, details shorter than ℓ are smoothed; where it is 0, the plate continues its surroundings'
+    position and slope.
     """
     from scipy import sparse
     from scipy.sparse.linalg import splu

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.carving import Hull, carve_hull
@@ -15,7 +15,7 @@ from panoless.surfels import Surfels
 from panoless.views import Views
 
 OVERLAP = 0.8
-#: A surfel's disk may leave the first surface by so much at twice its radius.
+#: A surfel's disk may leave the first surface, or the hull, by so much at twice its radius.
 SAG_PX = 1.0
 LEAST_RADIUS_PX = 1.5
 SHRINKING_STEPS, SHRINKAGE = 6, 0.75
@@ -44,13 +44,13 @@ def hull_surfels(views: Views, config: SurfelConfig, seed: int) -> Surfels:
     radii, largest = _radii(areas, bends, config.count, hull.pixel)
     rng = np.random.default_rng(seed)
     expected = np.cumsum(areas / radii.prod(1))
-    # Stratified over the cumulative number: as even as possible without a relaxation.
+    # Stratified over the cumulative number, and more than are needed, so that they can be spread.
     candidates = CANDIDATES * config.count
     picks = np.searchsorted(expected, (np.arange(candidates) + rng.random(candidates)) * expected[-1] / candidates)
     faces = surface.triangles[np.minimum(picks, len(corners) - 1)]
     shares = rng.dirichlet([1.0, 1.0, 1.0], candidates)
     points = np.einsum("kv,kvi->ki", shares, surface.vertices[faces])
-    chosen = _spread(points, config.count, rng)
+    chosen = _spread(points, config.count)
     points, faces, shares = points[chosen], faces[chosen], shares[chosen]
     normals, tensors = (np.einsum("kv,kv...->k...", shares, values[faces]) for values in (vertex_normals, tensors))
     bends, frames = _principal(tensors, _tangent_frames(unit(normals)))
@@ -100,8 +100,8 @@ def _within_hull(
     return radii
 
 
-def _spread(points: Float[np.ndarray, "C 3"], count: int, rng: np.random.Generator) -> np.ndarray:
-    """Indices of `count` of the points, spread evenly among them: Lloyd's relaxation of a random choice."""
+def _spread(points: Float[np.ndarray, "C 3"], count: int) -> Int[np.ndarray, "K"]:
+    """Indices of `count` of the points, spread evenly among them: Lloyd's relaxation of a regular choice."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(points)
@@ -111,8 +111,7 @@ def _spread(points: Float[np.ndarray, "C 3"], count: int, rng: np.random.Generat
         total = np.bincount(owner, minlength=count)
         sums = np.stack([np.bincount(owner, column, minlength=count) for column in points.T], 1)
         centers = np.where(total[:, None] > 0, sums / np.maximum(total, 1)[:, None], centers)
-    chosen = tree.query(centers)[1]
-    return chosen
+    return tree.query(centers)[1]
 
 
 def _principal(

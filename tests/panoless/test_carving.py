@@ -1,4 +1,4 @@
-"""The hull is as exact as the outlines are, not as its voxels, and leaves out views only where they contradict each other."""
+"""The hull is as exact as outlines, not as its voxels, and leaves out views only where they contradict each other."""
 
 import math
 from dataclasses import replace
@@ -70,7 +70,7 @@ def distance_from_rims(points: np.ndarray, views: Views) -> np.ndarray:
     return RADIUS * np.abs((normals @ cameras.T - RADIUS) / np.linalg.norm(cameras, axis=1)).min(1)
 
 
-def test_where_outlines_touch_it_the_hull_of_a_sphere_is_the_sphere_to_a_tenth_of_a_voxel(all_around: Views) -> None:
+def test_where_touched_the_hull_of_a_sphere_is_the_sphere_to_a_tenth_of_a_voxel(all_around: Views) -> None:
     """A voxel is as large as three pixels here."""
     hull = carve_hull(all_around, RESOLUTION, votes=0.96)
     assert hull.pixel == pytest.approx(VOXEL / 3, rel=0.2)
