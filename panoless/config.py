@@ -21,13 +21,13 @@ class SurfelConfig:
     """`thin-plate`: on the visual hull where outlines touch the object, continued smoothly where none does;
     `hull`: on the visual hull of the masks; `random`: uniformly in the normalized cube, as the paper's code does."""
     count: int = 6000
-    """Number of surfels at the start."""
+    """Number of surfels at the start; denser where the first surface is strongly curved."""
     curved: bool = True
     """Give every surfel a linear normal field (three numbers of a shape operator) instead of one normal."""
     hull_resolution: int = 96
-    """Voxels along the longest side of the hull."""
+    """Voxels along a side of the cube in which the hull is carved; outlines count below the size of a voxel."""
     hull_votes: float = 0.96
-    """Share of the views whose mask must keep a voxel."""
+    """Least share of the views whose mask must keep a point of the hull; all views count unless they contradict."""
 
 
 @dataclass(frozen=True)
