@@ -22,6 +22,7 @@ LEAST_RADIUS_PX = 1.5
 SHRINKING_STEPS, SHRINKAGE = 6, 0.75
 CANDIDATES = 8
 RELAXATION_ROUNDS = 3
+TIE_TOLERANCE = 1e-6
 INITIAL_OPACITY_LOGIT = 2.2
 INITIAL_ROUGHNESS_LOGIT = -2.2
 RANDOM_OPACITY = 0.1
@@ -105,14 +106,16 @@ def _spread(points: Float[np.ndarray, "C 3"], count: int) -> Int[np.ndarray, "K"
     """Indices of `count` of the points, spread evenly among them: Lloyd's relaxation of a regular choice."""
     from scipy.spatial import cKDTree
 
-    tree = cKDTree(points)
     centers = points[:: max(len(points) // count, 1)][:count]
     for _ in range(RELAXATION_ROUNDS):
         _, owner = cKDTree(centers).query(points)
         total = np.bincount(owner, minlength=count)
         sums = np.stack([np.bincount(owner, column, minlength=count) for column in points.T], 1)
         centers = np.where(total[:, None] > 0, sums / np.maximum(total, 1)[:, None], centers)
-    return tree.query(centers)[1]
+    distances, nearest = cKDTree(points).query(centers, k=2)
+    # The middle of two points is as near to one as to the other: not rounding decides then, but their order.
+    tied = distances[:, 1] <= (1 + TIE_TOLERANCE) * distances[:, 0]
+    return np.where(tied, nearest.min(1), nearest[:, 0])
 
 
 def _principal(
