@@ -42,6 +42,7 @@ class Fit:
         from shinypartial.files import only_writer
         from shinypartial.prediction import claim_prediction
 
+        _announce_compilation()
         root = self.dataset
         if root is None:
             root = newest_dataset()
@@ -58,7 +59,9 @@ class Fit:
             state = fit(dataset, self.config, run_folder, marks, device)
             export_prediction(dataset, state, self.config, prediction)
         print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
-        if marks and not state.flat:
+        if marks and state.flat:
+            print("No snapshots: this run took a plane, which is fitted without steps.")
+        elif marks:
             print(f"Snapshots: panoless export {run_folder} --output {prediction} --snapshots")
 
 
@@ -82,6 +85,7 @@ class Export:
         from shinypartial.files import newest_folder, only_writer
         from shinypartial.prediction import claim_prediction
 
+        _announce_compilation()
         folder = self.run_folder or newest_folder(RUNS, DESCRIPTION, "a run", "Make one: `panoless fit`.")
         description = read_description(folder)
         state = load_state(folder)
@@ -92,6 +96,13 @@ class Export:
                 if state is None
                 else f"{state.iteration} of {description.config.iterations} iterations",
                 remedy="Run the same `panoless fit` command again: it continues where it stopped.",
+            )
+        if self.snapshots and state.flat:
+            raise InputError(
+                expected=f"a run of surfels in {folder}, for --snapshots",
+                found="a run that took a plane, which is fitted without steps: there are no moments in between",
+                remedy="Leave --snapshots out; or fit surfels: "
+                "`panoless fit --model surfels --snapshots 6 --output NEW`.",
             )
         prediction = self.output or Path("predictions") / folder.resolve().name
         _refuse_run_folder(prediction, folder)
@@ -119,9 +130,26 @@ def _refuse_run_folder(prediction: Path, run_folder: Path) -> None:
 def _prepare_threads() -> None:
     """Before torch loads: let idle OpenMP threads sleep, because spinning ones slow a busy machine tenfold."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    kernels = Path(__file__).parent / "kernels" / "cpu"
-    if not any(kernels.glob("__pycache__/*.nbi")):
-        print("First run on this machine: compiling kernels, about a minute …", file=sys.stderr)
+
+
+def _announce_compilation() -> None:
+    """Say once that kernels are compiled, when that begins; those that lie on disk load in a second."""
+    from numba.core import event
+
+    class Announcement(event.Listener):
+        made = False
+
+        def on_start(self, event: object) -> None:
+            if not self.made:
+                self.made = True
+                clear = "\r\x1b[2K" if sys.stderr.isatty() else ""
+                note = "some 20 seconds in all if none is there yet; later runs find them on disk"
+                print(f"{clear}Compiling kernels for this machine: {note} …", file=sys.stderr)
+
+        def on_end(self, event: object) -> None:
+            pass
+
+    event.register("numba:compile", Announcement())
 
 
 def _preset_of(arguments: list[str]) -> str:

@@ -38,6 +38,8 @@ class EnvironmentConfig:
     """Texels along a face side during the optimization."""
     activation: Literal["clamp", "sigmoid"] = "clamp"
     """`sigmoid`: Eq. 7 of the paper, started at random logits; `clamp`: radiance itself, kept in [0, 1]."""
+    range: Literal["ldr", "hdr"] = "ldr"
+    """`ldr`: views are clipped to [0, 1], as photographs are; `hdr`: radiance above 1 is fitted, too (needs EXR)."""
     warmup: float = 0.06
     """Share of the iterations in which only the environment learns, before the geometry moves."""
     solve: bool = True
@@ -132,6 +134,8 @@ class FitConfig:
     """`auto`: the simplest that explains held-out views; `plane`: three numbers and an outline; `surfels`: curved."""
     albedo: bool = False
     """Learn a diffuse term A (Eq. 8); a perfect mirror has none."""
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Known reflectance of the mirror in red, green and blue (linear): what it shows is tint · environment."""
     alpha_applied: Literal["once", "paper"] = "once"
     """`paper`: (A + L)·α as Eq. 10 is written, though A is blended already; `once`: A + L·α."""
     downscale: int = 1
@@ -223,6 +227,8 @@ def _rebuild(default: Any, content: Any) -> Any:
     for name in names:
         value = getattr(default, name)
         values[name] = _rebuild(value, content[name]) if is_dataclass(value) else content[name]
+        if isinstance(value, tuple):  # JSON knows lists only.
+            values[name] = tuple(content[name])
     return type(default)(**values)
 
 
@@ -244,8 +250,9 @@ _UNBOUNDED_NUMBERS = {"seed", "density.gradient_threshold", "density.dense_share
 
 def check_config(config: FitConfig) -> None:
     """Raise InputError for a number outside its range: counts from their smallest value, weights and rates from 0,
-    shares and opacities in [0, 1].
+    shares and opacities in [0, 1]; and for options that exclude each other.
     """
+    _check_light(config)
     for name, value in _numbers(config, ""):
         high = math.inf
         if name in _COUNTS:
@@ -266,6 +273,22 @@ def check_config(config: FitConfig) -> None:
                 found=str(value),
                 remedy="See `panoless fit --help` for what it means.",
             )
+
+
+def _check_light(config: FitConfig) -> None:
+    if not all(0 < value < math.inf for value in config.tint):
+        raise InputError(
+            expected="--config.tint to be three numbers above 0",
+            found=" ".join(map(str, config.tint)),
+            remedy="Give the linear reflectance in red, green and blue, such as 1.0 0.86 0.57.",
+        )
+    linear = config.albedo or config.loss.photometric == "paper" or config.environment.activation == "sigmoid"
+    if config.environment.range == "hdr" and linear:
+        raise InputError(
+            expected="a mirror without diffuse color, the masked photometric term and the activation `clamp` for hdr",
+            found=f"options of the preset {config.preset} that work in [0, 1]",
+            remedy="Use --preset fast, default or best, or leave --config.environment.range out.",
+        )
 
 
 def _numbers(config: Any, prefix: str) -> Iterator[tuple[str, float]]:

@@ -1,15 +1,19 @@
 """The environment as a cubemap: lookup with its activation, the closed-form robust map, and the fill of gaps."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from panoless.config import EnvironmentConfig
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap, scatter_cubemap
+from shinypartial.sphere import cube_to_directions, directions_to_cube
 
 INITIAL_LOGIT = 5.0
 ROBUST_SCALES = (None, 0.3, 0.15, 0.08, 0.05)
@@ -17,6 +21,9 @@ REFINING_SCALES = (0.08, 0.05)
 CONJUGATE_GRADIENT_STEPS = 6
 CONFIDENT_WEIGHT = 1.0
 MERGED_RAYS = 1_000_000
+#: A level of L texels a side is relaxed this often over L: the coarse ones, which carry far and cost little, most.
+RELAXED_TEXELS = 256
+DAMPING = 0.8
 
 
 @dataclass(frozen=True)
@@ -59,7 +66,8 @@ def solve_environment(
     Rounds of iteratively re-weighted least squares with the rays' trust t and Geman–McClure weights
     w = 1/(1 + ‖e‖²/s²)², so that pixels which see the object itself or a wrong normal lose their vote. Each round
     starts from the weighted splat Eᵀ(t w c)/Eᵀ(t w) and sharpens it by conjugate gradients on the normal equations.
-    From a `start`, a map of the same rays at any resolution, only the last scales are needed.
+    From a `start`, a map of the same rays at any resolution, only the last scales are needed. The map lies between 0
+    and the brightest ray, or 1 where that is more.
     """
     rays = _merged(rays)
     weights = [batch.initial_weight() for batch in rays]
@@ -76,7 +84,8 @@ def solve_environment(
         right_side = _right_side(rays, weights, environment)
         splat = fill_unobserved(right_side / total.clamp(min=1e-9), total[:, 0])
         environment = _sharpen(splat, right_side, total, rays, weights)
-    return environment.clamp(0, 1)
+    brightest = max([1.0, *(float(batch.radiance.max()) for batch in rays if batch.radiance.numel())])
+    return environment.clamp(0, brightest)
 
 
 def _merged(rays: Sequence[Rays]) -> list[Rays]:
@@ -150,9 +159,11 @@ def _sharpen(
 
 
 def fill_unobserved(values: Float[Tensor, "6 C L L"], weight: Float[Tensor, "6 L L"]) -> Float[Tensor, "6 C L L"]:
-    """Push–pull (Gortler et al. 1996): average what is known to coarser levels, interpolate it back into gaps.
+    """A harmonic fill of gaps: a texel of weight 0 is the mean of its four neighbors, as far as some sweeps reach.
 
-    A texel whose weight is at least one keeps its value; below that it is blended with the coarser level.
+    Solved from coarse to fine. What is known is averaged to coarser levels (the push of Gortler et al. 1996), and each
+    level starts from the coarser one and is relaxed. A texel whose weight w is at least one keeps its value, below that
+    it is w of itself and 1 − w of the mean of its neighbors, so nothing leaves the range of what is known.
     """
     confidence = weight.clamp(max=1)[:, None]
     pyramid = [(values * confidence, confidence)]
@@ -164,8 +175,40 @@ def fill_unobserved(values: Float[Tensor, "6 C L L"], weight: Float[Tensor, "6 L
     everywhere = color.sum(0, keepdim=True) / known.sum(0, keepdim=True).clamp(min=1e-9)
     filled = color + (1 - known) * everywhere
     for color, known in reversed(pyramid[:-1]):
-        filled = color + (1 - known) * resample(filled, color.shape[-1])
+        filled = _relaxed(color, known, resample(filled, color.shape[-1]))
     return filled
+
+
+def _relaxed(
+    color: Float[Tensor, "6 C L L"], known: Float[Tensor, "6 1 L L"], start: Float[Tensor, "6 C L L"]
+) -> Float[Tensor, "6 C L L"]:
+    """Damped Jacobi sweeps of u = color + (1 − known) · mean of the four neighbors, across edges too."""
+    resolution = color.shape[-1]
+    gaps = torch.nonzero(known.flatten() < 1)[:, 0]
+    if not len(gaps):
+        return color
+    around = _neighbors(resolution).to(gaps.device)[:, gaps]
+    free = (1 - known.flatten()[gaps])[:, None]
+    fixed = color.permute(0, 2, 3, 1).flatten(0, 2)[gaps]
+    texels = (color + (1 - known) * start).permute(0, 2, 3, 1).flatten(0, 2)
+    for _ in range(math.ceil(RELAXED_TEXELS / resolution)):
+        texels[gaps] = torch.lerp(texels[gaps], fixed + free * texels[around].mean(0), DAMPING)
+    return texels.view(6, resolution, resolution, -1).permute(0, 3, 1, 2).contiguous()
+
+
+@lru_cache(maxsize=16)
+def _neighbors(resolution: int) -> Int[Tensor, "4 P"]:
+    """Flat indices of the texels to either side of each along s and t; at a border, of the one straight across."""
+    centers = 2 * (np.arange(resolution) + 0.5) / resolution - 1
+    face, t, s = np.meshgrid(np.arange(6), centers, centers, indexing="ij")
+    beyond = 1 + 1e-6
+    found = []
+    for shift in np.array([[1, 0], [-1, 0], [0, 1], [0, -1]]) * 2 / resolution:
+        shifted = np.clip(np.stack([s, t], -1) + shift, -beyond, beyond)
+        other, st = directions_to_cube(cube_to_directions(face, shifted))
+        column, row = np.moveaxis(np.clip((st + 1) * resolution / 2, 0, resolution - 1).astype(int), -1, 0)
+        found.append(((other * resolution + row) * resolution + column).ravel())
+    return torch.from_numpy(np.stack(found))
 
 
 def resample(environment: Float[Tensor, "6 C L L"], resolution: int) -> Float[Tensor, "6 C M M"]:

@@ -20,6 +20,7 @@ from panoless.fit import clear_views, complete, normalization_of
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.rasterize import RasterCamera
 from panoless.kernels.reference.rasterize import rotation_matrices
+from panoless.light import light_of
 from panoless.plane import Plane, plane_buffers
 from panoless.shading import ALPHA_FLOOR, compose, reflection_directions_world, surface_buffers
 from panoless.snapshots import read_snapshot, snapshot_folders
@@ -77,7 +78,7 @@ def render(
     normalization: Normalization,
     config: FitConfig,
 ) -> Decomposition:
-    """Render one camera with the final environment (radiance, not logits)."""
+    """Render one camera with the final environment (radiance, not logits) in a mirror of the configured tint."""
     with torch.no_grad():
         if isinstance(geometry, Plane):
             buffers = plane_buffers(geometry, camera)
@@ -93,10 +94,11 @@ def render(
         specular.flatten(1)[:, pixels] = look_up(environment, directions, "clamp").T
         normals = torch.zeros_like(buffers.albedo)
         normals.flatten(1)[:, pixels] = rotation @ normalize(normals_camera, dim=0, eps=1e-8)
+        tint = specular.new_tensor(config.tint)[:, None, None]
         return Decomposition(
-            radiance=compose(buffers.albedo, specular, buffers.alpha, config.alpha_applied),
-            albedo=buffers.albedo,
-            specular=specular,
+            radiance=tint * compose(buffers.albedo, specular, buffers.alpha, config.alpha_applied),
+            albedo=tint * buffers.albedo,
+            specular=tint * specular,
             alpha=buffers.alpha,
             normals_world=normals,
             depth=buffers.surface_depth * normalization.radius * (buffers.alpha > ALPHA_FLOOR),
@@ -170,7 +172,9 @@ def export_snapshots(dataset: Dataset, run: Path, config: FitConfig, prediction:
         state, target = read_snapshot(source), prediction / SNAPSHOTS / source.name
         if _is_exported(target, state, config, dataset):
             continue
-        views = views or clear_views(load_views(dataset, config.crop_margin_px, config.downscale), state)
+        if views is None:
+            loaded = load_views(dataset, config.crop_margin_px, config.downscale, light_of(config))
+            views = clear_views(loaded, state)
         complete(state, views, config)
         claim_prediction(target)
         export_prediction(dataset, state, config, target, snapshot=True)

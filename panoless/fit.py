@@ -1,5 +1,6 @@
 """The fit: views in, surfels and environment out. It never sees a score."""
 
+import math
 import resource
 import sys
 import time
@@ -17,15 +18,17 @@ from panoless.config import FitConfig, check_config
 from panoless.cubemap import initial_environment, look_up, resample, solve_environment
 from panoless.densify import DensityStatistics, Edit, grow_and_prune, propagate_normals, reset_opacities
 from panoless.initialize import initial_surfels, surfels_on_plane
+from panoless.kernels.adam import UNBOUNDED
 from panoless.kernels.backend import gpu_kernels_installed
-from panoless.kernels.objective import MirrorView, ObjectiveTerms, mirror_objective
+from panoless.kernels.objective import mirror_objective
 from panoless.kernels.rasterize import Channels, RasterBuffers
 from panoless.ladder import choose_rung, without_mirrored_frame
+from panoless.light import light_of
 from panoless.losses import photometric_paper
 from panoless.observation import observed_rays, reflections, solved_environment
 from panoless.optimizer import SurfelOptimizer
-from panoless.schedule import Schedule
-from panoless.shading import ALPHA_FLOOR, compose, rasterize_surfels, tiles_of
+from panoless.schedule import Phase, Schedule, phase_of
+from panoless.shading import ALPHA_FLOOR, compose, rasterize_surfels
 from panoless.snapshots import Marks, SnapshotKeeper, require_snapshots
 from panoless.surfels import Surfels
 from panoless.views import Normalization, TrainView, Views, load_views
@@ -35,7 +38,6 @@ from panoless.visibility import (
     visibility_from_agreement,
     visibility_from_evidence,
 )
-from shinypartial.conventions import SOLID_ALPHA
 from shinypartial.dataset.schema import Dataset
 from shinypartial.errors import InputError
 from shinypartial.files import only_writer
@@ -75,6 +77,8 @@ class Fitter:
         self.views, self.config, self.folder, self.state, self.marks = views, config, folder, state, marks
         self.schedule = Schedule(config)
         self._epoch, self._order = -1, list[int]()
+        self._phases = dict[tuple[bool, float], Phase]()
+        self._brightest = max(1.0, *(float(view.radiance.max()) for view in views.train))
         self.optimizer = SurfelOptimizer(state.surfels, state.environment, config.rates)
         if state.optimizer:
             self.optimizer.load_state_dict(state.optimizer)
@@ -111,33 +115,34 @@ class Fitter:
         offsets = None
         if self.config.density.enabled:
             offsets = torch.zeros_like(surfels.means[:, :2], requires_grad=True)
+        phase = self._phase(iteration)
         # While only the environment learns, surfels need no gradient, unless density control counts it.
-        with torch.set_grad_enabled(self.schedule.geometry_moves(iteration) or offsets is not None):
+        with torch.set_grad_enabled(phase.geometry_moves or offsets is not None):
             raster = rasterize_surfels(
                 surfels,
                 view.camera,
                 curved=self.config.surfels.curved,
                 screen_offsets=offsets,
-                channels=self._channels(iteration),
+                channels=phase.channels,
                 active_tiles=self._active_tiles(view, iteration),
             )
         terms, observed = self._loss(view, raster, surfels, iteration)
         terms.total.backward()  # type: ignore[no-untyped-call]
-        if not torch.isfinite(terms.total):
+        total = float(terms.total.detach())
+        if not math.isfinite(total):
             raise InputError(
                 expected="a finite loss",
-                found=f"{float(terms.total.detach())} at iteration {iteration}",
+                found=f"{total} at iteration {iteration}",
                 remedy="Check the images for extreme values, or lower the rates (--config.rates.…).",
             )
         if offsets is not None and offsets.grad is not None:
             self.statistics.observe(offsets.grad, raster.in_frustum, view.camera.width)
         self.optimizer.step(
             self.schedule.rate_factor(iteration),
-            geometry=self.schedule.geometry_moves(iteration),
+            geometry=phase.geometry_moves,
             frozen=self._frozen,
+            environment_bounds=(0, self._brightest) if self.config.environment.activation == "clamp" else UNBOUNDED,
         )
-        if self.config.environment.activation == "clamp":
-            self.optimizer.environment.data.clamp_(0, 1)
         if observed is not None:
             accumulate(self.state.evidence, observed.directions, observed.alpha, self.config.visibility_alpha)
         self._control_density(iteration)
@@ -160,44 +165,23 @@ class Fitter:
             number = (number * 1_000_003 + part + 1) % (1 << 62)
         return torch.Generator().manual_seed(number)
 
-    def _terms(self, iteration: int) -> ObjectiveTerms:
-        """What acts in this iteration; geometric terms wait until the geometry moves."""
-        loss, moves = self.config.loss, self.schedule.geometry_moves(iteration)
-        masked = loss.photometric == "masked"
-        return ObjectiveTerms(
-            robust_scale=loss.robust_scale,
-            photometric=masked,
-            lambda_normal_consistency=loss.lambda_normal_consistency * moves,
-            consistency_everywhere=not masked,
-            lambda_silhouette=self.schedule.lambda_silhouette(iteration) * moves,
-            depth_blend=loss.depth_blend,
-            activation=self.config.environment.activation,
-            alpha_applied=self.config.alpha_applied,
-        )
-
-    def _channels(self, iteration: int) -> Channels:
-        """The images that some term of this iteration reads."""
-        moves = self.schedule.geometry_moves(iteration)
-        return Channels(
-            colors=self.config.albedo,
-            depth=self._terms(iteration).lambda_normal_consistency > 0,
-            distortion=self.config.loss.lambda_distortion > 0 and moves,
-        )
+    def _phase(self, iteration: int) -> Phase:
+        acts = self.schedule.geometry_moves(iteration), self.schedule.lambda_silhouette(iteration)
+        if acts not in self._phases:
+            self._phases[acts] = phase_of(self.config, *acts)
+        return self._phases[acts]
 
     def _active_tiles(self, view: TrainView, iteration: int) -> Tensor | None:
         """The tiles that some term of this iteration reads; None for all."""
-        terms = self._terms(iteration)
-        everywhere = not terms.photometric or terms.lambda_silhouette > 0 or self._channels(iteration).distortion
-        if everywhere:
+        phase = self._phase(iteration)
+        if phase.everywhere:
             return None
-        if terms.lambda_normal_consistency > 0:
-            return tiles_of(view.mask > 0, margin_px=1)
-        return tiles_of(view.mask > SOLID_ALPHA)
+        return view.mask_tiles if phase.channels.depth else view.solid_tiles
 
     def _loss(
         self, view: TrainView, raster: RasterBuffers, surfels: Surfels, iteration: int
     ) -> tuple[LossTerms, Observed | None]:
-        terms = self._terms(iteration)
+        phase = self._phase(iteration)
         objective = mirror_objective(
             raster.normals_camera,
             raster.alpha,
@@ -205,16 +189,16 @@ class Fitter:
             raster.median_depth,
             raster.colors if self.config.albedo else None,
             self.optimizer.environment,
-            _mirror_view(view),
-            terms,
+            view.mirror,
+            phase.terms,
         )
         total, photometric = objective.total, objective.photometric
         pixels = view.solid
-        if not terms.photometric:
+        if not phase.terms.photometric:
             pixels = torch.nonzero(raster.alpha.detach().flatten() > ALPHA_FLOOR)[:, 0]
             composited = self._composited(view, raster, surfels, pixels, iteration)
             total, photometric = total + composited, float(composited.detach())
-        if self._channels(iteration).distortion:
+        if phase.channels.distortion:
             total = total + self.config.loss.lambda_distortion * raster.distortion.mean()
         observed = None
         if self.config.visibility == "online":
@@ -311,13 +295,6 @@ def _timed(state: FitState, stage: str) -> Iterator[None]:
         state.seconds[stage] = before + time.monotonic() - start
 
 
-def _mirror_view(view: TrainView) -> MirrorView:
-    camera = view.camera
-    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
-    rotation = view.camera_to_world_rotation
-    return MirrorView(view.radiance, view.mask, view.rays_camera, rotation, *intrinsics, solid_alpha=SOLID_ALPHA)
-
-
 def complete(state: FitState, views: Views, config: FitConfig) -> None:
     """Solve the environment for the geometry of a state, and say how well each direction was observed."""
     with _timed(state, "solve environment"), torch.no_grad():
@@ -332,6 +309,7 @@ def complete(state: FitState, views: Views, config: FitConfig) -> None:
             state.visibility = visibility_from_evidence(state.evidence)
         else:
             state.visibility = visibility_from_agreement(agreement(rays, state.final_environment))
+        state.final_environment = light_of(config).decoded(state.final_environment)
 
 
 def new_state(views: Views, config: FitConfig, surfels: Surfels | None = None) -> FitState:
@@ -376,7 +354,7 @@ def fit(
                 require_snapshots(folder, marks)
             return state
         start = time.monotonic()
-        views = load_views(dataset, config.crop_margin_px, config.downscale).to(device)
+        views = load_views(dataset, config.crop_margin_px, config.downscale, light_of(config)).to(device)
         loaded = time.monotonic()
         if state is None:
             state = _first_state(views, config)

@@ -64,7 +64,7 @@ def choose_rung(views: Views, config: FitConfig, trial: Trial) -> Rung:
     if config.model == "surfels":
         return Rung("surfels", "asked for")
     try:
-        found = fit_plane(views)
+        found = fit_plane(views, thorough=config.model == "plane")
     except InputError:
         if config.model == "plane":
             raise

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from panoless.config import RateConfig
-from panoless.kernels.adam import AdamTensor, adam_step
+from panoless.kernels.adam import UNBOUNDED, AdamTensor, adam_step
 from panoless.surfels import Surfels
 
 BETAS = (0.9, 0.99)
@@ -28,59 +28,56 @@ class SurfelOptimizer:
             for name, value in named.items()
         ]
         self._adam = torch.optim.Adam(groups, betas=BETAS, eps=EPSILON)
+        self._index()
 
-    def _groups(self) -> dict[str, dict[str, Any]]:
-        return {group["name"]: group for group in self._adam.param_groups}
-
-    @property
-    def surfels(self) -> Surfels:
-        """The surfel parameters, leaves of the graph."""
-        return Surfels(**{name: group["params"][0] for name, group in self._groups().items() if name != ENVIRONMENT})
-
-    @property
-    def environment(self) -> Tensor:
+    def _index(self) -> None:
+        self._groups: dict[str, dict[str, Any]] = {group["name"]: group for group in self._adam.param_groups}
+        leaves = {name: group["params"][0] for name, group in self._groups.items()}
+        self.environment: Tensor = leaves.pop(ENVIRONMENT)
         """The environment parameters, a leaf of the graph."""
-        return self._groups()[ENVIRONMENT]["params"][0]
+        self.surfels = Surfels(**leaves)
+        """The surfel parameters, leaves of the graph."""
 
-    def step(self, factor: float, *, geometry: bool, frozen: frozenset[str]) -> None:
-        """One step with every rate times `factor`; without `geometry` only the environment moves."""
-        for name, group in self._groups().items():
-            group["lr"] = group["base"] * factor
-            if name in frozen or (name != ENVIRONMENT and not geometry):
-                group["params"][0].grad = None
-        self._move()
-        self._adam.zero_grad(set_to_none=True)
-
-    @torch.no_grad()
-    def _move(self) -> None:
-        """Adam on every parameter that has a gradient; torch's own optimizer holds rates and state."""
+    def step(
+        self,
+        factor: float,
+        *,
+        geometry: bool,
+        frozen: frozenset[str],
+        environment_bounds: tuple[float, float] = UNBOUNDED,
+    ) -> None:
+        """One step with every rate times `factor`; without `geometry` only the environment moves, in its bounds."""
         tensors = []
-        for group in self._adam.param_groups:
+        for name, group in self._groups.items():
+            group["lr"] = group["base"] * factor
             parameter = group["params"][0]
-            if parameter.grad is None:
+            gradient, parameter.grad = parameter.grad, None
+            if gradient is None or name in frozen or (name != ENVIRONMENT and not geometry):
                 continue
             state = self._adam.state[parameter]
             if not state:
                 state["step"] = torch.zeros(())
-                state.update({name: torch.zeros_like(parameter) for name in MOMENTS})
+                state.update({moment: torch.zeros_like(parameter) for moment in MOMENTS})
             state["step"] += 1
-            mean, square = (state[name] for name in MOMENTS)
-            tensors.append(AdamTensor(parameter, parameter.grad, mean, square, group["lr"], int(state["step"])))
+            numbers = parameter.detach(), gradient, *(state[moment] for moment in MOMENTS)
+            bounds = environment_bounds if name == ENVIRONMENT else UNBOUNDED
+            tensors.append(AdamTensor(*numbers, group["lr"], int(state["step"]), bounds))
         adam_step(tensors, BETAS, EPSILON)
 
     def edit_surfels(self, surfels: Surfels, source: Tensor, keep_moments: Tensor) -> None:
         """Take `surfels`; row i inherits the moments of old row `source[i]` where `keep_moments[i]`, else zeros."""
         for name, value in surfels.named().items():
-            state = self._adam.state.get(self._groups()[name]["params"][0], {})
+            state = self._adam.state.get(self._groups[name]["params"][0], {})
             moments = {
                 key: state[key][source] * keep_moments.view(-1, *[1] * (value.dim() - 1)).to(value.dtype)
                 for key in MOMENTS
                 if key in state
             }
             self._replace(name, value, {"step": state["step"], **moments} if moments else None)
+        self._index()
 
     def _replace(self, name: str, value: Tensor, state: dict[str, Tensor] | None) -> None:
-        group = self._groups()[name]
+        group = self._groups[name]
         self._adam.state.pop(group["params"][0], None)
         leaf = value.detach().clone().requires_grad_()
         group["params"] = [leaf]
@@ -94,3 +91,4 @@ class SurfelOptimizer:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` gave."""
         self._adam.load_state_dict(state)
+        self._index()

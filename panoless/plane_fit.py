@@ -6,6 +6,7 @@ height of a frame that hides part of the mirror are found together, by robust Ga
 of each view's contour from the outline that it should see.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -46,6 +47,7 @@ CHAMFER_PX = 6.0
 """Shorter sides that cut a corner of longer ones are what a vote makes of it."""
 SIMPLE_PX = 0.25
 """A vertex goes if the outline without it is nowhere further away than this."""
+HOPELESS_PX = 2.0
 FINAL_SCALE_PX = 0.5
 SIMPLIFICATIONS = 2
 FINAL_STEPS = 3
@@ -92,8 +94,11 @@ FIRST_ROUND = _Round(96, 0.5, 1.0, (16.0, 8.0, 8.0))
 LATER_ROUNDS = (_Round(128, 0.5, 1.0, (4.0, 4.0, 2.0, 2.0)), _Round(256, 0.4, 0.7, (1.0, 1.0, 0.5, 0.5, 0.5)))
 
 
-def fit_plane(views: Views) -> PlaneFit:
+def fit_plane(views: Views, *, thorough: bool = True) -> PlaneFit:
     """The plane and outline that explain the masks best, from several starts; never a failure because none is good.
+
+    Unless `thorough`, a plane that the first round leaves hopelessly far from the contours is returned as it is then,
+    with no idea of its normal's error.
 
     Raises InputError when masks have an outline in fewer than three views taken from distinct places.
     """
@@ -102,6 +107,8 @@ def fit_plane(views: Views) -> PlaneFit:
     sparse = contours.every(max(1, len(contours.view) // MAX_POINTS))
     starts = [_refine(views, sparse, start, FIRST_ROUND) for start in _starts(views)]
     plane = min(starts, key=lambda start: _cost(sparse, start))
+    if not thorough and _hopeless(sparse, plane):
+        return _score(views, contours, plane, math.inf)
     for each in LATER_ROUNDS:
         plane = _refine(views, sparse, plane, each)
     for _ in range(SIMPLIFICATIONS):
@@ -240,6 +247,19 @@ def _cost(contours: Contours, plane: Plane) -> float:
     distances = outline_distances(contours, plane)
     squared = (distances.pixels / FIRST_ROUND.scales_px[-1]) ** 2
     return float(np.where(distances.valid, squared / (1 + squared), 1.0).mean())
+
+
+def _hopeless(contours: Contours, plane: Plane) -> bool:
+    """Whether half of the contour points are more than a cell of the first round's grid, and 2 px, from the outline.
+
+    That outline follows the vote to a cell before it is moved. Planes were within a tenth of a cell, a vase and a can
+    two to four cells away.
+    """
+    distances = outline_distances(contours, plane)
+    size = np.where(distances.valid, np.abs(distances.pixels), np.inf)
+    pixels_per_unit = float(np.median(np.linalg.norm(distances.outward, axis=1)))
+    cell = float(np.ptp(plane.outline, axis=0).max()) * pixels_per_unit / FIRST_ROUND.grid
+    return float(np.median(size)) > max(cell, HOPELESS_PX)
 
 
 def _step(contours: Contours, plane: Plane, scale_px: float, rim: bool = True) -> Plane:

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 
 from panoless.config import FitConfig
+from panoless.kernels.objective import ObjectiveTerms
+from panoless.kernels.rasterize import Channels
 
 RECOVERY_STEPS = 100
 
@@ -62,3 +64,36 @@ class Schedule:
         """Whether normals are propagated after this iteration; an opacity reset has precedence."""
         due = self._density_active(iteration) and self._due(iteration, self.config.density.propagate_every)
         return due and not self.opacity_reset(iteration)
+
+
+@dataclass(frozen=True)
+class Phase:
+    """What acts in a run of iterations: the terms of the objective, and what of the images they read."""
+
+    geometry_moves: bool
+    terms: ObjectiveTerms
+    channels: Channels
+    everywhere: bool
+    """Whether some term reads pixels that are not the object's."""
+
+
+def phase_of(config: FitConfig, geometry_moves: bool, lambda_silhouette: float) -> Phase:
+    """The phase of given answers of a `Schedule`; geometric terms wait until the geometry moves."""
+    loss, masked = config.loss, config.loss.photometric == "masked"
+    terms = ObjectiveTerms(
+        robust_scale=loss.robust_scale,
+        photometric=masked,
+        lambda_normal_consistency=loss.lambda_normal_consistency * geometry_moves,
+        consistency_everywhere=not masked,
+        lambda_silhouette=lambda_silhouette * geometry_moves,
+        depth_blend=loss.depth_blend,
+        activation=config.environment.activation,
+        alpha_applied=config.alpha_applied,
+    )
+    channels = Channels(
+        colors=config.albedo,
+        depth=terms.lambda_normal_consistency > 0,
+        distortion=loss.lambda_distortion > 0 and geometry_moves,
+    )
+    everywhere = not masked or terms.lambda_silhouette > 0 or channels.distortion
+    return Phase(geometry_moves, terms, channels, everywhere)

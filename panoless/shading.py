@@ -4,10 +4,9 @@ from dataclasses import dataclass
 
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
-from panoless.kernels.constants import ALPHA_FLOOR, TILE
-from panoless.kernels.rasterize import ALL_CHANNELS, Channels, RasterBuffers, RasterCamera, rasterize
+from panoless.kernels.constants import ALPHA_FLOOR
+from panoless.kernels.rasterize import ALL_CHANNELS, Channels, RasterBuffers, RasterCamera, rasterize, tiles_of
 from panoless.kernels.reference.objective import compose, reflection_directions_world, surface_depth
 from panoless.surfels import Surfels
 
@@ -63,14 +62,6 @@ def rasterize_surfels(
         channels=channels,
         active_tiles=active_tiles,
     )
-
-
-def tiles_of(pixels: Bool[Tensor, "H W"], margin_px: int = 0) -> Bool[Tensor, "tile_rows tile_columns"]:
-    """The tiles of the rasterizer that hold one of the pixels, or come within a margin of it."""
-    chosen = pixels[None].float()
-    if margin_px:
-        chosen = max_pool2d(chosen, 2 * margin_px + 1, stride=1, padding=margin_px)
-    return max_pool2d(chosen, TILE, ceil_mode=True)[0] > 0
 
 
 def surface_buffers(

@@ -1,16 +1,21 @@
 """Dataset folder → training views: cropped tensors with cameras in a normalized frame."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.objective import MirrorView
+from panoless.kernels.rasterize import RasterCamera, tiles_of
+from panoless.kernels.reference.objective import unit_rays
+from panoless.light import USUAL, Light
 from shinypartial.camera import Camera
-from shinypartial.conventions import PIXEL_CENTER, SOLID_ALPHA
+from shinypartial.conventions import SOLID_ALPHA
 from shinypartial.dataset.read import read_view
 from shinypartial.dataset.schema import Dataset
 from shinypartial.errors import InputError
@@ -26,14 +31,25 @@ class Normalization:
 
 
 @dataclass(frozen=True)
+class Photograph:
+    """A picture around its object, in world coordinates. Radiance is as in `TrainView`."""
+
+    camera: Camera
+    radiance: Float[Tensor, "3 H W"]
+    mask: Float[Tensor, "H W"]
+
+
+@dataclass(frozen=True)
 class TrainView:
-    """One cropped training view. Radiance is linear, premultiplied, clipped to [0, 1]; rays are unit, camera frame."""
+    """One cropped training view. Radiance is linear, premultiplied, clipped to [0, 1].
+
+    Under another `Light` than the usual one its encoding stands in place of radiance.
+    """
 
     camera: RasterCamera
     radiance: Float[Tensor, "3 H W"]
     mask: Float[Tensor, "H W"]
-    rays_camera: Float[Tensor, "3 H W"]
-    solid: Float[Tensor, "P"] | Tensor
+    solid: Int[Tensor, "P"]
     """Flat indices of the pixels that lie wholly on the object."""
 
     def to(self, device: torch.device) -> "TrainView":
@@ -42,9 +58,30 @@ class TrainView:
             camera=replace(self.camera, world_to_camera=self.camera.world_to_camera.to(device)),
             radiance=self.radiance.to(device),
             mask=self.mask.to(device),
-            rays_camera=self.rays_camera.to(device),
             solid=self.solid.to(device),
         )
+
+    @property
+    def rays_camera(self) -> Float[Tensor, "3 H W"]:
+        """Unit ray directions in the camera frame through pixel centers, made anew: a view is 16 bytes a pixel."""
+        return unit_rays_camera(self.camera).to(self.mask.device)
+
+    @cached_property
+    def mirror(self) -> MirrorView:
+        """What the objective compares with."""
+        camera, rotation = self.camera, self.camera_to_world_rotation.contiguous()
+        intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+        return MirrorView(self.radiance, self.mask, rotation, *intrinsics, solid_alpha=SOLID_ALPHA)
+
+    @cached_property
+    def solid_tiles(self) -> Bool[Tensor, "tile_rows tile_columns"]:
+        """Tiles of the rasterizer with a pixel that lies wholly on the object."""
+        return tiles_of(self.mask > SOLID_ALPHA)
+
+    @cached_property
+    def mask_tiles(self) -> Bool[Tensor, "tile_rows tile_columns"]:
+        """Tiles of the rasterizer within a pixel of the mask."""
+        return tiles_of(self.mask > 0, margin_px=1)
 
     @property
     def camera_to_world_rotation(self) -> Float[Tensor, "3 3"]:
@@ -71,13 +108,13 @@ class Views:
         return replace(self, train=tuple(view.to(device) for view in self.train))
 
 
-def load_views(dataset: Dataset, crop_margin_px: int, downscale: int = 1) -> Views:
-    """Read the training split, averaged over blocks of `downscale` pixels a side.
+def load_views(dataset: Dataset, crop_margin_px: int, downscale: int = 1, light: Light = USUAL) -> Views:
+    """Read the training split, averaged over blocks of `downscale` pixels a side, in the encoding of a light.
 
     Raises InputError for unreadable images and for masks that are all empty.
     """
     progress = Progress("reading views", len(dataset.train))
-    loaded: list[tuple[Camera, np.ndarray, np.ndarray]] = []
+    photographs = []
     for frame in dataset.train:
         view = read_view(frame)
         if not (view.alpha >= 0.5).any():
@@ -86,18 +123,30 @@ def load_views(dataset: Dataset, crop_margin_px: int, downscale: int = 1) -> Vie
                 found="an empty mask",
                 remedy="Correct the mask, or remove the frame from transforms_train.json.",
             )
-        radiance, alpha = (_block_means(np.clip(image, 0, 1), downscale) for image in (view.radiance, view.alpha))
-        loaded.append((frame.camera.downscaled(downscale), radiance, alpha))
+        radiance = light.encoded(_block_means(light.clipped(frame, view), downscale))
+        alpha = _block_means(np.clip(view.alpha, 0, 1), downscale)
+        photographs.append(cropped(frame.camera.downscaled(downscale), radiance, alpha, crop_margin_px))
         progress.advance()
-    normalization = estimate_normalization([(camera, alpha) for camera, _, alpha in loaded])
-    distances = [
-        np.linalg.norm(camera.position_world - normalization.center) / normalization.radius for camera, _, _ in loaded
-    ]
-    near = 0.1 * float(min(distances))
-    views = tuple(
-        _make_view(camera, radiance, alpha, normalization, near, crop_margin_px) for camera, radiance, alpha in loaded
+    return views_of(photographs)
+
+
+def views_of(photographs: Sequence[Photograph]) -> Views:
+    """The same pictures in the normalized frame that their masks determine."""
+    normalization = estimate_normalization([(each.camera, each.mask.numpy()) for each in photographs])
+    near = 0.1 * min(
+        float(np.linalg.norm(each.camera.position_world - normalization.center)) / normalization.radius
+        for each in photographs
     )
-    return Views(views, normalization, near)
+    train = tuple(
+        TrainView(
+            camera=raster_camera(each.camera, normalization, near),
+            radiance=each.radiance,
+            mask=each.mask,
+            solid=torch.nonzero(each.mask.flatten() > SOLID_ALPHA)[:, 0],
+        )
+        for each in photographs
+    )
+    return Views(train, normalization, near)
 
 
 def _block_means(image: Float[np.ndarray, "H W *C"], side: int) -> Float[np.ndarray, "h w *C"]:
@@ -127,45 +176,25 @@ def pose_of(camera: RasterCamera) -> tuple[Float[np.ndarray, "3 3"], Float[np.nd
 
 def unit_rays_camera(camera: RasterCamera) -> Float[Tensor, "3 H W"]:
     """Unit ray directions in the camera frame through pixel centers."""
-    x = (torch.arange(camera.width) + PIXEL_CENTER - camera.cx) / camera.fx
-    y = (torch.arange(camera.height) + PIXEL_CENTER - camera.cy) / camera.fy
-    grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
-    rays = torch.stack([grid_x, grid_y, torch.ones_like(grid_x)])
-    return torch.nn.functional.normalize(rays, dim=0)
+    size, focal, center = (camera.height, camera.width), (camera.fx, camera.fy), (camera.cx, camera.cy)
+    return unit_rays(size, focal, center)
 
 
-def _make_view(
-    camera: Camera,
-    radiance: Float[np.ndarray, "H W 3"],
-    alpha: Float[np.ndarray, "H W"],
-    normalization: Normalization,
-    near: float,
-    crop_margin_px: int,
-) -> TrainView:
-    if crop_margin_px >= 0:
-        rows, columns = np.nonzero(alpha > 0)
-        top, left = max(rows.min() - crop_margin_px, 0), max(columns.min() - crop_margin_px, 0)
-        bottom = min(rows.max() + 1 + crop_margin_px, camera.height)
-        right = min(columns.max() + 1 + crop_margin_px, camera.width)
+def cropped(
+    camera: Camera, radiance: Float[np.ndarray, "H W 3"], alpha: Float[np.ndarray, "H W"], margin_px: int
+) -> Photograph:
+    """The picture around its object, which a negative margin leaves whole."""
+    if margin_px >= 0:
+        rows, columns = np.nonzero(alpha.any(1))[0], np.nonzero(alpha.any(0))[0]
+        top, left = (max(int(places[0]) - margin_px, 0) for places in (rows, columns))
+        bottom = min(int(rows[-1]) + 1 + margin_px, camera.height)
+        right = min(int(columns[-1]) + 1 + margin_px, camera.width)
         radiance, alpha = radiance[top:bottom, left:right], alpha[top:bottom, left:right]
-        camera = Camera(
-            camera.camera_to_world,
-            camera.fx,
-            camera.fy,
-            camera.cx - left,
-            camera.cy - top,
-            int(right - left),
-            int(bottom - top),
-        )
-    raster = raster_camera(camera, normalization, near)
-    mask = torch.from_numpy(np.ascontiguousarray(alpha, dtype=np.float32))
-    return TrainView(
-        camera=raster,
-        radiance=torch.from_numpy(np.ascontiguousarray(radiance.transpose(2, 0, 1), dtype=np.float32)),
-        mask=mask,
-        rays_camera=unit_rays_camera(raster),
-        solid=torch.nonzero(mask.flatten() > SOLID_ALPHA)[:, 0],
-    )
+        center = camera.cx - left, camera.cy - top
+        camera = Camera(camera.camera_to_world, camera.fx, camera.fy, *center, right - left, bottom - top)
+    # Copies, so that nothing keeps the whole picture.
+    planes, mask = (np.array(image, np.float32, order="C") for image in (radiance.transpose(2, 0, 1), alpha))
+    return Photograph(camera, torch.from_numpy(planes), torch.from_numpy(mask))
 
 
 def estimate_normalization(masks: list[tuple[Camera, Float[np.ndarray, "H W"]]]) -> Normalization:

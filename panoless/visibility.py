@@ -69,7 +69,7 @@ def agreement(rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"]) -> Ag
 
 
 def _srgb(radiance: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-    return torch.from_numpy(linear_to_srgb(radiance.clamp(0, 1).cpu().numpy())).to(radiance.device)
+    return torch.from_numpy(linear_to_srgb(radiance.clamp(min=0).cpu().numpy())).to(radiance.device)
 
 
 def visibility_from_agreement(found: Agreement) -> Float[Tensor, "6 L L"]:

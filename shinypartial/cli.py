@@ -234,6 +234,31 @@ class Oracle:
 
 
 @dataclass(frozen=True)
+class Postprocess:
+    """Blur the environment where a prediction says it was hardly seen; writes another prediction folder."""
+
+    prediction: tyro.conf.Positional[Path | None] = None
+    """Prediction folder of any method, with environment.exr and visibility.exr; the newest one when not given."""
+    output: Path | None = None
+    """Folder to write; PREDICTION-blurred beside it when not given."""
+    blur_deg: float = 2.0
+    """Standard deviation of the blur, in degrees on the sphere."""
+    feather_deg: float = 2.0
+    """Standard deviation of the transition from what was seen to what is blurred."""
+
+    def run(self) -> None:
+        """Blur and say how much of the sphere it concerned."""
+        from shinypartial.postprocess import BlurOptions, postprocess
+        from shinypartial.prediction import newest_prediction
+
+        prediction = self.prediction or _chosen("prediction", newest_prediction())
+        output = self.output or prediction.resolve().with_name(f"{prediction.resolve().name}-blurred")
+        made = postprocess(prediction, output, BlurOptions(self.blur_deg, self.feather_deg))
+        print(f"{made.share:.1%} of the sphere has a visibility below {made.threshold:.3f} (Otsu) and was blurred")
+        print(f"Prediction written to {output}\nNext: shinypartial evaluate {output}")
+
+
+@dataclass(frozen=True)
 class Compare:
     """Compare two groups of scored predictions: mean, spread, and paired differences with bootstrap intervals."""
 
@@ -386,7 +411,20 @@ def _chosen(what: str, folder: Path) -> Path:
     return folder
 
 
-Command = Generate | Subset | Validate | Evaluate | Oracle | Compare | Weights | Report | Release | Leaderboard | Chart
+Command = (
+    Generate
+    | Subset
+    | Validate
+    | Evaluate
+    | Oracle
+    | Postprocess
+    | Compare
+    | Weights
+    | Report
+    | Release
+    | Leaderboard
+    | Chart
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,9 +1,11 @@
 """Files appear whole or not at all: temporary names, renames, one writer a folder, checksums, the newest of a kind."""
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -31,6 +33,28 @@ def whole_file(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def place_file(old: Path, new: Path, link: bool) -> None:
+    """Copy or hard-link a file, whole or not at all; InputError where the file system can't link."""
+    if not link:
+        with whole_file(new) as temporary:
+            shutil.copyfile(old, temporary)
+        return
+    new.parent.mkdir(parents=True, exist_ok=True)
+    temporary = new.with_name(f"{PARTIAL_PREFIX}{new.name}")
+    temporary.unlink(missing_ok=True)
+    try:
+        os.link(old, temporary)
+    except OSError as error:
+        if error.errno not in (errno.EXDEV, errno.EPERM, errno.ENOTSUP, errno.EMLINK):
+            raise
+        raise InputError(
+            expected=f"a file system that can link {old} into {new.parent}",
+            found=error.strerror or "a failed link",
+            remedy="Leave out --link, so that files are copied.",
+        ) from None
+    temporary.replace(new)
 
 
 def remove_partial_files(root: Path) -> None:

@@ -1,4 +1,4 @@
-"""Directions ⇄ lat-long ⇄ cubemap, their solid angles, and bilinear lookups (numpy).
+"""Directions ⇄ lat-long ⇄ cubemap, their solid angles, bilinear lookups, and a blur of the sphere (numpy).
 
 Lat-long: u = ½ − atan2(y, x)/2π grows to the right, v = acos(z)/π grows downward (Cycles, kernel/camera/projection.h);
 texel centers lie at (i + ½)/N. Cubemap: texel centers at 2(i + ½)/L − 1 on faces oriented as OpenGL 4.6 table 8.19.
@@ -8,6 +8,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from shinypartial.conventions import FACE_AXES
+
+#: A blur ends at this many standard deviations, where its kernel has fallen to 4e-6.
+BLUR_REACH = 5.0
 
 
 def latlong_to_directions(uv: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "... 3"]:
@@ -120,3 +123,23 @@ def latlong_to_cube(latlong: Float[np.ndarray, "H W C"], resolution: int) -> Flo
 def cube_to_latlong(cube: Float[np.ndarray, "6 L L C"], height: int) -> Float[np.ndarray, "H 2*H C"]:
     """Resample a cubemap onto lat-long texel centers."""
     return sample_cube(cube, latlong_directions(height)).astype(cube.dtype)
+
+
+def blur_latlong(latlong: Float[np.ndarray, "H W C"], std_rad: float) -> Float[np.ndarray, "H W C"]:
+    """Mean of a map over a Gaussian of angle: Σ_j Ω_j k(γ_ij) x_j / Σ_j Ω_j k(γ_ij), k = exp((cos γ − 1)/σ²).
+
+    The kernel (von Mises–Fisher) knows angles γ alone, so there is no seam and a pole is like any other direction. Two
+    rows see each other through differences of azimuth, hence a circular convolution for each pair. Needs σ > 0.
+    """
+    height, width = latlong.shape[:2]
+    polar, azimuth = np.pi * (np.arange(height) + 0.5) / height, 2 * np.pi * np.arange(width) / width
+    weighted = np.concatenate([latlong.astype(np.float64), np.ones((height, width, 1))], -1)
+    spectra = np.fft.rfft(weighted * latlong_solid_angles(height)[..., None], axis=1)
+    blurred = np.empty((height, width, weighted.shape[-1]))
+    for i in range(height):
+        near = np.flatnonzero(np.abs(polar - polar[i]) <= max(BLUR_REACH * std_rad, np.pi / height))
+        cosine = np.sin(polar[i]) * np.sin(polar[near])[:, None] * np.cos(azimuth)
+        cosine += (np.cos(polar[i]) * np.cos(polar[near]))[:, None]
+        kernel = np.fft.rfft(np.exp((np.minimum(cosine, 1) - 1) / std_rad**2), axis=1)
+        blurred[i] = np.fft.irfft((kernel[..., None] * spectra[near]).sum(0), n=width, axis=0)
+    return (blurred[..., :-1] / blurred[..., -1:]).astype(latlong.dtype)

@@ -1,6 +1,8 @@
 """One step of Adam (Kingma and Ba 2015) on many tensors at once."""
 
+import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float
@@ -8,10 +10,15 @@ from torch import Tensor
 
 from panoless.kernels.backend import Backend, choose_backend
 
+UNBOUNDED = (-math.inf, math.inf)
+
 
 @dataclass(frozen=True)
 class AdamTensor:
-    """A parameter with its gradient, its running moments, its rate and the number of steps including this one."""
+    """A parameter with its gradient, its running moments, its rate and the number of steps including this one.
+
+    After the step the parameter is clipped to `bounds`.
+    """
 
     parameter: Float[Tensor, "*S"]
     gradient: Float[Tensor, "*S"]
@@ -19,6 +26,7 @@ class AdamTensor:
     square: Float[Tensor, "*S"]
     rate: float
     steps: int
+    bounds: tuple[float, float] = UNBOUNDED
 
 
 @torch.no_grad()
@@ -32,8 +40,8 @@ def adam_step(
     """
     if not tensors:
         return
-    kinds = {f"{field} {i}": getattr(each, field) for i, each in enumerate(tensors) for field in _TENSORS}
-    if choose_backend(backend, **kinds) == "cpu" and all(tensor.is_contiguous() for tensor in kinds.values()):
+    given = [tensor for each in tensors for tensor in (each.parameter, each.gradient, each.mean, each.square)]
+    if choose_backend(backend, **_named(given)) == "cpu" and all(tensor.is_contiguous() for tensor in given):
         from panoless.kernels.cpu.adam import adam_step_cpu
 
         adam_step_cpu(tensors, betas, epsilon)
@@ -43,6 +51,17 @@ def adam_step(
         each.square.mul_(betas[1]).addcmul_(each.gradient, each.gradient, value=1 - betas[1])
         spread = (each.square / (1 - betas[1] ** each.steps)).sqrt() + epsilon
         each.parameter.addcdiv_(each.mean, spread, value=-each.rate / (1 - betas[0] ** each.steps))
+        if each.bounds != UNBOUNDED:
+            each.parameter.clamp_(*each.bounds)
+
+
+@lru_cache(maxsize=8)
+def _names(count: int) -> tuple[str, ...]:
+    return tuple(f"{field} {index // 4}" for index in range(0, count, 4) for field in _TENSORS)
+
+
+def _named(tensors: list[Tensor]) -> dict[str, Tensor]:
+    return dict(zip(_names(len(tensors)), tensors, strict=True))
 
 
 _TENSORS = ("parameter", "gradient", "mean", "square")

@@ -1,6 +1,7 @@
 """The objective of a mirror seen by one view: deferred shading against photographs, consistent normals, silhouette."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 from jaxtyping import Float
@@ -24,8 +25,6 @@ class MirrorView:
     radiance: Float[Tensor, "3 H W"]
     """Target, linear and premultiplied."""
     mask: Float[Tensor, "H W"]
-    rays_camera: Float[Tensor, "3 H W"]
-    """Unit, from the camera."""
     camera_to_world_rotation: Float[Tensor, "3 3"]
     fx: float
     fy: float
@@ -33,6 +32,11 @@ class MirrorView:
     cy: float
     solid_alpha: float
     """Pixels whose mask is above this lie wholly on the object; only they are compared with the photograph."""
+
+    @cached_property
+    def solid_pixels(self) -> int:
+        """How many pixels lie wholly on the object."""
+        return int((self.mask > self.solid_alpha).sum())
 
 
 @dataclass(frozen=True)
@@ -80,8 +84,8 @@ def mirror_objective(
 
     - photometric: the mean over solid pixels of w·√(‖e‖² + ε²), e = C − radiance. C = A + L·α (`once`) or (A + L)·α
       (`paper`), A the albedo (None for none) and L the environment, through its activation, in the direction
-      ω = v − 2 (v·n) n (Eq. 5) of the normalized blended normal n. The weight w = (1 + ‖e‖²/s²)⁻² is held constant in
-      the gradient.
+      ω = v − 2 (v·n) n (Eq. 5), v the unit ray through the pixel's center and n the normalized blended normal. The
+      weight w = (1 + ‖e‖²/s²)⁻² is held constant in the gradient.
     - consistency: the mean over pixels, weighted by the mask or everywhere, of 1 − n·n_surf (Eq. 12), where alpha is
       above ½ and the surface depth D = (1 − λ_d) accumulated/alpha + λ_d median (Eq. 3) has a normal.
     - silhouette: the mean binary cross-entropy of alpha and mask over all pixels (Eq. 13).
@@ -100,7 +104,7 @@ def mirror_objective(
         "median_depth": median_depth,
         **({} if albedo is None else {"albedo": albedo}),
     }
-    _check_shapes({**images, "radiance": view.radiance, "mask": view.mask, "rays_camera": view.rays_camera}, alpha)
+    _check_shapes({**images, "radiance": view.radiance, "mask": view.mask}, alpha)
     chosen = choose_backend(backend, **images, environment=environment)
     arguments = normals_camera, alpha, accumulated_depth, median_depth, albedo, environment, view, terms
     if chosen == "cpu" and environment.shape[-1] <= LARGEST_KERNEL_FACE:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from panoless.kernels.backend import Backend, choose_backend
 from panoless.kernels.constants import TILE
@@ -174,6 +175,14 @@ def _only_active(images: tuple[Tensor, ...], active_tiles: Tensor | None) -> tup
 def tile_shape(height: int, width: int) -> tuple[int, int]:
     """Rows and columns of tiles that an image has."""
     return -(-height // TILE), -(-width // TILE)
+
+
+def tiles_of(pixels: Bool[Tensor, "H W"], margin_px: int = 0) -> Bool[Tensor, "tile_rows tile_columns"]:
+    """The tiles that hold one of the pixels, or come within a margin of it."""
+    chosen = pixels[None].float()
+    if margin_px:
+        chosen = max_pool2d(chosen, 2 * margin_px + 1, stride=1, padding=margin_px)
+    return max_pool2d(chosen, TILE, ceil_mode=True)[0] > 0
 
 
 def _check_tiles(active_tiles: Tensor | None, camera: RasterCamera) -> None:

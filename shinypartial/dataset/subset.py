@@ -4,9 +4,6 @@ The images are copied as they are, so that the new folder has the layout of the 
 continues when it is started again, and a folder that holds anything else is refused.
 """
 
-import errno
-import os
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,12 +20,11 @@ from shinypartial.dataset.schema import CHECKSUMS, SPLITS, Dataset, Frame
 from shinypartial.dataset.write import claim_folder, complete_dataset
 from shinypartial.errors import InputError
 from shinypartial.files import (
-    PARTIAL_PREFIX,
     only_writer,
+    place_file,
     read_json,
     remove_partial_files,
     sha256_of,
-    whole_file,
     write_json,
 )
 from shinypartial.progress import Progress
@@ -188,7 +184,7 @@ def make_subset(source: Path, root: Path, options: SubsetOptions, *, link: bool 
         remove_partial_files(root)
         progress = Progress("Linking" if link else "Copying", len(files), len(files) - len(missing))
         for old, new in missing:
-            _place(old, new, link)
+            place_file(old, new, link)
             progress.advance()
         for split in SPLITS:
             write_json(root / f"transforms_{split}.json", contents[split])
@@ -289,25 +285,3 @@ def _copies(root: Path, split: str, frames: Sequence[Frame]) -> list[tuple[Path,
             )
         pairs += [(path, root / split / f"r_{i}{path.name[len(name) :]}") for path in files if path not in dropped]
     return pairs
-
-
-def _place(old: Path, new: Path, link: bool) -> None:
-    """Copy or hard-link a file, whole or not at all."""
-    if not link:
-        with whole_file(new) as temporary:
-            shutil.copyfile(old, temporary)
-        return
-    new.parent.mkdir(parents=True, exist_ok=True)
-    temporary = new.with_name(f"{PARTIAL_PREFIX}{new.name}")
-    temporary.unlink(missing_ok=True)
-    try:
-        os.link(old, temporary)
-    except OSError as error:
-        if error.errno not in (errno.EXDEV, errno.EPERM, errno.ENOTSUP, errno.EMLINK):
-            raise
-        raise InputError(
-            expected=f"a file system that can link {old} into {new.parent}",
-            found=error.strerror or "a failed link",
-            remedy="Leave out --link, so that files are copied.",
-        ) from None
-    temporary.replace(new)

@@ -38,6 +38,7 @@ class Case:
     pixels: int
     surfels: int
     texels: int = 128
+    views: int = 16
 
 
 SERIES = {
@@ -147,7 +148,7 @@ def measure(dataset: Path, case: Case, steps: int, threads: int) -> Cost:
 def _make_fitter(dataset: Path, case: Case, threads: int) -> Any:
     from dataclasses import replace
 
-    from tests.benchmarks.bench_step import PRESETS, Fitter, new_state, torch, views_of
+    from tests.benchmarks.bench_step import PRESETS, Fitter, new_state, resampled_views, torch
 
     torch.set_num_threads(threads)
     config = PRESETS["default"]
@@ -156,7 +157,7 @@ def _make_fitter(dataset: Path, case: Case, threads: int) -> Any:
         surfels=replace(config.surfels, count=case.surfels),
         environment=replace(config.environment, resolution=case.texels),
     )
-    views = views_of(dataset, case.pixels, config.crop_margin_px)
+    views = resampled_views(dataset, case.pixels, config.crop_margin_px, case.views)
     return Fitter(views, config, Path(tempfile.gettempdir()) / "bench-cost", new_state(views, config))
 
 

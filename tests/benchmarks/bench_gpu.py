@@ -170,7 +170,7 @@ def time_fit(surfels: Vase, camera: RasterCamera, device: torch.device) -> Row:
     from panoless.config import FitConfig
     from panoless.fit import Fitter
     from panoless.surfels import Surfels
-    from panoless.views import Normalization, TrainView, Views, unit_rays_camera
+    from panoless.views import Normalization, TrainView, Views
 
     with torch.no_grad():
         picture = drawn(placed(surfels, device), camera, True)
@@ -179,7 +179,6 @@ def time_fit(surfels: Vase, camera: RasterCamera, device: torch.device) -> Row:
         camera=replace(camera, world_to_camera=camera.world_to_camera.to(device)),
         radiance=(picture.colors * mask).clamp(0, 1),
         mask=mask,
-        rays_camera=unit_rays_camera(camera).to(device),
         solid=torch.nonzero(mask.flatten())[:, 0],
     )
     here = placed(surfels, device)

@@ -28,7 +28,7 @@ from panoless import fit as fit_module
 from panoless.config import PRESETS
 from panoless.fit import Fitter, new_state
 from panoless.optimizer import SurfelOptimizer
-from panoless.views import Views, _make_view, estimate_normalization
+from panoless.views import Views, cropped, views_of
 from shinypartial.camera import Camera
 from shinypartial.dataset.read import open_dataset, read_view
 
@@ -63,27 +63,25 @@ def resampled(image: np.ndarray, size: int) -> np.ndarray:
     return found[0].permute(1, 2, 0).numpy().reshape(size, size, *image.shape[2:])
 
 
-def views_of(dataset: Path, size: int, crop_margin_px: int) -> Views:
+def resampled_views(dataset: Path, size: int, crop_margin_px: int, count: int = NUM_VIEWS) -> Views:
     """Evenly chosen training views at the given size."""
     frames = open_dataset(dataset).train
-    loaded = []
-    for frame in frames[:: max(1, len(frames) // NUM_VIEWS)][:NUM_VIEWS]:
+    photographs = []
+    for frame in frames[:: max(1, len(frames) // count)][:count]:
         view = read_view(frame)
         old, scale = frame.camera, size / frame.camera.width
         intrinsics = (scale * old.fx, scale * old.fy, scale * old.cx, scale * old.cy)
         camera = Camera(old.camera_to_world, *intrinsics, size, size)
-        loaded.append((camera, resampled(view.radiance.clip(0, 1), size), resampled(view.alpha.clip(0, 1), size)))
-    frame_of = estimate_normalization([(camera, alpha) for camera, _, alpha in loaded])
-    distances = [np.linalg.norm(camera.position_world - frame_of.center) / frame_of.radius for camera, _, _ in loaded]
-    near = 0.1 * float(min(distances))
-    return Views(tuple(_make_view(*each, frame_of, near, crop_margin_px) for each in loaded), frame_of, near)
+        images = (resampled(image.clip(0, 1), size) for image in (view.radiance, view.alpha))
+        photographs.append(cropped(camera, *images, crop_margin_px))
+    return views_of(photographs)
 
 
 def make_fitter(dataset: Path, size: int, count: int, preset: str) -> Fitter:
     """A fit right after its warm-up, when all terms act."""
     config = PRESETS[preset]
     config = replace(config, surfels=replace(config.surfels, count=count))
-    views = views_of(dataset, size, config.crop_margin_px)
+    views = resampled_views(dataset, size, config.crop_margin_px)
     return Fitter(views, config, Path(tempfile.gettempdir()) / "bench-step", new_state(views, config))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from panoless.cli import main
+from panoless.cli import _announce_compilation, main
 from panoless.config import PRESETS, FitConfig
 from shinypartial.dataset.schema import Dataset
 
@@ -143,3 +143,19 @@ def test_the_run_folder_is_no_place_for_the_prediction(
     assert main(["fit", str(sphere_dataset.root), *TINY, "--output", "runs/mine"]) == 2
     assert "apart from the run folder" in capsys.readouterr().err
     assert not (tmp_path / "runs").exists()
+
+
+def test_compilation_is_announced_once_and_only_when_it_happens(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from collections import defaultdict
+
+    from numba import njit
+    from numba.core import event
+
+    monkeypatch.setattr(event, "_registered", defaultdict(list))
+    _announce_compilation()
+    assert capsys.readouterr().err == ""
+    for value in (1, 1.0):
+        assert njit(lambda x: x + 1)(value) == value + 1
+    assert capsys.readouterr().err.count("Compiling kernels") == 1

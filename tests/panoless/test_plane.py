@@ -12,7 +12,7 @@ from matplotlib.path import Path as PolygonPath
 
 from panoless.plane import Plane, plane_buffers, polygon_coverage, unobstructed
 from panoless.plane_fit import MAX_VERTICES, PlaneFit, fit_plane
-from panoless.views import Views, pose_of
+from panoless.views import Normalization, Views, pose_of, unit_rays_camera
 from shinypartial.errors import InputError
 from tests.support.mirror_plane import (
     L_SHAPE,
@@ -235,6 +235,21 @@ def test_a_sphere_is_no_plane(views: Views, flat_fit: PlaneFit) -> None:
     assert float(np.median(fit.rms_px)) > 5 * float(np.median(flat_fit.rms_px))
     assert float(fit.iou.mean()) < 0.95
     assert all(np.isfinite(value).all() for value in (fit.plane.normal, fit.plane.outline, fit.rms_px))
+
+
+def test_giving_up_early_changes_no_plane(flat_fit: PlaneFit) -> None:
+    """A ball is left after the first round, pixels away from any outline; a plane is found to the last bit."""
+    balls = []
+    for camera in arc(12):
+        rotation, center = pose_of(camera)
+        across = np.cross(rotation @ -center, unit_rays_camera(camera).numpy(), axisb=0)
+        balls.append(train_view(camera, (np.linalg.norm(across, axis=-1) < 0.8).astype(np.float64)))
+    given_up = fit_plane(Views(tuple(balls), Normalization(np.zeros(3), 1.0), 0.3), thorough=False)
+    assert np.isinf(given_up.normal_sigma_deg)
+    assert float(np.median(given_up.median_px)) > 2.0
+    quick = fit_plane(mirror_views(plane_of(L_SHAPE), arc(12)), thorough=False)
+    np.testing.assert_array_equal(quick.plane.normal, flat_fit.plane.normal)
+    np.testing.assert_array_equal(quick.plane.outline, flat_fit.plane.outline)
 
 
 def test_views_from_behind_are_not_explained() -> None:

@@ -233,3 +233,14 @@ def test_the_commands_take_and_export_snapshots(
     assert [folder.name for folder in exported_snapshots(tmp_path / "p")] == ["000002", "000004"]
     assert read_info(tmp_path / "p").config == read_info(exported_snapshots(tmp_path / "p")[0]).config
     assert "snapshots" not in asdict(CONFIG)
+
+
+def test_a_plane_has_no_snapshots_and_the_command_says_why(
+    tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    options = ["--model", "plane", "--config.environment.solve-resolution", "16"]
+    assert main(["fit", str(sphere_dataset.root), "--output", "p", "--snapshots", "2", *options]) == 0
+    assert "No snapshots" in capsys.readouterr().out
+    assert main(["export", "runs/p", "--output", "p", "--snapshots"]) == 2
+    assert "fitted without steps" in capsys.readouterr().err

@@ -78,7 +78,6 @@ def train_view(camera: RasterCamera, mask: Float[np.ndarray, "H W"]) -> TrainVie
         camera,
         torch.zeros(3, *mask.shape),
         tensor,
-        unit_rays_camera(camera),
         torch.nonzero(tensor.flatten() > SOLID_ALPHA)[:, 0],
     )
 

@@ -24,7 +24,12 @@ def adam_step_cpu(tensors, betas, epsilon) -> None:
     arrays += ((nothing,) * 4,) * (-len(arrays) % TENSORS)
     numbers = np.array(
         [
-            (each.rate / (1 - betas[0] ** each.steps), 1 / math.sqrt(1 - betas[1] ** each.steps), epsilon)
+            (
+                each.rate / (1 - betas[0] ** each.steps),
+                1 / math.sqrt(1 - betas[1] ** each.steps),
+                epsilon,
+                *each.bounds,
+            )
             for each in tensors
         ],
         f32,
@@ -60,6 +65,7 @@ def _adam(counter, arrays, numbers, decays):
 @njit(**VECTORIZED_LOOPS)
 def _move(parameter, gradient, mean, square, numbers, decays):
     rate, correction, epsilon = numbers[0], numbers[1], numbers[2]
+    low, high = numbers[3], numbers[4]
     first, second = decays[0], decays[1]
     for i in range(parameter.size):
         g = gradient[i]
@@ -67,4 +73,7 @@ def _move(parameter, gradient, mean, square, numbers, decays):
         v = square[i] + second * (g * g - square[i])
         mean[i] = m
         square[i] = v
-        parameter[i] -= rate * m / (f32(math.sqrt(v)) * correction + epsilon)
+        moved = parameter[i] - rate * m / (f32(math.sqrt(v)) * correction + epsilon)
+        # Comparisons that let a value pass that is not a number.
+        moved = low if moved < low else moved
+        parameter[i] = high if moved > high else moved

@@ -7,8 +7,8 @@ and results are safe as long as anyone can see them.
 
 import math
 import threading
-import weakref
 from bisect import bisect_left, insort
+from collections.abc import Callable
 
 import numpy as np
 
@@ -42,19 +42,26 @@ def _give_back(buffer: _Buffer) -> None:
 class _Lease:
     """The owner at the end of an array's chain of bases; when it goes, nobody can see the memory any more."""
 
-    def __init__(self, buffer: _Buffer, size: int):
-        self.__array_interface__ = {"version": 3, "shape": (size,), "typestr": "|u1", "data": (buffer[1], False)}
-        weakref.finalize(self, _give_back, buffer).atexit = False
+    __slots__ = ("__array_interface__", "_buffer")
+
+    def __init__(self, buffer: _Buffer, shape: tuple[int, ...], dtype: np.dtype):
+        self._buffer = buffer
+        address = (buffer[1], False)
+        self.__array_interface__ = {"version": 3, "shape": shape, "typestr": dtype.str, "data": address}
+
+    def __del__(self, give_back: Callable[[_Buffer], None] = _give_back) -> None:
+        # The default keeps the function alive while the interpreter shuts down.
+        give_back(self._buffer)
 
 
 def take(shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
     """Return an uninitialized C-contiguous array; its memory is used again once nothing refers to the array."""
-    size = math.prod(shape) * np.dtype(dtype).itemsize
+    kind = np.dtype(dtype)
+    size = math.prod(shape) * kind.itemsize
     if size == 0:
-        return np.empty(shape, dtype)
+        return np.empty(shape, kind)
     with _lock:
         index = bisect_left(_free, (size,))
         found = index < len(_free) and _free[index][0] <= 2 * size + 4096
         buffer = _free.pop(index) if found else None
-    lease = _Lease(buffer or _new_buffer(size), size)
-    return np.asarray(lease).view(dtype).reshape(shape)
+    return np.asarray(_Lease(buffer or _new_buffer(size), shape, kind))

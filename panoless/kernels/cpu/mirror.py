@@ -63,7 +63,6 @@ class Pixels(NamedTuple):
     albedo: Any
     mask: Any
     radiance: Any
-    rays: Any
 
 
 class PixelGradients(NamedTuple):
@@ -90,6 +89,11 @@ class ShadingNumbers(NamedTuple):
     """Whether alpha multiplies the albedo as well."""
     geometry: Any
     """Whether gradients of the images are wanted, beside the environment's."""
+    width: Any
+    focal: Any
+    """f_x and f_y in pixels."""
+    center: Any
+    """c_x and c_y in pixels."""
 
 
 class Cell(NamedTuple):
@@ -196,12 +200,24 @@ def store_channels(image, pixels, first, wanted, values):
 
 
 @njit(**INLINED_LANE_CODE)
+def unit_rays(first, numbers):
+    """Camera rays through the centers of sixteen pixels from flat index `first`, which may go on in later rows."""
+    row = first // numbers.width
+    column = lane_indices() + f32(first - row * numbers.width)
+    later = round_down((column + 0.5) / f32(numbers.width))
+    x = ((column - later * f32(numbers.width) + 0.5) - numbers.center[0]) / numbers.focal[0]
+    y = ((later + f32(row) + 0.5) - numbers.center[1]) / numbers.focal[1]
+    length = square_root(x * x + y * y + 1.0)
+    return x / length, y / length, 1.0 / length
+
+
+@njit(**INLINED_LANE_CODE)
 def shade_group(first, active, solid, alpha, images, rotation, texture, numbers, gradients, kept):
     """Shade sixteen pixels, some of which are solid; returns their losses and the gradient of their alpha."""
     pixels = images.alpha.size
     stride = numbers.resolution + 2
     normal = load_channels(images.normals, pixels, first, solid)
-    ray = load_channels(images.rays, pixels, first, solid)
+    ray = unit_rays(first, numbers)
     squared = dot(normal, normal)
     short = squared < SHORTEST_NORMAL_SQUARED
     inverse_length = where(short, f32(1 / SHORTEST_NORMAL), 1.0 / square_root(where(short, 1.0, squared)))

@@ -48,8 +48,8 @@ class _MirrorObjective(torch.autograd.Function):
             _image(wanted[4], 3, height, width),
             _image(wanted[5] and terms.photometric, *environment.shape),
         )
-        images = mirror.Pixels(*map(_flat, (normals, alpha, albedo, view.mask, view.radiance, view.rays_camera)))
-        photometric, outline = _shade(images, environment, view, terms, gradients, geometry)
+        images = mirror.Pixels(*map(_flat, (normals, alpha, albedo, view.mask, view.radiance)))
+        photometric, outline = _shade(images, width, environment, view, terms, gradients, geometry)
         total, compared = photometric + terms.lambda_silhouette * outline, 0.0
         if compares:
             weight = np.ones_like(images.mask) if terms.consistency_everywhere else images.mask
@@ -74,7 +74,7 @@ class _MirrorObjective(torch.autograd.Function):
         return None, None, *gradients
 
 
-def _shade(images, environment, view, terms, gradients: Gradients, geometry: bool) -> tuple[float, float]:
+def _shade(images, width, environment, view, terms, gradients: Gradients, geometry: bool) -> tuple[float, float]:
     """Photometric and silhouette terms; fills the gradients of normals, alpha, albedo and environment."""
     resolution, pixels = environment.shape[-1], images.alpha.size
     solid_alpha = f32(view.solid_alpha if terms.photometric else np.inf)
@@ -85,16 +85,18 @@ def _shade(images, environment, view, terms, gradients: Gradients, geometry: boo
         cubemap = environment.detach().contiguous().numpy()
         run_shared(spread_faces, cubemap, texture)
         show_ring(cubemap.reshape(-1), ring, area, flat_texture)
-    solid = int(np.count_nonzero(images.mask > solid_alpha))
     numbers = mirror.ShadingNumbers(
         resolution=resolution,
         inverse_scale_squared=f32(1 / terms.robust_scale**2 if terms.robust_scale > 0 else 0),
-        share=f32(1 / max(solid, 1)),
+        share=f32(1 / max(view.solid_pixels, 1)),
         silhouette_share=f32(terms.lambda_silhouette / pixels),
         solid_alpha=solid_alpha,
         sigmoid=terms.activation == "sigmoid",
         alpha_twice=terms.alpha_applied == "paper",
         geometry=geometry,
+        width=width,
+        focal=(f32(view.fx), f32(view.fy)),
+        center=(f32(view.cx), f32(view.cy)),
     )
     kept = take((mirror.RAY_SIZE * pixels,))
     sums = take((-(-pixels // mirror.PIXELS_PER_CLAIM), LANES))

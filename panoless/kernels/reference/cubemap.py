@@ -14,6 +14,7 @@ from functools import lru_cache
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 NUM_CORNERS = 8
 SHORTEST_DIRECTION = 1e-30
@@ -44,14 +45,14 @@ class CubemapPadding:
 @torch.inference_mode(False)  # A table first built in inference mode could never serve a backward.
 def cubemap_padding(resolution: int, device: torch.device) -> CubemapPadding:
     """The padding table of faces of `resolution`² texels; computed once per resolution and device."""
-    directions = _face_directions(resolution, torch.arange(-1, resolution + 1, dtype=torch.float64))
-    face, st, _ = project_to_face(directions.reshape(-1, 3))
-    sources = _texel_index(face, st, resolution).reshape(6, resolution + 2, resolution + 2)
-    ends = torch.tensor([0, -1])
-    is_corner = torch.zeros(sources.shape, dtype=torch.bool)
-    is_corner[:, ends[:, None], ends] = True
-    octant = ((directions > 0) * torch.tensor([1, 2, 4])).sum(-1)
-    sources = torch.where(is_corner, 6 * resolution**2 + octant, sources)
+    sources = pad(torch.arange(6 * resolution**2).reshape(6, resolution, resolution), (1, 1, 1, 1))
+    ends, lines = torch.tensor([-1, resolution]), torch.arange(-1, resolution + 1)
+    for rows, columns in ((ends, lines), (lines, ends)):
+        directions = _face_directions(resolution, columns.double(), rows.double())
+        face, st, _ = project_to_face(directions.reshape(-1, 3))
+        sources[:, rows[:, None] + 1, columns + 1] = _texel_index(face, st, resolution).reshape(6, len(rows), -1)
+    octant = ((_face_directions(resolution, ends.double()) > 0) * torch.tensor([1, 2, 4])).sum(-1)
+    sources[:, ends[:, None] + 1, ends + 1] = 6 * resolution**2 + octant
 
     signs = torch.tensor([[1 if corner >> axis & 1 else -1 for axis in range(3)] for corner in range(NUM_CORNERS)])
     # A shade inside the corner of the face of each axis lies the texel that this face contributes.
@@ -152,11 +153,15 @@ def cubemap_solid_angles(resolution: int, dtype: torch.dtype, device: torch.devi
     return below.diff(dim=0).diff(dim=1).to(device, dtype)
 
 
-def _face_directions(resolution: int, texel: Float[Tensor, "N"]) -> Float[Tensor, "6 N N 3"]:
-    """Directions (not unit) of the centers of texel rows and columns `texel`, which may lie outside the face."""
+def _face_directions(
+    resolution: int, columns: Float[Tensor, "N"], rows: Float[Tensor, "M"] | None = None
+) -> Float[Tensor, "6 M N 3"]:
+    """Directions (not unit) of the centers of texels, which may lie outside the face; the same rows as columns
+    unless given.
+    """
     s_axis, t_axis, outward = torch.tensor(FACE_FRAMES, dtype=torch.float64)[:, None, None].unbind(-2)
-    st = 2 * (texel + 0.5) / resolution - 1
-    return outward + st[None, None, :, None] * s_axis + st[None, :, None, None] * t_axis
+    s, t = (2 * (texel + 0.5) / resolution - 1 for texel in (columns, columns if rows is None else rows))
+    return outward + s[None, None, :, None] * s_axis + t[None, :, None, None] * t_axis
 
 
 def _texel_index(face: Int[Tensor, "P"], st: Float[Tensor, "P 2"], resolution: int) -> Int[Tensor, "P"]:

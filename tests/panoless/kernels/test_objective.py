@@ -52,13 +52,10 @@ def scene(height: int = 21, width: int = 37, resolution: int = 5, seed: int = 0,
         "albedo": 0.3 * alpha * noise(3, height, width),
         "environment": 2 * noise(6, 3, resolution, resolution) - 0.5,
     }
-    rays = noise(3, height, width) - 0.5
-    rays[2] += 1.5
     rotation = torch.linalg.qr(noise(3, 3) - 0.5)[0]
     view = MirrorView(
         radiance=noise(3, height, width),
         mask=(2 * noise(height, width)).clamp(max=1),
-        rays_camera=torch.nn.functional.normalize(rays, dim=0),
         camera_to_world_rotation=rotation,
         fx=40.0,
         fy=42.0,

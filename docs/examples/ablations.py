@@ -1,0 +1,256 @@
+"""Make docs/ablations.md: figures of every scene, one lever less, surfels flat and curved, the paper's method.
+
+    for S in vase cola mirror deformed-mirror sculpture; do shinypartial generate --scene $S --resolution 400; done
+    for S in vase cola mirror deformed-mirror sculpture; do shinypartial oracle datasets/$S-400; done
+    python docs/examples/ablations.py
+
+Every row is `panoless fit` and `shinypartial evaluate` in a process of its own. What was scored before is kept, so the
+command continues where it stopped; delete predictions/ablations and runs/ablations to begin anew. All tables but the
+first are scored on every fifth test view. `--seeds 0 1 2` sets the seeds, `--tables levers counts` makes some tables
+only, `--collect` writes the page from what is there.
+"""
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from shinypartial.dataset.read import open_dataset
+from shinypartial.files import whole_file, write_json
+from shinypartial.prediction import read_info
+from shinypartial.scores import read_scores
+
+PAGE = Path("docs/ablations.md")
+NUMBERS = Path("docs/results/ablations.json")
+PREDICTIONS = Path("predictions/ablations")
+THINNED = Path("build/ablations")
+TEST_VIEW_EVERY = 5
+PAPER_ITERATIONS = 4500
+
+
+@dataclass(frozen=True)
+class Row:
+    """One configuration on one scene; `arguments` follow `panoless fit DATASET`."""
+
+    name: str
+    scene: str
+    arguments: tuple[str, ...] = ()
+    one_seed: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows under a heading, with a sentence that says how to read them."""
+
+    title: str
+    text: str
+    rows: tuple[Row, ...]
+    all_test_views: bool = False
+
+
+SCENES = ("vase", "cola", "mirror", "deformed-mirror", "sculpture")
+TABLES = {
+    "figures": Table(
+        "Figures",
+        "`panoless fit` as it is, beside the bound of each scene (ground-truth normals, same views), 200 test views.",
+        tuple(Row("default", scene) for scene in SCENES),
+        all_test_views=True,
+    ),
+    "levers": Table(
+        "One lever less",
+        "The default without one of its parts.",
+        (),
+    ),
+    "counts": Table(
+        "Surfels, flat and curved",
+        "`--model surfels` with fewer and more surfels, with and without a linear normal field each.",
+        tuple(
+            Row(
+                f"{count} {kind}",
+                "vase",
+                ("--model", "surfels", "--config.surfels.count", str(count), f"--config.surfels.{switch}"),
+                one_seed=True,
+            )
+            for kind, switch in (("flat", "no-curved"), ("curved", "curved"))
+            for count in (500, 1000, 2000, 4000, 8000, 16000)
+        ),
+    ),
+    "paper": Table(
+        "The paper's method",
+        f"Our implementation of the paper's method and of its ablations, {PAPER_ITERATIONS} iterations in place of "
+        "45,000: every schedule is shortened in proportion.",
+        tuple(
+            Row(preset, "vase", ("--preset", preset, "--config.iterations", str(PAPER_ITERATIONS)), one_seed=True)
+            for preset in ("paper", "paper-rho-weighted", "paper-no-silhouette", "paper-no-normal")
+        ),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Scores of one prediction: dB, degrees, seconds."""
+
+    full: float | None
+    observed: float | None
+    normal_mean: float | None
+    normal_median: float | None
+    render: float | None
+    auroc: float | None
+    seconds: float
+    model: str
+    parameters: int
+
+
+def figures_of(folder: Path) -> Figures:
+    """Read a scored prediction folder. Normals are over pixels that see the environment."""
+    scores, info = read_scores(folder), read_info(folder)
+    environment = scores.environment.as_predicted if scores.environment else None
+    normals = scores.normals_environment
+    return Figures(
+        full=environment and environment.full.psnr_linear,
+        observed=environment and environment.observed and environment.observed.psnr_linear,
+        normal_mean=normals and normals.mean_angular_error_deg,
+        normal_median=normals and normals.median_angular_error_deg,
+        render=scores.render and scores.render.psnr,
+        auroc=scores.calibration and scores.calibration.visibility_error_auroc,
+        seconds=sum(info.seconds.values()),
+        model=(info.model or "").split(" ")[0],
+        parameters=sum(count for name, count in info.parameter_counts.items() if not name.startswith("environment")),
+    )
+
+
+def folder_of(table: str, row: Row, seed: int) -> Path:
+    """Where the prediction of a row and a seed lies."""
+    words = "".join(letter if letter.isalnum() else "-" for letter in row.name.lower())
+    return PREDICTIONS / f"{table}-{row.scene}-{words}-{seed}"
+
+
+def thinned(dataset: Path) -> Path:
+    """A dataset of the same files with every fifth test view."""
+    target = THINNED / dataset.name
+    target.mkdir(parents=True, exist_ok=True)
+    for source in dataset.iterdir():
+        link = target / source.name
+        if source.name != "transforms_test.json" and not link.exists():
+            link.symlink_to(source.resolve())
+    transforms = json.loads((dataset / "transforms_test.json").read_text(encoding="utf-8"))
+    transforms["frames"] = transforms["frames"][::TEST_VIEW_EVERY]
+    if not (target / "transforms_test.json").exists():
+        write_json(target / "transforms_test.json", transforms)
+    return target
+
+
+def make(table: str, row: Row, seed: int) -> None:
+    """Fit and score a row, unless it is there."""
+    folder = folder_of(table, row, seed)
+    if (folder / "scores.json").exists():
+        return
+    dataset = Path("datasets") / f"{row.scene}-400"
+    dataset = dataset if TABLES[table].all_test_views else thinned(dataset)
+    open_dataset(dataset)
+    print(f"— {table}: {row.name}, {row.scene}, seed {seed}", flush=True)
+    script = Path(sys.executable).parent
+    arguments = [*row.arguments, "--config.seed", str(seed), "--output", str(folder)]
+    subprocess.run([script / "panoless", "fit", dataset, *arguments], check=True)
+    protocol = "both" if TABLES[table].all_test_views else "linear-v1"
+    subprocess.run(
+        [script / "shinypartial", "evaluate", folder, "--dataset", dataset, "--protocol", protocol], check=True
+    )
+
+
+def seeds_of(row: Row, seeds: list[int]) -> list[int]:
+    """Long rows have one seed."""
+    return seeds[:1] if row.one_seed else seeds
+
+
+def found(table: str, row: Row, seeds: list[int]) -> list[Figures]:
+    """What was scored of a row."""
+    folders = [folder_of(table, row, seed) for seed in seeds_of(row, seeds)]
+    return [figures_of(folder) for folder in folders if (folder / "scores.json").exists()]
+
+
+def cell(values: list[float | None], digits: int = 2) -> str:
+    """Median, and lowest to highest where there are several."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return "–"
+    middle = f"{statistics.median(known):.{digits}f}"
+    return middle if len(known) == 1 else f"{middle} ({min(known):.{digits}f}–{max(known):.{digits}f})"
+
+
+COLUMNS: tuple[tuple[str, Callable[[Figures], float | None], int], ...] = (
+    ("Environment, observed dB", lambda f: f.observed, 2),
+    ("full dB", lambda f: f.full, 2),
+    ("Normals, mean °", lambda f: f.normal_mean, 2),
+    ("median °", lambda f: f.normal_median, 2),
+    ("Render dB", lambda f: f.render, 2),
+    ("AUROC", lambda f: f.auroc, 3),
+    ("Seconds", lambda f: f.seconds, 0),
+)
+
+
+def markdown(table: str, seeds: list[int]) -> Iterator[str]:
+    """The lines of a table."""
+    content = TABLES[table]
+    yield from (f"## {content.title}", "", content.text, "")
+    yield "| Scene | | " + " | ".join(name for name, _, _ in COLUMNS) + " | Model | Numbers |"
+    yield "| --- " * (len(COLUMNS) + 4) + "|"
+    shown = set()
+    for row in content.rows:
+        figures = found(table, row, seeds)
+        bound = Path("predictions") / f"{row.scene}-400-oracle"
+        if row.scene not in shown and (bound / "scores.json").exists():
+            best = figures_of(bound)
+            yield f"| {row.scene} | bound | {cell([best.observed])} | {cell([best.full])} |" + " – |" * 7
+        shown.add(row.scene)
+        if not figures:
+            continue
+        cells = [cell([of(figure) for figure in figures], digits) for _, of, digits in COLUMNS]
+        models = "/".join(sorted({figure.model or "?" for figure in figures}))
+        yield f"| {row.scene} | {row.name} | " + " | ".join([*cells, models, str(figures[0].parameters)]) + " |"
+    yield ""
+
+
+def collect(seeds: list[int]) -> None:
+    """Write the page and the numbers behind it."""
+    numbers = {
+        table: [
+            {"name": row.name, "scene": row.scene, "arguments": row.arguments, "fits": [vars(f) for f in figures]}
+            for row in content.rows
+            if (figures := found(table, row, seeds))
+        ]
+        for table, content in TABLES.items()
+    }
+    write_json(NUMBERS, numbers)
+    introduction = PAGE.read_text(encoding="utf-8").split("\n## ")[0].rstrip() if PAGE.exists() else "# Ablations"
+    lines = [introduction, ""]
+    for table in TABLES:
+        if numbers[table]:
+            lines.extend(markdown(table, seeds))
+    with whole_file(PAGE) as temporary:
+        temporary.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+
+
+def main() -> None:
+    """Make the tables asked for, then the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--tables", nargs="+", choices=sorted(TABLES), default=sorted(TABLES))
+    parser.add_argument("--collect", action="store_true", help="write the page from what is there")
+    arguments = parser.parse_args()
+    if not arguments.collect:
+        for table in arguments.tables:
+            for row in TABLES[table].rows:
+                for seed in seeds_of(row, arguments.seeds):
+                    make(table, row, seed)
+                    collect(arguments.seeds)
+    collect(arguments.seeds)
+
+
+if __name__ == "__main__":
+    main()
