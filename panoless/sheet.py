@@ -1,7 +1,7 @@
 """A mirror that bends: a plane with an outline and a smooth height over it.
 
-Surfels are free to tilt without moving; a height is not, because its slope is its normal. This takes the freedom away in
-which a nearly flat mirror drifts: a tilt that the environment turns after.
+Surfels are free to tilt without moving; a height is not, because its slope is its normal. So a nearly flat mirror can't
+drift into a tilt that the environment turns after.
 """
 
 from dataclasses import dataclass, replace
@@ -38,7 +38,7 @@ class Sheet:
         return 3 + self.plane.outline.size + (self.plane.rim_height > 0) + self.coefficients.numel()
 
     def tilted(self, slope_u: float, slope_v: float) -> "Sheet":
-        """The sheet with the plane slope_u u + slope_v v added about the middle of the outline. Splines hold it exactly."""
+        """The sheet plus slope_u u + slope_v v, about the middle of the outline. Splines hold a plane exactly."""
         rows, columns = (torch.arange(count) - 1.0 for count in self.coefficients.shape)
         middle = (self.plane.outline.min(0) + self.plane.outline.max(0)) / 2 - self.low
         added = slope_u * (rows[:, None] * self.spacing - middle[0]) + slope_v * (columns * self.spacing - middle[1])
@@ -66,9 +66,8 @@ class SheetSurfels:
         rows, columns = sheet.coefficients.shape
         cell = place.floor().clamp(min=0).minimum(torch.tensor([rows - 4.0, columns - 4.0]))
         along = [_cubic_basis((place - cell)[:, axis]) for axis in (0, 1)]
-        first = cell.long()
-        near = torch.arange(4)
-        self._index = ((first[:, 0, None] + near)[:, :, None] * columns + (first[:, 1, None] + near)[:, None]).flatten(1)
+        row, column = (cell[:, axis, None].long() + torch.arange(4) for axis in (0, 1))
+        self._index = (row[:, :, None] * columns + column[:, None]).flatten(1)
         self._weights = [
             (along[0][i][:, :, None] * along[1][j][:, None]).flatten(1) / sheet.spacing ** (i + j) for i, j in ORDERS
         ]
