@@ -2,7 +2,7 @@
 
 import io
 import json
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from panoless.config import FitConfig, config_from_dict
+from panoless.lathe import Lathe
 from panoless.plane import Plane
 from panoless.surfels import Surfels
 from shinypartial.errors import InputError
@@ -46,12 +47,23 @@ class FitState:
     """The plane of the outline, where there is one."""
     flat: bool = False
     """Whether that plane is the geometry; there are no surfels then."""
+    lathe: Lathe | None = None
+    """The surface of revolution of the outlines, where there is one."""
+    turned: bool = False
+    """Whether that surface is the geometry; no steps are taken with it then."""
     rung: str = ""
     """Which rung of the ladder was taken, and why."""
 
     @property
-    def geometry(self) -> Surfels | Plane:
+    def stepless(self) -> bool:
+        """Whether the geometry is not made of surfels, so that no steps of the optimization are taken."""
+        return self.flat or self.turned
+
+    @property
+    def geometry(self) -> Surfels | Plane | Lathe:
         """What mirrors the environment."""
+        if self.turned and self.lathe is not None:
+            return self.lathe
         return self.plane if self.flat and self.plane is not None else self.surfels
 
     def to(self, device: torch.device) -> "FitState":
@@ -65,8 +77,9 @@ def save_state(folder: Path, state: FitState) -> None:
     """Write the checkpoint whole or not at all."""
     content = {**vars(state), "surfels": {name: value.detach() for name, value in state.surfels.named().items()}}
     content["environment"] = state.environment.detach()
-    if state.plane is not None:
-        content["plane"] = {name: np.asarray(value).tolist() for name, value in vars(state.plane).items()}
+    for name, found in (("plane", state.plane), ("lathe", state.lathe)):
+        if found is not None:
+            content[name] = {item.name: np.asarray(getattr(found, item.name)).tolist() for item in fields(found)}
     # Through memory, because torch reports a full disk as an internal error of its own.
     buffer = io.BytesIO()
     torch.save(content, buffer)
@@ -81,10 +94,11 @@ def load_state(folder: Path) -> FitState | None:
         return None
     try:
         content = torch.load(path, weights_only=True, map_location="cpu")
-        if content["plane"] is not None:
-            listed: dict[str, Any] = content["plane"]
-            arrays: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in listed.items()}
-            content["plane"] = Plane(**arrays)
+        kinds: dict[str, Any] = {"plane": Plane, "lathe": Lathe}
+        for name, kind in kinds.items():
+            if content[name] is not None:
+                listed: dict[str, Any] = content[name]
+                content[name] = kind(**{k: np.array(v) if isinstance(v, list) else v for k, v in listed.items()})
         return FitState(**{**content, "surfels": Surfels(**content["surfels"])})
     except Exception as error:
         raise InputError(

@@ -59,8 +59,8 @@ class Fit:
             state = fit(dataset, self.config, run_folder, marks, device)
             export_prediction(dataset, state, self.config, prediction)
         print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
-        if marks and state.flat:
-            print("No snapshots: this run took a plane, which is fitted without steps.")
+        if marks and state.stepless:
+            print(f"No snapshots: this run took a {state.rung.split()[0]}, whose map is solved without steps.")
         elif marks:
             print(f"Snapshots: panoless export {run_folder} --output {prediction} --snapshots")
 

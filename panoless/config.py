@@ -21,13 +21,13 @@ class SurfelConfig:
     """`thin-plate`: on the visual hull where outlines touch the object, continued smoothly where none does;
     `hull`: on the visual hull of the masks; `random`: uniformly in the normalized cube, as the paper's code does."""
     count: int = 6000
-    """Number of surfels at the start."""
+    """Number of surfels at the start; denser where the first surface is strongly curved."""
     curved: bool = True
     """Give every surfel a linear normal field (three numbers of a shape operator) instead of one normal."""
     hull_resolution: int = 96
-    """Voxels along the longest side of the hull."""
+    """Voxels along a side of the cube in which the hull is carved; outlines count below the size of a voxel."""
     hull_votes: float = 0.96
-    """Share of the views whose mask must keep a voxel."""
+    """Least share of the views whose mask must keep a point of the hull; all views count unless they contradict."""
 
 
 @dataclass(frozen=True)
@@ -130,8 +130,9 @@ class FitConfig:
     """Number of optimization steps (one view each)."""
     seed: int = 0
     """Seed of the initial surfels and of the order of views."""
-    model: Annotated[Literal["auto", "plane", "surfels"], tyro.conf.arg(prefix_name=False)] = "auto"
-    """`auto`: the simplest that explains held-out views; `plane`: three numbers and an outline; `surfels`: curved."""
+    model: Annotated[Literal["auto", "plane", "revolution", "surfels"], tyro.conf.arg(prefix_name=False)] = "auto"
+    """`auto`: the simplest that explains held-out views; `plane`: three numbers and an outline; `revolution`: an axis
+    and a profile; `surfels`: curved."""
     albedo: bool = False
     """Learn a diffuse term A (Eq. 8); a perfect mirror has none."""
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)

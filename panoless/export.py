@@ -20,6 +20,7 @@ from panoless.fit import clear_views, complete, normalization_of
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.rasterize import RasterCamera
 from panoless.kernels.reference.rasterize import rotation_matrices
+from panoless.lathe import Lathe, lathe_buffers, outgoing_directions
 from panoless.light import light_of
 from panoless.plane import Plane, plane_buffers
 from panoless.shading import ALPHA_FLOOR, compose, reflection_directions_world, surface_buffers
@@ -51,8 +52,10 @@ from shinypartial.sphere import latlong_directions
 
 PLY_NAME = "surfels.ply"
 PLANE_PLY_NAME = "plane.ply"
+LATHE_PLY_NAME = "lathe.ply"
 PICTURES = "pictures"
 SUPERSAMPLING = 2
+LATHE_AROUND = 128
 SH_DEGREE_0 = 0.28209479177387814
 
 
@@ -72,7 +75,7 @@ class Decomposition:
 
 
 def render(
-    geometry: Surfels | Plane,
+    geometry: Surfels | Plane | Lathe,
     environment: Float[Tensor, "6 3 L L"],
     camera: RasterCamera,
     normalization: Normalization,
@@ -82,6 +85,8 @@ def render(
     with torch.no_grad():
         if isinstance(geometry, Plane):
             buffers = plane_buffers(geometry, camera)
+        elif isinstance(geometry, Lathe):
+            buffers = lathe_buffers(geometry, camera)
         else:
             curved, depth_blend = config.surfels.curved, config.loss.depth_blend
             buffers = surface_buffers(geometry, camera, curved=curved, depth_blend=depth_blend)
@@ -90,6 +95,8 @@ def render(
         normals_camera = buffers.raster_normals_camera.flatten(1)[:, pixels]
         rays = unit_rays_camera(camera).flatten(1)[:, pixels]
         directions = reflection_directions_world(normals_camera, rays, rotation)
+        if isinstance(geometry, Lathe):
+            directions = outgoing_directions(geometry, camera, pixels, directions)
         specular = torch.zeros_like(buffers.albedo)
         specular.flatten(1)[:, pixels] = look_up(environment, directions, "clamp").T
         normals = torch.zeros_like(buffers.albedo)
@@ -123,11 +130,13 @@ def export_prediction(
     write_environment_map(folder, cube_to_latlong(environment, height))
     write_visibility(folder, cube_to_latlong(state.visibility[:, None], height)[..., 0].clip(0, 1))
     geometry = state.geometry
+    for name in (PLY_NAME, PLANE_PLY_NAME, LATHE_PLY_NAME):
+        (folder / name).unlink(missing_ok=True)
     if isinstance(geometry, Surfels):
-        (folder / PLANE_PLY_NAME).unlink(missing_ok=True)
         write_ply(folder / PLY_NAME, geometry, normalization_of(state))
+    elif isinstance(geometry, Lathe):
+        write_lathe_ply(folder / LATHE_PLY_NAME, geometry, normalization_of(state))
     else:
-        (folder / PLY_NAME).unlink(missing_ok=True)
         write_plane_ply(folder / PLANE_PLY_NAME, geometry, normalization_of(state))
     _write_test_views(dataset, state, config, folder)
     info = PredictionInfo(
@@ -146,7 +155,7 @@ def export_prediction(
         parameter_counts=_parameter_counts(state, config),
         peak_memory_bytes=state.peak_memory_bytes,
         curves=state.curves,
-        primitives=1 if state.flat else state.surfels.count,
+        primitives=1 if state.stepless else state.surfels.count,
         model_bytes=sum((folder / name).stat().st_size for name in (_ply_name(state), ENVIRONMENT)),
         model=state.rung or None,
         iteration=state.iteration if snapshot else None,
@@ -293,8 +302,24 @@ def write_plane_ply(path: Path, plane: Plane, normalization: Normalization) -> N
         temporary.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
+def write_lathe_ply(path: Path, lathe: Lathe, normalization: Normalization) -> None:
+    """Write the surface of revolution in world units as an ASCII PLY of quadrilaterals, 128 around."""
+    rings = lathe.rings(LATHE_AROUND) * normalization.radius + normalization.center
+    count, around = rings.shape[:2]
+    index = np.arange(count * around).reshape(count, around)
+    following = np.roll(index, -1, 1)
+    faces = np.stack([index[:-1], following[:-1], following[1:], index[1:]], -1).reshape(-1, 4)
+    lines = ["ply", "format ascii 1.0", f"element vertex {count * around}"]
+    lines += [f"property float {axis}" for axis in "xyz"]
+    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+    lines += [" ".join(f"{value:.9g}" for value in corner) for corner in rings.reshape(-1, 3)]
+    lines += ["4 " + " ".join(map(str, face)) for face in faces.tolist()]
+    with whole_file(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
 def _ply_name(state: FitState) -> str:
-    return PLANE_PLY_NAME if state.flat else PLY_NAME
+    return LATHE_PLY_NAME if state.turned else PLANE_PLY_NAME if state.flat else PLY_NAME
 
 
 def _columns(names: str | tuple[str, ...], matrix: Tensor) -> dict[str, np.ndarray]:
@@ -308,6 +333,9 @@ def _parameter_counts(state: FitState, config: FitConfig) -> dict[str, int]:
         # Normal and offset; the outline's vertices; the rim.
         numbers = 3 + state.geometry.outline.size + (state.geometry.rim_height > 0)
         return {"plane parameters": numbers, "environment parameters": state.final_environment.numel()}
+    if isinstance(state.geometry, Lathe):
+        numbers = state.geometry.numbers
+        return {"revolution parameters": numbers, "environment parameters": state.final_environment.numel()}
     per_surfel = 3 + 4 + 2 + 1
     per_surfel += 3 * config.albedo + 3 * config.surfels.curved + config.loss.roughness_weighted
     return {

@@ -17,7 +17,7 @@ from panoless.checkpoint import FitState, claim_run, load_state, save_state
 from panoless.config import FitConfig, check_config
 from panoless.cubemap import initial_environment, look_up, resample, solve_environment
 from panoless.densify import DensityStatistics, Edit, grow_and_prune, propagate_normals, reset_opacities
-from panoless.initialize import initial_surfels, surfels_on_plane
+from panoless.initialize import initial_surfels, surfels_on_lathe, surfels_on_plane
 from panoless.kernels.adam import UNBOUNDED
 from panoless.kernels.backend import gpu_kernels_installed
 from panoless.kernels.objective import mirror_objective
@@ -298,14 +298,14 @@ def _timed(state: FitState, stage: str) -> Iterator[None]:
 def complete(state: FitState, views: Views, config: FitConfig) -> None:
     """Solve the environment for the geometry of a state, and say how well each direction was observed."""
     with _timed(state, "solve environment"), torch.no_grad():
-        # No steps are taken with a plane, so there is no other map of it.
-        if config.environment.solve or state.flat:
+        # No steps are taken with what is no set of surfels, so there is no other map of it.
+        if config.environment.solve or state.stepless:
             state.final_environment, rays = solved_environment(views, state.geometry, config)
         else:
             rays = list(observed_rays(views, state.geometry, config, config.environment.rays))
             sigmoid = config.environment.activation == "sigmoid"
             state.final_environment = torch.sigmoid(state.environment) if sigmoid else state.environment
-        if config.visibility == "online" and not state.flat:
+        if config.visibility == "online" and not state.stepless:
             state.visibility = visibility_from_evidence(state.evidence)
         else:
             state.visibility = visibility_from_agreement(agreement(rays, state.final_environment))
@@ -350,7 +350,7 @@ def fit(
         claim_run(folder, dataset.root, dataset_hash(dataset), config)
         state = load_state(folder)
         if state is not None and state.final_environment is not None:
-            if not state.flat:
+            if not state.stepless:
                 require_snapshots(folder, marks)
             return state
         start = time.monotonic()
@@ -361,7 +361,7 @@ def fit(
             state.seconds = {"read views": loaded - start, "initialize": time.monotonic() - loaded}
             print(f"Model: {state.rung}", file=sys.stderr)
         views, state = clear_views(views, state), state.to(device)
-        if state.flat:
+        if state.stepless:
             complete(state, views, config)
             _note_peak_memory(state)
             save_state(folder, state)
@@ -388,12 +388,15 @@ def find_device(name: str) -> torch.device:
 def _first_state(views: Views, config: FitConfig) -> FitState:
     """The state before the first step, on the rung of the ladder that the scene needs."""
     rung = choose_rung(views, config, _trial)
-    if rung.plane is None:
+    if rung.lathe is not None:
+        state = new_state(views, config, surfels_on_lathe(rung.lathe, config.surfels.count))
+    elif rung.plane is None:
         state = new_state(views, config)
     else:
         start = surfels_on_plane(rung.plane, config.surfels.count if rung.model == "surfels" else 1, config.seed)
         state = new_state(without_mirrored_frame(views, rung.plane), config, start)
     state.plane, state.flat, state.rung = rung.plane, rung.model == "plane", f"{rung.model} ({rung.reason})"
+    state.lathe, state.turned = rung.lathe, rung.model == "revolution"
     return state
 
 

@@ -13,37 +13,35 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from panoless.views import TrainView, Views, pose_of
-from shinypartial.errors import InputError
+from panoless.carving import HULL_HALF_SIDE, Hull, outline_of
+from panoless.views import TrainView, Views
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-HULL_HALF_SIDE = 1.1
-SURFACE_SMOOTHING_VOXELS = 1.5
 #: Standard deviation of a hull vertex from an outline's cone, and of a contact from the rim, along its ray.
-TOLERANCE_VOXELS = 0.9
+TOLERANCE_PX = 3.9
 #: Below this the hull has no say.
 LEAST_TRUST = 0.01
 #: Keeps the thin plate solvable where nothing is trusted.
 TRUST_FLOOR = 1e-7
 #: The thin plate smooths the trusted hull over this length.
-PLATE_LENGTH_VOXELS = 1.75
+PLATE_LENGTH_PX = 5.0
+#: Of sharper images than this, a grid shows the shape no finer.
+MOST_PIXELS_A_VOXEL = 4.5
 #: Views compared for a contact: from directions and at heights over the tangent plane within about these angles.
 NEIGHBOR_VIEW_RAD = math.radians(12)
 NEIGHBOR_HEIGHT_RAD = math.radians(8)
 #: As many views tell contacts as well as all of a long video.
 MOST_VIEWS = 150
+#: A plate that leaves the hull by more is held on it, as if outlines touched it there.
+OBSTACLE_PX = 0.25
+OBSTACLE_TRUST = 0.5
+OBSTACLE_ROUNDS = 3
+PROJECTION_STEPS = 3
+LEAST_SLOPE = 0.5
 STEEPEST_COTANGENT = 5.0
 TENSOR_ROUNDS = 3
-
-
-@dataclass(frozen=True)
-class Hull:
-    """Signed distance (normalized units, negative inside) on a cubic grid of voxel centers, axes x, y, z."""
-
-    distance: Float[np.ndarray, "N N N"]
-    voxel: float
 
 
 @dataclass(frozen=True)
@@ -57,7 +55,7 @@ class Surface:
         """Unit means of the faces' normals, weighted by area."""
         corners = self.vertices[self.triangles]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        return _unit(_sum_at_vertices(np.repeat(cross[:, None], 3, 1), self))
+        return unit(_sum_at_vertices(np.repeat(cross[:, None], 3, 1), self))
 
     def shape_tensors(self) -> Float[np.ndarray, "V 3 3"]:
         """S with dn = S dx, the change of the normal along the surface.
@@ -95,57 +93,39 @@ class Contact:
         return np.where(trust < LEAST_TRUST, 0.0, trust)
 
 
-def carve_hull(views: Views, resolution: int, votes: float) -> Hull:
-    """Visual hull: a voxel stays if at least `votes` of the views have it inside their mask.
-
-    Raises InputError when nothing stays, which means masks and poses contradict each other.
-    """
-    from scipy.ndimage import distance_transform_edt
-
-    device = views.train[0].mask.device
-    line = torch.linspace(-HULL_HALF_SIDE, HULL_HALF_SIDE, resolution, device=device)
-    points = torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1).view(-1, 3)
-    allowed = math.floor((1 - votes) * len(views.train))
-    misses = torch.zeros(len(points), dtype=torch.int32, device=device)
-    alive = torch.arange(len(points), device=device)
-    for view in views.train:
-        camera, mask = view.camera, view.mask
-        seen = points[alive] @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        depth = seen[:, 2].clamp(min=1e-6)
-        column = (seen[:, 0] / depth * camera.fx + camera.cx).floor().long()
-        row = (seen[:, 1] / depth * camera.fy + camera.cy).floor().long()
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (seen[:, 2] > 0)
-        index = row.clamp(0, camera.height - 1) * camera.width + column.clamp(0, camera.width - 1)
-        misses[alive] += (~(inside & (mask.flatten()[index] >= 0.5))).int()
-        alive = alive[misses[alive] <= allowed]
-    if len(alive) < 8:
-        raise InputError(
-            expected="masks and poses that agree on an object",
-            found=f"no point in space that {votes:.0%} of the masks contain",
-            remedy="Check the axes of transform_matrix (OpenGL) and that masks mark the object, not the background.",
-        )
-    occupied = np.zeros(resolution**3, dtype=bool)
-    occupied[alive.cpu().numpy()] = True
-    occupied = np.pad(occupied.reshape(resolution, resolution, resolution)[1:-1, 1:-1, 1:-1], 1)
-    voxel = 2 * HULL_HALF_SIDE / (resolution - 1)
-    distance = distance_transform_edt(~occupied) - distance_transform_edt(occupied)
-    return Hull(distance.astype(np.float32) * voxel, voxel)
-
-
 def hull_surface(hull: Hull) -> Surface:
-    """The smoothed hull's zero level by marching cubes."""
-    from scipy.ndimage import gaussian_filter
+    """The hull's zero level by marching cubes."""
     from skimage.measure import marching_cubes
 
-    vertices, triangles, _, _ = marching_cubes(gaussian_filter(hull.distance, SURFACE_SMOOTHING_VOXELS), 0.0)
+    vertices, triangles, _, _ = marching_cubes(hull.distance, 0.0)
     return Surface(vertices * hull.voxel - HULL_HALF_SIDE, triangles.astype(np.int64))
 
 
 def completed_surface(hull: Hull, views: Views) -> Surface:
-    """The hull where outlines touch the object, continued as a thin plate: see `thin_plate`."""
+    """The hull where outlines touch the object, continued as a thin plate that stays inside the hull.
+
+    The plate is an obstacle problem: vertices that it would lift out of the hull are put on the hull, and held there
+    while it is solved again; what is left outside is moved onto the hull.
+    """
     surface = hull_surface(hull)
-    trust = outline_contact(surface, views).trust(TOLERANCE_VOXELS * hull.voxel)
-    return thin_plate(surface, trust + TRUST_FLOOR, PLATE_LENGTH_VOXELS * hull.voxel)
+    pixel = max(hull.pixel, hull.voxel / MOST_PIXELS_A_VOXEL)
+    trust = outline_contact(surface, views).trust(TOLERANCE_PX * pixel) + TRUST_FLOOR
+    target, plate = surface.vertices, surface
+    for _ in range(OBSTACLE_ROUNDS):
+        plate = thin_plate(surface, trust, PLATE_LENGTH_PX * pixel, target)
+        inside = _moved_inside(hull, plate.vertices)
+        out = np.linalg.norm(inside - plate.vertices, axis=1) > OBSTACLE_PX * hull.pixel
+        trust, target = np.where(out, np.maximum(trust, OBSTACLE_TRUST), trust), np.where(out[:, None], inside, target)
+    return Surface(_moved_inside(hull, plate.vertices), surface.triangles)
+
+
+def _moved_inside(hull: Hull, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+    """Points outside the hull on its surface, the others where they are: Newton steps along the gradient."""
+    for _ in range(PROJECTION_STEPS):
+        value, gradient = hull.sample(points)
+        step = np.maximum(value, 0) / np.maximum((gradient**2).sum(1), LEAST_SLOPE**2)
+        points = points - step[:, None] * gradient
+    return points
 
 
 def outline_contact(surface: Surface, views: Views) -> Contact:
@@ -160,7 +140,7 @@ def outline_contact(surface: Surface, views: Views) -> Contact:
     chosen = views.train[::stride]
     seen = [_seen_from(view, surface, normals) for view in chosen]
     margins, heights = (np.stack([each[part] for each in seen], 1) for part in (0, 1))
-    directions = _unit(np.stack([view.position for view in chosen]))
+    directions = unit(np.stack([view.position for view in chosen]))
     nearest = margins.argmin(1)
     rows = np.arange(len(nearest))
     apart = np.arccos(np.clip(directions @ directions.T, -1, 1))[nearest]
@@ -176,25 +156,23 @@ def _seen_from(
     view: TrainView, surface: Surface, normals: Float[np.ndarray, "V 3"]
 ) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:
     """Margin inside the outline, and height of the camera over the tangent plane (rad)."""
-    from scipy.ndimage import distance_transform_edt, map_coordinates
-
-    camera, inside = view.camera, view.mask.cpu().numpy() >= 0.5
-    rotation, center = pose_of(camera)
-    points = (surface.vertices - center) @ rotation.T
-    column = points[:, 0] / points[:, 2] * camera.fx + camera.cx
-    row = points[:, 1] / points[:, 2] * camera.fy + camera.cy
-    # Pixel centers lie half a pixel from the edge between two pixels.
-    distance = np.where(inside, distance_transform_edt(inside) - 0.5, 0.5 - distance_transform_edt(~inside))
-    margin = map_coordinates(distance, [row - 0.5, column - 0.5], order=1, mode="nearest")
-    toward = _unit(center - surface.vertices)
-    return margin * points[:, 2] / camera.fx, np.arcsin(np.clip((toward * normals).sum(1), -1, 1))
+    points = torch.from_numpy(surface.vertices.astype(np.float32)).to(view.mask.device)
+    margin = -outline_of(view).distances(points).cpu().numpy().astype(np.float64)
+    toward = unit(view.position - surface.vertices)
+    return margin, np.arcsin(np.clip((toward * normals).sum(1), -1, 1))
 
 
-def thin_plate(surface: Surface, trust: Float[np.ndarray, "V"], length: float) -> Surface:
+def thin_plate(
+    surface: Surface,
+    trust: Float[np.ndarray, "V"],
+    length: float,
+    target: Float[np.ndarray, "V 3"] | None = None,
+) -> Surface:
     """Vertices x that minimize Σ A t ‖x − x₀‖² + ℓ⁴ Σ A ‖Δx‖², the bending of a plate through the trusted ones.
 
-    A are vertex areas, t the trust, Δ the cotangent Laplacian of the given mesh. Where t is 1, details shorter than
-    ℓ are smoothed; where it is 0, the plate continues its surroundings' position and slope.
+    x₀ are the targets, or else the given vertices; A are vertex areas, t the trust, Δ the cotangent Laplacian of the
+    given mesh. Where t is 1, details shorter than ℓ are smoothed; where it is 0, the plate continues its surroundings'
+    position and slope.
     """
     from scipy import sparse
     from scipy.sparse.linalg import splu
@@ -202,9 +180,10 @@ def thin_plate(surface: Surface, trust: Float[np.ndarray, "V"], length: float) -
     areas = _vertex_areas(surface)
     laplacian = _cotangent_laplacian(surface)
     data = areas * trust
+    goals = surface.vertices if target is None else target
     system = length**4 * (laplacian.T @ sparse.diags(1 / areas) @ laplacian) + sparse.diags(data)
     factors = splu(system.tocsc())
-    moved = np.stack([factors.solve(data * column) for column in surface.vertices.T.astype(np.float64)], 1)
+    moved = np.stack([factors.solve(data * column) for column in goals.T.astype(np.float64)], 1)
     return Surface(moved, surface.triangles)
 
 
@@ -239,5 +218,6 @@ def _sum_at_vertices(values: Float[np.ndarray, "T 3 C"], surface: Surface) -> Fl
     return np.stack([np.bincount(index, column, minlength=count) for column in flat.T], 1)
 
 
-def _unit(vectors: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+def unit(vectors: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+    """Vectors of length one; zero stays zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)

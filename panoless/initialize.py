@@ -4,48 +4,126 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from panoless.carving import Hull, carve_hull
 from panoless.config import SurfelConfig
-from panoless.hull import carve_hull, completed_surface, hull_surface
+from panoless.hull import completed_surface, hull_surface, unit
+from panoless.lathe import Lathe
 from panoless.plane import Plane
 from panoless.surfels import Surfels
 from panoless.views import Views
 
 OVERLAP = 0.8
+#: A surfel's disk may leave the first surface, or the hull, by so much at twice its radius.
+SAG_PX = 1.0
+LEAST_RADIUS_PX = 1.5
+SHRINKING_STEPS, SHRINKAGE = 6, 0.75
+CANDIDATES = 8
+RELAXATION_ROUNDS = 3
 INITIAL_OPACITY_LOGIT = 2.2
 INITIAL_ROUGHNESS_LOGIT = -2.2
 RANDOM_OPACITY = 0.1
 
 
 def hull_surfels(views: Views, config: SurfelConfig, seed: int) -> Surfels:
-    """Surfels evenly over the part of the first surface that faces some camera, curved as it is.
+    """Surfels over the part of the first surface that faces some camera, curved as it is, within the outlines.
 
-    `thin-plate` takes the completed hull, `hull` the hull itself.
+    `thin-plate` takes the completed hull, `hull` the hull itself. Axes follow the principal directions; a radius is
+    at most that of `_reach`, so that strong curvature gets smaller surfels, and more of them.
     """
     hull = carve_hull(views, config.hull_resolution, config.hull_votes)
     surface = completed_surface(hull, views) if config.initial == "thin-plate" else hull_surface(hull)
-    vertex_normals = surface.vertex_normals()
+    vertex_normals, tensors = surface.vertex_normals(), surface.shape_tensors()
     corners = surface.vertices[surface.triangles]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     facing = _faces_some_camera(corners.mean(1), vertex_normals[surface.triangles].sum(1), views)
     areas = np.where(facing, np.linalg.norm(cross, axis=1) / 2, 0)
+    face_normals = unit(vertex_normals[surface.triangles].sum(1))
+    bends, _ = _principal(tensors[surface.triangles].mean(1), _tangent_frames(face_normals))
+    radii, largest = _radii(areas, bends, config.count, hull.pixel)
     rng = np.random.default_rng(seed)
-    # Stratified over the cumulative area: as even as possible without a relaxation.
-    picks = np.searchsorted(
-        np.cumsum(areas), (np.arange(config.count) + rng.random(config.count)) * areas.sum() / config.count
-    )
+    expected = np.cumsum(areas / radii.prod(1))
+    # Stratified over the cumulative number, and more than are needed, so that they can be spread.
+    candidates = CANDIDATES * config.count
+    picks = np.searchsorted(expected, (np.arange(candidates) + rng.random(candidates)) * expected[-1] / candidates)
     faces = surface.triangles[np.minimum(picks, len(corners) - 1)]
-    shares = rng.dirichlet([1.0, 1.0, 1.0], config.count)
-    points, normals, tensors = (
-        np.einsum("kv,kv...->k...", shares, values[faces])
-        for values in (surface.vertices, vertex_normals, surface.shape_tensors())
-    )
-    frames = _tangent_frames(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
-    curvatures = _shape_operators(tensors, frames)
-    scale = OVERLAP * math.sqrt(areas.sum() / config.count)
-    return _surfels(points, frames, np.full((config.count, 2), scale), curvatures, INITIAL_OPACITY_LOGIT)
+    shares = rng.dirichlet([1.0, 1.0, 1.0], candidates)
+    points = np.einsum("kv,kvi->ki", shares, surface.vertices[faces])
+    chosen = _spread(points, config.count)
+    points, faces, shares = points[chosen], faces[chosen], shares[chosen]
+    normals, tensors = (np.einsum("kv,kv...->k...", shares, values[faces]) for values in (vertex_normals, tensors))
+    bends, frames = _principal(tensors, _tangent_frames(unit(normals)))
+    scales = _within_hull(hull, points, frames, np.minimum(_reach(bends, hull.pixel), largest))
+    return _surfels(points, frames, scales, _shape_operators(tensors, frames), INITIAL_OPACITY_LOGIT)
+
+
+def _radii(
+    areas: Float[np.ndarray, "T"], bends: Float[np.ndarray, "T 2"], count: int, pixel: float
+) -> tuple[Float[np.ndarray, "T 2"], float]:
+    """Radii of `count` overlapping surfels on faces of these principal curvatures, and the largest of them.
+
+    The largest radius r solves Σ A/(min(r, l_u) min(r, l_v)) = n/OVERLAP², l the limit by curvature.
+    """
+    limits = _reach(bends, pixel)
+    low, high = 1e-6, OVERLAP * math.sqrt(areas.sum() / count) * 100
+    for _ in range(60):
+        middle = math.sqrt(low * high)
+        needed = (areas / np.minimum(limits, middle).prod(1)).sum() * OVERLAP**2
+        low, high = (middle, high) if needed > count else (low, middle)
+    return np.minimum(limits, high), high
+
+
+def _reach(bends: Float[np.ndarray, "K 2"], pixel: float) -> Float[np.ndarray, "K 2"]:
+    """The radius s at which a disk leaves a surface of curvature κ by SAG_PX at 2 s, at least LEAST_RADIUS_PX."""
+    limit = np.sqrt(SAG_PX * pixel / 2 / np.maximum(np.abs(bends), 1e-9))
+    return np.maximum(limit, LEAST_RADIUS_PX * pixel)
+
+
+def _within_hull(
+    hull: Hull,
+    points: Float[np.ndarray, "K 3"],
+    frames: Float[np.ndarray, "K 3 3"],
+    radii: Float[np.ndarray, "K 2"],
+) -> Float[np.ndarray, "K 2"]:
+    """Radii, shrunk until the disk at twice the radius leaves the hull by no more than SAG_PX, along either axis.
+
+    What lies outside the hull is seen outside the masks, where it would be a halo.
+    """
+    radii = radii.copy()
+    for _ in range(SHRINKING_STEPS):
+        tips = 2 * radii[:, :, None] * frames[:, :, :2].transpose(0, 2, 1)
+        excess = np.maximum(hull.at(points[:, None] + tips), hull.at(points[:, None] - tips))
+        radii = np.where(
+            excess > SAG_PX * hull.pixel, np.maximum(SHRINKAGE * radii, LEAST_RADIUS_PX * hull.pixel), radii
+        )
+    return radii
+
+
+def _spread(points: Float[np.ndarray, "C 3"], count: int) -> Int[np.ndarray, "K"]:
+    """Indices of `count` of the points, spread evenly among them: Lloyd's relaxation of a regular choice."""
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(points)
+    centers = points[:: max(len(points) // count, 1)][:count]
+    for _ in range(RELAXATION_ROUNDS):
+        _, owner = cKDTree(centers).query(points)
+        total = np.bincount(owner, minlength=count)
+        sums = np.stack([np.bincount(owner, column, minlength=count) for column in points.T], 1)
+        centers = np.where(total[:, None] > 0, sums / np.maximum(total, 1)[:, None], centers)
+    return tree.query(centers)[1]
+
+
+def _principal(
+    tensors: Float[np.ndarray, "K 3 3"], frames: Float[np.ndarray, "K 3 3"]
+) -> tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, "K 3 3"]]:
+    """Principal curvatures of shape tensors, and the frames turned about their normals to the principal directions."""
+    tangents = frames[:, :, :2]
+    shape = np.einsum("kiu,kij,kjv->kuv", tangents, tensors, tangents)
+    bends, directions = np.linalg.eigh((shape + shape.transpose(0, 2, 1)) / 2)
+    tangent_u = np.einsum("kiu,ku->ki", tangents, directions[:, :, 0])
+    return bends, np.stack([tangent_u, np.cross(frames[:, :, 2], tangent_u), frames[:, :, 2]], 2)
 
 
 def surfels_on_plane(plane: Plane, count: int, seed: int) -> Surfels:
@@ -65,6 +143,38 @@ def surfels_on_plane(plane: Plane, count: int, seed: int) -> Surfels:
     frames = np.broadcast_to(frame, (len(points), 3, 3))
     scales = np.full((len(points), 2), OVERLAP * math.sqrt(area / count))
     return _surfels(points, frames, scales, np.zeros((len(points), 3)), INITIAL_OPACITY_LOGIT)
+
+
+def surfels_on_lathe(lathe: Lathe, count: int) -> Surfels:
+    """About `count` surfels in rings around a lathe, curved as it is: half as long along the profile as around."""
+    profile, ends = lathe.profile, lathe.angles
+    steps = np.diff(lathe.arc_lengths)
+    areas = math.pi * steps * (profile[:-1, 0] + profile[1:, 0])
+    # A ring of radius ρ and width w holds 2πρ/2w surfels.
+    width = math.sqrt(areas.sum() / count / 2)
+    rings = max(round(lathe.arc_lengths[-1] / width), 1)
+    place = (np.arange(rings) + 0.5) * lathe.arc_lengths[-1] / rings
+    side = np.clip(np.searchsorted(lathe.arc_lengths, place) - 1, 0, len(steps) - 1)
+    along = (place - lathe.arc_lengths[side]) / np.maximum(steps[side], 1e-12)
+    radius, height = (profile[side] + along[:, None] * (profile[side + 1] - profile[side])).T
+    angle = ends[side, 0] + along * (ends[side, 1] - ends[side, 0])
+    bend = (ends[side, 1] - ends[side, 0]) / np.maximum(steps[side], 1e-12)
+    around = np.maximum(np.round(math.pi * radius / width), 3).astype(np.int64)
+    ring = np.repeat(np.arange(rings), around)
+    first = np.cumsum(around) - around
+    turn = 2 * math.pi * (np.arange(len(ring)) - first[ring] + ring % 2 / 2) / around[ring]
+    cos, sin, zero = np.cos(turn), np.sin(turn), np.zeros(len(ring))
+    along_radius, along_axis = np.cos(angle[ring]), np.sin(angle[ring])
+    local = np.stack([radius[ring] * cos, radius[ring] * sin, height[ring]], 1)
+    meridian = np.stack([along_radius * cos, along_radius * sin, along_axis], 1)
+    azimuth = np.stack([-sin, cos, zero], 1)
+    frames = np.stack([azimuth, meridian, np.cross(azimuth, meridian)], 2)
+    frames = np.einsum("ji,kjl->kil", lathe.frame, frames)
+    # n = n₀ − S·(x − x₀): the normal turns with the profile, and by n_ρ/ρ around the axis.
+    curvatures = np.stack([-along_axis / np.maximum(radius[ring], width / 2), zero, -bend[ring]], 1)
+    spacing = np.stack([2 * math.pi * radius[ring] / around[ring], np.full(len(ring), width)], 1)
+    scales = OVERLAP * np.maximum(spacing, 1e-6)
+    return _surfels(lathe.origin + local @ lathe.frame, frames, scales, curvatures, INITIAL_OPACITY_LOGIT)
 
 
 def random_surfels(config: SurfelConfig, seed: int) -> Surfels:

@@ -13,7 +13,9 @@ import torch
 
 from panoless.config import FitConfig
 from panoless.cubemap import solve_environment
-from panoless.initialize import surfels_on_plane
+from panoless.initialize import surfels_on_lathe, surfels_on_plane
+from panoless.lathe import Lathe
+from panoless.lathe_fit import fit_lathe, refine_lathe
 from panoless.observation import (
     TRIAL_RESOLUTION,
     Geometry,
@@ -48,41 +50,80 @@ Trial = Callable[[Views, FitConfig, Surfels], Surfels]
 class Rung:
     """The model that was taken, and why. `plane` is that of the outline, also when surfels bend away from it."""
 
-    model: Literal["plane", "surfels"]
+    model: Literal["plane", "revolution", "surfels"]
     reason: str
     plane: Plane | None = None
+    lathe: Lathe | None = None
+    """The surface of revolution, also when surfels that start on it explain more."""
 
 
 def choose_rung(views: Views, config: FitConfig, trial: Trial) -> Rung:
     """The rung of a scene.
 
-    A plane is refused when it misses the outlines. Else surfels that start on it are fitted to four fifths of the
-    views, and the plane stays unless they explain the others better: by 5 % of the mean ‖e‖²/(‖e‖² + s²) and by two
-    standard errors of the paired differences. A plane with an error above 0.3 goes anyway. `config.model` overrides.
+    A plane is refused when it misses the outlines, and after it a surface of revolution by the same measure. Else
+    surfels that start on the plane, or on the surface of revolution, are fitted to four fifths of the views, and it
+    stays unless they explain the others better: by 5 % of the mean ‖e‖²/(‖e‖² + s²) and by two standard errors of the
+    paired differences. A plane with an error above 0.3 goes anyway. `config.model` overrides.
     Raises InputError when a plane is asked for and can't be fitted.
     """
     if config.model == "surfels":
         return Rung("surfels", "asked for")
+    if config.model == "revolution":
+        return _revolution(views, config, trial, "asked for")
     try:
         found = fit_plane(views, thorough=config.model == "plane")
     except InputError:
         if config.model == "plane":
             raise
-        return Rung("surfels", "the masks don't determine a plane")
+        return _revolution(views, config, trial, "the masks don't determine a plane")
     distance, overlap = float(np.median(found.median_px)), float(np.median(found.iou))
     if config.model == "auto" and not (distance <= LARGEST_MEDIAN_PX and overlap >= LEAST_IOU):
         away = f"{distance:.2g} px" if np.isfinite(distance) else "far"
-        return Rung("surfels", f"no plane explains the outlines: {away} away, overlap {overlap:.0%}")
+        refused = f"no plane explains the outlines: {away} away, overlap {overlap:.0%}"
+        return _revolution(views, config, trial, refused)
     outline = f"a plane explains the outlines to {distance:.2g} px"
     if config.model == "plane":
         return Rung("plane", f"asked for; {outline}", found.plane)
-    flat, bent = _held_out_errors(without_mirrored_frame(views, found.plane), config, found.plane, trial)
-    gain = flat - bent
-    noise = STANDARD_ERRORS * float(gain.std(ddof=1)) / len(gain) ** 0.5 if len(gain) > 1 else np.inf
+    start = surfels_on_plane(found.plane, config.surfels.count, config.seed)
+    flat, bent = _held_out_errors(without_mirrored_frame(views, found.plane), config, found.plane, start, trial)
     compared = f"{outline}; held-out error {flat.mean():.4f} flat, {bent.mean():.4f} with surfels"
-    if flat.mean() > LARGEST_ERROR or gain.mean() > max(noise, LEAST_GAIN * flat.mean()):
+    if flat.mean() > LARGEST_ERROR or _clearly_better(flat, bent):
         return Rung("surfels", f"{compared}: bent", found.plane)
     return Rung("plane", f"{compared}: no better", found.plane)
+
+
+def _revolution(views: Views, config: FitConfig, trial: Trial, reason: str) -> Rung:
+    """The second rung, after `reason` spoke against the first."""
+    found, asked = fit_lathe(views), config.model == "revolution"
+    if found is None:
+        if asked:
+            raise InputError(
+                expected="masks of a surface of revolution, for --model revolution",
+                found="no axis around which their outlines agree",
+                remedy="Take --model auto or --model surfels.",
+            )
+        return Rung("surfels", f"{reason}; no axis of revolution")
+    distance, overlap = float(np.median(found.median_px)), float(np.median(found.iou))
+    if not asked and not (distance <= LARGEST_MEDIAN_PX and overlap >= LEAST_IOU):
+        refused = f"no surface of revolution: {distance:.2g} px away, overlap {overlap:.0%}"
+        return Rung("surfels", f"{reason}; {refused}")
+    outline = f"{reason}; a surface of revolution explains them to {distance:.2g} px"
+    lathe = refine_lathe(views, found.lathe)
+    if asked:
+        return Rung("revolution", outline, lathe=lathe)
+    start = surfels_on_lathe(lathe, config.surfels.count)
+    round_, free = _held_out_errors(views, config, lathe, start, trial)
+    compared = f"{outline}; held-out error {round_.mean():.4f}, {free.mean():.4f} with surfels"
+    if _clearly_better(round_, free):
+        return Rung("surfels", f"{compared}: not round", lathe=lathe)
+    return Rung("revolution", f"{compared}: no better", lathe=lathe)
+
+
+def _clearly_better(lower: np.ndarray, higher: np.ndarray) -> bool:
+    """Whether the errors of the higher rung are smaller by the margins above."""
+    gain = lower - higher
+    noise = STANDARD_ERRORS * float(gain.std(ddof=1)) / len(gain) ** 0.5 if len(gain) > 1 else np.inf
+    return bool(gain.mean() > max(noise, LEAST_GAIN * lower.mean()))
 
 
 def without_mirrored_frame(views: Views, plane: Plane) -> Views:
@@ -95,14 +136,15 @@ def without_mirrored_frame(views: Views, plane: Plane) -> Views:
     return replace(views, train=tuple(clear(view) for view in views.train))
 
 
-def _held_out_errors(views: Views, config: FitConfig, plane: Plane, trial: Trial) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of held-out views, one a view, for the plane and for surfels that started on it."""
+def _held_out_errors(
+    views: Views, config: FitConfig, lower: Geometry, start: Surfels, trial: Trial
+) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of held-out views, one a view, for a rung and for surfels that started on it."""
     kept, held_out = split_held_out(views.train)
     if not kept or not held_out:
         return np.zeros(1), np.zeros(1)
     solved, tested = replace(views, train=tuple(kept)), replace(views, train=tuple(held_out))
-    start = surfels_on_plane(plane, config.surfels.count, config.seed)
-    geometries: tuple[Geometry, Geometry] = (plane, trial(solved, config, start))
+    geometries: tuple[Geometry, Geometry] = (lower, trial(solved, config, start))
     errors = []
     for geometry in geometries:
         with torch.no_grad():

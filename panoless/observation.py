@@ -13,6 +13,7 @@ from panoless.config import FitConfig
 from panoless.cubemap import Rays, robust_weight, solve_environment
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.rasterize import Channels, RasterBuffers
+from panoless.lathe import Lathe, lathe_rays
 from panoless.plane import Plane, plane_buffers
 from panoless.shading import ALPHA_FLOOR, rasterize_surfels, reflection_directions_world, tiles_of
 from panoless.surfels import Surfels
@@ -33,7 +34,7 @@ TRUST_SCALE = 0.15
 PRIOR_PIXELS, PRIOR_TRUST = 1.0, 0.2
 TRUST_POWER = 4
 
-Geometry = Surfels | Plane
+Geometry = Surfels | Plane | Lathe
 Each = TypeVar("Each")
 
 
@@ -54,6 +55,9 @@ def observed_rays(
         pixels = view.solid[index % stride :: stride]
         if isinstance(geometry, Plane):
             yield _plane_rays(view, geometry, pixels)
+            continue
+        if isinstance(geometry, Lathe):
+            yield lathe_rays(geometry, view, pixels)[0]
             continue
         rays, pixels = _surfel_rays(view, geometry, config, pixels)
         if trust is not None:

@@ -59,9 +59,11 @@ class SurfelOptimizer:
                 state["step"] = torch.zeros(())
                 state.update({moment: torch.zeros_like(parameter) for moment in MOMENTS})
             state["step"] += 1
-            numbers = parameter.detach(), gradient, *(state[moment] for moment in MOMENTS)
+            mean, square = (state[moment] for moment in MOMENTS)
             bounds = environment_bounds if name == ENVIRONMENT else UNBOUNDED
-            tensors.append(AdamTensor(*numbers, group["lr"], int(state["step"]), bounds))
+            tensors.append(
+                AdamTensor(parameter.detach(), gradient, mean, square, group["lr"], int(state["step"]), bounds)
+            )
         adam_step(tensors, BETAS, EPSILON)
 
     def edit_surfels(self, surfels: Surfels, source: Tensor, keep_moments: Tensor) -> None:

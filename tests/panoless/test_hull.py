@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from panoless.carving import HULL_HALF_SIDE, carve_hull
 from panoless.config import SurfelConfig
 from panoless.hull import (
-    HULL_HALF_SIDE,
     Contact,
     Surface,
-    carve_hull,
     completed_surface,
     hull_surface,
     outline_contact,

@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 import torch
 
+from panoless.carving import HULL_HALF_SIDE, carve_hull
 from panoless.config import SurfelConfig
-from panoless.hull import HULL_HALF_SIDE
-from panoless.initialize import initial_surfels, surfels_on_plane
+from panoless.initialize import (
+    LEAST_RADIUS_PX,
+    OVERLAP,
+    SAG_PX,
+    _radii,
+    _reach,
+    initial_surfels,
+    surfels_on_plane,
+)
 from panoless.kernels.reference.rasterize import rotation_matrices
 from panoless.surfels import Surfels
 from panoless.views import Views
@@ -144,3 +152,43 @@ def test_surfels_on_a_plane_fill_its_outline(outline: np.ndarray, count: int) ->
     area = abs((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()) / 2
     spacing = (area / count / np.sin(np.pi / 3)) ** 0.5
     np.testing.assert_allclose(cKDTree(points).query(points, 2)[0][:, 1], spacing, rtol=1e-3)
+
+
+@pytest.mark.parametrize("bend", [2.0, 200.0])
+def test_a_disk_leaves_a_curved_surface_by_a_pixel_at_twice_its_radius(bend: float) -> None:
+    """A parabola of curvature κ falls by κ (2 s)²/2 there; radii below a pixel and a half are not made."""
+    pixel = 0.005
+    radius = float(_reach(np.array([[bend, bend]]), pixel)[0, 0])
+    assert bend * (2 * radius) ** 2 / 2 == pytest.approx(pixel) or radius == pytest.approx(LEAST_RADIUS_PX * pixel)
+    assert radius >= LEAST_RADIUS_PX * pixel
+
+
+def test_strong_curvature_gets_smaller_surfels_and_more_of_them_across_it_only() -> None:
+    """Half of an area is flat, half a cylinder: the radius along its axis is that of the flat half."""
+    pixel, bend, count = 0.005, 20.0, 4000
+    areas = np.full(100, 0.01)
+    bends = np.zeros((100, 2))
+    bends[50:, 1] = bend
+    radii, largest = _radii(areas, bends, count, pixel)
+    limit = np.sqrt(pixel / (2 * bend))
+    np.testing.assert_allclose(radii[:50], largest)
+    np.testing.assert_allclose(radii[50:, 0], largest)
+    np.testing.assert_allclose(radii[50:, 1], limit)
+    assert limit < largest
+    density = areas / radii.prod(1)
+    assert density.sum() * OVERLAP**2 == pytest.approx(count)
+    assert density[-1] / density[0] == pytest.approx(largest / limit)
+
+
+def test_no_surfel_reaches_far_out_of_the_hull(views: Views) -> None:
+    """Disks at twice the radius stay within a pixel, or are as small as surfels start."""
+    surfels, carved = (
+        initial_surfels(views, CONFIG, seed=0),
+        carve_hull(views, CONFIG.hull_resolution, CONFIG.hull_votes),
+    )
+    frames, radii = rotation_matrices(surfels.quats).double().numpy(), surfels.scales.double().numpy()
+    points = surfels.means.double().numpy()
+    for axis in (0, 1):
+        tips = 2 * radii[:, axis, None] * frames[:, :, axis]
+        outside = np.maximum(carved.at(points + tips), carved.at(points - tips)) / carved.pixel
+        assert ((outside < SAG_PX + 0.01) | (radii[:, axis] < 1.01 * LEAST_RADIUS_PX * carved.pixel)).mean() > 0.99

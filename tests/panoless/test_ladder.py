@@ -17,10 +17,11 @@ from panoless.surfels import Surfels
 from panoless.views import Views
 from shinypartial.dataset.schema import Dataset
 from shinypartial.errors import InputError
+from tests.support.mirror_lathe import around, goblet, lathe_views, pillar_views
 from tests.support.mirror_plane import NORMAL, RECTANGLE, arc, make_plane_dataset, plane_of, reflecting_views
 from tests.support.mirror_sphere import tiny_config
 
-CONFIG = tiny_config(iterations=200, count=200)
+CONFIG = replace(tiny_config(iterations=200, count=200), model="auto")
 SIZE_PX = 64
 
 
@@ -93,12 +94,22 @@ def test_surfels_that_cover_nothing_do_not_beat_the_plane() -> None:
     assert choose_rung(framed(0.0), CONFIG, vanished).model == "plane"
 
 
-def test_a_sphere_is_refused_by_its_outline(views: Views) -> None:
-    """Before anything is fitted; the reason says how far away the plane is."""
-    rung = choose_rung(views, CONFIG, no_trial)
+def test_a_box_is_refused_by_its_outline() -> None:
+    """Before anything is fitted, as plane and as surface of revolution; the reason says how far away the plane is."""
+    rung = choose_rung(pillar_views(around(16)), CONFIG, no_trial)
     assert rung.model == "surfels"
     assert rung.plane is None
+    assert rung.lathe is None
     assert rung.reason.startswith("no plane explains the outlines: ")
+    assert "revolution" in rung.reason
+
+
+def test_a_goblet_takes_the_surface_of_revolution() -> None:
+    """Surfels that only start on it explain no more."""
+    rung = choose_rung(lathe_views(goblet(), around(12)), CONFIG, as_started)
+    assert rung.model == "revolution"
+    assert rung.lathe is not None
+    assert rung.reason.endswith("no better")
 
 
 def test_the_configuration_overrides_both_ways(views: Views) -> None:

@@ -37,11 +37,12 @@ def clipped_environment(directions: Float[Tensor, "*S 3"]) -> Float[Tensor, "*S 
 
 
 def tiny_config(preset: str = "default", iterations: int = 80, count: int = 300) -> FitConfig:
-    """A preset with few surfels, texels and iterations; density control keeps a sensible rhythm at this length."""
+    """A preset of surfels, few, with few texels and iterations; density control keeps a rhythm at this length."""
     config = PRESETS[preset]
     density = replace(config.density, start=0.1, stop=0.9, every=0.2, reset_every=0.4, propagate_every=0.3)
     return replace(
         config,
+        model="surfels",
         iterations=iterations,
         surfels=replace(config.surfels, count=count, hull_resolution=40),
         environment=replace(config.environment, resolution=24, solve_resolution=24),
