@@ -103,6 +103,11 @@ class SheetSurfels:
         return (h_uu.square() + 2 * h_uv.square() + h_vv.square()).mean()
 
 
+def sheet_surfels(sheet: Sheet, count: int, seed: int) -> Surfels:
+    """About `count` surfels on a sheet."""
+    return SheetSurfels(sheet, count, seed).surfels(sheet.coefficients)
+
+
 def _cubic_basis(t: Float[Tensor, "K"]) -> list[Float[Tensor, "K 4"]]:
     """The four uniform cubic B-splines over a cell, t in [0, 1], and their first and second derivatives by t."""
     values = ((1 - t) ** 3 / 6, (3 * t**3 - 6 * t**2 + 4) / 6, (-3 * t**3 + 3 * t**2 + 3 * t + 1) / 6, t**3 / 6)

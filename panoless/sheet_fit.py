@@ -98,7 +98,8 @@ def tilted_best(views: Views, config: FitConfig, mirror: SheetSurfels, sheet: Sh
         with torch.no_grad():
             surfels = mirror.surfels(sheet.tilted(*tilt).coefficients)
             solved, held_out = split_held_out(list(observed_rays(views, surfels, config, TILT_RAYS)))
-            return prediction_error(held_out, solve_environment(solved, TILT_RESOLUTION), TILT_SCALE)
+            resolution = min(TILT_RESOLUTION, config.environment.resolution)
+            return prediction_error(held_out, solve_environment(solved, resolution), TILT_SCALE)
 
     places = step * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1)])
     errors = np.array([error(place) for place in places])
