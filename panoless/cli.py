@@ -97,10 +97,10 @@ class Export:
                 else f"{state.iteration} of {description.config.iterations} iterations",
                 remedy="Run the same `panoless fit` command again: it continues where it stopped.",
             )
-        if self.snapshots and state.flat:
+        if self.snapshots and state.stepless:
             raise InputError(
                 expected=f"a run of surfels in {folder}, for --snapshots",
-                found="a run that took a plane, which is fitted without steps: there are no moments in between",
+                found=f"a run of the model {state.rung.split()[0]}, without steps: there are no moments in between",
                 remedy="Leave --snapshots out; or fit surfels: "
                 "`panoless fit --model surfels --snapshots 6 --output NEW`.",
             )

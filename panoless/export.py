@@ -155,7 +155,7 @@ def export_prediction(
         parameter_counts=_parameter_counts(state, config),
         peak_memory_bytes=state.peak_memory_bytes,
         curves=state.curves,
-        primitives=1 if state.stepless else state.surfels.count,
+        primitives=state.surfels.count if isinstance(geometry, Surfels) else 1,
         model_bytes=sum((folder / name).stat().st_size for name in (_ply_name(state), ENVIRONMENT)),
         model=state.rung or None,
         iteration=state.iteration if snapshot else None,
@@ -336,6 +336,8 @@ def _parameter_counts(state: FitState, config: FitConfig) -> dict[str, int]:
     if isinstance(state.geometry, Lathe):
         numbers = state.geometry.numbers
         return {"revolution parameters": numbers, "environment parameters": state.final_environment.numel()}
+    if state.heights:
+        return {"bent plane parameters": state.heights, "environment parameters": state.final_environment.numel()}
     per_surfel = 3 + 4 + 2 + 1
     per_surfel += 3 * config.albedo + 3 * config.surfels.curved + config.loss.roughness_weighted
     return {
