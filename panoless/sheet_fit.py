@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from panoless.config import FitConfig
 from panoless.cubemap import resample, solve_environment
@@ -26,11 +27,11 @@ BETAS = (0.9, 0.99)
 WARM_UP_STEPS = 30
 DROP_AT, DROP_FACTOR = 0.5, 0.01
 """As in `RateConfig`: rates are constant until this share of the steps, then fall."""
-BOUTS = (0.6, 0.75, 0.9, 1.0)
+BOUTS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """Shares of the steps after which they pause; between two bouts the tilt is searched."""
-TILTS_DEG = (0.3, 0.15, 0.08)
+TILTS_DEG = (0.3, 0.3, 0.2, 0.2, 0.1)
 """Steps of the searches."""
-TILT_RAYS = 400_000
+TILT_RAYS = 300_000
 TILT_RESOLUTION = 128
 TILT_SCALE = 0.05
 NOTHING = Channels(colors=False, depth=False, distortion=False)
@@ -94,15 +95,20 @@ def _bout(
 def tilted_best(views: Views, config: FitConfig, mirror: SheetSurfels, sheet: Sheet, step: float) -> Sheet:
     """The sheet with the tilt at which held-out views are predicted best, by a parabola through six tilts."""
 
-    def error(tilt: Float[np.ndarray, "2"]) -> float:
+    resolution = min(TILT_RESOLUTION, config.environment.resolution)
+
+    def solved(
+        tilt: Float[np.ndarray, "2"], start: Float[Tensor, "6 3 L L"] | None
+    ) -> tuple[float, Float[Tensor, "6 3 L L"]]:
         with torch.no_grad():
             surfels = mirror.surfels(sheet.tilted(*tilt).coefficients)
-            solved, held_out = split_held_out(list(observed_rays(views, surfels, config, TILT_RAYS)))
-            resolution = min(TILT_RESOLUTION, config.environment.resolution)
-            return prediction_error(held_out, solve_environment(solved, resolution), TILT_SCALE)
+            known, held_out = split_held_out(list(observed_rays(views, surfels, config, TILT_RAYS)))
+            environment = solve_environment(known, resolution, start)
+            return prediction_error(held_out, environment, TILT_SCALE), environment
 
+    _, here = solved(np.zeros(2), None)
     places = step * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1)])
-    errors = np.array([error(place) for place in places])
+    errors = np.array([solved(place, here)[0] for place in places])
     u, v = places.T / step
     design = np.stack([np.ones(6), u, v, u * u / 2, u * v, v * v / 2], 1)
     _, *slope, uu, uv, vv = np.linalg.solve(design, errors)
