@@ -197,7 +197,7 @@ def cropped(
     return Photograph(camera, torch.from_numpy(planes), torch.from_numpy(mask))
 
 
-def estimate_normalization(masks: list[tuple[Camera, Float[np.ndarray, "H W"]]]) -> Normalization:
+def estimate_normalization(masks: list[tuple[Camera, Float[np.ndarray, "_ _"]]]) -> Normalization:
     """Center and radius of the object from where the masks lie in the views.
 
     The center is the point nearest, in least squares, to the rays through the masks' centers; the radius is the

@@ -21,6 +21,7 @@ from shinypartial.images import read_exr, write_exr, write_png
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = [
+    "--model", "surfels",
     "--config.iterations", "4",
     "--config.surfels.count", "40",
     "--config.surfels.hull-resolution", "24",

@@ -24,7 +24,7 @@ sys.exit(main(sys.argv[1:]))
 
 def start(dataset: Dataset, place: Path, output: str) -> subprocess.Popen[str]:
     """The command in a process of its own, with frequent checkpoints."""
-    options = ["--config.iterations", str(ITERATIONS), "--config.surfels.count", "100"]
+    options = ["--model", "surfels", "--config.iterations", str(ITERATIONS), "--config.surfels.count", "100"]
     options += ["--config.surfels.hull-resolution", "24", "--config.environment.resolution", "16"]
     options += ["--config.environment.solve-resolution", "16"]
     return subprocess.Popen(

@@ -1,6 +1,6 @@
 """A run folder: its state survives the disk, damage is named, and nobody else's folder is taken."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,9 @@ from panoless.checkpoint import (
     save_state,
 )
 from panoless.config import PRESETS
+from panoless.lathe import Lathe
 from shinypartial.errors import InputError
+from tests.support.mirror_lathe import around, funnel, goblet, rays_of
 from tests.support.mirror_plane import L_SHAPE, plane_of
 from tests.support.mirror_sphere import sphere_surfels
 
@@ -74,6 +76,37 @@ def test_a_plane_survives_the_disk(tmp_path: Path, flat: bool) -> None:
     assert isinstance(loaded.plane.offset, float)
     assert loaded.rung == "plane (asked for)"
     assert loaded.geometry is (loaded.plane if flat else loaded.surfels)
+
+
+@pytest.mark.parametrize("turned", [True, False], ids=["revolution", "surfels that began on it"])
+def test_a_surface_of_revolution_survives_the_disk(tmp_path: Path, turned: bool) -> None:
+    """To the last bit, and with it what its rays meet; it is the geometry only when it was taken."""
+    lathe = funnel(1 / 3)
+    save_state(tmp_path, replace(some_state(True), lathe=lathe, turned=turned, rung="revolution (asked for)"))
+    loaded = load_state(tmp_path)
+    assert loaded is not None
+    assert loaded.lathe is not None
+    for item in fields(lathe):
+        np.testing.assert_array_equal(getattr(loaded.lathe, item.name), getattr(lathe, item.name))
+    assert type(loaded.lathe.rim) is int
+    rays = rays_of(around(3, 24)[2])
+    for name, values in vars(lathe.hits(*rays)).items():
+        np.testing.assert_array_equal(getattr(loaded.lathe.hits(*rays), name), values)
+    assert loaded.stepless == turned
+    assert loaded.geometry is (loaded.lathe if turned else loaded.surfels)
+
+
+def test_a_surface_of_revolution_that_was_used_is_saved_like_a_new_one(tmp_path: Path) -> None:
+    """What it computed about itself meanwhile is no part of it."""
+    for name, lathe in (("new", goblet()), ("used", goblet())):
+        (tmp_path / name).mkdir()
+        if name == "used":
+            lathe.hits(*rays_of(around(1, 8)[0]))
+        save_state(tmp_path / name, replace(some_state(True), lathe=lathe, turned=True))
+    first, second = (load_state(tmp_path / name) for name in ("new", "used"))
+    assert first is not None
+    assert second is not None
+    assert vars(first.lathe).keys() == vars(second.lathe).keys() == {item.name for item in fields(Lathe)}
 
 
 def test_before_the_first_checkpoint_there_is_none(tmp_path: Path) -> None:

@@ -78,7 +78,7 @@ def test_bad_usage_exits_with_2(arguments: list[str], capsys: pytest.CaptureFixt
 def test_a_wrong_model_is_answered_with_the_right_ones(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["fit", "--model", "cube"]) == 2
     out, err = capsys.readouterr()
-    for name in ("cube", "--model", "auto", "plane", "surfels"):
+    for name in ("cube", "--model", "auto", "plane", "revolution", "surfels"):
         assert name in out + err
 
 
@@ -87,23 +87,26 @@ def test_the_model_is_that_of_the_preset_unless_named(
     preset: str, model: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = help_text(["fit", "--preset", preset], capsys, monkeypatch)
-    assert re.search(rf"--model \{{auto,plane,surfels\}}[^)]*\(default: {model}\)", text)
+    assert re.search(rf"--model \{{auto,plane,revolution,surfels\}}[^)]*\(default: {model}\)", text)
     text = help_text(["fit", "--preset", preset, "--model", "plane"], capsys, monkeypatch)
-    assert "--model {auto,plane,surfels}" in text
+    assert "--model {auto,plane,revolution,surfels}" in text
 
 
 def test_a_model_that_is_asked_for_is_taken_and_saved(
-    tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, many_views_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Even a plane for a sphere; the run says so, and so does the prediction."""
+    """Even a plane for a sphere, which is a surface of revolution; the run says so, and so does the prediction."""
     monkeypatch.chdir(tmp_path)
-    for model in ("plane", "surfels"):
-        assert main(["fit", str(sphere_dataset.root), *TINY, "--model", model, "--output", model]) == 0
+    tables = {"plane": "plane.ply", "revolution": "lathe.ply", "surfels": "surfels.ply"}
+    coarse = ["--config.environment.resolution", "16", "--config.environment.solve-resolution", "16"]
+    for model in tables:
+        assert main(["fit", str(many_views_dataset.root), *TINY, *coarse, "--model", model, "--output", model]) == 0
         assert f"Model: {model} (asked for" in capsys.readouterr().err
         content = json.loads((tmp_path / model / "prediction.json").read_text())
         assert content["config"]["model"] == model
         assert content["model"].startswith(f"{model} (asked for")
-        assert (tmp_path / model / "plane.ply").exists() == (model == "plane")
+        for other, table in tables.items():
+            assert (tmp_path / model / table).exists() == (model == other)
 
 
 def test_options_reach_the_fit_and_are_saved(
@@ -128,7 +131,7 @@ def test_the_newest_folder_is_taken_where_none_is_named(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "datasets").mkdir()
     (tmp_path / "datasets" / "sphere").symlink_to(sphere_dataset.root)
-    assert main(["fit", *TINY]) == 0
+    assert main(["fit", *TINY, "--model", "surfels"]) == 0
     assert "No dataset named" in capsys.readouterr().out
     assert main(["export", "--output", "again"]) == 0
     first = next((tmp_path / "predictions").iterdir())

@@ -11,6 +11,7 @@ import torch
 
 from panoless.checkpoint import FitState
 from panoless.export import (
+    LATHE_PLY_NAME,
     PICTURES,
     PLANE_PLY_NAME,
     PLY_NAME,
@@ -21,10 +22,12 @@ from panoless.export import (
     write_plane_ply,
     write_ply,
 )
-from panoless.initialize import surfels_on_plane
+from panoless.initialize import surfels_on_lathe, surfels_on_plane
 from panoless.kernels.cubemap import cubemap_directions
+from panoless.lathe import Lathe
 from panoless.views import Normalization, raster_camera
 from shinypartial.dataset.read import open_dataset, read_view
+from shinypartial.dataset.schema import Dataset
 from shinypartial.errors import InputError
 from shinypartial.evaluate import evaluate
 from shinypartial.picture_sheet import MAX_BYTES
@@ -328,11 +331,90 @@ def test_a_plane_is_described_as_what_it_is(plane_prediction: tuple[Path, Path])
     assert not (folder / PLY_NAME).exists()
 
 
-def test_surfels_say_why_there_is_no_plane(prediction: Path) -> None:
-    model = read_info(prediction).model
-    assert model is not None
-    assert model.startswith("surfels (no plane explains the outlines")
-    assert not (prediction / PLANE_PLY_NAME).exists()
+def test_surfels_say_why_they_were_taken(prediction: Path, finished: FinishedFit, tmp_path: Path) -> None:
+    """In the words of the ladder; no other model lies beside them."""
+    assert read_info(prediction).model == finished.state.rung == "surfels (asked for)"
+    reason = "surfels (no plane explains the outlines: 7 px away, overlap 80%; no axis of revolution)"
+    for name in (PLANE_PLY_NAME, LATHE_PLY_NAME):
+        (tmp_path / name).write_text("of an earlier fit")
+    export_prediction(finished.dataset, replace(finished.state, rung=reason), finished.config, tmp_path)
+    assert read_info(tmp_path).model == reason
+    for folder in (prediction, tmp_path):
+        assert (folder / PLY_NAME).exists()
+        assert not (folder / PLANE_PLY_NAME).exists()
+        assert not (folder / LATHE_PLY_NAME).exists()
+
+
+@pytest.fixture(scope="module")
+def ball_prediction(tmp_path_factory: pytest.TempPathFactory, sphere_dataset: Dataset) -> Path:
+    """The traced sphere as an exact surface of revolution, in a frame of twice the world's unit, exported."""
+    radius, center, sides = 2.0, np.array([0.3, -0.2, 0.1]), 720
+    angle = np.linspace(-np.pi / 2, np.pi / 2, sides + 1)
+    profile = np.stack([np.cos(angle).clip(0), np.sin(angle)], 1) / radius
+    axis = np.array([0.6, 0.0, 0.8])
+    middle = -center / radius
+    height = float(middle @ axis)
+    lathe = Lathe(middle - height * axis, axis, profile + np.array([0.0, height]), sides)
+    environment = clipped_environment(cubemap_directions(64)).permute(0, 3, 1, 2).contiguous()
+    state = FitState(
+        surfels=surfels_on_lathe(lathe, 40),
+        environment=environment,
+        iteration=0,
+        optimizer={},
+        gradient_sum=torch.zeros(1),
+        gradient_count=torch.zeros(1),
+        evidence=torch.zeros(6, 64, 64),
+        center=center.tolist(),
+        radius=radius,
+        final_environment=environment,
+        visibility=torch.ones(6, 64, 64),
+        lathe=lathe,
+        turned=True,
+        rung="revolution (asked for)",
+    )
+    folder = tmp_path_factory.mktemp("predictions") / "ball"
+    claim_prediction(folder)
+    export_prediction(sphere_dataset, state, tiny_config(), folder)
+    return folder
+
+
+def test_an_exact_surface_of_revolution_scores_perfect_normals(ball_prediction: Path, sphere_dataset: Dataset) -> None:
+    """A side of the profile turns by a quarter of a degree, and interpolation goes between."""
+    scores = evaluate(ball_prediction, sphere_dataset.root)
+    assert scores.normals is not None
+    assert scores.normals.median_angular_error_deg < 0.02
+
+
+def test_a_surface_of_revolution_renders_the_traced_views(ball_prediction: Path, sphere_dataset: Dataset) -> None:
+    """Alpha as traced with 25 points a pixel; depth and radiance of the mirror, in world units."""
+    for frame in sphere_dataset.test:
+        found, truth = read_view(prediction_frame(ball_prediction, frame)), read_view(frame)
+        np.testing.assert_allclose(found.alpha, truth.alpha, atol=0.13)
+        whole = truth.alpha == 1
+        assert whole.mean() > 0.1
+        assert found.depth is not None
+        assert truth.depth is not None
+        np.testing.assert_allclose(found.depth[whole], truth.depth[whole], atol=1e-3)
+        difference = np.abs(found.radiance - truth.radiance.clip(0, 1))[whole]
+        assert difference.mean() < 3e-3
+
+
+def test_a_surface_of_revolution_is_described_as_what_it_is(ball_prediction: Path) -> None:
+    """One primitive, the reason in words, and a mesh whose vertices lie on the traced sphere in world units."""
+    info = read_info(ball_prediction)
+    assert info.model == "revolution (asked for)"
+    assert info.primitives == 1
+    assert info.parameter_counts == {"revolution parameters": 5 + 2 * 721, "environment parameters": 6 * 3 * 64 * 64}
+    assert not (ball_prediction / PLY_NAME).exists()
+    lines = (ball_prediction / LATHE_PLY_NAME).read_text(encoding="ascii").splitlines()
+    count = next(int(line.split()[-1]) for line in lines if line.startswith("element vertex"))
+    begin = lines.index("end_header") + 1
+    vertices = np.array([[float(value) for value in line.split()] for line in lines[begin : begin + count]])
+    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1, atol=1e-6)
+    faces = np.array([[int(value) for value in line.split()] for line in lines[begin + count :]])
+    assert (faces[:, 0] == 4).all()
+    assert faces[:, 1:].min() == 0
+    assert faces[:, 1:].max() == count - 1
 
 
 def test_the_ply_of_a_plane_is_its_outline_in_world_units(tmp_path: Path) -> None:

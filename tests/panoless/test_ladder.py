@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from panoless.config import FitConfig
-from panoless.fit import _trial, fit
+from panoless.fit import _first_state, _trial, fit
 from panoless.initialize import surfels_on_plane
 from panoless.ladder import choose_rung, without_mirrored_frame
 from panoless.plane import Plane, unobstructed
@@ -102,6 +102,15 @@ def test_a_box_is_refused_by_its_outline() -> None:
     assert rung.lathe is None
     assert rung.reason.startswith("no plane explains the outlines: ")
     assert "revolution" in rung.reason
+
+
+def test_a_fit_remembers_why_it_took_surfels() -> None:
+    """The reason of the ladder becomes part of the state, from which it goes into the prediction."""
+    state = _first_state(pillar_views(around(16)), replace(CONFIG, model="auto"))
+    assert state.rung.startswith("surfels (no plane explains the outlines: ")
+    assert state.rung.endswith(")")
+    assert not state.stepless
+    assert state.geometry is state.surfels
 
 
 def test_a_goblet_takes_the_surface_of_revolution() -> None:

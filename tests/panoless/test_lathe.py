@@ -85,7 +85,7 @@ def test_buffers_cover_what_the_rays_cover() -> None:
 
 @pytest.fixture(scope="module")
 def goblet_fit():
-    return fit_lathe(lathe_views(goblet(), around(24)))
+    return fit_lathe(lathe_views(goblet(), around(12)))
 
 
 def test_outlines_give_axis_and_profile(goblet_fit) -> None:

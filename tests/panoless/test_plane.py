@@ -240,7 +240,7 @@ def test_a_sphere_is_no_plane(views: Views, flat_fit: PlaneFit) -> None:
 def test_giving_up_early_changes_no_plane(flat_fit: PlaneFit) -> None:
     """A ball is left after the first round, pixels away from any outline; a plane is found to the last bit."""
     balls = []
-    for camera in arc(12):
+    for camera in arc(12, half_angle_deg=60.0, size=128):
         rotation, center = pose_of(camera)
         across = np.cross(rotation @ -center, unit_rays_camera(camera).numpy(), axisb=0)
         balls.append(train_view(camera, (np.linalg.norm(across, axis=-1) < 0.8).astype(np.float64)))

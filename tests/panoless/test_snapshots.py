@@ -227,6 +227,7 @@ def test_the_commands_take_and_export_snapshots(
     monkeypatch.chdir(tmp_path)
     options = ["--config.iterations", "4", "--config.surfels.count", "40", "--config.surfels.hull-resolution", "24"]
     options += ["--config.environment.resolution", "16", "--config.environment.solve-resolution", "16"]
+    options += ["--model", "surfels"]
     assert main(["fit", str(sphere_dataset.root), "--output", "p", "--snapshots", "2", *options]) == 0
     assert "panoless export runs/p --output p --snapshots" in capsys.readouterr().out
     assert main(["export", "runs/p", "--output", "p", "--snapshots"]) == 0
@@ -235,12 +236,18 @@ def test_the_commands_take_and_export_snapshots(
     assert "snapshots" not in asdict(CONFIG)
 
 
-def test_a_plane_has_no_snapshots_and_the_command_says_why(
-    tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("model", "name"), [("plane", "a plane"), ("revolution", "a surface of revolution")])
+def test_what_takes_no_steps_has_no_snapshots_and_the_command_says_why(
+    model: str,
+    name: str,
+    tmp_path: Path,
+    many_views_dataset: Dataset,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    options = ["--model", "plane", "--config.environment.solve-resolution", "16"]
-    assert main(["fit", str(sphere_dataset.root), "--output", "p", "--snapshots", "2", *options]) == 0
-    assert "No snapshots" in capsys.readouterr().out
+    options = ["--model", model, "--config.environment.solve-resolution", "16"]
+    assert main(["fit", str(many_views_dataset.root), "--output", "p", "--snapshots", "2", *options]) == 0
+    assert f"No snapshots: this run took {name}" in capsys.readouterr().out
     assert main(["export", "runs/p", "--output", "p", "--snapshots"]) == 2
-    assert "fitted without steps" in capsys.readouterr().err
+    assert f"took {name}, which is fitted without steps" in capsys.readouterr().err
