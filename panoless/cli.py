@@ -4,12 +4,15 @@ import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from panoless.config import PRESETS, FitConfig
 from shinypartial.errors import EXIT_BAD_INPUT, InputError, run_command
+
+if TYPE_CHECKING:
+    from panoless.checkpoint import FitState
 
 RUNS = Path("runs")
 
@@ -119,7 +122,7 @@ class Export:
             print(f"Then: shinypartial evaluate {prediction} --snapshots")
 
 
-def _shape_name(state: FitState) -> str:
+def _shape_name(state: "FitState") -> str:
     return "a plane" if state.flat else "a bent plane" if state.heights else "a surface of revolution"
 
 
