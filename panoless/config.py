@@ -187,6 +187,7 @@ _PAPER = FitConfig(
 PRESETS: dict[str, FitConfig] = {
     "fast": FitConfig(
         preset="fast",
+        model="surfels",
         iterations=300,
         downscale=2,
         surfels=SurfelConfig(count=3000, hull_resolution=64),
