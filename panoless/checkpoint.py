@@ -51,13 +51,15 @@ class FitState:
     """The surface of revolution of the outlines, where there is one."""
     turned: bool = False
     """Whether that surface is the geometry; no steps are taken with it then."""
+    heights: int = 0
+    """Of how many numbers the surfels are functions, when they lie on a bent plane; 0 when they are free."""
     rung: str = ""
     """Which rung of the ladder was taken, and why."""
 
     @property
     def stepless(self) -> bool:
-        """Whether the geometry is not made of surfels, so that no steps of the optimization are taken."""
-        return self.flat or self.turned
+        """Whether the geometry is not made of free surfels, so that no steps of the optimization are taken."""
+        return self.flat or self.turned or self.heights > 0
 
     @property
     def geometry(self) -> Surfels | Plane | Lathe:

@@ -60,7 +60,7 @@ class Fit:
             export_prediction(dataset, state, self.config, prediction)
         print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
         if marks and state.stepless:
-            print(f"No snapshots: this run took {_shape_name(state.flat)}, whose map is solved without steps.")
+            print(f"No snapshots: this run is of the model {state.rung.split()[0]}, whose map is solved without steps.")
         elif marks:
             print(f"Snapshots: panoless export {run_folder} --output {prediction} --snapshots")
 
@@ -100,8 +100,7 @@ class Export:
         if self.snapshots and state.stepless:
             raise InputError(
                 expected=f"a run of surfels in {folder}, for --snapshots",
-                found=f"a run that took {_shape_name(state.flat)}, which is fitted without steps: "
-                "there are no moments in between",
+                found=f"a run of the model {state.rung.split()[0]}, without steps: there are no moments in between",
                 remedy="Leave --snapshots out; or fit surfels: "
                 "`panoless fit --model surfels --snapshots 6 --output NEW`.",
             )
@@ -117,10 +116,6 @@ class Export:
         print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
         if self.snapshots:
             print(f"Then: shinypartial evaluate {prediction} --snapshots")
-
-
-def _shape_name(flat: bool) -> str:
-    return "a plane" if flat else "a surface of revolution"
 
 
 def _refuse_run_folder(prediction: Path, run_folder: Path) -> None:

@@ -130,9 +130,11 @@ class FitConfig:
     """Number of optimization steps (one view each)."""
     seed: int = 0
     """Seed of the initial surfels and of the order of views."""
-    model: Annotated[Literal["auto", "plane", "revolution", "surfels"], tyro.conf.arg(prefix_name=False)] = "auto"
-    """`auto`: the simplest that explains held-out views; `plane`: three numbers and an outline; `revolution`: an axis
-    and a profile; `surfels`: curved."""
+    model: Annotated[Literal["auto", "plane", "bent", "revolution", "surfels"], tyro.conf.arg(prefix_name=False)] = (
+        "auto"
+    )
+    """`auto`: the simplest that explains held-out views; `plane`: three numbers and an outline; `bent`: a smooth height
+    over that plane; `revolution`: an axis and a profile; `surfels`: curved."""
     albedo: bool = False
     """Learn a diffuse term A (Eq. 8); a perfect mirror has none."""
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)

@@ -3,7 +3,7 @@
 import json
 import os
 import platform
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -80,8 +80,12 @@ def render(
     camera: RasterCamera,
     normalization: Normalization,
     config: FitConfig,
+    outline: Plane | None = None,
 ) -> Decomposition:
-    """Render one camera with the final environment (radiance, not logits) in a mirror of the configured tint."""
+    """Render one camera with the final environment (radiance, not logits) in a mirror of the configured tint.
+
+    Surfels that lie over a plane end where its outline does, if one is given.
+    """
     with torch.no_grad():
         if isinstance(geometry, Plane):
             buffers = plane_buffers(geometry, camera)
@@ -90,6 +94,8 @@ def render(
         else:
             curved, depth_blend = config.surfels.curved, config.loss.depth_blend
             buffers = surface_buffers(geometry, camera, curved=curved, depth_blend=depth_blend)
+        if outline is not None:
+            buffers = replace(buffers, alpha=plane_buffers(outline, camera).alpha * (buffers.alpha > ALPHA_FLOOR))
         rotation = camera.world_to_camera[:3, :3].T
         pixels = torch.nonzero(buffers.alpha.flatten() > ALPHA_FLOOR)[:, 0]
         normals_camera = buffers.raster_normals_camera.flatten(1)[:, pixels]
@@ -155,7 +161,7 @@ def export_prediction(
         parameter_counts=_parameter_counts(state, config),
         peak_memory_bytes=state.peak_memory_bytes,
         curves=state.curves,
-        primitives=1 if state.stepless else state.surfels.count,
+        primitives=state.surfels.count if isinstance(geometry, Surfels) else 1,
         model_bytes=sum((folder / name).stat().st_size for name in (_ply_name(state), ENVIRONMENT)),
         model=state.rung or None,
         iteration=state.iteration if snapshot else None,
@@ -208,7 +214,8 @@ def _write_test_views(dataset: Dataset, state: FitState, config: FitConfig, fold
     for index, frame in enumerate(dataset.test):
         distance = np.linalg.norm(frame.camera.position_world - normalization.center) / normalization.radius
         camera = raster_camera(frame.camera, normalization, 0.1 * float(distance))
-        parts = render(state.geometry, environment, camera, normalization, config)
+        outline = state.plane if state.heights else None
+        parts = render(state.geometry, environment, camera, normalization, config, outline)
         view = View(
             radiance=parts.radiance.permute(1, 2, 0).numpy(),
             alpha=parts.alpha.numpy(),
@@ -336,6 +343,8 @@ def _parameter_counts(state: FitState, config: FitConfig) -> dict[str, int]:
     if isinstance(state.geometry, Lathe):
         numbers = state.geometry.numbers
         return {"revolution parameters": numbers, "environment parameters": state.final_environment.numel()}
+    if state.heights:
+        return {"bent plane parameters": state.heights, "environment parameters": state.final_environment.numel()}
     per_surfel = 3 + 4 + 2 + 1
     per_surfel += 3 * config.albedo + 3 * config.surfels.curved + config.loss.roughness_weighted
     return {

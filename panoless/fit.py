@@ -29,6 +29,7 @@ from panoless.observation import observed_rays, reflections, solved_environment
 from panoless.optimizer import SurfelOptimizer
 from panoless.schedule import Phase, Schedule, phase_of
 from panoless.shading import ALPHA_FLOOR, compose, rasterize_surfels
+from panoless.sheet import sheet_surfels
 from panoless.snapshots import Marks, SnapshotKeeper, require_snapshots
 from panoless.surfels import Surfels
 from panoless.views import Normalization, TrainView, Views, load_views
@@ -388,12 +389,16 @@ def find_device(name: str) -> torch.device:
 def _first_state(views: Views, config: FitConfig) -> FitState:
     """The state before the first step, on the rung of the ladder that the scene needs."""
     rung = choose_rung(views, config, _trial)
-    if rung.lathe is not None:
+    if rung.sheet is not None and rung.plane is not None:
+        start = sheet_surfels(rung.sheet, config.surfels.count, config.seed)
+        state = new_state(without_mirrored_frame(views, rung.plane), config, start)
+        state.heights = rung.sheet.numbers if rung.model == "bent" else 0
+    elif rung.lathe is not None:
         state = new_state(views, config, surfels_on_lathe(rung.lathe, config.surfels.count))
     elif rung.plane is None:
         state = new_state(views, config)
     else:
-        start = surfels_on_plane(rung.plane, config.surfels.count if rung.model == "surfels" else 1, config.seed)
+        start = surfels_on_plane(rung.plane, 1, config.seed)
         state = new_state(without_mirrored_frame(views, rung.plane), config, start)
     state.plane, state.flat, state.rung = rung.plane, rung.model == "plane", f"{rung.model} ({rung.reason})"
     state.lathe, state.turned = rung.lathe, rung.model == "revolution"

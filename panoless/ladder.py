@@ -25,6 +25,8 @@ from panoless.observation import (
 )
 from panoless.plane import Plane, unobstructed
 from panoless.plane_fit import fit_plane
+from panoless.sheet import Sheet, sheet_surfels
+from panoless.sheet_fit import fit_sheet
 from panoless.surfels import Surfels
 from panoless.views import TrainView, Views
 from shinypartial.errors import InputError
@@ -48,11 +50,13 @@ Trial = Callable[[Views, FitConfig, Surfels], Surfels]
 
 @dataclass(frozen=True)
 class Rung:
-    """The model that was taken, and why. `plane` is that of the outline, also when surfels bend away from it."""
+    """The model that was taken, and why. `plane` is that of the outline, also when a mirror bends away from it."""
 
-    model: Literal["plane", "revolution", "surfels"]
+    model: Literal["plane", "bent", "revolution", "surfels"]
     reason: str
     plane: Plane | None = None
+    sheet: Sheet | None = None
+    """The heights over the plane, also when surfels that start on them explain more."""
     lathe: Lathe | None = None
     """The surface of revolution, also when surfels that start on it explain more."""
 
@@ -63,7 +67,8 @@ def choose_rung(views: Views, config: FitConfig, trial: Trial) -> Rung:
     A plane is refused when it misses the outlines, and after it a surface of revolution by the same measure. Else
     surfels that start on the plane, or on the surface of revolution, are fitted to four fifths of the views, and it
     stays unless they explain the others better: by 5 % of the mean ‖e‖²/(‖e‖² + s²) and by two standard errors of the
-    paired differences. A plane with an error above 0.3 goes anyway. `config.model` overrides.
+    paired differences. A plane with an error above 0.3 goes anyway. Where a plane goes, heights over it are fitted, and
+    stay by the same rule. `config.model` overrides.
     Raises InputError when a plane is asked for and can't be fitted.
     """
     if config.model == "surfels":
@@ -71,9 +76,9 @@ def choose_rung(views: Views, config: FitConfig, trial: Trial) -> Rung:
     if config.model == "revolution":
         return _revolution(views, config, trial, "asked for")
     try:
-        found = fit_plane(views, thorough=config.model == "plane")
+        found = fit_plane(views, thorough=config.model != "auto")
     except InputError:
-        if config.model == "plane":
+        if config.model != "auto":
             raise
         return _revolution(views, config, trial, "the masks don't determine a plane")
     distance, overlap = float(np.median(found.median_px)), float(np.median(found.iou))
@@ -84,12 +89,28 @@ def choose_rung(views: Views, config: FitConfig, trial: Trial) -> Rung:
     outline = f"a plane explains the outlines to {distance:.2g} px"
     if config.model == "plane":
         return Rung("plane", f"asked for; {outline}", found.plane)
+    if config.model == "bent":
+        return _bent(views, config, trial, found.plane, f"asked for; {outline}")
     start = surfels_on_plane(found.plane, config.surfels.count, config.seed)
     flat, bent = _held_out_errors(without_mirrored_frame(views, found.plane), config, found.plane, start, trial)
     compared = f"{outline}; held-out error {flat.mean():.4f} flat, {bent.mean():.4f} with surfels"
     if flat.mean() > LARGEST_ERROR or _clearly_better(flat, bent):
-        return Rung("surfels", f"{compared}: bent", found.plane)
+        return _bent(views, config, trial, found.plane, f"{compared}: not flat")
     return Rung("plane", f"{compared}: no better", found.plane)
+
+
+def _bent(views: Views, config: FitConfig, trial: Trial, plane: Plane, reason: str) -> Rung:
+    """Heights over a plane, after `reason` spoke against the plane itself."""
+    clear = without_mirrored_frame(views, plane)
+    sheet = fit_sheet(clear, config, plane)
+    if config.model == "bent":
+        return Rung("bent", reason, plane, sheet)
+    start = sheet_surfels(sheet, config.surfels.count, config.seed)
+    smooth, free = _held_out_errors(clear, config, start, start, trial)
+    compared = f"{reason}; {smooth.mean():.4f} with heights, {free.mean():.4f} with surfels on them"
+    if _clearly_better(smooth, free):
+        return Rung("surfels", f"{compared}: not smooth", plane, sheet)
+    return Rung("bent", f"{compared}: no better", plane, sheet)
 
 
 def _revolution(views: Views, config: FitConfig, trial: Trial, reason: str) -> Rung:

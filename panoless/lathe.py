@@ -18,6 +18,7 @@ from panoless.kernels.rasterize import RasterCamera
 from panoless.shading import SurfaceBuffers
 from panoless.views import TrainView, pose_of
 from shinypartial.conventions import PIXEL_CENTER
+from shinypartial.sphere import pixel_footprint_sr
 
 CREASE_RAD = math.radians(35.0)
 """A turn of the profile above this is an edge: normals are not interpolated across it."""
@@ -25,6 +26,7 @@ SUBPIXELS = 4
 BOUNCES = 6
 """What is mirrored more often is not followed."""
 BOX_AROUND = 64
+FOOTPRINT_TEXEL_SR = (math.pi / 2 / 128) ** 2
 LEAVING = 1e-4
 """A mirrored ray starts this far from the surface, in scene units."""
 
@@ -244,9 +246,15 @@ def followed(
     return Escapes(final, bounces, first)
 
 
-def lathe_rays(lathe: Lathe, view: TrainView, pixels: Tensor, most: int = 1) -> tuple[Rays, Hits]:
+def lathe_rays(
+    lathe: Lathe, view: TrainView, pixels: Tensor, most: int = 1, *, weighted: bool = False
+) -> tuple[Rays, Hits]:
     """What pixels (flat indices) of a view observed of the environment by at most that many reflections, and where
     they met the lathe.
+
+    If `weighted`, rays have the trust 1/(1 + a/t): a is the square of the larger angle to the next of the given pixels
+    by row and by column, t the solid angle of a texel of 0.7°. A pixel near the rim sees a long strip, which says
+    little about any texel of it. Pixels are in ascending order then.
     """
     origins, directions = pixel_rays(view.camera, pixels.cpu().numpy())
     escapes = followed(lathe, origins, directions, most)
@@ -255,7 +263,14 @@ def lathe_rays(lathe: Lathe, view: TrainView, pixels: Tensor, most: int = 1) -> 
     outgoing = torch.from_numpy(escapes.directions[seen]).float().to(view.radiance.device)
     first = escapes.first
     hits = Hits(*(values[seen] for values in (first.distance, first.side, first.along, first.points, first.normals)))
-    return Rays(outgoing, view.radiance.flatten(1)[:, kept].T.contiguous()), hits
+    trust = None
+    if weighted:
+        image, mask = np.zeros((*view.mask.shape, 3)), np.zeros(view.mask.shape, dtype=bool)
+        places = kept.cpu().numpy()
+        image.reshape(-1, 3)[places], mask.ravel()[places] = escapes.directions[seen], True
+        footprint_sr = pixel_footprint_sr(image, mask)[mask]
+        trust = torch.from_numpy(1 / (1 + footprint_sr / FOOTPRINT_TEXEL_SR)).to(outgoing)
+    return Rays(outgoing, view.radiance.flatten(1)[:, kept].T.contiguous(), trust), hits
 
 
 def outgoing_directions(

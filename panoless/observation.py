@@ -11,7 +11,7 @@ from torch import Tensor
 
 from panoless.config import FitConfig
 from panoless.cubemap import Rays, robust_weight, solve_environment
-from panoless.kernels.cubemap import sample_cubemap
+from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap
 from panoless.kernels.rasterize import Channels, RasterBuffers
 from panoless.lathe import Lathe, lathe_rays
 from panoless.plane import Plane, plane_buffers
@@ -29,6 +29,7 @@ RESOLUTIONS = (64, 128, 256)
 HELD_OUT_EVERY = 5
 #: A finer map has to lower the held-out error by this share.
 LEAST_GAIN = 0.02
+RAYS_A_TEXEL = 8
 TRUST_SCALE = 0.15
 #: Pixels' worth of an opinion that every surfel starts with, so that one that is hardly seen is hardly believed.
 PRIOR_PIXELS, PRIOR_TRUST = 1.0, 0.2
@@ -48,7 +49,8 @@ def observed_rays(
     """Reflection directions and radiance of pixels that lie wholly on mask and surface, a batch a view.
 
     When the views hold more than `max_rays` such pixels, every k-th is taken, beginning elsewhere in each view. With
-    the `trust` of each surfel a ray has that of what it meets, blended, to the fourth power.
+    the `trust` of each surfel a ray has that of what it meets, blended, to the fourth power. On a surface of revolution
+    rays are trusted by the solid angle of their pixels, if all are taken.
     """
     stride = max(1, math.ceil(sum(len(view.solid) for view in views.train) / max_rays))
     for index, view in enumerate(views.train):
@@ -57,7 +59,7 @@ def observed_rays(
             yield _plane_rays(view, geometry, pixels)
             continue
         if isinstance(geometry, Lathe):
-            yield lathe_rays(geometry, view, pixels)[0]
+            yield lathe_rays(geometry, view, pixels, weighted=stride == 1)[0]
             continue
         rays, pixels = _surfel_rays(view, geometry, config, pixels)
         if trust is not None:
@@ -91,8 +93,9 @@ def solved_environment(
         trust = surfel_trust(views, geometry, config, coarse)
         trial = list(observed_rays(views, geometry, config, few, trust))
         coarse = solve_environment(trial, resolution or TRIAL_RESOLUTION)
-    resolution = resolution or finest_resolution(trial, coarse)
     rays = list(observed_rays(views, geometry, config, config.environment.rays, trust))
+    if not resolution:
+        resolution = finest_resolution(trial, coarse) if isinstance(geometry, Surfels) else densest_resolution(rays)
     return solve_environment(rays, resolution, coarse), rays
 
 
@@ -136,6 +139,21 @@ def finest_resolution(rays: Sequence[Rays], start: Float[Tensor, "6 3 L L"]) -> 
             break
         best, error = resolution, found
     return best
+
+
+def densest_resolution(rays: Sequence[Rays]) -> int:
+    """Texels along a face side: the finest of 64, 128, 256 with eight rays or more in the median observed texel.
+
+    For geometry whose normals are as exact as their pixels: then no held-out view speaks against detail.
+    """
+    coarsest = RESOLUTIONS[0]
+    device = rays[0].directions.device if rays else None
+    count = torch.zeros(6, 1, coarsest, coarsest, device=device)
+    for batch in rays:
+        count += scatter_cubemap(torch.ones_like(batch.radiance[:, :1]), batch.directions, coarsest)
+    observed = count[count >= 1]
+    usual = float(observed.median()) if len(observed) else 0.0
+    return max((each for each in RESOLUTIONS if usual * (coarsest / each) ** 2 >= RAYS_A_TEXEL), default=coarsest)
 
 
 def split_held_out(views: Sequence[Each]) -> tuple[list[Each], list[Each]]:

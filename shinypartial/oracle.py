@@ -30,7 +30,7 @@ from shinypartial.prediction import (
     write_visibility,
 )
 from shinypartial.progress import Progress
-from shinypartial.sphere import sample_latlong
+from shinypartial.sphere import pixel_footprint_sr, sample_latlong
 from shinypartial.threads import in_threads
 
 METHOD = "oracle"
@@ -38,8 +38,6 @@ METHOD = "oracle"
 HEIGHTS = tuple(PROTOCOL_HEIGHT >> step for step in range(4))
 #: A map is tried when there are this many rays a texel; with ENOUGH_RAYS no coarser one is.
 FEWEST_RAYS, ENOUGH_RAYS = 2.0, 16.0
-#: Side (rad) of what a pixel sees when no neighbor tells: such a lone pixel is given hardly any weight.
-UNKNOWN_SPREAD = 1.0
 
 Mask = Bool[np.ndarray, "H W"]
 
@@ -133,24 +131,6 @@ def rays_of_view(frame: Frame) -> Rays:
     directions = reflect(ray_directions_world(frame.camera), normals.astype(np.float64))
     footprint = pixel_footprint_sr(directions, mask)[mask]
     return Rays(directions[mask].astype(np.float32), view.radiance[mask].astype(np.float32), footprint)
-
-
-def pixel_footprint_sr(directions: Float[np.ndarray, "H W 3"], mask: Mask) -> Float[np.ndarray, "H W"]:
-    """Square of the larger of the two angles to the next pixel's direction, by row and by column, within the mask.
-
-    The larger one, not the product: a pixel at the rim sees a long thin strip, which blurs along its length.
-    """
-    longest = np.zeros(mask.shape)
-    for axis in (0, 1):
-        first, second = ((slice(None),) * axis + (part,) for part in (slice(None, -1), slice(1, None)))
-        both = mask[first] & mask[second]
-        step = np.where(both, np.linalg.norm(directions[first] - directions[second], axis=-1), 0.0)
-        total, number = np.zeros(mask.shape), np.zeros(mask.shape)
-        for side in (first, second):
-            total[side] += step
-            number[side] += both
-        longest = np.maximum(longest, np.where(number > 0, total / np.maximum(number, 1), UNKNOWN_SPREAD))
-    return (longest**2).astype(np.float32)
 
 
 def heights_to_try(rays: int) -> tuple[int, ...]:

@@ -5,10 +5,12 @@ texel centers lie at (i + ½)/N. Cubemap: texel centers at 2(i + ½)/L − 1 on 
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from shinypartial.conventions import FACE_AXES
 
+#: Side (rad) of what a pixel sees when no neighbor tells: such a lone pixel is given hardly any weight.
+UNKNOWN_SPREAD = 1.0
 #: A blur ends at this many standard deviations, where its kernel has fallen to 4e-6.
 BLUR_REACH = 5.0
 
@@ -143,3 +145,23 @@ def blur_latlong(latlong: Float[np.ndarray, "H W C"], std_rad: float) -> Float[n
         kernel = np.fft.rfft(np.exp((np.minimum(cosine, 1) - 1) / std_rad**2), axis=1)
         blurred[i] = np.fft.irfft((kernel[..., None] * spectra[near]).sum(0), n=width, axis=0)
     return (blurred[..., :-1] / blurred[..., -1:]).astype(latlong.dtype)
+
+
+def pixel_footprint_sr(
+    directions: Float[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]
+) -> Float[np.ndarray, "H W"]:
+    """Square of the larger of the two angles to the next pixel's direction, by row and by column, within the mask.
+
+    The larger one, not the product: a pixel at the rim sees a long thin strip, which blurs along its length.
+    """
+    longest = np.zeros(mask.shape)
+    for axis in (0, 1):
+        first, second = ((slice(None),) * axis + (part,) for part in (slice(None, -1), slice(1, None)))
+        both = mask[first] & mask[second]
+        step = np.where(both, np.linalg.norm(directions[first] - directions[second], axis=-1), 0.0)
+        total, number = np.zeros(mask.shape), np.zeros(mask.shape)
+        for side in (first, second):
+            total[side] += step
+            number[side] += both
+        longest = np.maximum(longest, np.where(number > 0, total / np.maximum(number, 1), UNKNOWN_SPREAD))
+    return (longest**2).astype(np.float32)

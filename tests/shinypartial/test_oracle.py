@@ -18,10 +18,11 @@ from shinypartial.latlong_solver import Rays, solve_latlong
 from shinypartial.masks import environment_mask, solid_mask
 from shinypartial.metrics import perceptual
 from shinypartial.metrics.environment import RegionMasks, region_scores
-from shinypartial.oracle import Oracle, heights_to_try, make_oracle, pixel_footprint_sr, rays_of_view
+from shinypartial.oracle import Oracle, heights_to_try, make_oracle, rays_of_view
 from shinypartial.prediction import dataset_hash, newest_prediction, read_info, read_visibility
 from shinypartial.report import summary_lines, write_report
 from shinypartial.scores import read_bound, read_scores
+from shinypartial.sphere import pixel_footprint_sr
 from tests.support.synthetic_dataset import make_plain_sphere_dataset, make_sphere_dataset
 from tests.support.truth_prediction import write_truth_prediction
 
