@@ -4,12 +4,15 @@ import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from panoless.config import PRESETS, FitConfig
 from shinypartial.errors import EXIT_BAD_INPUT, InputError, run_command
+
+if TYPE_CHECKING:
+    from panoless.checkpoint import FitState
 
 RUNS = Path("runs")
 
@@ -60,11 +63,7 @@ class Fit:
             export_prediction(dataset, state, self.config, prediction)
         print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
         if marks and state.stepless:
-<<<<<<< HEAD
-            print(f"No snapshots: this run is of the model {state.rung.split()[0]}, whose map is solved without steps.")
-=======
             print(f"No snapshots: this run took {_shape_name(state)}, whose map is solved without steps.")
->>>>>>> main
         elif marks:
             print(f"Snapshots: panoless export {run_folder} --output {prediction} --snapshots")
 
@@ -104,12 +103,8 @@ class Export:
         if self.snapshots and state.stepless:
             raise InputError(
                 expected=f"a run of surfels in {folder}, for --snapshots",
-<<<<<<< HEAD
-                found=f"a run of the model {state.rung.split()[0]}, without steps: there are no moments in between",
-=======
                 found=f"a run that took {_shape_name(state)}, which is fitted without steps: "
                 "there are no moments in between",
->>>>>>> main
                 remedy="Leave --snapshots out; or fit surfels: "
                 "`panoless fit --model surfels --snapshots 6 --output NEW`.",
             )
@@ -127,13 +122,10 @@ class Export:
             print(f"Then: shinypartial evaluate {prediction} --snapshots")
 
 
-<<<<<<< HEAD
-=======
-def _shape_name(state: FitState) -> str:
+def _shape_name(state: "FitState") -> str:
     return "a plane" if state.flat else "a bent plane" if state.heights else "a surface of revolution"
 
 
->>>>>>> main
 def _refuse_run_folder(prediction: Path, run_folder: Path) -> None:
     if prediction.resolve() == run_folder.resolve():
         raise InputError(

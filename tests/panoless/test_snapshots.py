@@ -236,9 +236,10 @@ def test_the_commands_take_and_export_snapshots(
     assert "snapshots" not in asdict(CONFIG)
 
 
-@pytest.mark.parametrize("model", ["plane", "revolution"])
+@pytest.mark.parametrize(("model", "name"), [("plane", "a plane"), ("revolution", "a surface of revolution")])
 def test_what_takes_no_steps_has_no_snapshots_and_the_command_says_why(
     model: str,
+    name: str,
     tmp_path: Path,
     many_views_dataset: Dataset,
     monkeypatch: pytest.MonkeyPatch,
@@ -247,6 +248,6 @@ def test_what_takes_no_steps_has_no_snapshots_and_the_command_says_why(
     monkeypatch.chdir(tmp_path)
     options = ["--model", model, "--config.environment.solve-resolution", "16"]
     assert main(["fit", str(many_views_dataset.root), "--output", "p", "--snapshots", "2", *options]) == 0
-    assert f"No snapshots: this run is of the model {model}" in capsys.readouterr().out
+    assert f"No snapshots: this run took {name}" in capsys.readouterr().out
     assert main(["export", "runs/p", "--output", "p", "--snapshots"]) == 2
-    assert f"a run of the model {model}, without steps" in capsys.readouterr().err
+    assert f"took {name}, which is fitted without steps" in capsys.readouterr().err
