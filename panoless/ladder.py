@@ -105,7 +105,7 @@ def _bent(views: Views, config: FitConfig, trial: Trial, plane: Plane, reason: s
     sheet = fit_sheet(clear, config, plane)
     if config.model == "bent":
         return Rung("bent", reason, plane, sheet)
-    start = sheet_surfels(sheet, config.surfels.count, config.seed)
+    start = sheet_surfels(sheet, config.surfels.count, config.seed).to(views.train[0].mask.device)
     smooth, free = _held_out_errors(clear, config, start, start, trial)
     compared = f"{reason}; {smooth.mean():.4f} with heights, {free.mean():.4f} with surfels on them"
     if _clearly_better(smooth, free):

@@ -63,8 +63,10 @@ def _bout(
     steps: range,
 ) -> Sheet:
     """Steps of Adam on heights and an environment that is solved first, one view each."""
+    # Heights stay in main memory; what is seen of them lies where the views do.
+    device = views.train[0].mask.device
     with torch.no_grad():
-        rays = list(observed_rays(views, mirror.surfels(sheet.coefficients), config, TILT_RAYS))
+        rays = list(observed_rays(views, mirror.surfels(sheet.coefficients).to(device), config, TILT_RAYS))
         half = solve_environment(rays, config.environment.resolution // 2)
         light = resample(half, config.environment.resolution).requires_grad_()
     coefficients = sheet.coefficients.clone().requires_grad_()
@@ -79,9 +81,8 @@ def _bout(
         factor = DROP_FACTOR ** (max(step / config.iterations - DROP_AT, 0) / (1 - DROP_AT))
         adam.param_groups[0]["lr"] = HEIGHT_RATE * factor * (step >= steps.start + WARM_UP_STEPS)
         adam.param_groups[1]["lr"] = ENVIRONMENT_RATE * factor
-        raster = rasterize_surfels(
-            mirror.surfels(coefficients), view.camera, curved=True, channels=NOTHING, active_tiles=view.solid_tiles
-        )
+        surfels = mirror.surfels(coefficients).to(device)
+        raster = rasterize_surfels(surfels, view.camera, curved=True, channels=NOTHING, active_tiles=view.solid_tiles)
         images = raster.normals_camera, raster.alpha, raster.accumulated_depth, raster.median_depth
         objective = mirror_objective(*images, None, light, view.mirror, terms)
         adam.zero_grad()
@@ -101,7 +102,7 @@ def tilted_best(views: Views, config: FitConfig, mirror: SheetSurfels, sheet: Sh
         tilt: Float[np.ndarray, "2"], start: Float[Tensor, "6 3 L L"] | None
     ) -> tuple[float, Float[Tensor, "6 3 L L"]]:
         with torch.no_grad():
-            surfels = mirror.surfels(sheet.tilted(*tilt).coefficients)
+            surfels = mirror.surfels(sheet.tilted(*tilt).coefficients).to(views.train[0].mask.device)
             known, held_out = split_held_out(list(observed_rays(views, surfels, config, TILT_RAYS)))
             environment = solve_environment(known, resolution, start)
             return prediction_error(held_out, environment, TILT_SCALE), environment

@@ -10,7 +10,7 @@ import torch
 from panoless.carving import HULL_HALF_SIDE, carve_hull, outline_distance_px
 from panoless.hull import completed_surface, hull_surface
 from panoless.kernels.rasterize import RasterCamera
-from panoless.views import Normalization, TrainView, Views, unit_rays_camera
+from panoless.views import Normalization, TrainView, Views
 
 RADIUS = 0.6
 CENTER = np.array([0.05, -0.1, 0.08])
@@ -41,7 +41,6 @@ def view_of_sphere(direction: np.ndarray) -> TrainView:
         camera=camera,
         radiance=torch.zeros(3, SIDE, SIDE),
         mask=torch.from_numpy(mask).float(),
-        rays_camera=unit_rays_camera(camera),
         solid=torch.nonzero(torch.from_numpy(mask).flatten() > 0.99)[:, 0],
     )
 

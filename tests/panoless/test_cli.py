@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import fields, is_dataclass
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pytest
 
@@ -12,6 +13,7 @@ from panoless.config import PRESETS, FitConfig
 from shinypartial.dataset.schema import Dataset
 
 TINY = ["--config.iterations", "4", "--config.surfels.count", "40", "--config.surfels.hull-resolution", "24"]
+MODELS = get_args(get_args(get_type_hints(FitConfig, include_extras=True)["model"])[0])
 
 
 def option_names(config: object, prefix: str = "--config.") -> list[str]:
@@ -78,7 +80,7 @@ def test_bad_usage_exits_with_2(arguments: list[str], capsys: pytest.CaptureFixt
 def test_a_wrong_model_is_answered_with_the_right_ones(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["fit", "--model", "cube"]) == 2
     out, err = capsys.readouterr()
-    for name in ("cube", "--model", "auto", "plane", "revolution", "surfels"):
+    for name in ("cube", "--model", *MODELS):
         assert name in out + err
 
 
@@ -87,9 +89,9 @@ def test_the_model_is_that_of_the_preset_unless_named(
     preset: str, model: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = help_text(["fit", "--preset", preset], capsys, monkeypatch)
-    assert re.search(rf"--model \{{auto,plane,revolution,surfels\}}[^)]*\(default: {model}\)", text)
+    assert re.search(rf"--model \{{{','.join(MODELS)}\}}[^)]*\(default: {model}\)", text)
     text = help_text(["fit", "--preset", preset, "--model", "plane"], capsys, monkeypatch)
-    assert "--model {auto,plane,revolution,surfels}" in text
+    assert f"--model {{{','.join(MODELS)}}}" in text
 
 
 def test_a_model_that_is_asked_for_is_taken_and_saved(
