@@ -82,20 +82,21 @@ def solved_environment(
     """The closed-form map of the training views for a geometry, and the rays that it was solved from.
 
     A trial map says which surfels to trust, and held-out views how fine the map should be, unless the configuration
-    does; then all rays are solved.
+    does; then all rays are solved. Exact surfaces need no trial: their map starts from nothing, because a coarse start
+    would reject what is finer.
     """
+    if not isinstance(geometry, Surfels):
+        rays = list(observed_rays(views, geometry, config, config.environment.rays))
+        return solve_environment(rays, config.environment.solve_resolution or densest_resolution(rays)), rays
     few = math.ceil(TRIAL_SHARE * config.environment.rays)
     trial = list(observed_rays(views, geometry, config, few))
     resolution = config.environment.solve_resolution
     coarse = solve_environment(trial, resolution or TRIAL_RESOLUTION)
-    trust = None
-    if isinstance(geometry, Surfels):
-        trust = surfel_trust(views, geometry, config, coarse)
-        trial = list(observed_rays(views, geometry, config, few, trust))
-        coarse = solve_environment(trial, resolution or TRIAL_RESOLUTION)
+    trust = surfel_trust(views, geometry, config, coarse)
+    trial = list(observed_rays(views, geometry, config, few, trust))
+    coarse = solve_environment(trial, resolution or TRIAL_RESOLUTION)
+    resolution = resolution or finest_resolution(trial, coarse)
     rays = list(observed_rays(views, geometry, config, config.environment.rays, trust))
-    if not resolution:
-        resolution = finest_resolution(trial, coarse) if isinstance(geometry, Surfels) else densest_resolution(rays)
     return solve_environment(rays, resolution, coarse), rays
 
 
