@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from panoless.cubemap import Rays, robust_weight
 from panoless.kernels.cubemap import cubemap_solid_angles, sample_cubemap, scatter_cubemap
@@ -14,18 +15,23 @@ from shinypartial.color import linear_to_srgb
 SATURATING_QUANTILE = 0.9
 VOTE_SCALE = 0.05
 HALVING_DISAGREEMENT = 0.05
+HALVING_CONTRAST = 0.1
 
 
 @dataclass(frozen=True)
 class Agreement:
     """What the rays that look in a texel's direction say about it, on the cubemap's grid.
 
-    `votes` is the sum of their robust weights: how many rays agree that this is the environment. `disagreement` is
-    the weighted mean of their absolute sRGB difference from the map, in [0, 1]: small only where they all see the same.
+    `votes` is the sum of their robust weights: how many rays agree that this is the environment. `share` is what part
+    of all their trust that is. `disagreement` is the weighted mean of their absolute sRGB difference from the map, in
+    [0, 1]: small only where they all see the same. `contrast` is the larger difference of the map's mean radiance
+    between the two neighbors of a texel, by row and by column.
     """
 
     votes: Float[Tensor, "6 L L"]
+    share: Float[Tensor, "6 L L"]
     disagreement: Float[Tensor, "6 L L"]
+    contrast: Float[Tensor, "6 L L"]
 
 
 def accumulate(
@@ -56,16 +62,25 @@ def agreement(rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"]) -> Ag
     """Weigh each ray by t (1 + ‖e‖²/s²)⁻², t its trust and s = 0.05 (linear); average its sRGB residual by texel."""
     resolution = environment.shape[-1]
     votes = environment.new_zeros(6, resolution, resolution)
-    residual = torch.zeros_like(votes)
+    residual, trusted = torch.zeros_like(votes), torch.zeros_like(votes)
     for batch in rays:
         seen = sample_cubemap(environment, batch.directions)
-        weight = batch.initial_weight() * robust_weight(seen - batch.radiance, VOTE_SCALE)
+        trust = batch.initial_weight()
+        weight = trust * robust_weight(seen - batch.radiance, VOTE_SCALE)
         difference = (_srgb(seen) - _srgb(batch.radiance)).abs().mean(1)
-        both = torch.stack([weight, weight * difference], 1)
-        summed = scatter_cubemap(both, batch.directions, resolution)
+        summed = scatter_cubemap(torch.stack([weight, weight * difference, trust], 1), batch.directions, resolution)
         votes += summed[:, 0]
         residual += summed[:, 1]
-    return Agreement(votes, residual / votes.clamp(min=1e-6))
+        trusted += summed[:, 2]
+    share = (votes / trusted.clamp(min=1e-6)).clamp(max=1)
+    return Agreement(votes, share, residual / votes.clamp(min=1e-6), _contrast(environment.mean(1)))
+
+
+def _contrast(radiance: Float[Tensor, "6 L L"]) -> Float[Tensor, "6 L L"]:
+    """Difference of the neighbors on both sides, within a face; at its edge that of the texel and its neighbor."""
+    padded = pad(radiance[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
+    across = (padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]).abs()
+    return across.maximum((padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1]).abs())
 
 
 def _srgb(radiance: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
@@ -73,12 +88,14 @@ def _srgb(radiance: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
 
 
 def visibility_from_agreement(found: Agreement) -> Float[Tensor, "6 L L"]:
-    """Confidence in [0, 1]: v/(1 + v) · 1/(1 + d/0.05), with v the votes a mean-sized texel would have had.
+    """Confidence in [0, 1]: v/(1 + v) · s · 1/(1 + d/0.05) · 1/(1 + c/0.1), with v the votes a mean-sized texel would
+    have had, s the share that agrees, d the disagreement and c the contrast.
 
     Zero exactly where no ray fell; ½ at most where a single ray did or where rays disagree by 0.05. It uses training
     views only, yet orders directions by their actual error: rays disagree where normals are wrong, where the map is
-    too coarse, and where the object sees itself.
+    too coarse, and where the object sees itself; and where the map is steep, a small shift is a large error.
     """
     relative = cubemap_solid_angles(found.votes.shape[-1]).to(found.votes)
     votes = found.votes / (relative / relative.mean())
-    return votes / (1 + votes) / (1 + found.disagreement / HALVING_DISAGREEMENT)
+    sure = votes / (1 + votes) * found.share
+    return sure / (1 + found.disagreement / HALVING_DISAGREEMENT) / (1 + found.contrast / HALVING_CONTRAST)

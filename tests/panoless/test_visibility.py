@@ -1,5 +1,7 @@
 """Visibility: evidence is conserved, and its map to [0, 1] is zero exactly where nothing was seen."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import given
@@ -7,7 +9,7 @@ from hypothesis import strategies as st
 from torch.nn.functional import normalize
 
 from panoless.cubemap import Rays
-from panoless.kernels.cubemap import cubemap_directions, cubemap_solid_angles
+from panoless.kernels.cubemap import cubemap_directions, cubemap_solid_angles, sample_cubemap
 from panoless.visibility import accumulate, agreement, visibility_from_agreement, visibility_from_evidence
 
 LENGTH = 8
@@ -127,3 +129,22 @@ def test_rays_split_into_batches_say_the_same() -> None:
     whole, split = agreement([batch], environment), agreement(halves, environment)
     torch.testing.assert_close(split.votes, whole.votes, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(split.disagreement, whole.disagreement, rtol=1e-4, atol=1e-5)
+
+
+def test_directions_beside_an_edge_of_the_map_are_trusted_less() -> None:
+    """The rays agree with a step in the map as well as with what is even; a small shift would be wrong there alone."""
+    batch, environment = agreeing_rays(0.0)
+    environment[:, :, :, LENGTH // 2 :] = 0.8
+    seen = replace(batch, radiance=sample_cubemap(environment, batch.directions))
+    confidence = visibility_from_agreement(agreement([seen], environment))
+    column = confidence.amax((0, 1))
+    assert float(column[LENGTH // 2 - 1 : LENGTH // 2 + 1].max()) < 0.5 * float(column[1])
+
+
+def test_rays_that_the_others_outvote_lower_the_confidence() -> None:
+    """The disagreement of those that agree is the same; what part they are of all is not."""
+    batch, environment = agreeing_rays(0.0)
+    wrong = replace(batch, radiance=batch.radiance + 0.5)
+    alone, disputed = (visibility_from_agreement(agreement(rays, environment)) for rays in ([batch], [batch, wrong]))
+    seen = alone > 0
+    assert bool((disputed[seen] < 0.6 * alone[seen]).all())
