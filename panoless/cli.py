@@ -19,7 +19,7 @@ RUNS = Path("runs")
 
 @dataclass(frozen=True)
 class Fit:
-    """Fit a dataset: surfels, an environment map and a visibility map; then export the prediction."""
+    """Fit a dataset: its surface, an environment map and a visibility map; then export the prediction."""
 
     dataset: Annotated[Path | None, tyro.conf.Positional] = None
     """Dataset folder, also a plain NeRF-synthetic one; without it the newest below ./datasets."""
