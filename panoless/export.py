@@ -337,8 +337,7 @@ def _parameter_counts(state: FitState, config: FitConfig) -> dict[str, int]:
     """Numbers that the fit may choose, by what they belong to."""
     assert state.final_environment is not None
     if isinstance(state.geometry, Plane):
-        # Normal and offset; the outline's vertices; the rim.
-        numbers = 3 + state.geometry.outline.size + (state.geometry.rim_height > 0)
+        numbers = state.geometry.numbers
         return {"plane parameters": numbers, "environment parameters": state.final_environment.numel()}
     if isinstance(state.geometry, Lathe):
         numbers = state.geometry.numbers

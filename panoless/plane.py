@@ -37,6 +37,11 @@ class Plane:
     does not let through. Zero: no frame, or a flat one.
     """
 
+    @property
+    def numbers(self) -> int:
+        """How many numbers it is made of: normal and offset; the outline's vertices; the rim."""
+        return 3 + self.outline.size + (self.rim_height > 0)
+
     def points(self, coordinates: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P 3"]:
         """Plane coordinates to points in space."""
         return self.offset * self.normal + coordinates @ np.stack([self.tangent_u, self.tangent_v])

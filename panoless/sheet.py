@@ -5,7 +5,6 @@ drift into a tilt that the environment turns after.
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -35,7 +34,7 @@ class Sheet:
     @property
     def numbers(self) -> int:
         """How many numbers it is made of: those of the plane and its outline, and the coefficients."""
-        return 3 + self.plane.outline.size + (self.plane.rim_height > 0) + self.coefficients.numel()
+        return self.plane.numbers + self.coefficients.numel()
 
     def tilted(self, slope_u: float, slope_v: float) -> "Sheet":
         """The sheet plus slope_u u + slope_v v, about the middle of the outline. Splines hold a plane exactly."""
@@ -58,7 +57,6 @@ class SheetSurfels:
 
     def __init__(self, sheet: Sheet, count: int, seed: int) -> None:
         """About `count` surfels, evenly within the outline."""
-        self.sheet = sheet
         self._flat = surfels_on_plane(sheet.plane, count, seed)
         self._normal = torch.from_numpy(sheet.plane.normal).float()
         tangents = torch.from_numpy(np.stack([sheet.plane.tangent_u, sheet.plane.tangent_v], 1)).float()
@@ -71,11 +69,6 @@ class SheetSurfels:
         self._weights = [
             (along[0][i][:, :, None] * along[1][j][:, None]).flatten(1) / sheet.spacing ** (i + j) for i, j in ORDERS
         ]
-
-    @cached_property
-    def count(self) -> int:
-        """Number of surfels."""
-        return self._flat.count
 
     def heights(self, coefficients: Float[Tensor, "M N"]) -> list[Float[Tensor, "K"]]:
         """h, h_u, h_v, h_uu, h_uv and h_vv at the surfels."""

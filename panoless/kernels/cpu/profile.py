@@ -25,11 +25,9 @@ def envelope(
     best = np.full((cells, ranks), np.inf)
     for ray in range(len(origins)):
         o, d = origins[ray], directions[ray]
-        middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2])
-        clear = o[0] ** 2 + o[1] ** 2 + o[2] ** 2 - middle**2
-        if clear > reach**2:
+        middle, half = _chord(o, d, reach)
+        if half < 0:
             continue
-        half = np.sqrt(reach**2 - clear)
         last, least = -1, np.inf
         for step in range(int(8 * half / cell) + 1):
             t = middle - half + step * cell / 4
@@ -42,6 +40,14 @@ def envelope(
                 least = rho
         _keep(best, last, least)
     return best
+
+
+@njit(**EXACT)
+def _chord(origin, direction, reach):
+    """Middle and half length of the part of a unit ray's line within `reach` of the origin; −1 for none."""
+    middle = -(origin[0] * direction[0] + origin[1] * direction[1] + origin[2] * direction[2])
+    clear = origin[0] ** 2 + origin[1] ** 2 + origin[2] ** 2 - middle**2
+    return middle, np.sqrt(reach**2 - clear) if clear <= reach**2 else -1.0
 
 
 @njit(**EXACT)
@@ -115,11 +121,9 @@ def closest_approach(
     rows, columns = grid.shape
     for ray in range(count):
         o, d = origins[ray], directions[ray]
-        middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2])
-        clear = o[0] ** 2 + o[1] ** 2 + o[2] ** 2 - middle**2
-        if clear > reach**2:
+        middle, half = _chord(o, d, reach)
+        if half < 0:
             continue
-        half = np.sqrt(reach**2 - clear)
         steps = int(4 * half / cell) + 2
         size = 2 * half / (steps - 1)
         best, at = np.inf, -1
