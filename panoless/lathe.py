@@ -261,8 +261,7 @@ def lathe_rays(
     seen = escapes.bounces > 0
     kept = pixels[torch.from_numpy(seen).to(pixels.device)]
     outgoing = torch.from_numpy(escapes.directions[seen]).float().to(view.radiance.device)
-    first = escapes.first
-    hits = Hits(*(values[seen] for values in (first.distance, first.side, first.along, first.points, first.normals)))
+    hits = Hits(**{name: values[seen] for name, values in vars(escapes.first).items()})
     trust = None
     if weighted:
         image, mask = np.zeros((*view.mask.shape, 3)), np.zeros(view.mask.shape, dtype=bool)

@@ -64,12 +64,7 @@ def observations(views: Views, lathe: Lathe, most: int) -> Observations:
         rays, hits = lathe_rays(lathe, view, pixels)
         way = hits.points - view.position
         parts.append((way / hits.distance[:, None], rays.radiance, hits))
-    joined = Hits(
-        *(
-            np.concatenate([getattr(part[2], name) for part in parts])
-            for name in ("distance", "side", "along", "points", "normals")
-        )
-    )
+    joined = Hits(**{name: np.concatenate([getattr(part[2], name) for part in parts]) for name in vars(parts[0][2])})
     return Observations(np.concatenate([part[0] for part in parts]), torch.cat([part[1] for part in parts]), joined)
 
 
