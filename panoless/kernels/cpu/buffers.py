@@ -1,57 +1,42 @@
 """Large arrays that are used again, because fresh pages cost as much as the kernels that fill them.
 
 An array from `take` belongs to the caller alone until its last reference is gone; then its memory may be handed out
-again. That holds for views and for tensors made by `torch.from_numpy`, which keep the array alive, so autograd state
-and results are safe as long as anyone can see them.
+again. That holds for views and for tensors made by `torch.from_numpy` too, so autograd state and results are safe as
+long as anyone can see them: a view of a view refers to the array that owns the memory, so the owner's reference count
+says whether anyone does.
 """
 
 import math
-import threading
 from bisect import bisect_left, insort
-from collections.abc import Callable
+from sys import getrefcount
+from threading import Lock
 
 import numpy as np
 
-_KEEP = 64
-"""Buffers kept for later use; beyond this the smallest are released."""
+_KEEP = 128
+"""Buffers, in use or not; beyond this the smallest unused one is forgotten."""
 
 _ALIGNMENT = 64
 
 _Buffer = tuple[int, int, np.ndarray]
-"""Bytes that fit, their aligned address, and the memory."""
+"""Bytes that fit, where they are aligned, and the memory."""
 
-_free: list[_Buffer] = []
-"""Sorted by size; addresses differ, so that two buffers never compare their memory."""
-_lock = threading.RLock()
+_buffers: list[_Buffer] = []
+"""Sorted by size."""
+_lock = Lock()
 
 
 def _new_buffer(size: int) -> _Buffer:
     room = size + size // 8
     memory = np.empty(room + _ALIGNMENT, np.uint8)
-    address = memory.ctypes.data
-    return room, address + -address % _ALIGNMENT, memory
+    return room, -memory.ctypes.data % _ALIGNMENT, memory
 
 
-def _give_back(buffer: _Buffer) -> None:
-    with _lock:
-        insort(_free, buffer)
-        if len(_free) > _KEEP:
-            del _free[0]
+def _references(buffer: _Buffer) -> int:
+    return getrefcount(buffer[2])
 
 
-class _Lease:
-    """The owner at the end of an array's chain of bases; when it goes, nobody can see the memory any more."""
-
-    __slots__ = ("__array_interface__", "_buffer")
-
-    def __init__(self, buffer: _Buffer, shape: tuple[int, ...], dtype: np.dtype):
-        self._buffer = buffer
-        address = (buffer[1], False)
-        self.__array_interface__ = {"version": 3, "shape": shape, "typestr": dtype.str, "data": address}
-
-    def __del__(self, give_back: Callable[[_Buffer], None] = _give_back) -> None:
-        # The default keeps the function alive while the interpreter shuts down.
-        give_back(self._buffer)
+_UNUSED = _references(_new_buffer(0))
 
 
 def take(shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
@@ -61,7 +46,26 @@ def take(shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
     if size == 0:
         return np.empty(shape, kind)
     with _lock:
-        index = bisect_left(_free, (size,))
-        found = index < len(_free) and _free[index][0] <= 2 * size + 4096
-        buffer = _free.pop(index) if found else None
-    return np.asarray(_Lease(buffer or _new_buffer(size), shape, kind))
+        _, offset, memory = _find(size) or _add(size)
+        return np.ndarray(shape, kind, memory, offset)
+
+
+def _find(size: int) -> _Buffer | None:
+    """The smallest unused buffer that fits, unless it is more than twice as large."""
+    for index in range(bisect_left(_buffers, (size,)), len(_buffers)):
+        buffer = _buffers[index]
+        if buffer[0] > 2 * size + 4096:
+            return None
+        if _references(buffer) == _UNUSED:
+            return buffer
+    return None
+
+
+def _add(size: int) -> _Buffer:
+    if len(_buffers) >= _KEEP:
+        smallest = next((i for i, buffer in enumerate(_buffers) if _references(buffer) == _UNUSED), None)
+        if smallest is not None:
+            del _buffers[smallest]
+    buffer = _new_buffer(size)
+    insort(_buffers, buffer, key=lambda each: each[0])
+    return buffer

@@ -9,14 +9,13 @@ import os
 from collections.abc import Callable
 from functools import lru_cache
 from queue import SimpleQueue
-from threading import Thread
+from threading import Lock, Thread
 
 import numpy as np
 import torch
 
-_Task = tuple[Callable[..., None], tuple[object, ...], "SimpleQueue[BaseException | None]"]
-
 _pools: dict[int, "_Pool"] = {}
+_joining = Lock()
 
 
 @lru_cache(maxsize=1)
@@ -30,8 +29,42 @@ def thread_count() -> int:
     return max(1, min(torch.get_num_threads(), _usable_cores(os.getpid())))
 
 
+class _Task:
+    """A kernel that threads may join until it is closed; what has joined, answers."""
+
+    def __init__(self, kernel: Callable[..., None], arguments: tuple[object, ...]) -> None:
+        self.answers: SimpleQueue[BaseException | None] = SimpleQueue()
+        self._work: tuple[Callable[..., None], tuple[object, ...]] | None = (kernel, arguments)
+        self._joined = 0
+
+    def join(self) -> None:
+        """Run the kernel, unless the task is closed."""
+        with _joining:
+            work = self._work
+            self._joined += work is not None
+        if work is None:
+            return
+        kernel, arguments = work
+        try:
+            kernel(*arguments)
+            self.answers.put(None)
+        except BaseException as error:
+            self.answers.put(error)
+
+    def close(self) -> list[BaseException]:
+        """Let no more threads join, wait for those that have, and return their errors."""
+        with _joining:
+            self._work = None
+            joined = self._joined
+        return [error for error in (self.answers.get() for _ in range(joined)) if error is not None]
+
+
 class _Pool:
-    """Threads that sleep at one queue. A task and its answer cost a fifth of what a future does."""
+    """Threads that sleep at one queue. A task and its answer cost a fifth of what a future does.
+
+    Who finds nothing left to claim doesn't wait for threads that have yet to wake: on a virtual machine that may take a
+    millisecond, longer than many a kernel.
+    """
 
     def __init__(self) -> None:
         self.tasks: SimpleQueue[_Task] = SimpleQueue()
@@ -45,14 +78,10 @@ class _Pool:
 
     def _serve(self) -> None:
         while True:
-            kernel, arguments, answers = self.tasks.get()
-            try:
-                kernel(*arguments)
-                answers.put(None)
-            except BaseException as error:
-                answers.put(error)
+            task = self.tasks.get()
+            task.join()
             # What a sleeping thread still names can't be used again.
-            del kernel, arguments, answers
+            del task
 
 
 def _pool() -> _Pool:
@@ -75,13 +104,13 @@ def run_shared(kernel: Callable[..., None], *arguments: object) -> None:
     if helpers == 0:
         kernel(*arguments)
         return
-    pool, answers = _pool(), SimpleQueue[BaseException | None]()
+    pool, task = _pool(), _Task(kernel, arguments)
     pool.grow(helpers)
     for _ in range(helpers):
-        pool.tasks.put((kernel, arguments, answers))
+        pool.tasks.put(task)
     try:
         kernel(*arguments)
     finally:
-        errors = [error for error in (answers.get() for _ in range(helpers)) if error is not None]
+        errors = task.close()
     if errors:
         raise errors[0]
