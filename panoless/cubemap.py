@@ -41,6 +41,11 @@ class Rays:
         """The trust, or ones."""
         return torch.ones_like(self.radiance[:, 0]) if self.trust is None else self.trust.clone()
 
+    def every(self, stride: int, first: int) -> "Rays":
+        """Every stride-th ray from the first."""
+        part = slice(first, None, stride)
+        return Rays(self.directions[part], self.radiance[part], None if self.trust is None else self.trust[part])
+
 
 def initial_environment(config: EnvironmentConfig, generator: torch.Generator) -> Float[Tensor, "6 3 L L"]:
     """Gray radiance for `clamp`; logits uniform in ±5 for `sigmoid`."""

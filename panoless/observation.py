@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.config import FitConfig
@@ -39,32 +39,25 @@ Geometry = Surfels | Plane | Lathe
 Each = TypeVar("Each")
 
 
-def observed_rays(
-    views: Views,
-    geometry: Geometry,
-    config: FitConfig,
-    max_rays: int,
-    trust: Float[Tensor, "K"] | None = None,
-) -> Iterator[Rays]:
+def observed_rays(views: Views, geometry: Geometry, config: FitConfig, max_rays: int) -> Iterator[Rays]:
     """Reflection directions and radiance of pixels that lie wholly on mask and surface, a batch a view.
 
-    When the views hold more than `max_rays` such pixels, every k-th is taken, beginning elsewhere in each view. With
-    the `trust` of each surfel a ray has that of what it meets, blended, to the fourth power. On a surface of revolution
-    rays are trusted by the solid angle of their pixels, if all are taken.
+    When the views hold more than `max_rays` such pixels, every k-th is taken, beginning elsewhere in each view. On a
+    surface of revolution rays are trusted by the solid angle of their pixels, if all are taken.
     """
-    stride = max(1, math.ceil(sum(len(view.solid) for view in views.train) / max_rays))
-    for index, view in enumerate(views.train):
-        pixels = view.solid[index % stride :: stride]
+    for view, pixels in _chosen_pixels(views, max_rays):
         if isinstance(geometry, Plane):
             yield _plane_rays(view, geometry, pixels)
-            continue
-        if isinstance(geometry, Lathe):
-            yield lathe_rays(geometry, view, pixels, weighted=stride == 1)[0]
-            continue
-        rays, pixels = _surfel_rays(view, geometry, config, pixels)
-        if trust is not None:
-            rays = replace(rays, trust=_blended(view, geometry, trust)[pixels].clamp(0, 1) ** TRUST_POWER)
-        yield rays
+        elif isinstance(geometry, Lathe):
+            yield lathe_rays(geometry, view, pixels, weighted=len(pixels) == len(view.solid))[0]
+        else:
+            yield _surfel_rays(view, geometry, config, pixels)[0]
+
+
+def _chosen_pixels(views: Views, most: int) -> Iterator[tuple[TrainView, Tensor]]:
+    stride = max(1, math.ceil(sum(len(view.solid) for view in views.train) / most))
+    for index, view in enumerate(views.train):
+        yield view, view.solid[index % stride :: stride]
 
 
 def reflections(view: TrainView, normals_camera: Float[Tensor, "3 H W"], pixels: Tensor) -> Float[Tensor, "P 3"]:
@@ -88,16 +81,24 @@ def solved_environment(
     if not isinstance(geometry, Surfels):
         rays = list(observed_rays(views, geometry, config, config.environment.rays))
         return solve_environment(rays, config.environment.solve_resolution or densest_resolution(rays)), rays
-    few = math.ceil(TRIAL_SHARE * config.environment.rays)
-    trial = list(observed_rays(views, geometry, config, few))
+    seen = [
+        (view, *_surfel_rays(view, geometry, config, pixels))
+        for view, pixels in _chosen_pixels(views, config.environment.rays)
+    ]
     resolution = config.environment.solve_resolution
-    coarse = solve_environment(trial, resolution or TRIAL_RESOLUTION)
+    few = config.environment.rays * TRIAL_SHARE
+    coarse = solve_environment(_thinned([rays for _, rays, _ in seen], few), resolution or TRIAL_RESOLUTION)
     trust = surfel_trust(views, geometry, config, coarse)
-    trial = list(observed_rays(views, geometry, config, few, trust))
+    rays = [replace(rays, trust=_trust_of(view, geometry, trust, pixels)) for view, rays, pixels in seen]
+    trial = _thinned(rays, few)
     coarse = solve_environment(trial, resolution or TRIAL_RESOLUTION)
-    resolution = resolution or finest_resolution(trial, coarse)
-    rays = list(observed_rays(views, geometry, config, config.environment.rays, trust))
-    return solve_environment(rays, resolution, coarse), rays
+    return solve_environment(rays, resolution or finest_resolution(trial, coarse), coarse), rays
+
+
+def _thinned(rays: Sequence[Rays], most: float) -> list[Rays]:
+    """About `most` of the rays at most: every k-th, beginning elsewhere in each batch."""
+    stride = max(1, math.ceil(sum(len(batch.directions) for batch in rays) / most))
+    return [batch.every(stride, index % stride) for index, batch in enumerate(rays)]
 
 
 def surfel_trust(
@@ -116,9 +117,11 @@ def surfel_trust(
         shares = torch.zeros(surfels.count, 3, device=surfels.means.device, requires_grad=True)
         with torch.enable_grad():
             buffers = _rasterize_attribute(view, surfels.detached(), shares)
-        votes = torch.zeros_like(buffers.colors).flatten(1)
-        votes[0, pixels], votes[1, pixels] = robust_weight(error, TRUST_SCALE), 1.0
-        (gradient,) = torch.autograd.grad(buffers.colors, shares, votes.view_as(buffers.colors))
+            votes = torch.zeros_like(buffers.colors).flatten(1)
+            votes[0, pixels], votes[1, pixels] = robust_weight(error, TRUST_SCALE), 1.0
+            # A scalar, because torch loads much code to check the shapes of other cotangents.
+            voted = (buffers.colors * votes.view_as(buffers.colors)).sum()
+        (gradient,) = torch.autograd.grad(voted, shares)
         agreeing += gradient[:, 0]
         total += gradient[:, 1]
     return (agreeing + PRIOR_TRUST * PRIOR_PIXELS) / (total + PRIOR_PIXELS)
@@ -198,10 +201,13 @@ def _plane_rays(view: TrainView, plane: Plane, pixels: Tensor) -> Rays:
     return Rays(directions, view.radiance.flatten(1)[:, pixels].T.contiguous())
 
 
-def _blended(view: TrainView, surfels: Surfels, values: Float[Tensor, "K"]) -> Float[Tensor, "P"]:
-    """A value of each surfel as each pixel sees it: blended, over alpha."""
-    buffers = _rasterize_attribute(view, surfels, values[:, None].expand(-1, 3).contiguous())
-    return (buffers.colors[0] / buffers.alpha.clamp(min=ALPHA_FLOOR)).flatten()
+def _trust_of(
+    view: TrainView, surfels: Surfels, trust: Float[Tensor, "K"], pixels: Int[Tensor, "P"]
+) -> Float[Tensor, "P"]:
+    """The trust of the surfels that pixels see, blended, to the fourth power."""
+    buffers = _rasterize_attribute(view, surfels, trust[:, None].expand(-1, 3).contiguous())
+    blended = buffers.colors[0].flatten()[pixels] / buffers.alpha.flatten()[pixels].clamp(min=ALPHA_FLOOR)
+    return blended.clamp(0, 1) ** TRUST_POWER
 
 
 def _rasterize_attribute(view: TrainView, surfels: Surfels, attribute: Float[Tensor, "K 3"]) -> RasterBuffers:

@@ -87,7 +87,9 @@ def reflection_directions_world(
 
     Computed in the camera frame and rotated once: reflection commutes with rotation.
     """
-    normals = normalize(raster_normals_camera, dim=0, eps=SHORTEST_NORMAL)
+    # As `normalize` does, which takes ten times as long along the first of two dimensions.
+    squared = raster_normals_camera.square().sum(0, keepdim=True)
+    normals = raster_normals_camera * squared.clamp(min=SHORTEST_NORMAL**2).rsqrt()
     along = (rays_camera * normals).sum(0, keepdim=True)
     return (camera_to_world_rotation @ (rays_camera - 2 * along * normals)).T
 
