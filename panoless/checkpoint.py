@@ -2,7 +2,7 @@
 
 import io
 import json
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,15 @@ from torch import Tensor
 from panoless.config import FitConfig, config_from_dict
 from panoless.lathe import Lathe
 from panoless.plane import Plane
+from panoless.sheet import Sheet
 from panoless.surfels import Surfels
 from shinypartial.errors import InputError
 from shinypartial.files import PARTIAL_PREFIX, read_json, remove_partial_files, whole_file, write_json
 
 CHECKPOINT = "checkpoint.pt"
 DESCRIPTION = "fit.json"
+SHAPES: dict[str, Any] = {"plane": Plane, "sheet": Sheet, "lathe": Lathe}
+"""What a state may be made of beside surfels, by the name of its field."""
 
 
 @dataclass
@@ -51,19 +54,23 @@ class FitState:
     """The surface of revolution of the outlines, where there is one."""
     turned: bool = False
     """Whether that surface is the geometry; no steps are taken with it then."""
-    heights: int = 0
-    """Of how many numbers the surfels are functions, when they lie on a bent plane; 0 when they are free."""
+    sheet: Sheet | None = None
+    """The heights over the plane, where it bends."""
+    bent: bool = False
+    """Whether that bent plane is the geometry; no steps are taken with it then."""
     rung: str = ""
     """Which rung of the ladder was taken, and why."""
 
     @property
     def stepless(self) -> bool:
         """Whether the geometry is not made of free surfels, so that no steps of the optimization are taken."""
-        return self.flat or self.turned or self.heights > 0
+        return self.flat or self.bent or self.turned
 
     @property
-    def geometry(self) -> Surfels | Plane | Lathe:
+    def geometry(self) -> Surfels | Plane | Sheet | Lathe:
         """What mirrors the environment."""
+        if self.bent and self.sheet is not None:
+            return self.sheet
         if self.turned and self.lathe is not None:
             return self.lathe
         return self.plane if self.flat and self.plane is not None else self.surfels
@@ -79,9 +86,8 @@ def save_state(folder: Path, state: FitState) -> None:
     """Write the checkpoint whole or not at all."""
     content = {**vars(state), "surfels": {name: value.detach() for name, value in state.surfels.named().items()}}
     content["environment"] = state.environment.detach()
-    for name, found in (("plane", state.plane), ("lathe", state.lathe)):
-        if found is not None:
-            content[name] = {item.name: np.asarray(getattr(found, item.name)).tolist() for item in fields(found)}
+    for name in SHAPES:
+        content[name] = _listed(getattr(state, name))
     # Through memory, because torch reports a full disk as an internal error of its own.
     buffer = io.BytesIO()
     torch.save(content, buffer)
@@ -96,11 +102,8 @@ def load_state(folder: Path) -> FitState | None:
         return None
     try:
         content = torch.load(path, weights_only=True, map_location="cpu")
-        kinds: dict[str, Any] = {"plane": Plane, "lathe": Lathe}
-        for name, kind in kinds.items():
-            if content[name] is not None:
-                listed: dict[str, Any] = content[name]
-                content[name] = kind(**{k: np.array(v) if isinstance(v, list) else v for k, v in listed.items()})
+        for name in SHAPES:
+            content[name] = _shape(name, content[name])
         return FitState(**{**content, "surfels": Surfels(**content["surfels"])})
     except Exception as error:
         raise InputError(
@@ -108,6 +111,23 @@ def load_state(folder: Path) -> FitState | None:
             found=f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}",
             remedy="Delete that run folder and fit again.",
         ) from None
+
+
+def _listed(shape: Any) -> Any:
+    """A shape as lists and numbers, which torch reads without running code."""
+    if not is_dataclass(shape):
+        return None if shape is None else np.asarray(shape).tolist()
+    return {item.name: _listed(getattr(shape, item.name)) for item in fields(shape)}
+
+
+def _shape(name: str, listed: Any) -> Any:
+    """The shape of that name from its lists."""
+    if listed is None:
+        return None
+    values = {key: np.array(value) if isinstance(value, list) else value for key, value in listed.items()}
+    return SHAPES[name](
+        **{key: _shape(key, value) if isinstance(value, dict) else value for key, value in values.items()}
+    )
 
 
 def claim_run(folder: Path, dataset: Path, dataset_hash: str, config: FitConfig) -> None:

@@ -123,7 +123,7 @@ class Export:
 
 
 def _shape_name(state: "FitState") -> str:
-    return "a plane" if state.flat else "a bent plane" if state.heights else "a surface of revolution"
+    return "a plane" if state.flat else "a bent plane" if state.bent else "a surface of revolution"
 
 
 def _refuse_run_folder(prediction: Path, run_folder: Path) -> None:

@@ -3,12 +3,12 @@
 import json
 import os
 import platform
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -24,6 +24,7 @@ from panoless.lathe import Lathe, lathe_buffers, outgoing_directions
 from panoless.light import light_of
 from panoless.plane import Plane, plane_buffers
 from panoless.shading import ALPHA_FLOOR, compose, reflection_directions_world, surface_buffers
+from panoless.sheet import Sheet, sheet_buffers
 from panoless.snapshots import read_snapshot, snapshot_folders
 from panoless.surfels import Surfels
 from panoless.views import Normalization, load_views, raster_camera, unit_rays_camera
@@ -53,6 +54,7 @@ from shinypartial.sphere import latlong_directions
 PLY_NAME = "surfels.ply"
 PLANE_PLY_NAME = "plane.ply"
 LATHE_PLY_NAME = "lathe.ply"
+SHEET_PLY_NAME = "sheet.ply"
 PICTURES = "pictures"
 SUPERSAMPLING = 2
 LATHE_AROUND = 128
@@ -75,27 +77,23 @@ class Decomposition:
 
 
 def render(
-    geometry: Surfels | Plane | Lathe,
+    geometry: Surfels | Plane | Sheet | Lathe,
     environment: Float[Tensor, "6 3 L L"],
     camera: RasterCamera,
     normalization: Normalization,
     config: FitConfig,
-    outline: Plane | None = None,
 ) -> Decomposition:
-    """Render one camera with the final environment (radiance, not logits) in a mirror of the configured tint.
-
-    Surfels that lie over a plane end where its outline does, if one is given.
-    """
+    """Render one camera with the final environment (radiance, not logits) in a mirror of the configured tint."""
     with torch.no_grad():
         if isinstance(geometry, Plane):
             buffers = plane_buffers(geometry, camera)
+        elif isinstance(geometry, Sheet):
+            buffers = sheet_buffers(geometry, camera)
         elif isinstance(geometry, Lathe):
             buffers = lathe_buffers(geometry, camera)
         else:
             curved, depth_blend = config.surfels.curved, config.loss.depth_blend
             buffers = surface_buffers(geometry, camera, curved=curved, depth_blend=depth_blend)
-        if outline is not None:
-            buffers = replace(buffers, alpha=plane_buffers(outline, camera).alpha * (buffers.alpha > ALPHA_FLOOR))
         rotation = camera.world_to_camera[:3, :3].T
         pixels = torch.nonzero(buffers.alpha.flatten() > ALPHA_FLOOR)[:, 0]
         normals_camera = buffers.raster_normals_camera.flatten(1)[:, pixels]
@@ -136,12 +134,14 @@ def export_prediction(
     write_environment_map(folder, cube_to_latlong(environment, height))
     write_visibility(folder, cube_to_latlong(state.visibility[:, None], height)[..., 0].clip(0, 1))
     geometry = state.geometry
-    for name in (PLY_NAME, PLANE_PLY_NAME, LATHE_PLY_NAME):
+    for name in (PLY_NAME, PLANE_PLY_NAME, SHEET_PLY_NAME, LATHE_PLY_NAME):
         (folder / name).unlink(missing_ok=True)
     if isinstance(geometry, Surfels):
         write_ply(folder / PLY_NAME, geometry, normalization_of(state))
     elif isinstance(geometry, Lathe):
         write_lathe_ply(folder / LATHE_PLY_NAME, geometry, normalization_of(state))
+    elif isinstance(geometry, Sheet):
+        write_sheet_ply(folder / SHEET_PLY_NAME, geometry, normalization_of(state))
     else:
         write_plane_ply(folder / PLANE_PLY_NAME, geometry, normalization_of(state))
     _write_test_views(dataset, state, config, folder)
@@ -214,8 +214,7 @@ def _write_test_views(dataset: Dataset, state: FitState, config: FitConfig, fold
     for index, frame in enumerate(dataset.test):
         distance = np.linalg.norm(frame.camera.position_world - normalization.center) / normalization.radius
         camera = raster_camera(frame.camera, normalization, 0.1 * float(distance))
-        outline = state.plane if state.heights else None
-        parts = render(state.geometry, environment, camera, normalization, config, outline)
+        parts = render(state.geometry, environment, camera, normalization, config)
         view = View(
             radiance=parts.radiance.permute(1, 2, 0).numpy(),
             alpha=parts.alpha.numpy(),
@@ -316,17 +315,28 @@ def write_lathe_ply(path: Path, lathe: Lathe, normalization: Normalization) -> N
     index = np.arange(count * around).reshape(count, around)
     following = np.roll(index, -1, 1)
     faces = np.stack([index[:-1], following[:-1], following[1:], index[1:]], -1).reshape(-1, 4)
-    lines = ["ply", "format ascii 1.0", f"element vertex {count * around}"]
+    _write_quadrilaterals(path, rings.reshape(-1, 3), faces)
+
+
+def write_sheet_ply(path: Path, sheet: Sheet, normalization: Normalization) -> None:
+    """Write the bent plane in world units as an ASCII PLY of quadrilaterals, those within the outline."""
+    points, faces = sheet.quadrilaterals()
+    _write_quadrilaterals(path, points * normalization.radius + normalization.center, faces)
+
+
+def _write_quadrilaterals(path: Path, points: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "F 4"]) -> None:
+    lines = ["ply", "format ascii 1.0", f"element vertex {len(points)}"]
     lines += [f"property float {axis}" for axis in "xyz"]
     lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
-    lines += [" ".join(f"{value:.9g}" for value in corner) for corner in rings.reshape(-1, 3)]
+    lines += [" ".join(f"{value:.9g}" for value in corner) for corner in points]
     lines += ["4 " + " ".join(map(str, face)) for face in faces.tolist()]
     with whole_file(path) as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
 def _ply_name(state: FitState) -> str:
-    return LATHE_PLY_NAME if state.turned else PLANE_PLY_NAME if state.flat else PLY_NAME
+    names = {Lathe: LATHE_PLY_NAME, Sheet: SHEET_PLY_NAME, Plane: PLANE_PLY_NAME, Surfels: PLY_NAME}
+    return names[type(state.geometry)]
 
 
 def _columns(names: str | tuple[str, ...], matrix: Tensor) -> dict[str, np.ndarray]:
@@ -336,20 +346,13 @@ def _columns(names: str | tuple[str, ...], matrix: Tensor) -> dict[str, np.ndarr
 def _parameter_counts(state: FitState, config: FitConfig) -> dict[str, int]:
     """Numbers that the fit may choose, by what they belong to."""
     assert state.final_environment is not None
-    if isinstance(state.geometry, Plane):
-        numbers = state.geometry.numbers
-        return {"plane parameters": numbers, "environment parameters": state.final_environment.numel()}
-    if isinstance(state.geometry, Lathe):
-        numbers = state.geometry.numbers
-        return {"revolution parameters": numbers, "environment parameters": state.final_environment.numel()}
-    if state.heights:
-        return {"bent plane parameters": state.heights, "environment parameters": state.final_environment.numel()}
+    geometry, environment = state.geometry, {"environment parameters": state.final_environment.numel()}
+    if not isinstance(geometry, Surfels):
+        kinds = {Plane: "plane", Sheet: "bent plane", Lathe: "revolution"}
+        return {f"{kinds[type(geometry)]} parameters": geometry.numbers, **environment}
     per_surfel = 3 + 4 + 2 + 1
     per_surfel += 3 * config.albedo + 3 * config.surfels.curved + config.loss.roughness_weighted
-    return {
-        "surfel parameters": per_surfel * state.surfels.count,
-        "environment parameters": state.final_environment.numel(),
-    }
+    return {"surfel parameters": per_surfel * geometry.count, **environment}
 
 
 def _processor_name() -> str:

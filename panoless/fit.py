@@ -17,7 +17,7 @@ from panoless.checkpoint import FitState, claim_run, load_state, save_state
 from panoless.config import FitConfig, check_config
 from panoless.cubemap import initial_environment, look_up, resample, solve_environment
 from panoless.densify import DensityStatistics, Edit, grow_and_prune, propagate_normals, reset_opacities
-from panoless.initialize import initial_surfels, surfels_on_lathe, surfels_on_plane
+from panoless.initialize import initial_surfels, surfels_on_lathe, surfels_on_plane, surfels_on_sheet
 from panoless.kernels.adam import UNBOUNDED
 from panoless.kernels.backend import gpu_kernels_installed
 from panoless.kernels.objective import mirror_objective
@@ -29,7 +29,6 @@ from panoless.observation import observed_rays, reflections, solved_environment
 from panoless.optimizer import SurfelOptimizer
 from panoless.schedule import Phase, Schedule, phase_of
 from panoless.shading import ALPHA_FLOOR, compose, rasterize_surfels
-from panoless.sheet import sheet_surfels
 from panoless.snapshots import Marks, SnapshotKeeper, require_snapshots
 from panoless.surfels import Surfels
 from panoless.views import Normalization, TrainView, Views, load_views
@@ -389,10 +388,9 @@ def find_device(name: str) -> torch.device:
 def _first_state(views: Views, config: FitConfig) -> FitState:
     """The state before the first step, on the rung of the ladder that the scene needs."""
     rung = choose_rung(views, config, _trial)
-    if rung.sheet is not None and rung.plane is not None:
-        start = sheet_surfels(rung.sheet, config.surfels.count, config.seed)
-        state = new_state(without_mirrored_frame(views, rung.plane), config, start)
-        state.heights = rung.sheet.numbers if rung.model == "bent" else 0
+    if rung.sheet is not None:
+        start = surfels_on_sheet(rung.sheet, 1 if rung.model == "bent" else config.surfels.count, config.seed)
+        state = new_state(without_mirrored_frame(views, rung.sheet), config, start)
     elif rung.lathe is not None:
         state = new_state(views, config, surfels_on_lathe(rung.lathe, config.surfels.count))
     elif rung.plane is None:
@@ -401,13 +399,15 @@ def _first_state(views: Views, config: FitConfig) -> FitState:
         start = surfels_on_plane(rung.plane, 1, config.seed)
         state = new_state(without_mirrored_frame(views, rung.plane), config, start)
     state.plane, state.flat, state.rung = rung.plane, rung.model == "plane", f"{rung.model} ({rung.reason})"
+    state.sheet, state.bent = rung.sheet, rung.model == "bent"
     state.lathe, state.turned = rung.lathe, rung.model == "revolution"
     return state
 
 
 def clear_views(views: Views, state: FitState) -> Views:
     """The views without the pixels that mirror the frame of a planar outline, if that is what a state found."""
-    return views if state.plane is None else without_mirrored_frame(views, state.plane)
+    mirror = state.sheet or state.plane
+    return views if mirror is None else without_mirrored_frame(views, mirror)
 
 
 def _trial(views: Views, config: FitConfig, start: Surfels) -> Surfels:

@@ -12,6 +12,7 @@ from panoless.config import SurfelConfig
 from panoless.hull import completed_surface, hull_surface, unit
 from panoless.lathe import Lathe
 from panoless.plane import Plane
+from panoless.sheet import Sheet
 from panoless.surfels import Surfels
 from panoless.views import Views
 
@@ -131,21 +132,41 @@ def _principal(
 
 def surfels_on_plane(plane: Plane, count: int, seed: int) -> Surfels:
     """Flat surfels evenly within the outline of a plane: about `count`, on a hexagonal grid shifted by the seed."""
+    places, radius = _places_within(plane.outline, count, seed)
+    frames = np.broadcast_to(np.stack([plane.tangent_u, plane.tangent_v, plane.normal], 1), (len(places), 3, 3))
+    scales, curvatures = np.full((len(places), 2), radius), np.zeros((len(places), 3))
+    return _surfels(plane.points(places), frames, scales, curvatures, INITIAL_OPACITY_LOGIT)
+
+
+def surfels_on_sheet(sheet: Sheet, count: int, seed: int) -> Surfels:
+    """Surfels over the same places of a bent plane, tilted and curved as it is.
+
+    Curvatures are D²h/√(1 + |∇h|²), which is the shape operator but for terms of second order in the slope.
+    """
+    places, radius = _places_within(sheet.plane.outline, count, seed)
+    h, h_u, h_v, *bends = sheet.heights(places)
+    points = sheet.plane.points(places) + h[:, None] * sheet.plane.normal
+    norm, zero = np.sqrt(1 + h_u**2 + h_v**2), np.zeros_like(h)
+    normals = np.stack([-h_u, -h_v, zero + 1], 1) / norm[:, None]
+    tangents = np.stack([zero + 1, zero, h_u], 1) / np.sqrt(1 + h_u**2)[:, None]
+    frames = np.einsum("iw,pij->pwj", sheet.frame, np.stack([tangents, np.cross(normals, tangents), normals], 2))
+    scales = np.full((len(places), 2), radius)
+    return _surfels(points, frames, scales, np.stack(bends, 1) / norm[:, None], INITIAL_OPACITY_LOGIT)
+
+
+def _places_within(outline: Float[np.ndarray, "N 2"], count: int, seed: int) -> tuple[Float[np.ndarray, "K 2"], float]:
+    """Points of a hexagonal grid within an outline, and the radius of surfels there."""
     from skimage.measure import points_in_poly
 
-    low, extent = plane.outline.min(0), np.ptp(plane.outline, 0)
-    x, y = plane.outline.T
+    low, extent = outline.min(0), np.ptp(outline, 0)
+    x, y = outline.T
     area = abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
     across = math.sqrt(area / count / math.sin(math.pi / 3))
     up = across * math.sin(math.pi / 3)
     shift = np.random.default_rng(seed).random(2) - 1
     row, column = np.indices((math.ceil(extent[1] / up) + 2, math.ceil(extent[0] / across) + 2)).reshape(2, -1)
     grid = low + np.stack([(column + row % 2 / 2 + shift[0]) * across, (row + shift[1]) * up], 1)
-    points = plane.points(grid[points_in_poly(grid, plane.outline)])
-    frame = np.stack([plane.tangent_u, plane.tangent_v, plane.normal], 1)
-    frames = np.broadcast_to(frame, (len(points), 3, 3))
-    scales = np.full((len(points), 2), OVERLAP * math.sqrt(area / count))
-    return _surfels(points, frames, scales, np.zeros((len(points), 3)), INITIAL_OPACITY_LOGIT)
+    return grid[points_in_poly(grid, outline)], OVERLAP * math.sqrt(area / count)
 
 
 def surfels_on_lathe(lathe: Lathe, count: int) -> Surfels:

@@ -13,7 +13,7 @@ import torch
 
 from panoless.config import FitConfig
 from panoless.cubemap import solve_environment
-from panoless.initialize import surfels_on_lathe, surfels_on_plane
+from panoless.initialize import surfels_on_lathe, surfels_on_plane, surfels_on_sheet
 from panoless.lathe import Lathe
 from panoless.lathe_fit import fit_lathe, refine_lathe
 from panoless.observation import (
@@ -25,7 +25,7 @@ from panoless.observation import (
 )
 from panoless.plane import Plane, unobstructed
 from panoless.plane_fit import fit_plane
-from panoless.sheet import Sheet, sheet_surfels
+from panoless.sheet import Sheet, sightings
 from panoless.sheet_fit import fit_sheet
 from panoless.surfels import Surfels
 from panoless.views import TrainView, Views
@@ -101,16 +101,15 @@ def choose_rung(views: Views, config: FitConfig, trial: Trial) -> Rung:
 
 def _bent(views: Views, config: FitConfig, trial: Trial, plane: Plane, reason: str) -> Rung:
     """Heights over a plane, after `reason` spoke against the plane itself."""
-    clear = without_mirrored_frame(views, plane)
-    sheet = fit_sheet(clear, config, plane)
+    sheet = fit_sheet(views, plane)
     if config.model == "bent":
-        return Rung("bent", reason, plane, sheet)
-    start = sheet_surfels(sheet, config.surfels.count, config.seed).to(views.train[0].mask.device)
-    smooth, free = _held_out_errors(clear, config, start, start, trial)
+        return Rung("bent", reason, sheet.plane, sheet)
+    start = surfels_on_sheet(sheet, config.surfels.count, config.seed)
+    smooth, free = _held_out_errors(without_mirrored_frame(views, sheet), config, sheet, start, trial)
     compared = f"{reason}; {smooth.mean():.4f} with heights, {free.mean():.4f} with surfels on them"
     if _clearly_better(smooth, free):
-        return Rung("surfels", f"{compared}: not smooth", plane, sheet)
-    return Rung("bent", f"{compared}: no better", plane, sheet)
+        return Rung("surfels", f"{compared}: not smooth", sheet.plane, sheet)
+    return Rung("bent", f"{compared}: no better", sheet.plane, sheet)
 
 
 def _revolution(views: Views, config: FitConfig, trial: Trial, reason: str) -> Rung:
@@ -147,11 +146,13 @@ def _clearly_better(lower: np.ndarray, higher: np.ndarray) -> bool:
     return bool(gain.mean() > max(noise, LEAST_GAIN * lower.mean()))
 
 
-def without_mirrored_frame(views: Views, plane: Plane) -> Views:
-    """The views without the pixels in which a frame around the plane mirrors itself."""
+def without_mirrored_frame(views: Views, mirror: Plane | Sheet) -> Views:
+    """The views without the pixels in which a frame around a flat or bent mirror mirrors itself."""
 
     def clear(view: TrainView) -> TrainView:
-        seen = unobstructed(plane, view.camera).flatten()[view.solid] > UNOBSTRUCTED_SHARE
+        if isinstance(mirror, Sheet):
+            return replace(view, solid=sightings(mirror, view, view.solid).pixels)
+        seen = unobstructed(mirror, view.camera).flatten()[view.solid] > UNOBSTRUCTED_SHARE
         return replace(view, solid=view.solid[seen])
 
     return replace(views, train=tuple(clear(view) for view in views.train))

@@ -16,6 +16,7 @@ from panoless.kernels.rasterize import Channels, RasterBuffers
 from panoless.lathe import Lathe, lathe_rays
 from panoless.plane import Plane, plane_buffers
 from panoless.shading import ALPHA_FLOOR, rasterize_surfels, reflection_directions_world, tiles_of
+from panoless.sheet import Sheet, sheet_rays
 from panoless.surfels import Surfels
 from panoless.views import TrainView, Views
 from shinypartial.conventions import SOLID_ALPHA
@@ -35,7 +36,7 @@ TRUST_SCALE = 0.15
 PRIOR_PIXELS, PRIOR_TRUST = 1.0, 0.2
 TRUST_POWER = 4
 
-Geometry = Surfels | Plane | Lathe
+Geometry = Surfels | Plane | Sheet | Lathe
 Each = TypeVar("Each")
 
 
@@ -48,6 +49,8 @@ def observed_rays(views: Views, geometry: Geometry, config: FitConfig, max_rays:
     for view, pixels in _chosen_pixels(views, max_rays):
         if isinstance(geometry, Plane):
             yield _plane_rays(view, geometry, pixels)
+        elif isinstance(geometry, Sheet):
+            yield sheet_rays(geometry, view, pixels)
         elif isinstance(geometry, Lathe):
             yield lathe_rays(geometry, view, pixels, weighted=len(pixels) == len(view.solid))[0]
         else:

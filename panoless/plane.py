@@ -62,9 +62,9 @@ def plane_buffers(plane: Plane, camera: RasterCamera) -> SurfaceBuffers:
         return _buffers(nothing, nothing, np.zeros(3), camera)
     corners = (plane.points(plane.outline) - center) @ rotation.T
     normal = rotation @ plane.normal
-    alpha = _projected_coverage(corners, camera)
+    alpha = projected_coverage(corners, camera)
     if 0 < plane.rim_height < height_above:
-        alpha = np.minimum(alpha, _projected_coverage(corners + plane.rim_height * normal, camera))
+        alpha = np.minimum(alpha, projected_coverage(corners + plane.rim_height * normal, camera))
     x = (np.arange(camera.width) + PIXEL_CENTER - camera.cx) / camera.fx
     y = (np.arange(camera.height) + PIXEL_CENTER - camera.cy) / camera.fy
     slope = -(normal[0] * x + (normal[1] * y + normal[2])[:, None])
@@ -83,8 +83,8 @@ def unobstructed(plane: Plane, camera: RasterCamera) -> Float[Tensor, "H W"]:
     if plane.rim_height <= 0 or plane.normal @ center <= plane.offset:
         return camera.world_to_camera.new_ones(camera.height, camera.width)
     outline = (plane.points(plane.outline) - center) @ rotation.T
-    image = _projected_coverage(outline - plane.rim_height * (rotation @ plane.normal), camera)
-    return _tensor(np.where(_projected_coverage(outline, camera) > 0, image, 1.0), camera)
+    image = projected_coverage(outline - plane.rim_height * (rotation @ plane.normal), camera)
+    return _tensor(np.where(projected_coverage(outline, camera) > 0, image, 1.0), camera)
 
 
 def _buffers(
@@ -111,7 +111,7 @@ def _tensor(values: Float[np.ndarray, "*S"], camera: RasterCamera) -> Float[Tens
     return torch.from_numpy(values).float().to(camera.world_to_camera.device)
 
 
-def _projected_coverage(corners_camera: Float[np.ndarray, "N 3"], camera: RasterCamera) -> Float[np.ndarray, "H W"]:
+def projected_coverage(corners_camera: Float[np.ndarray, "N 3"], camera: RasterCamera) -> Float[np.ndarray, "H W"]:
     """Coverage of the part of a flat polygon that lies beyond the near plane."""
     kept = _beyond(corners_camera, camera.near)
     pixels = kept[:, :2] / kept[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]

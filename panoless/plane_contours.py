@@ -2,7 +2,9 @@
 the outline's vertices.
 """
 
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -11,6 +13,10 @@ from panoless.plane import Plane
 from panoless.views import Views, pose_of
 from shinypartial.conventions import PIXEL_CENTER
 
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+HeightOf = Callable[[Float[np.ndarray, "P 2"]], Float[np.ndarray, "P"]]
 CONTOUR_LEVEL = 0.5
 CORNER_DEG = 20.0
 CORNER_PX = 1.5
@@ -51,6 +57,8 @@ class Distances:
     valid: Bool[np.ndarray, "P"]
     """In front of a camera that faces the mirror."""
     corner: Bool[np.ndarray, "P"]
+    by_height: Float[np.ndarray, "P"]
+    """Derivatives by the height of the mirror's edge over the plane; zero where the rim hides that edge."""
 
 
 def view_contours(views: Views) -> Contours:
@@ -83,12 +91,13 @@ def carried(contours: Contours, plane: Plane) -> tuple[Float[np.ndarray, "P 2"],
     return np.where(valid[:, None], coordinates, 0.0), valid
 
 
-def outline_distances(contours: Contours, plane: Plane) -> Distances:
+def outline_distances(contours: Contours, plane: Plane, height_of: HeightOf | None = None) -> Distances:
     """First-order pixel distances: the plane distance from an edge times |det J|/‖J τ‖, J = ∂pixel/∂coordinates.
 
     A turn of the normal by a t_u + b t_v and a shift of the offset by c move the hit point by r (c − a p₁ − b p₂)/(n·r)
-    along its ray r. Where a camera at height H stands beyond an edge, the rim of height h hides the mirror up to
-    (ν·(camera − edge)) h/(H − h) inside of it, ν the outward normal.
+    along its ray r. What stands at height z over an edge is seen (ν·(camera − edge)) z/(H − z) inside of it by a camera
+    at height H, ν the outward normal. This is the rim where the camera stands beyond the edge, and elsewhere the edge
+    of the mirror itself, at height zero unless `height_of` gives one.
     """
     coordinates, valid = carried(contours, plane)
     edge, along = _nearest(coordinates, plane.outline)
@@ -107,25 +116,29 @@ def outline_distances(contours: Contours, plane: Plane) -> Distances:
     scale = np.abs(column_u * row_v - column_v * row_u) / np.maximum(stretch, 1e-12)
     outward = scale[:, None] * np.stack([tangent[:, 1], -tangent[:, 0]], 1)
     hit_moves = outward[:, 0] * (contours.rays @ tangent_u) + outward[:, 1] * (contours.rays @ tangent_v)
-    height = np.where(valid, contours.centers @ plane.normal - plane.offset, np.inf)
-    above = np.where(height > 2 * plane.rim_height, height - plane.rim_height, np.inf)
     foot = corners[edge] + along[:, None] * sides[edge]
     camera = np.stack([contours.centers @ tangent_u, contours.centers @ tangent_v], 1)
-    beyond = np.maximum((outward * (camera - foot)).sum(1), 0.0)
-    by_rim = np.where(np.isfinite(above), beyond / above, 0.0)
+    toward_camera = (outward * (camera - foot)).sum(1)
+    own = np.zeros(len(edge)) if height_of is None else height_of(foot)
+    framed = plane.rim_height > 0 or height_of is None
+    by_rim = (toward_camera > 0) & (own <= plane.rim_height) & framed
+    level = np.where(by_rim, plane.rim_height, own)
+    height = np.where(valid, contours.centers @ plane.normal - plane.offset, np.inf)
+    lean = toward_camera / np.where(height > 2 * np.abs(level), height - level, np.inf)
     by_plane = (hit_moves / slope)[:, None] * np.concatenate([-coordinates, np.ones((len(edge), 1))], 1)
     turns = np.einsum("ni,ni->n", tangents, np.roll(tangents, 1, 0)) < np.cos(np.radians(CORNER_DEG))
     reach = stretch * lengths[edge]
     return Distances(
         coordinates=coordinates,
-        pixels=(outward * (coordinates - foot)).sum(1) + by_rim * plane.rim_height,
-        by_plane=np.concatenate([by_plane, by_rim[:, None]], 1),
+        pixels=(outward * (coordinates - foot)).sum(1) + lean * level,
+        by_plane=np.concatenate([by_plane, (lean * by_rim)[:, None]], 1),
         edge=edge,
         along=along,
         outward=outward,
         valid=valid,
         corner=(turns[edge] & (along * reach < CORNER_PX))
         | (np.roll(turns, -1)[edge] & ((1 - along) * reach < CORNER_PX)),
+        by_height=lean * ~by_rim,
     )
 
 
@@ -151,6 +164,30 @@ def robust_weights(distances: Distances, scale_px: float) -> Float[np.ndarray, "
     return (distances.valid & ~distances.corner) / (1 + (distances.pixels / scale) ** 2) ** 2
 
 
+def outline_jacobian(distances: Distances, vertices: int) -> "csr_matrix":
+    """Derivatives of the distances by the four numbers of the plane and by two of each vertex, P rows."""
+    from scipy.sparse import csr_matrix
+
+    count = len(distances.edge)
+    ends = np.stack([distances.edge, (distances.edge + 1) % vertices], 1)
+    shares = np.stack([1 - distances.along, distances.along], 1)
+    values = -shares[:, :, None] * distances.outward[:, None, :]
+    columns = 4 + 2 * ends[:, :, None] + np.arange(2)
+    return csr_matrix(
+        (
+            np.concatenate([distances.by_plane, values.reshape(count, 4)], 1).ravel(),
+            np.concatenate([np.tile(np.arange(4), (count, 1)), columns.reshape(count, 4)], 1).ravel(),
+            np.arange(count + 1) * 8,
+        ),
+        shape=(count, 4 + 2 * vertices),
+    )
+
+
+def outline_pull(distances: Distances, weights: Float[np.ndarray, "P"], vertices: int) -> float:
+    """What holds each number of a vertex against the sum of the contour points' weights."""
+    return float(PULL * weights.sum() / vertices * np.median((distances.outward**2).sum(1)))
+
+
 def normal_equations(
     contours: Contours, distances: Distances, scale_px: float, vertices: int, rim: bool
 ) -> tuple[Float[np.ndarray, "V D"], Float[np.ndarray, "D D"]]:
@@ -161,21 +198,25 @@ def normal_equations(
     from scipy import sparse
 
     count, weights = len(distances.edge), robust_weights(distances, scale_px)
-    ends = np.stack([distances.edge, (distances.edge + 1) % vertices], 1)
-    shares = np.stack([1 - distances.along, distances.along], 1)
-    values = -shares[:, :, None] * distances.outward[:, None, :]
-    columns = 4 + 2 * ends[:, :, None] + np.arange(2)
-    by_plane = distances.by_plane * [1, 1, 1, rim]
-    jacobian = sparse.csr_matrix(
-        (
-            np.concatenate([by_plane, values.reshape(count, 4)], 1).ravel(),
-            np.concatenate([np.tile(np.arange(4), (count, 1)), columns.reshape(count, 4)], 1).ravel(),
-            np.arange(count + 1) * 8,
-        ),
-        shape=(count, 4 + 2 * vertices),
-    )
+    jacobian = outline_jacobian(replace(distances, by_plane=distances.by_plane * [1, 1, 1, rim]), vertices)
     matrix = (jacobian.T @ jacobian.multiply(weights[:, None]).tocsr()).toarray()
-    pull = PULL * weights.sum() / vertices * np.median((distances.outward**2).sum(1))
+    pull = outline_pull(distances, weights, vertices)
     matrix += np.diag(np.append(np.full(4, 1e-9 * np.trace(matrix[:4, :4])), np.full(2 * vertices, pull)))
     by_view = sparse.csr_matrix((weights * distances.pixels, (contours.view, np.arange(count))))
     return (by_view @ jacobian).toarray(), matrix
+
+
+def moved_plane(plane: Plane, step: Float[np.ndarray, "D"]) -> Plane:
+    """The plane after a turn of its normal by step₀ t_u + step₁ t_v, shifts of offset and rim, and of each vertex."""
+    tilted = plane.normal + step[0] * plane.tangent_u + step[1] * plane.tangent_v
+    length = np.linalg.norm(tilted)
+    # The outline moves along the old normal onto the new plane, as the derivatives have it.
+    flat = (plane.outline + step[4:].reshape(-1, 2)) @ np.stack([plane.tangent_u, plane.tangent_v])
+    points = flat + (plane.offset + step[2] - flat @ tilted)[:, None] * plane.normal
+    normal = tilted / length
+    tangent_u = plane.tangent_u - (plane.tangent_u @ normal) * normal
+    tangent_u /= np.linalg.norm(tangent_u)
+    tangent_v = np.cross(normal, tangent_u)
+    outline = np.stack([points @ tangent_u, points @ tangent_v], 1)
+    rim_height = max(plane.rim_height + float(step[3]), 0.0)
+    return Plane(normal, float((plane.offset + step[2]) / length), tangent_u, tangent_v, outline, rim_height)

@@ -18,6 +18,7 @@ from panoless.plane_contours import (
     CORNER_DEG,
     Contours,
     carried,
+    moved_plane,
     normal_equations,
     outline_distances,
     robust_weights,
@@ -268,18 +269,8 @@ def _step(contours: Contours, plane: Plane, scale_px: float, rim: bool = True) -
     gradients, matrix = normal_equations(contours, distances, scale_px, len(plane.outline), rim)
     step = -np.linalg.lstsq(matrix, gradients.sum(0), rcond=None)[0]
     step *= min(1.0, LARGEST_STEP / max(float(np.abs(step).max()), 1e-12))
-    tilted = plane.normal + step[0] * plane.tangent_u + step[1] * plane.tangent_v
-    length = np.linalg.norm(tilted)
-    # The outline moves along the old normal onto the new plane, as the derivatives have it.
-    flat = (plane.outline + step[4:].reshape(-1, 2)) @ np.stack([plane.tangent_u, plane.tangent_v])
-    points = flat + (plane.offset + step[2] - flat @ tilted)[:, None] * plane.normal
-    normal = tilted / length
-    tangent_u = plane.tangent_u - (plane.tangent_u @ normal) * normal
-    tangent_u /= np.linalg.norm(tangent_u)
-    tangent_v = np.cross(normal, tangent_u)
-    outline = np.stack([points @ tangent_u, points @ tangent_v], 1)
-    rim_height = max(plane.rim_height + float(step[3]) * rim, 0.0)
-    return Plane(normal, float((plane.offset + step[2]) / length), tangent_u, tangent_v, outline, rim_height)
+    step[3] *= rim
+    return moved_plane(plane, step)
 
 
 def _simplified(plane: Plane, contours: Contours) -> Plane:

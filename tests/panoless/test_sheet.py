@@ -1,4 +1,4 @@
-"""A bent mirror: surfels follow from heights, and heights from what the mirror shows."""
+"""A bent mirror: where rays meet it, what a camera sees of it, and surfels that follow from it."""
 
 from dataclasses import replace
 
@@ -6,128 +6,161 @@ import numpy as np
 import pytest
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
-from panoless.cubemap import solve_environment
+from panoless.initialize import surfels_on_plane, surfels_on_sheet
 from panoless.kernels.reference.rasterize import rotation_matrices
-from panoless.observation import observed_rays, prediction_error, reflections
-from panoless.shading import rasterize_surfels
-from panoless.sheet import Sheet, SheetSurfels, flat_sheet, sheet_surfels
-from panoless.sheet_fit import NOTHING, _bout
+from panoless.lathe import mirrored, pixel_rays
+from panoless.plane import plane_buffers, unobstructed
+from panoless.sheet import Sheet, edge_points, flat_sheet, sheet_buffers, sightings
 from panoless.surfels import Surfels
-from panoless.views import Normalization, Views
-from tests.support.mirror_plane import NORMAL, RECTANGLE, arc, mirror_views, plane_of
-from tests.support.mirror_sphere import tiny_config
+from tests.support.mirror_plane import L_SHAPE, NORMAL, RECTANGLE, arc, mirror_views, plane_of, train_view
+from tests.support.mirror_sheet import bumpy
 
 COUNT = 300
 PLANE = plane_of(RECTANGLE)
 
 
 def normals_of(surfels: Surfels) -> Float[np.ndarray, "K 3"]:
-    return rotation_matrices(surfels.quats)[:, :, 2].detach().numpy().astype(np.float64)
+    return rotation_matrices(surfels.quats)[:, :, 2].numpy().astype(np.float64)
 
 
-def coordinates_of(surfels: Surfels) -> Float[np.ndarray, "K 2"]:
-    tangents = np.stack([PLANE.tangent_u, PLANE.tangent_v], 1)
-    return surfels.means.detach().numpy().astype(np.float64) @ tangents
+def coordinates_of(points: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 2"]:
+    return points @ np.stack([PLANE.tangent_u, PLANE.tangent_v], 1)
 
 
-def spline_through(sheet: Sheet, bend: Float[np.ndarray, "2 2"]) -> Float[Tensor, "M N"]:
-    """Coefficients of h = ½ pᵀ bend p: a cubic B-spline of a quadratic is its value less spacing²/6 of each bend."""
+def parabolic(cells: int, bend: Float[np.ndarray, "2 2"]) -> Sheet:
+    """h = ½ pᵀ bend p: a cubic B-spline of a quadratic is its value less spacing²/6 of each bend."""
+    sheet = flat_sheet(PLANE, cells)
     rows, columns = sheet.coefficients.shape
     u = sheet.low[0] + sheet.spacing * (np.arange(rows) - 1)
     v = sheet.low[1] + sheet.spacing * (np.arange(columns) - 1)
     height = (bend[0, 0] * u[:, None] ** 2 + bend[1, 1] * v**2) / 2 + bend[0, 1] * u[:, None] * v
-    return torch.from_numpy(height - np.trace(bend) * sheet.spacing**2 / 6).float()
+    return replace(sheet, coefficients=height - np.trace(bend) * sheet.spacing**2 / 6)
 
 
-def test_without_height_the_surfels_are_those_of_the_plane() -> None:
-    surfels = SheetSurfels(flat_sheet(PLANE, 8), COUNT, 0).surfels(flat_sheet(PLANE, 8).coefficients)
-    assert np.allclose(normals_of(surfels), NORMAL, atol=1e-6)
-    assert np.allclose(surfels.means.numpy() @ NORMAL, PLANE.offset, atol=1e-6)
-    assert torch.count_nonzero(surfels.curvatures) == 0
+def test_a_quadratic_has_its_heights_slopes_and_bends() -> None:
+    bend = np.array([[0.1, 0.03], [0.03, -0.08]])
+    p = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 2))
+    h, h_u, h_v, *bends = parabolic(8, bend).heights(p)
+    assert np.allclose(h, (p @ bend * p).sum(1) / 2, atol=1e-12)
+    assert np.allclose(np.stack([h_u, h_v], 1), p @ bend, atol=1e-12)
+    assert np.allclose(np.stack(bends, 1), [0.1, 0.03, -0.08], atol=1e-12)
 
 
-def test_a_tilt_is_exact() -> None:
-    """Every surfel turns by atan |slope| about the same axis and none bends."""
-    tilted = flat_sheet(PLANE, 8).tilted(0.03, -0.02)
-    surfels = SheetSurfels(tilted, COUNT, 0).surfels(tilted.coefficients)
-    expected = NORMAL - 0.03 * PLANE.tangent_u + 0.02 * PLANE.tangent_v
-    assert np.allclose(normals_of(surfels), expected / np.linalg.norm(expected), atol=1e-5)
-    assert surfels.curvatures.abs().max() < 1e-3
+def test_rays_end_on_the_surface_with_its_normal() -> None:
+    sheet, camera = bumpy(PLANE, 0.02), arc(5)[1]
+    pixels = np.flatnonzero(sheet_buffers(sheet, camera).alpha.numpy() > 0.5)
+    origins, directions = pixel_rays(camera, pixels)
+    hits = sheet.hits(origins, directions)
+    points = origins + hits.distance[:, None] * directions
+    h, h_u, h_v, *_ = sheet.heights(coordinates_of(points))
+    assert hits.met.all()
+    assert np.allclose(points @ NORMAL - PLANE.offset, h, atol=1e-9)
+    assert np.allclose(hits.places, coordinates_of(points), atol=1e-9)
+    expected = NORMAL - h_u[:, None] * PLANE.tangent_u - h_v[:, None] * PLANE.tangent_v
+    assert np.allclose(hits.normals @ sheet.frame, expected / np.linalg.norm(expected, axis=1)[:, None], atol=1e-8)
 
 
-def test_a_quadratic_has_its_normals_heights_and_curvatures() -> None:
+def test_beyond_its_knots_a_sheet_goes_on_straight() -> None:
+    """A tilted plane is met where a plane is, however far out; its back and what runs along it never."""
+    slope = np.array([0.03, -0.02])
+    tilted = flat_sheet(PLANE, 8)
+    rows, columns = (np.arange(count) - 1.0 for count in tilted.coefficients.shape)
+    places = np.stack(np.meshgrid(rows, columns, indexing="ij"), -1) * tilted.spacing + tilted.low
+    tilted = replace(tilted, coefficients=places @ slope)
+    normal = NORMAL - slope[0] * PLANE.tangent_u - slope[1] * PLANE.tangent_v
+    ends = PLANE.points(np.array([[5.0, -4.0], [-3.0, 0.1], [0.2, 0.1]]))
+    origins = np.tile(4 * NORMAL, (3, 1))
+    hits = tilted.hits(origins, ends - origins)
+    points = origins + hits.distance[:, None] * (ends - origins)
+    assert np.allclose(points @ normal, PLANE.offset, atol=1e-9)
+    assert not tilted.hits(-origins, ends + origins).met.any()
+    assert not tilted.hits(origins, np.tile(PLANE.tangent_u, (3, 1))).met.any()
+
+
+@pytest.mark.parametrize("rim_height", [0.0, 0.1])
+@pytest.mark.parametrize("outline", [RECTANGLE, L_SHAPE], ids=["rectangle", "L"])
+def test_without_height_it_is_seen_as_its_plane(outline: np.ndarray, rim_height: float) -> None:
+    plane = plane_of(outline, rim_height)
+    for camera in arc(3):
+        flat, expected = sheet_buffers(flat_sheet(plane, 6), camera), plane_buffers(plane, camera)
+        assert torch.allclose(flat.alpha, expected.alpha, atol=1e-5)
+        inside = expected.alpha > 0.99
+        assert torch.allclose(flat.surface_depth[inside], expected.surface_depth[inside], atol=1e-5)
+        assert torch.allclose(flat.raster_normals_camera, expected.raster_normals_camera, atol=1e-5)
+
+
+def test_its_edge_bounds_what_is_seen() -> None:
+    """Every point of the edge in space lies on the contour of the coverage, within the size of a pixel."""
+    sheet, camera = bumpy(PLANE, 0.03), arc(5)[4]
+    matrix = camera.world_to_camera.double().numpy()
+    seen = edge_points(sheet) @ matrix[:3, :3].T + matrix[:3, 3]
+    pixels = seen[:, :2] / seen[:, 2:] * camera.fx + [camera.cx, camera.cy]
+    alpha = sheet_buffers(sheet, camera).alpha.numpy()
+    for column, row in np.floor(pixels).astype(int):
+        around = alpha[row - 1 : row + 2, column - 1 : column + 2]
+        assert around.min() < 0.5 < around.max()
+
+
+def test_mirrored_rays_that_meet_the_rim_are_left_out() -> None:
+    """For a flat mirror these are the pixels in which the plane sees its frame from within; one pixel is the margin."""
+    plane = plane_of(RECTANGLE, rim_height=0.1)
+    sheet = flat_sheet(plane, 6)
+    for view in mirror_views(plane, arc(3)).train:
+        share = unobstructed(plane, view.camera).flatten()[view.solid]
+        kept = torch.isin(view.solid, sightings(sheet, view, view.solid).pixels)
+        assert (share[kept] > 0.99).all()
+        assert kept.sum() > 0.95 * (share > 0.99).sum() - view.camera.width - view.camera.height
+        assert (share < 0.5).any()
+
+
+def test_where_no_frame_stands_out_every_solid_pixel_is_seen_along_the_mirrored_ray() -> None:
+    sheet, camera = bumpy(PLANE, 0.01), arc(3)[0]
+    view = train_view(camera, sheet_buffers(sheet, camera).alpha.double().numpy())
+    found = sightings(sheet, view, view.solid)
+    assert torch.equal(found.pixels, view.solid)
+    normals = found.hits.normals @ sheet.frame
+    assert np.allclose(found.outgoing, unit(mirrored(pixel_rays(camera, view.solid.numpy())[1], normals)), atol=1e-9)
+
+
+def unit(vectors: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def test_only_planes_do_not_bend() -> None:
+    """The energy of a tilt is zero; that of h = ½ κ u² is κ² spacing⁴ for each interior coefficient."""
+    curved, rows = parabolic(8, np.diag([0.2, 0.0])), flat_sheet(PLANE, 8).coefficients.shape
+    energy = curved.coefficients.ravel() @ curved.bending() @ curved.coefficients.ravel()
+    assert energy == pytest.approx((rows[0] - 2) * rows[1] * 0.2**2 * curved.spacing**4)
+    tilt = np.add.outer(0.3 * np.arange(rows[0]), -0.2 * np.arange(rows[1])).ravel()
+    assert abs(tilt @ curved.bending() @ tilt) < 1e-12
+
+
+def test_surfels_of_a_flat_sheet_are_those_of_its_plane() -> None:
+    found, expected = surfels_on_sheet(flat_sheet(PLANE, 8), COUNT, 0), surfels_on_plane(PLANE, COUNT, 0)
+    for name, values in expected.named().items():
+        torch.testing.assert_close(getattr(found, name), values)
+
+
+def test_surfels_have_the_normals_heights_and_curvatures_of_a_quadratic() -> None:
     """h = ½ pᵀ B p has the gradient B p and the bending B everywhere."""
-    sheet, bend = flat_sheet(PLANE, 8), np.array([[0.1, 0.03], [0.03, -0.08]])
-    surfels = SheetSurfels(sheet, COUNT, 0).surfels(spline_through(sheet, bend))
-    p = coordinates_of(surfels)
+    bend = np.array([[0.1, 0.03], [0.03, -0.08]])
+    surfels = surfels_on_sheet(parabolic(8, bend), COUNT, 0)
+    means = surfels.means.numpy().astype(np.float64)
+    p = coordinates_of(means)
     slope = p @ bend
     expected = NORMAL - slope[:, :1] * PLANE.tangent_u - slope[:, 1:] * PLANE.tangent_v
     norm = np.linalg.norm(expected, axis=1, keepdims=True)
-    height = surfels.means.numpy().astype(np.float64) @ NORMAL - PLANE.offset
-    assert np.allclose(height, (p @ bend * p).sum(1) / 2, atol=1e-5)
-    assert np.allclose(normals_of(surfels), expected / norm, atol=1e-4)
-    assert np.allclose(surfels.curvatures.numpy() * norm, [0.1, 0.03, -0.08], atol=2e-3)
+    assert np.allclose(means @ NORMAL - PLANE.offset, (p @ bend * p).sum(1) / 2, atol=1e-6)
+    assert np.allclose(normals_of(surfels), expected / norm, atol=1e-6)
+    assert np.allclose(surfels.curvatures.numpy() * norm, [0.1, 0.03, -0.08], atol=1e-6)
 
 
-def test_normals_turn_as_their_curvatures_say() -> None:
-    """Along the tangent u a normal changes by −curvature per length, to first order in the slope."""
-    sheet = flat_sheet(PLANE, 6)
-    sheet = replace(sheet, coefficients=0.02 * torch.randn(sheet.coefficients.shape, generator=torch.manual_seed(1)))
-    mirror = SheetSurfels(sheet, COUNT, 0)
-    surfels, step = mirror.surfels(sheet.coefficients), 1e-2 * sheet.spacing
-    shifted = replace(sheet, low=sheet.low - np.array([step, 0.0]))
-    moved = SheetSurfels(shifted, COUNT, 0).surfels(sheet.coefficients)
-    turn = (normals_of(moved) - normals_of(surfels)) @ PLANE.tangent_u / step
-    scale = float(surfels.curvatures[:, 0].abs().max())
-    assert np.abs(turn + surfels.curvatures[:, 0].numpy()).max() < 0.1 * scale
-
-
-def test_gradients_are_those_of_finite_differences() -> None:
-    sheet = flat_sheet(PLANE, 5)
-    mirror = SheetSurfels(sheet, COUNT, 0)
-    start = 0.05 * torch.randn(sheet.coefficients.shape, generator=torch.manual_seed(2))
-    weights = torch.randn(10, COUNT + 200, generator=torch.manual_seed(3))
-
-    def value(coefficients: Tensor) -> Tensor:
-        surfels = mirror.surfels(coefficients)
-        numbers = torch.cat([surfels.means, surfels.quats, surfels.curvatures], 1).T
-        return (numbers * weights[:, : numbers.shape[1]]).sum() + mirror.bending(coefficients)
-
-    leaf = start.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(value(leaf), leaf)
-    direction = torch.randn(start.shape, generator=torch.manual_seed(4))
-    step = 2e-3
-    difference = (value(start + step * direction) - value(start - step * direction)) / (2 * step)
-    assert float((gradient * direction).sum()) == pytest.approx(float(difference), rel=1e-2)
-
-
-def patterned(directions: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
-    """An environment with detail everywhere, in [0, 1]."""
-    waves = 6 * torch.randn(3, 3, generator=torch.manual_seed(6)).numpy()
-    return 0.5 + 0.25 * np.sin(directions @ waves) + 0.25 * np.sin(2 * directions @ waves[::-1].T)
-
-
-def test_heights_explain_a_bent_mirror_better_than_its_plane() -> None:
-    """Steps from a flat start lower the error of the closed-form map by a third."""
-    bent = flat_sheet(PLANE, 4)
-    bent = replace(bent, coefficients=0.006 * torch.randn(bent.coefficients.shape, generator=torch.manual_seed(5)))
-    truth, train = sheet_surfels(bent, 1500, 1), []
-    for view in mirror_views(PLANE, arc(12, size=64)).train:
-        raster = rasterize_surfels(truth, view.camera, curved=True, channels=NOTHING)
-        radiance = torch.zeros_like(view.radiance)
-        seen = patterned(reflections(view, raster.normals_camera, view.solid).double().numpy())
-        radiance.flatten(1)[:, view.solid] = torch.from_numpy(seen.T).float()
-        train.append(replace(view, radiance=radiance))
-    views = Views(tuple(train), Normalization(np.zeros(3), 1.0), 0.3)
-    config = tiny_config(iterations=500, count=400)
-    config = replace(config, environment=replace(config.environment, resolution=32))
-
-    def error(sheet: Sheet) -> float:
-        rays = list(observed_rays(views, sheet_surfels(sheet, 400, 0), config, 100_000))
-        return prediction_error(rays, solve_environment(rays, 32))
-
-    flat = flat_sheet(PLANE, 6)
-    found = _bout(views, config, SheetSurfels(flat, 400, 0), flat, range(500))
-    assert error(found) < 2 / 3 * error(flat)
+def test_the_mesh_lies_on_the_sheet_within_the_outline() -> None:
+    sheet = bumpy(plane_of(L_SHAPE), 0.02)
+    points, faces = sheet.quadrilaterals()
+    assert np.allclose(points @ NORMAL - sheet.plane.offset, sheet.heights(coordinates_of(points))[0])
+    corners = coordinates_of(points)[faces]
+    across, up = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
+    area = (across[:, 0] * up[:, 1] - across[:, 1] * up[:, 0]).sum()
+    assert area == pytest.approx(1.2 * 1.0 - 0.6 * 0.4, rel=0.1)
