@@ -10,6 +10,7 @@ from torch import Tensor
 
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.lathe import BOUNCES, Lathe, lathe_buffers, lathe_rays, pixel_rays
+from panoless.lathe_base import found_base
 from panoless.lathe_contours import (
     ContourRays,
     axis_starts,
@@ -22,7 +23,7 @@ from panoless.lathe_contours import (
 from panoless.lathe_inside import searched_inside
 from panoless.lathe_photometric import Round, observations, photometric_step, solved_map
 from panoless.lathe_profile import resampled
-from panoless.lathe_rim import open_lathe, with_rim
+from panoless.lathe_rim import clear_of_rim, open_lathe, with_rim
 from panoless.views import Views
 from shinypartial.progress import Progress
 
@@ -99,12 +100,14 @@ def refine_lathe(views: Views, start: Lathe) -> Lathe:
     for each in FINE_ROUNDS:
         lathe, environment = _round(views, contours, lathe, each, environment, pixel)
         progress.advance()
-    return lathe
+    with torch.no_grad():
+        return found_base(views, lathe, environment)
 
 
 def _round(
     views: Views, contours: ContourRays, lathe: Lathe, each: Round, environment: Tensor | None, pixel: float
 ) -> tuple[Lathe, Tensor]:
+    views = clear_of_rim(views, lathe)
     with torch.no_grad():
         environment = solved_map(views, lathe, MAP_RAYS, each.resolution, environment)
         for _ in range(each.steps):

@@ -8,11 +8,13 @@ elevations and both sides of the rim have different m, and q is their common poi
 from dataclasses import replace
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from panoless.lathe import Lathe
 from panoless.lathe_contours import ContourRays, in_axis_frame, robust_scale, touches
 from panoless.lathe_profile import resampled
+from panoless.views import TrainView, Views, pose_of
 
 FEWEST_RAYS = 20
 STEPS = 6
@@ -23,6 +25,11 @@ SPOILED_PX = 7
 FITTED_PX = 16
 """The part before that, from which the profile goes on to the tip."""
 TIP_WEIGHT = 4.0
+END_PX = 4
+"""So much of an open wall before its rim has no pixels that see it alone."""
+CLEARANCE_PX = 2
+"""Pixels nearer than this to the rim's image may show what lies before and behind it."""
+AROUND = 2000
 
 
 def tip_shift(contours: ContourRays, lathe: Lathe, scale_px: float) -> Float[np.ndarray, "2"]:
@@ -89,13 +96,39 @@ def _ended(closed: Lathe, kept: int, tip: Float[np.ndarray, "2"], pixel: float) 
     return resampled(replace(closed, profile=profile, rim=len(profile) - 1), pixel)
 
 
-def with_rim(contours: ContourRays, lathe: Lathe, pixel: float) -> Lathe:
-    """An open lathe made longer or shorter, along its own end, to where outlines put its rim; others as they are."""
+def clear_of_rim(views: Views, lathe: Lathe) -> Views:
+    """The views without the pixels beside the rim of an open lathe, which mix two surfaces: a lid's doesn't matter."""
     if not lathe.is_open:
+        return views
+    turn = 2 * np.pi * np.arange(AROUND) / AROUND
+    radius, height = lathe.profile[-1]
+    ring = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(AROUND, height)], 1) @ lathe.frame
+    ring += lathe.origin
+    return replace(views, train=tuple(_clear(view, ring) for view in views.train))
+
+
+def _clear(view: TrainView, ring: Float[np.ndarray, "A 3"]) -> TrainView:
+    camera = view.camera
+    rotation, center = pose_of(camera)
+    seen = (ring - center) @ rotation.T
+    x, y = (seen[:, k] / seen[:, 2] * f + c for k, f, c in ((0, camera.fx, camera.cx), (1, camera.fy, camera.cy)))
+    reach = np.arange(-CLEARANCE_PX, CLEARANCE_PX + 1)
+    column, row = np.floor(x)[:, None, None] + reach, np.floor(y)[:, None, None] + reach[:, None]
+    apart = np.hypot(column + 0.5 - x[:, None, None], row + 0.5 - y[:, None, None])
+    near = (apart < CLEARANCE_PX) & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
+    mixed = np.zeros(camera.height * camera.width, bool)
+    mixed[(row * camera.width + column)[near].astype(np.int64)] = True
+    return replace(view, solid=view.solid[torch.from_numpy(~mixed).to(view.solid.device)[view.solid]])
+
+
+def with_rim(contours: ContourRays, lathe: Lathe, pixel: float) -> Lathe:
+    """An open lathe with its rim where outlines put it, and its last pixels led there as the wall before them goes.
+
+    Others are returned as they are, and so is a wall that is no longer than what the end is fitted to.
+    """
+    kept = lathe.rim - END_PX
+    if not lathe.is_open or kept - FITTED_PX < 1:
         return lathe
-    angle = lathe.angles[-1, 1]
-    direction = np.array([np.cos(angle), np.sin(angle)])
-    longer = float(np.clip(tip_shift(contours, lathe, 1.0) @ direction, -pixel, pixel))
-    profile = lathe.profile.copy()
-    profile[-1] += max(longer, -0.5 * float(np.linalg.norm(profile[-1] - profile[-2]))) * direction
-    return replace(lathe, profile=profile)
+    shift = tip_shift(contours, lathe, 1.0)
+    shift *= min(1.0, pixel / max(float(np.linalg.norm(shift)), 1e-12))
+    return _ended(lathe, kept, lathe.profile[-1] + shift, pixel)
