@@ -20,7 +20,8 @@ from panoless.fit import clear_views, complete, normalization_of
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.rasterize import RasterCamera
 from panoless.kernels.reference.rasterize import rotation_matrices
-from panoless.lathe import Lathe, lathe_buffers, outgoing_directions
+from panoless.lathe import Lathe, lathe_buffers
+from panoless.lathe_render import mean_light
 from panoless.light import light_of
 from panoless.plane import Plane, plane_buffers
 from panoless.shading import ALPHA_FLOOR, compose, reflection_directions_world, surface_buffers
@@ -97,12 +98,14 @@ def render(
         rotation = camera.world_to_camera[:3, :3].T
         pixels = torch.nonzero(buffers.alpha.flatten() > ALPHA_FLOOR)[:, 0]
         normals_camera = buffers.raster_normals_camera.flatten(1)[:, pixels]
-        rays = unit_rays_camera(camera).flatten(1)[:, pixels]
-        directions = reflection_directions_world(normals_camera, rays, rotation)
         if isinstance(geometry, Lathe):
-            directions = outgoing_directions(geometry, camera, pixels, directions)
+            light = mean_light(geometry, environment, camera, pixels)
+        else:
+            rays = unit_rays_camera(camera).flatten(1)[:, pixels]
+            directions = reflection_directions_world(normals_camera, rays, rotation)
+            light = look_up(environment, directions, "clamp")
         specular = torch.zeros_like(buffers.albedo)
-        specular.flatten(1)[:, pixels] = look_up(environment, directions, "clamp").T
+        specular.flatten(1)[:, pixels] = light.T
         normals = torch.zeros_like(buffers.albedo)
         normals.flatten(1)[:, pixels] = rotation @ normalize(normals_camera, dim=0, eps=1e-8)
         tint = specular.new_tensor(config.tint)[:, None, None]

@@ -23,6 +23,7 @@ from panoless.kernels.backend import gpu_kernels_installed
 from panoless.kernels.objective import mirror_objective
 from panoless.kernels.rasterize import Channels, RasterBuffers
 from panoless.ladder import choose_rung, without_mirrored_frame
+from panoless.lathe_rim import clear_of_rim
 from panoless.light import light_of
 from panoless.losses import photometric_paper
 from panoless.observation import observed_rays, reflections, solved_environment
@@ -405,7 +406,11 @@ def _first_state(views: Views, config: FitConfig) -> FitState:
 
 
 def clear_views(views: Views, state: FitState) -> Views:
-    """The views without the pixels that mirror the frame of a planar outline, if that is what a state found."""
+    """The views without pixels that show more than one reflection of a state's geometry: those that mirror the frame of
+    a planar outline, and those beside the rim of a wall without thickness.
+    """
+    if state.turned and state.lathe is not None:
+        return clear_of_rim(views, state.lathe)
     mirror = state.sheet or state.plane
     return views if mirror is None else without_mirrored_frame(views, mirror)
 

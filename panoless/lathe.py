@@ -24,7 +24,7 @@ CREASE_RAD = math.radians(35.0)
 """A turn of the profile above this is an edge: normals are not interpolated across it."""
 SUBPIXELS = 4
 BOUNCES = 6
-"""What is mirrored more often is not followed."""
+"""What is mirrored more often is not followed in a fit."""
 BOX_AROUND = 64
 FOOTPRINT_TEXEL_SR = (math.pi / 2 / 128) ** 2
 LEAVING = 1e-4
@@ -96,6 +96,11 @@ class Lathe:
     def arc_lengths(self) -> Float[np.ndarray, "N"]:
         """Length of the profile up to each vertex."""
         return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(self.profile, axis=0), axis=1)))
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it is a wall without thickness, which ends at the rim."""
+        return self.rim == len(self.profile) - 1
 
     @property
     def numbers(self) -> int:
@@ -270,12 +275,3 @@ def lathe_rays(
         footprint_sr = pixel_footprint_sr(image, mask)[mask]
         trust = torch.from_numpy(1 / (1 + footprint_sr / FOOTPRINT_TEXEL_SR)).to(outgoing)
     return Rays(outgoing, view.radiance.flatten(1)[:, kept].T.contiguous(), trust), hits
-
-
-def outgoing_directions(
-    lathe: Lathe, camera: RasterCamera, pixels: Int[Tensor, "P"], otherwise: Float[Tensor, "P 3"]
-) -> Float[Tensor, "P 3"]:
-    """Directions in which pixels see the environment by up to `BOUNCES` reflections; `otherwise` where they don't."""
-    escapes = followed(lathe, *pixel_rays(camera, pixels.cpu().numpy()), BOUNCES)
-    left = torch.from_numpy(escapes.bounces > 0).to(otherwise.device)[:, None]
-    return torch.where(left, torch.from_numpy(escapes.directions).to(otherwise), otherwise)

@@ -61,6 +61,7 @@ class Touches:
 
     pixels: Float[np.ndarray, "P"]
     valid: Bool[np.ndarray, "P"]
+    """Whether it is the outside that they touch."""
     side: Int[np.ndarray, "P"]
     along: Float[np.ndarray, "P"]
     points: Float[np.ndarray, "P 3"]
@@ -111,7 +112,7 @@ def _bare(origin: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"]) -> Lathe
 
 def outer_lathe(rays: ContourRays, start: Lathe, cell: float) -> Lathe | None:
     """The envelope around an axis, closed flat at both ends; None when there is none."""
-    origins, directions = _in_frame(rays, start)
+    origins, directions = in_axis_frame(rays, start)
     cells = int(2 * TALLEST / cell)
     rank = int(RANK_SHARE * len(rays.view) / (2 * TALLEST / cell)) + 1
     smallest = envelope(origins, directions, -TALLEST, cell, cells, rank + 1, REACH)[:, rank]
@@ -151,7 +152,8 @@ def _ends(
     return ends[0], ends[1]
 
 
-def _in_frame(rays: ContourRays, lathe: Lathe) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]]:
+def in_axis_frame(rays: ContourRays, lathe: Lathe) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]]:
+    """Origins and directions in the frame of the axis."""
     return (rays.origins - lathe.origin) @ lathe.frame.T, rays.directions @ lathe.frame.T
 
 
@@ -170,14 +172,18 @@ def touches(rays: ContourRays, lathe: Lathe, cell: float) -> Touches:
     rows = int((np.ptp(polyline[:, 1]) + 16 * cell) / cell) + 1
     columns = int(polyline[:, 0].max() / cell) + 9
     grid = distance_grid(polyline, lowest, cell, rows, columns)
-    origins, directions = _in_frame(rays, lathe)
+    origins, directions = in_axis_frame(rays, lathe)
     where, signed, side, along = closest_approach(origins, directions, polyline, grid, lowest, cell, REACH)
     points = origins + where[:, None] * directions
     step = np.diff(polyline, axis=0)[side]
     step /= np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-12)
     rho = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-9)
     normals = np.stack([step[:, 1] * points[:, 0] / rho, step[:, 1] * points[:, 1] / rho, -step[:, 0]], 1)
-    return Touches(signed / rays.pixel, (side >= 0) & (side < lathe.rim), side, along, points, normals)
+    valid = (side >= 0) & (side < lathe.rim)
+    if lathe.is_open:
+        # Beyond the end of a wall without thickness the rim alone is touched: no shift along normals mends that.
+        valid &= (side < lathe.rim - 1) | (along < 1)
+    return Touches(signed / rays.pixel, valid, side, along, points, normals)
 
 
 def robust_scale(pixels: Float[np.ndarray, "P"], scale_px: float) -> float:

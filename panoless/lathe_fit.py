@@ -1,7 +1,7 @@
 """A surface of revolution from photographs: outside by outlines, inside by search, then all by what it mirrors."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.lathe import BOUNCES, Lathe, lathe_buffers, lathe_rays, pixel_rays
+from panoless.lathe_base import found_base
 from panoless.lathe_contours import (
     ContourRays,
     axis_starts,
@@ -22,6 +23,7 @@ from panoless.lathe_contours import (
 from panoless.lathe_inside import searched_inside
 from panoless.lathe_photometric import Round, observations, photometric_step, solved_map
 from panoless.lathe_profile import resampled
+from panoless.lathe_rim import clear_of_rim, open_lathe, with_rim
 from panoless.views import Views
 from shinypartial.progress import Progress
 
@@ -40,8 +42,6 @@ MAP_RAYS = 600_000
 STEP_PIXELS = 120_000
 CONTOUR_POINTS = 20_000
 BENDING = 1e-4
-
-CORNER_PX = 4.0
 JUDGED_SCALE = 0.1
 
 
@@ -93,37 +93,28 @@ def refine_lathe(views: Views, start: Lathe) -> Lathe:
         lathe, environment = _round(views, contours, lathe, each, None, pixel)
         progress.advance()
     assert environment is not None
-    candidates = [*insides(lathe, pixel), searched_inside(views, lathe, environment, pixel)]
+    thin = open_lathe(contours, lathe, pixel)
+    searched = searched_inside(views, lathe, environment, pixel)
+    candidates = [lathe, searched] if thin is None else [lathe, thin, searched]
     lathe = best_inside(views, lathe, environment, candidates)
     for each in FINE_ROUNDS:
         lathe, environment = _round(views, contours, lathe, each, environment, pixel)
         progress.advance()
-    return lathe
+    with torch.no_grad():
+        return found_base(views, lathe, environment)
 
 
 def _round(
     views: Views, contours: ContourRays, lathe: Lathe, each: Round, environment: Tensor | None, pixel: float
 ) -> tuple[Lathe, Tensor]:
+    views = clear_of_rim(views, lathe)
     with torch.no_grad():
         environment = solved_map(views, lathe, MAP_RAYS, each.resolution, environment)
         for _ in range(each.steps):
             seen = observations(views, lathe, STEP_PIXELS)
-            lathe = resampled(photometric_step(seen, contours, lathe, environment, each, BENDING), pixel)
+            lathe = with_rim(contours, photometric_step(seen, contours, lathe, environment, each, BENDING), pixel)
+            lathe = resampled(lathe, pixel)
     return lathe, environment
-
-
-def insides(lathe: Lathe, pixel: float) -> list[Lathe]:
-    """The lathe as it is, and as a wall without thickness: its outside, continued straight up to its lid."""
-    kept = max(lathe.rim - int(CORNER_PX), 2)
-    before, end = lathe.profile[max(kept - int(2 * CORNER_PX), 1)], lathe.profile[kept]
-    slope = end - before
-    length = np.linalg.norm(slope)
-    thin = [lathe]
-    if slope[1] > 0.1 * length:
-        tip = end + slope * max((lathe.profile[lathe.rim, 1] - end[1]) / slope[1], 0.0)
-        profile = np.concatenate([lathe.profile[: kept + 1], tip[None]])
-        thin.append(resampled(replace(lathe, profile=profile, rim=len(profile) - 1), pixel))
-    return thin
 
 
 def best_inside(views: Views, lathe: Lathe, environment: Tensor, candidates: Sequence[Lathe]) -> Lathe:

@@ -42,6 +42,14 @@ def funnel(depth: float = 0.3) -> Lathe:
     return replace(body, profile=np.concatenate([body.profile[: body.rim], inner]))
 
 
+def bowl() -> Lathe:
+    """A wall without thickness that flares to its rim at (0.6, 0.5); ρ = 0.3 + 0.3 ((h + 0.7)/1.2)², closed below."""
+    height = np.linspace(-0.7, 0.5, 200)
+    outer = np.stack([0.3 + 0.3 * ((height + 0.7) / 1.2) ** 2, height], 1)
+    profile = np.concatenate([[[0.0, -0.7]], outer])
+    return Lathe(AROUND - (AROUND @ TILTED) * TILTED, TILTED, profile, len(outer))
+
+
 def lathe_views(lathe: Lathe, cameras: list[RasterCamera], subpixels: int = 4) -> Views:
     """Views of a lathe under the environment of the synthetic dataset, clipped to [0, 1]; one reflection only."""
     views = []

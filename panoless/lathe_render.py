@@ -1,0 +1,115 @@
+"""What a camera sees in a lathe: radiance averaged over pixels, many reflections deep.
+
+A camera averages light over the area of a pixel, and so does this: over 4×4 rays. On a smooth mirror the directions in
+which neighboring pixels see the environment tell those in between,
+
+ω(a, b) = ω + a ω_x + b ω_y + ½ a² ω_xx + ½ b² ω_yy + a b ω_xy,
+
+with central differences and |a|, |b| < ½; rays are traced only where neighbors disagree.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from panoless.kernels.cubemap import sample_cubemap
+from panoless.kernels.rasterize import RasterCamera
+from panoless.lathe import SUBPIXELS, Lathe, followed, pixel_rays
+
+DEEPEST = 16
+"""Reflections that a render follows."""
+LARGEST_BEND = 0.05
+"""Second differences of directions (rad per pixel²) up to which they are interpolated."""
+OFFSETS = tuple((i + 0.5) / SUBPIXELS for i in range(SUBPIXELS))
+
+
+@dataclass(frozen=True)
+class _Continued:
+    """Directions of pixels and their differences along columns (x) and rows (y)."""
+
+    center: Float[np.ndarray, "P 3"]
+    x: Float[np.ndarray, "P 3"]
+    y: Float[np.ndarray, "P 3"]
+    xx: Float[np.ndarray, "P 3"]
+    yy: Float[np.ndarray, "P 3"]
+    xy: Float[np.ndarray, "P 3"]
+
+
+def mean_light(
+    lathe: Lathe, environment: Float[Tensor, "6 3 L L"], camera: RasterCamera, pixels: Int[Tensor, "P"]
+) -> Float[Tensor, "P 3"]:
+    """Radiance of pixels (flat indices): the mean over those of their 4×4 rays that meet the lathe; zero if none does.
+
+    A ray that has not left after sixteen reflections is black.
+    """
+    places = pixels.cpu().numpy()
+    directions, bounces = np.zeros((camera.height * camera.width, 3)), np.zeros(camera.height * camera.width, np.int64)
+    escapes = followed(lathe, *pixel_rays(camera, places), DEEPEST)
+    directions[places], bounces[places] = escapes.directions, escapes.bounces
+    shape = camera.height, camera.width
+    continued, smooth = _continued(directions.reshape(*shape, 3), bounces.reshape(shape), places)
+    light = torch.zeros(len(places), 3, device=environment.device)
+    light[torch.from_numpy(smooth)] = _interpolated(environment, continued)
+    light[torch.from_numpy(~smooth)] = _traced(lathe, environment, camera, places[~smooth])
+    return light
+
+
+def _interpolated(environment: Float[Tensor, "6 3 L L"], at: _Continued) -> Float[Tensor, "P 3"]:
+    terms = [torch.from_numpy(each).float().to(environment.device) for each in vars(at).values()]
+    center, x, y, xx, yy, xy = terms
+    total = torch.zeros_like(center)
+    for row in OFFSETS:
+        b = row - 0.5
+        in_row, slope = center + b * y + b * b / 2 * yy, x + b * xy
+        for column in OFFSETS:
+            a = column - 0.5
+            total += sample_cubemap(environment, in_row + a * slope + a * a / 2 * xx)
+    return total / SUBPIXELS**2
+
+
+def _traced(
+    lathe: Lathe, environment: Float[Tensor, "6 3 L L"], camera: RasterCamera, pixels: Int[np.ndarray, "P"]
+) -> Float[Tensor, "P 3"]:
+    total, count = torch.zeros(len(pixels), 3, device=environment.device), np.zeros(len(pixels))
+    for row in OFFSETS:
+        for column in OFFSETS:
+            escapes = followed(lathe, *pixel_rays(camera, pixels, (column, row)), DEEPEST)
+            left = escapes.bounces > 0
+            ways = torch.from_numpy(escapes.directions[left]).float().to(environment.device)
+            total[torch.from_numpy(left)] += sample_cubemap(environment, ways)
+            count += escapes.first.met
+    return total / torch.from_numpy(np.maximum(count, 1)).to(total)[:, None]
+
+
+def _continued(
+    directions: Float[np.ndarray, "H W 3"], bounces: Int[np.ndarray, "H W"], pixels: Int[np.ndarray, "P"]
+) -> tuple[_Continued, Bool[np.ndarray, "P"]]:
+    """Differences at those of the pixels that continue smoothly to all eight neighbors, and which these are."""
+    height, width = bounces.shape
+    row, column = np.divmod(pixels, width)
+    inside = np.flatnonzero((row > 0) & (row < height - 1) & (column > 0) & (column < width - 1))
+    own = bounces.ravel()[pixels[inside]]
+    alike = own > 0
+    for shift in (-width - 1, -width, -width + 1, -1, 1, width - 1, width, width + 1):
+        alike &= bounces.ravel()[pixels[inside] + shift] == own
+    chosen = inside[alike]
+    flat, at = directions.reshape(-1, 3), pixels[chosen]
+    center, left, right, above, below = (flat[at + shift] for shift in (0, -1, 1, -width, width))
+    corners = [flat[at + shift] for shift in (width + 1, width - 1, -width + 1, -width - 1)]
+    found = _Continued(
+        center,
+        (right - left) / 2,
+        (below - above) / 2,
+        right - 2 * center + left,
+        below - 2 * center + above,
+        (corners[0] - corners[1] - corners[2] + corners[3]) / 4,
+    )
+    straight = np.ones(len(chosen), bool)
+    for second in (found.xx, found.yy, found.xy):
+        straight &= (second**2).sum(1) < LARGEST_BEND**2
+    smooth = np.zeros(len(pixels), bool)
+    smooth[chosen[straight]] = True
+    return _Continued(*(each[straight] for each in vars(found).values())), smooth

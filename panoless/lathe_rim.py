@@ -1,0 +1,134 @@
+"""The end of a wall without thickness, which is a circle: where outlines put it, and how the profile gets there.
+
+A contour ray that passes over the rim touches that circle alone. In the half-plane of radius ρ and height h it is a
+hyperbola through the tip q of the profile, with unit normal m where it comes nearest, so m·q is known; rays of several
+elevations and both sides of the rim have different m, and q is their common point.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from panoless.lathe import Lathe
+from panoless.lathe_contours import ContourRays, in_axis_frame, robust_scale, touches
+from panoless.lathe_profile import resampled
+from panoless.views import TrainView, Views, pose_of
+
+FEWEST_RAYS = 20
+STEPS = 6
+FARTHEST_PX = 6.0
+"""Rays whose nearest point lies farther from the tip than this touch something else."""
+SPOILED_PX = 7
+"""So much of a closed lathe's outside, before its lid, is bent by the corner that it was given there."""
+FITTED_PX = 16
+"""The part before that, from which the profile goes on to the tip."""
+TIP_WEIGHT = 4.0
+END_PX = 4
+"""So much of an open wall before its rim has no pixels that see it alone."""
+CLEARANCE_PX = 2
+"""Pixels nearer than this to the rim's image may show what lies before and behind it."""
+AROUND = 2000
+
+
+def tip_shift(contours: ContourRays, lathe: Lathe, scale_px: float) -> Float[np.ndarray, "2"]:
+    """How (ρ, h) of the rim has to move for the outlines: one robust Gauss–Newton step; zero when hardly any see it."""
+    pixel = float(np.median(contours.pixel))
+    found = touches(contours, lathe, pixel)
+    tip = lathe.profile[lathe.rim]
+    radius = np.maximum(np.hypot(found.points[:, 0], found.points[:, 1]), 1e-9)
+    apart = np.stack([radius, found.points[:, 2]], 1) - tip
+    over = (found.side >= 0) & ~found.valid & (np.linalg.norm(apart, axis=1) < FARTHEST_PX * pixel)
+    if int(over.sum()) < FEWEST_RAYS:
+        return np.zeros(2)
+    directions = in_axis_frame(contours, lathe)[1][over]
+    outward = (found.points[over, :2] * directions[:, :2]).sum(1) / radius[over]
+    normals = np.stack([directions[:, 2], -outward], 1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    distance = (normals * apart[over]).sum(1)
+    in_pixels = distance / contours.pixel[over]
+    weights = (1 + (in_pixels / robust_scale(in_pixels, scale_px)) ** 2) ** -2
+    matrix = (normals * weights[:, None]).T @ normals
+    return np.linalg.solve(matrix + 1e-3 * np.trace(matrix) * np.eye(2), normals.T @ (weights * distance))
+
+
+def open_lathe(contours: ContourRays, closed: Lathe, pixel: float) -> Lathe | None:
+    """The outside of a closed lathe as a wall without thickness that ends where outlines put its rim.
+
+    Up to there the profile goes on as a cubic through its last good vertex, fitted to those before it and to the rim.
+    None where the outside is no longer than what is fitted, or doesn't rise to its rim.
+    """
+    kept = closed.rim - SPOILED_PX
+    first = kept - FITTED_PX
+    if first < 1:
+        return None
+    last = closed.profile[kept]
+    rise = last - closed.profile[first]
+    if rise[1] < 0.1 * np.linalg.norm(rise):
+        return None
+    ended = _ended(closed, kept, last + rise * max((closed.profile[closed.rim, 1] - last[1]) / rise[1], 0.0), pixel)
+    for step in range(STEPS):
+        shift = tip_shift(contours, ended, max(4.0 / 2**step, 0.5))
+        ended = _ended(closed, kept, ended.profile[-1] + shift, pixel)
+    return ended
+
+
+def _ended(closed: Lathe, kept: int, tip: Float[np.ndarray, "2"], pixel: float) -> Lathe:
+    """The outside up to the vertex `kept`, and a cubic from there to the tip."""
+    start, points = closed.profile[kept], closed.profile[kept - FITTED_PX : kept]
+    way = tip - start
+    length = float(np.linalg.norm(way))
+    if length < pixel:
+        profile = np.concatenate([closed.profile[: kept + 1], tip[None]])
+        return replace(closed, profile=profile, rim=len(profile) - 1)
+    along, across = way / length, np.array([-way[1], way[0]]) / length
+    x = np.append((points - start) @ along, length)
+    y = np.append((points - start) @ across, 0.0)
+    weights = np.append(np.ones(len(points)), TIP_WEIGHT)
+    powers = np.stack([x, x**2, x**3], 1) / length ** np.arange(1, 4)
+    coefficients = np.linalg.lstsq(powers * weights[:, None], y * weights, rcond=None)[0]
+    t = np.arange(1, max(int(np.ceil(length / pixel)), 1) + 1) / max(int(np.ceil(length / pixel)), 1)
+    # What the fit misses the tip by is made up for along the way.
+    bend = np.stack([t, t**2, t**3], 1) @ coefficients - t**2 * coefficients.sum()
+    new = start + t[:, None] * way + bend[:, None] * across
+    profile = np.concatenate([closed.profile[: kept + 1], new])
+    return resampled(replace(closed, profile=profile, rim=len(profile) - 1), pixel)
+
+
+def clear_of_rim(views: Views, lathe: Lathe) -> Views:
+    """The views without the pixels beside the rim of an open lathe, which mix two surfaces: a lid's doesn't matter."""
+    if not lathe.is_open:
+        return views
+    turn = 2 * np.pi * np.arange(AROUND) / AROUND
+    radius, height = lathe.profile[-1]
+    ring = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(AROUND, height)], 1) @ lathe.frame
+    ring += lathe.origin
+    return replace(views, train=tuple(_clear(view, ring) for view in views.train))
+
+
+def _clear(view: TrainView, ring: Float[np.ndarray, "A 3"]) -> TrainView:
+    camera = view.camera
+    rotation, center = pose_of(camera)
+    seen = (ring - center) @ rotation.T
+    x, y = (seen[:, k] / seen[:, 2] * f + c for k, f, c in ((0, camera.fx, camera.cx), (1, camera.fy, camera.cy)))
+    reach = np.arange(-CLEARANCE_PX, CLEARANCE_PX + 1)
+    column, row = np.floor(x)[:, None, None] + reach, np.floor(y)[:, None, None] + reach[:, None]
+    apart = np.hypot(column + 0.5 - x[:, None, None], row + 0.5 - y[:, None, None])
+    near = (apart < CLEARANCE_PX) & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
+    mixed = np.zeros(camera.height * camera.width, bool)
+    mixed[(row * camera.width + column)[near].astype(np.int64)] = True
+    return replace(view, solid=view.solid[torch.from_numpy(~mixed).to(view.solid.device)[view.solid]])
+
+
+def with_rim(contours: ContourRays, lathe: Lathe, pixel: float) -> Lathe:
+    """An open lathe with its rim where outlines put it, and its last pixels led there as the wall before them goes.
+
+    Others are returned as they are, and so is a wall that is no longer than what the end is fitted to.
+    """
+    kept = lathe.rim - END_PX
+    if not lathe.is_open or kept - FITTED_PX < 1:
+        return lathe
+    shift = tip_shift(contours, lathe, 1.0)
+    shift *= min(1.0, pixel / max(float(np.linalg.norm(shift)), 1e-12))
+    return _ended(lathe, kept, lathe.profile[-1] + shift, pixel)
