@@ -21,6 +21,7 @@ from panoless.lathe_contours import (
 )
 from panoless.lathe_inside import searched_inside
 from panoless.lathe_photometric import Round, observations, photometric_step, solved_map
+from panoless.lathe_pixels import refined_in_pixels
 from panoless.lathe_profile import resampled
 from panoless.views import Views
 from shinypartial.progress import Progress
@@ -87,7 +88,7 @@ def refine_lathe(views: Views, start: Lathe) -> Lathe:
     rays = contour_rays(views)
     pixel = float(np.median(rays.pixel))
     contours = rays.every(max(1, len(rays.view) // CONTOUR_POINTS))
-    progress = Progress("fitting a surface of revolution", len(COARSE_ROUNDS) + len(FINE_ROUNDS))
+    progress = Progress("fitting a surface of revolution", len(COARSE_ROUNDS) + len(FINE_ROUNDS) + 1)
     lathe, environment = start, None
     for each in COARSE_ROUNDS:
         lathe, environment = _round(views, contours, lathe, each, None, pixel)
@@ -98,6 +99,8 @@ def refine_lathe(views: Views, start: Lathe) -> Lathe:
     for each in FINE_ROUNDS:
         lathe, environment = _round(views, contours, lathe, each, environment, pixel)
         progress.advance()
+    lathe = refined_in_pixels(views, contours, lathe, pixel)
+    progress.advance()
     return lathe
 
 

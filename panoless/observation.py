@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TypeVar
 
 import torch
 from jaxtyping import Float
@@ -17,7 +16,7 @@ from panoless.lathe import Lathe, lathe_rays
 from panoless.plane import Plane, plane_buffers
 from panoless.shading import ALPHA_FLOOR, rasterize_surfels, reflection_directions_world, tiles_of
 from panoless.surfels import Surfels
-from panoless.views import TrainView, Views
+from panoless.views import TrainView, Views, split_held_out
 from shinypartial.conventions import SOLID_ALPHA
 
 SOLID_SURFACE_ALPHA = 0.9
@@ -26,7 +25,6 @@ TRIAL_SHARE = 1 / 8
 TRUST_VIEWS = 40
 TRIAL_RESOLUTION = 128
 RESOLUTIONS = (64, 128, 256)
-HELD_OUT_EVERY = 5
 #: A finer map has to lower the held-out error by this share.
 LEAST_GAIN = 0.02
 RAYS_A_TEXEL = 8
@@ -36,7 +34,6 @@ PRIOR_PIXELS, PRIOR_TRUST = 1.0, 0.2
 TRUST_POWER = 4
 
 Geometry = Surfels | Plane | Lathe
-Each = TypeVar("Each")
 
 
 def observed_rays(
@@ -155,12 +152,6 @@ def densest_resolution(rays: Sequence[Rays]) -> int:
     observed = count[count >= 1]
     usual = float(observed.median()) if len(observed) else 0.0
     return max((each for each in RESOLUTIONS if usual * (coarsest / each) ** 2 >= RAYS_A_TEXEL), default=coarsest)
-
-
-def split_held_out(views: Sequence[Each]) -> tuple[list[Each], list[Each]]:
-    """Things that stand for the views: four fifths to solve from, and every fifth to predict."""
-    phase = HELD_OUT_EVERY // 2
-    return [view for i, view in enumerate(views) if i % HELD_OUT_EVERY != phase], list(views[phase::HELD_OUT_EVERY])
 
 
 def prediction_error(rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"], scale: float = 0.1) -> float:

@@ -12,11 +12,11 @@ from panoless.config import FitConfig
 from panoless.cubemap import resample, solve_environment
 from panoless.kernels.objective import ObjectiveTerms, mirror_objective
 from panoless.kernels.rasterize import Channels
-from panoless.observation import observed_rays, prediction_error, split_held_out
+from panoless.observation import observed_rays, prediction_error
 from panoless.plane import Plane
 from panoless.shading import rasterize_surfels
 from panoless.sheet import Sheet, SheetSurfels, flat_sheet
-from panoless.views import Views
+from panoless.views import Views, split_held_out
 from shinypartial.progress import Progress
 
 CELLS = 16
