@@ -84,7 +84,8 @@ def solved_environment(
     """
     if not isinstance(geometry, Surfels):
         rays = list(observed_rays(views, geometry, config, config.environment.rays))
-        return solve_environment(rays, config.environment.solve_resolution or densest_resolution(rays)), rays
+        resolution = config.environment.solve_resolution or densest_resolution(rays)
+        return solve_environment(of_mean_trust_one(rays), resolution), rays
     few = math.ceil(TRIAL_SHARE * config.environment.rays)
     trial = list(observed_rays(views, geometry, config, few))
     resolution = config.environment.solve_resolution
@@ -95,6 +96,19 @@ def solved_environment(
     resolution = resolution or finest_resolution(trial, coarse)
     rays = list(observed_rays(views, geometry, config, config.environment.rays, trust))
     return solve_environment(rays, resolution, coarse), rays
+
+
+def of_mean_trust_one(rays: Sequence[Rays]) -> list[Rays]:
+    """The same rays with their trust in units of its mean.
+
+    The map's fill of gaps and its pull toward a start count in rays: if all are hardly trusted, these would outvote
+    them where only the least trusted see.
+    """
+    total = sum(float(batch.initial_weight().sum()) for batch in rays)
+    mean = total / max(sum(len(batch.directions) for batch in rays), 1)
+    if mean <= 0:
+        return list(rays)
+    return [replace(batch, trust=batch.initial_weight() / mean) for batch in rays]
 
 
 def surfel_trust(
