@@ -38,6 +38,7 @@ FINE_ROUNDS = (
     Round(256, 0.1, 1.0),
 )
 MAP_RAYS = 600_000
+SEARCHED_RESOLUTION = 128
 STEP_PIXELS = 120_000
 CONTOUR_POINTS = 20_000
 BENDING = 1e-4
@@ -88,7 +89,7 @@ def refine_lathe(views: Views, start: Lathe) -> Lathe:
     rays = contour_rays(views)
     pixel = float(np.median(rays.pixel))
     contours = rays.every(max(1, len(rays.view) // CONTOUR_POINTS))
-    progress = Progress("fitting a surface of revolution", len(COARSE_ROUNDS) + len(FINE_ROUNDS) + 1)
+    progress = Progress("fitting a surface of revolution", len(COARSE_ROUNDS) + len(FINE_ROUNDS) + 2)
     lathe, environment = start, None
     for each in COARSE_ROUNDS:
         lathe, environment = _round(views, contours, lathe, each, None, pixel)
@@ -100,6 +101,8 @@ def refine_lathe(views: Views, start: Lathe) -> Lathe:
         lathe, environment = _round(views, contours, lathe, each, environment, pixel)
         progress.advance()
     lathe = refined_in_pixels(views, contours, lathe, pixel)
+    progress.advance()
+    lathe = refined_in_pixels(views, contours, with_searched_inside(views, lathe, pixel), pixel)
     progress.advance()
     return lathe
 
@@ -127,6 +130,19 @@ def insides(lathe: Lathe, pixel: float) -> list[Lathe]:
         profile = np.concatenate([lathe.profile[: kept + 1], tip[None]])
         thin.append(resampled(replace(lathe, profile=profile, rim=len(profile) - 1), pixel))
     return thin
+
+
+def with_searched_inside(views: Views, lathe: Lathe, pixel: float) -> Lathe:
+    """The lathe with an inside searched anew under its own map, unless it explains no more than the present one."""
+    with torch.no_grad():
+        environment = solved_map(views, lathe, MAP_RAYS, SEARCHED_RESOLUTION)
+        lid = [[0.0, lathe.profile[lathe.rim, 1]]]
+        closed = replace(lathe, profile=np.concatenate([lathe.profile[: lathe.rim + 1], lid]))
+        found = searched_inside(views, closed, environment, pixel)
+        # The search samples the outside anew, too, which would blunt its edges.
+        inner = found.profile[found.rim + 1 :]
+        candidate = replace(lathe, profile=np.concatenate([lathe.profile[: lathe.rim + 1], inner]))
+        return min((lathe, candidate), key=lambda each: inside_error(views, closed, environment, each))
 
 
 def best_inside(views: Views, lathe: Lathe, environment: Tensor, candidates: Sequence[Lathe]) -> Lathe:
