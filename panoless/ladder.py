@@ -21,14 +21,13 @@ from panoless.observation import (
     Geometry,
     observed_rays,
     prediction_error,
-    split_held_out,
 )
 from panoless.plane import Plane, unobstructed
 from panoless.plane_fit import fit_plane
 from panoless.sheet import Sheet, sightings
 from panoless.sheet_fit import fit_sheet
 from panoless.surfels import Surfels
-from panoless.views import TrainView, Views
+from panoless.views import TrainView, Views, split_held_out
 from shinypartial.errors import InputError
 
 #: A plane is considered when its outline explains the masks this well: median over views of the median distance, and

@@ -22,6 +22,7 @@ from panoless.lathe_contours import (
 )
 from panoless.lathe_inside import searched_inside
 from panoless.lathe_photometric import Round, observations, photometric_step, solved_map
+from panoless.lathe_pixels import refined_in_pixels
 from panoless.lathe_profile import resampled
 from panoless.lathe_rim import clear_of_rim, open_lathe, with_rim
 from panoless.views import Views
@@ -39,6 +40,7 @@ FINE_ROUNDS = (
     Round(256, 0.1, 1.0),
 )
 MAP_RAYS = 600_000
+SEARCHED_RESOLUTION = 128
 STEP_PIXELS = 120_000
 CONTOUR_POINTS = 20_000
 BENDING = 1e-4
@@ -82,12 +84,13 @@ def fit_lathe(views: Views) -> LatheFit | None:
 def refine_lathe(views: Views, start: Lathe) -> Lathe:
     """Profile and axis by what is mirrored, from the closed lathe of the outlines.
 
-    The outside gives a map; of the insides that are worth trying, the one that explains most under it is refined on.
+    The outside gives a map; of the insides that are worth trying, the one that explains most under it is refined on. An
+    open wall gets its bottom last, others their grooves and edges, and an inside searched anew between them.
     """
     rays = contour_rays(views)
     pixel = float(np.median(rays.pixel))
     contours = rays.every(max(1, len(rays.view) // CONTOUR_POINTS))
-    progress = Progress("fitting a surface of revolution", len(COARSE_ROUNDS) + len(FINE_ROUNDS))
+    progress = Progress("fitting a surface of revolution", len(COARSE_ROUNDS) + len(FINE_ROUNDS) + 1)
     lathe, environment = start, None
     for each in COARSE_ROUNDS:
         lathe, environment = _round(views, contours, lathe, each, None, pixel)
@@ -100,8 +103,14 @@ def refine_lathe(views: Views, start: Lathe) -> Lathe:
     for each in FINE_ROUNDS:
         lathe, environment = _round(views, contours, lathe, each, environment, pixel)
         progress.advance()
-    with torch.no_grad():
-        return found_base(views, lathe, environment)
+    if lathe.is_open:
+        with torch.no_grad():
+            lathe = found_base(views, lathe, environment)
+    else:
+        lathe = refined_in_pixels(views, contours, lathe, pixel)
+        lathe = refined_in_pixels(views, contours, with_searched_inside(views, lathe, pixel), pixel)
+    progress.advance()
+    return lathe
 
 
 def _round(
@@ -115,6 +124,19 @@ def _round(
             lathe = with_rim(contours, photometric_step(seen, contours, lathe, environment, each, BENDING), pixel)
             lathe = resampled(lathe, pixel)
     return lathe, environment
+
+
+def with_searched_inside(views: Views, lathe: Lathe, pixel: float) -> Lathe:
+    """The lathe with an inside searched anew under its own map, unless it explains no more than the present one."""
+    with torch.no_grad():
+        environment = solved_map(views, lathe, MAP_RAYS, SEARCHED_RESOLUTION)
+        lid = [[0.0, lathe.profile[lathe.rim, 1]]]
+        closed = replace(lathe, profile=np.concatenate([lathe.profile[: lathe.rim + 1], lid]))
+        found = searched_inside(views, closed, environment, pixel)
+        # The search samples the outside anew, too, which would blunt its edges.
+        inner = found.profile[found.rim + 1 :]
+        candidate = replace(lathe, profile=np.concatenate([lathe.profile[: lathe.rim + 1], inner]))
+        return min((lathe, candidate), key=lambda each: inside_error(views, closed, environment, each))
 
 
 def best_inside(views: Views, lathe: Lathe, environment: Tensor, candidates: Sequence[Lathe]) -> Lathe:

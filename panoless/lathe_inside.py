@@ -9,22 +9,22 @@ direction, and the inside is the cheapest way from the rim to the axis.
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from panoless.kernels.cubemap import sample_cubemap
-from panoless.lathe import Lathe, mirrored, pixel_rays
+from panoless.kernels.cpu.inside import slope_votes
+from panoless.lathe import Lathe, pixel_rays
 from panoless.lathe_profile import resampled
 from panoless.views import Views
 
 SLOPES = 48
-CELL_PX = 1.5
-MOST_CELLS = 64
+CELL_PX = 0.75
+MOST_CELLS = 128
 """Along the radius; wider mouths have larger cells."""
 DEPTH = 0.8
 """Of the mouth's radius."""
-MOST_PIXELS = 4_000
+ROWS_ABOVE = 3
+MOST_PIXELS = 60_000
 ERROR_SCALE = 0.15
 FEW_PIXELS = 4.0
 UNSEEN_COST = 0.7
@@ -34,12 +34,14 @@ REACH = 3
 
 @dataclass(frozen=True)
 class Grid:
-    """Cells of the half-plane below the lid: (ρ, h) = (column + ½, −row − ½)·cell from the lid's middle."""
+    """Cells of the half-plane within the rim: ρ = (column + ½)·cell, h = top − (row + ½)·cell."""
 
     cell: float
     top: float
     columns: int
     rows: int
+    above: int
+    """Rows above the rim: a wall may rise on where outlines end."""
 
 
 def searched_inside(views: Views, closed: Lathe, environment: Float[Tensor, "6 3 L L"], pixel: float) -> Lathe:
@@ -47,7 +49,8 @@ def searched_inside(views: Views, closed: Lathe, environment: Float[Tensor, "6 3
     radius = float(closed.profile[closed.rim, 0])
     cell = max(CELL_PX * pixel, radius / MOST_CELLS)
     columns = max(int(np.ceil(radius / cell)), 2)
-    grid = Grid(cell, float(closed.profile[closed.rim, 1]), columns, max(int(DEPTH * columns), 2))
+    top = float(closed.profile[closed.rim, 1]) + ROWS_ABOVE * cell
+    grid = Grid(cell, top, columns, max(int(DEPTH * columns), 2) + ROWS_ABOVE, ROWS_ABOVE)
     path = _cheapest(slope_costs(views, closed, environment, grid), grid)
     inner = np.stack([(path[:, 1] + 0.5) * cell, grid.top - (path[:, 0] + 0.5) * cell], 1)
     inner = _smoothed(np.concatenate([closed.profile[closed.rim, None], inner, [[0.0, inner[-1, 1]]]]))
@@ -64,45 +67,20 @@ def slope_costs(
 ) -> Float[np.ndarray, "rows columns slopes"]:
     """Mean of ‖e‖²/(‖e‖² + s²) for each cell and direction of the profile, 2π k/slopes from outward level.
 
-    Only rays count that leave through the mouth again, which alone is known to be open.
+    Only rays count that leave through the mouth again, which alone is known to be open, or above it.
     """
     origins, rays, radiance = _lid_pixels(views, closed)
-    summed = np.zeros((grid.rows * grid.columns, SLOPES))
-    count = np.zeros_like(summed)
-    start, way = (origins - closed.origin) @ closed.frame.T, rays @ closed.frame.T
-    angles = 2 * np.pi * np.arange(SLOPES) / SLOPES
-    reach = 2 * grid.columns
-    enter = (grid.top - start[:, 2]) / way[:, 2]
-    for step in range(4 * reach):
-        # Half a cell further along the ray, in the half-plane's own measure at most.
-        distance = enter + (step + 0.5) * grid.cell / 2
-        points = start + distance[:, None] * way
-        rho = np.hypot(points[:, 0], points[:, 1])
-        row = np.floor((grid.top - points[:, 2]) / grid.cell).astype(np.int64)
-        column = np.floor(rho / grid.cell).astype(np.int64)
-        inside = np.flatnonzero((row >= 0) & (row < grid.rows) & (column < grid.columns) & (rho > 0.1 * grid.cell))
-        if not len(inside):
-            break
-        cells = row[inside] * grid.columns + column[inside]
-        place, direction = points[inside], way[inside]
-        radial = place[:, :2] / rho[inside, None]
-        for k, angle in enumerate(angles):
-            normal = np.concatenate([np.sin(angle) * radial, np.full((len(inside), 1), -np.cos(angle))], 1)
-            # A wall is seen from its front: the normal of an inside looks into the mouth.
-            facing = (normal * direction).sum(1) < -0.05
-            outgoing = mirrored(direction, normal)
-            rise = outgoing[:, 2]
-            leaves = (grid.top - place[:, 2]) / np.where(rise > 1e-6, rise, 1.0)
-            at_mouth = place[:, :2] + leaves[:, None] * outgoing[:, :2]
-            free = facing & (rise > 1e-6) & (np.hypot(*at_mouth.T) < closed.profile[closed.rim, 0])
-            chosen = np.flatnonzero(free)
-            if not len(chosen):
-                continue
-            world = torch.from_numpy(outgoing[chosen] @ closed.frame).float().to(environment.device)
-            error = sample_cubemap(environment, world).cpu().numpy() - radiance[inside[chosen]]
-            squared = (error**2).sum(1)
-            summed[:, k] += np.bincount(cells[chosen], squared / (squared + ERROR_SCALE**2), len(summed))
-            count[:, k] += np.bincount(cells[chosen], None, len(summed))
+    votes = slope_votes(
+        (origins - closed.origin) @ closed.frame.T,
+        rays @ closed.frame.T,
+        radiance,
+        environment.permute(0, 2, 3, 1).cpu().numpy().astype(np.float64),
+        closed.frame,
+        np.array([grid.cell, grid.top, grid.columns, grid.rows, closed.profile[closed.rim, 1]]),
+        2 * np.pi * np.arange(SLOPES) / SLOPES,
+        ERROR_SCALE,
+    )
+    summed, count = votes
     mean = (summed + UNSEEN_COST * FEW_PIXELS) / (count + FEW_PIXELS)
     return mean.reshape(grid.rows, grid.columns, SLOPES)
 
@@ -145,7 +123,7 @@ def _cheapest(costs: Float[np.ndarray, "rows columns slopes"], grid: Grid) -> In
             tails.append(target)
             weights.append(length * (own[valid] + own[target]) / 2)
     graph = csr_matrix((np.concatenate(weights), (np.concatenate(heads), np.concatenate(tails))), (count, count))
-    start = grid.columns - 1
+    start = grid.above * grid.columns + grid.columns - 1
     distance, before = dijkstra(graph, indices=start, return_predecessors=True)
     node = int(np.arange(grid.rows)[np.argmin(distance[:: grid.columns])] * grid.columns)
     path = [node]

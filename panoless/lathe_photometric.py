@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from panoless.cubemap import solve_environment
@@ -86,17 +86,70 @@ def photometric_equations(
     pixel: float,
 ) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
     """Gradient and matrix over the axis' four numbers and the splines, in units of the radiance's deviation."""
-    hits, rays = seen.hits, seen.directions @ lathe.frame.T
+    motion = normal_motion(seen.directions, seen.hits, lathe, splines, pixel)
+    radiance = seen.radiance[torch.from_numpy(motion.kept)].cpu().numpy()
+    residual = motion.look_up(environment, lathe) - radiance
+    weights = (1 + (residual**2).sum(1) / robust**2) ** -2 / RADIANCE_SIGMA**2
+    gradient, matrix = np.zeros(4 + splines.count), np.zeros((4 + splines.count, 4 + splines.count))
+    rows = motion.radiance_by_parameters(environment, lathe)
+    for channel in range(3):
+        by_axis, by_spline = rows[:, channel, :4], rows[:, channel, 4:]
+        g, m = accumulated(by_axis, by_spline, motion.index, residual[:, channel], weights, splines.count)
+        gradient, matrix = gradient + g, matrix + m
+    return gradient, matrix
+
+
+@dataclass(frozen=True)
+class NormalMotion:
+    """How normals turn, at fixed rays, with the axis' four numbers and the four splines that act at each hit.
+
+    For the rays that see the surface well enough, in the frame of the axis; turns are those along τ and along e_φ.
+    """
+
+    kept: Bool[np.ndarray, "P"]
+    """Which of all rays these are."""
+    rays: Float[np.ndarray, "Q 3"]
+    normals: Float[np.ndarray, "Q 3"]
+    along_profile: Float[np.ndarray, "Q 3"]
+    along_azimuth: Float[np.ndarray, "Q 3"]
+    turn_profile: Float[np.ndarray, "Q 8"]
+    turn_azimuth: Float[np.ndarray, "Q 8"]
+    index: Int[np.ndarray, "Q 4"]
+
+    def look_up(
+        self, environment: Float[Tensor, "6 3 L L"], lathe: Lathe, turned: Float[np.ndarray, "Q 3"] | None = None
+    ) -> Float[np.ndarray, "Q 3"]:
+        """What rays see of a map by the normals, or by others that need not be unit."""
+        normals = self.normals if turned is None else turned / np.linalg.norm(turned, axis=1, keepdims=True)
+        directions = torch.from_numpy(mirrored(self.rays, normals) @ lathe.frame).float().to(environment.device)
+        return sample_cubemap(environment, directions).cpu().numpy().astype(np.float64)
+
+    def radiance_by_parameters(self, environment: Float[Tensor, "6 3 L L"], lathe: Lathe) -> Float[np.ndarray, "Q 3 8"]:
+        """Derivatives of what rays see, by differences over a texel."""
+        step = np.pi / 2 / environment.shape[-1] / 2
+
+        def derivative(way: Float[np.ndarray, "Q 3"]) -> Float[np.ndarray, "Q 3"]:
+            ahead, behind = (self.look_up(environment, lathe, self.normals + s * way) for s in (step, -step))
+            return (ahead - behind) / (2 * step)
+
+        by_profile, by_azimuth = derivative(self.along_profile), derivative(self.along_azimuth)
+        return by_profile[:, :, None] * self.turn_profile[:, None] + by_azimuth[:, :, None] * self.turn_azimuth[:, None]
+
+
+def normal_motion(
+    directions: Float[np.ndarray, "P 3"], hits: Hits, lathe: Lathe, splines: ProfileSplines, pixel: float
+) -> NormalMotion:
+    """The turns of the module's equation for rays in the normalized frame and where they meet a lathe."""
+    rays = directions @ lathe.frame.T
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     points, normals = (hits.points - lathe.origin) @ lathe.frame.T, hits.normals @ lathe.frame.T
     rho = np.hypot(points[:, 0], points[:, 1])
     facing = (rays * normals).sum(1)
     kept = (np.abs(facing) > LEAST_COSINE) & (rho > LEAST_RADIUS_PX * pixel)
     rays, points, normals, rho, facing = (each[kept] for each in (rays, points, normals, rho, facing))
-    side, along, radiance = hits.side[kept], hits.along[kept], seen.radiance[torch.from_numpy(kept)]
+    side, along = hits.side[kept], hits.along[kept]
     azimuth = np.stack([-points[:, 1], points[:, 0], np.zeros_like(rho)], 1) / rho[:, None]
     profile_direction = np.cross(normals, azimuth)
-    residual, by_turn, by_azimuth = _residuals(rays, normals, profile_direction, azimuth, radiance, environment, lathe)
     ends = lathe.angles
     lengths = np.maximum(np.diff(lathe.arc_lengths), 1e-12)
     # n turns along the profile as it does: dn/ds = (dθ/ds) τ, and n_ρ/ρ is that around the axis.
@@ -108,20 +161,16 @@ def photometric_equations(
     spline_profile = -slopes + values * (bend * slide_profile / facing)[:, None]
     spline_azimuth = values * (around * slide_azimuth / facing)[:, None]
     axis_profile, axis_azimuth = _axis_turns(points, normals, profile_direction, azimuth, rays, facing, bend, around)
-    weights = (1 + (residual**2).sum(1) / robust**2) ** -2 / RADIANCE_SIGMA**2
-    gradient, matrix = np.zeros(4 + splines.count), np.zeros((4 + splines.count, 4 + splines.count))
-    for channel in range(3):
-        a, b = by_turn[:, channel, None], by_azimuth[:, channel, None]
-        g, m = accumulated(
-            a * axis_profile + b * axis_azimuth,
-            a * spline_profile + b * spline_azimuth,
-            index,
-            residual[:, channel],
-            weights,
-            splines.count,
-        )
-        gradient, matrix = gradient + g, matrix + m
-    return gradient, matrix
+    return NormalMotion(
+        kept=kept,
+        rays=rays,
+        normals=normals,
+        along_profile=profile_direction,
+        along_azimuth=azimuth,
+        turn_profile=np.concatenate([axis_profile, spline_profile], 1),
+        turn_azimuth=np.concatenate([axis_azimuth, spline_azimuth], 1),
+        index=index,
+    )
 
 
 def _axis_turns(points, normals, profile_direction, azimuth, rays, facing, bend, around):
@@ -139,23 +188,6 @@ def _axis_turns(points, normals, profile_direction, azimuth, rays, facing, bend,
     return turn_profile + bend[:, None] * slide_profile, turn_azimuth + around[:, None] * slide_azimuth
 
 
-def _residuals(rays, normals, profile_direction, azimuth, radiance, environment, lathe):
-    """E(ω) − c, and its derivatives by turns of the normal along τ and e_φ: differences over a texel."""
-    step = np.pi / 2 / environment.shape[-1] / 2
-
-    def look(turned: np.ndarray) -> np.ndarray:
-        unit = turned / np.linalg.norm(turned, axis=1, keepdims=True)
-        directions = torch.from_numpy(mirrored(rays, unit) @ lathe.frame).float().to(environment.device)
-        return sample_cubemap(environment, directions).cpu().numpy().astype(np.float64)
-
-    residual = look(normals) - radiance.cpu().numpy()
-    derivatives = [
-        (look(normals + step * direction) - look(normals - step * direction)) / (2 * step)
-        for direction in (profile_direction, azimuth)
-    ]
-    return residual, derivatives[0], derivatives[1]
-
-
 def photometric_step(
     seen: Observations,
     contours: ContourRays,
@@ -167,9 +199,22 @@ def photometric_step(
     """One Gauss–Newton step on photographs and contours together."""
     pixel = float(np.median(contours.pixel))
     splines = ProfileSplines.of(lathe, each.knot_px * pixel)
-    gradient, matrix = photometric_equations(seen, lathe, splines, environment, each.robust, pixel)
+    equations = photometric_equations(seen, lathe, splines, environment, each.robust, pixel)
+    return step_on_equations(equations, contours, lathe, splines, bending)
+
+
+def step_on_equations(
+    equations: tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]],
+    contours: ContourRays,
+    lathe: Lathe,
+    splines: ProfileSplines,
+    bending: float,
+) -> Lathe:
+    """The step of gradient and matrix of the photographs, with the contours and a share of their stiffness."""
+    gradient, matrix = equations
+    pixel = float(np.median(contours.pixel))
     by_contour, of_contours = contour_equations(contours, lathe, splines, pixel, 1.0)
-    gradient += by_contour / CONTOUR_SIGMA_PX**2
-    matrix += of_contours / CONTOUR_SIGMA_PX**2
+    gradient = gradient + by_contour / CONTOUR_SIGMA_PX**2
+    matrix = matrix + of_contours / CONTOUR_SIGMA_PX**2
     matrix[4:, 4:] += splines.bending(bending * np.trace(matrix[4:, 4:]) / splines.count)
     return moved(lathe, splines, solved(gradient, matrix))

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -18,7 +17,7 @@ from panoless.plane import Plane, plane_buffers
 from panoless.shading import ALPHA_FLOOR, rasterize_surfels, reflection_directions_world, tiles_of
 from panoless.sheet import Sheet, sheet_rays
 from panoless.surfels import Surfels
-from panoless.views import TrainView, Views
+from panoless.views import TrainView, Views, split_held_out
 from shinypartial.conventions import SOLID_ALPHA
 
 SOLID_SURFACE_ALPHA = 0.9
@@ -27,7 +26,6 @@ TRIAL_SHARE = 1 / 8
 TRUST_VIEWS = 40
 TRIAL_RESOLUTION = 128
 RESOLUTIONS = (64, 128, 256)
-HELD_OUT_EVERY = 5
 #: A finer map has to lower the held-out error by this share.
 LEAST_GAIN = 0.02
 RAYS_A_TEXEL = 8
@@ -37,7 +35,6 @@ PRIOR_PIXELS, PRIOR_TRUST = 1.0, 0.2
 TRUST_POWER = 4
 
 Geometry = Surfels | Plane | Sheet | Lathe
-Each = TypeVar("Each")
 
 
 def observed_rays(views: Views, geometry: Geometry, config: FitConfig, max_rays: int) -> Iterator[Rays]:
@@ -83,7 +80,8 @@ def solved_environment(
     """
     if not isinstance(geometry, Surfels):
         rays = list(observed_rays(views, geometry, config, config.environment.rays))
-        return solve_environment(rays, config.environment.solve_resolution or densest_resolution(rays)), rays
+        resolution = config.environment.solve_resolution or densest_resolution(rays)
+        return solve_environment(of_mean_trust_one(rays), resolution), rays
     seen = [
         (view, *_surfel_rays(view, geometry, config, pixels))
         for view, pixels in _chosen_pixels(views, config.environment.rays)
@@ -102,6 +100,19 @@ def _thinned(rays: Sequence[Rays], most: float) -> list[Rays]:
     """About `most` of the rays at most: every k-th, beginning elsewhere in each batch."""
     stride = max(1, math.ceil(sum(len(batch.directions) for batch in rays) / most))
     return [batch.every(stride, index % stride) for index, batch in enumerate(rays)]
+
+
+def of_mean_trust_one(rays: Sequence[Rays]) -> list[Rays]:
+    """The same rays with their trust in units of its mean.
+
+    The map's fill of gaps and its pull toward a start count in rays: if all are hardly trusted, these would outvote
+    them where only the least trusted see.
+    """
+    total = sum(float(batch.initial_weight().sum()) for batch in rays)
+    mean = total / max(sum(len(batch.directions) for batch in rays), 1)
+    if mean <= 0:
+        return list(rays)
+    return [replace(batch, trust=batch.initial_weight() / mean) for batch in rays]
 
 
 def surfel_trust(
@@ -161,12 +172,6 @@ def densest_resolution(rays: Sequence[Rays]) -> int:
     observed = count[count >= 1]
     usual = float(observed.median()) if len(observed) else 0.0
     return max((each for each in RESOLUTIONS if usual * (coarsest / each) ** 2 >= RAYS_A_TEXEL), default=coarsest)
-
-
-def split_held_out(views: Sequence[Each]) -> tuple[list[Each], list[Each]]:
-    """Things that stand for the views: four fifths to solve from, and every fifth to predict."""
-    phase = HELD_OUT_EVERY // 2
-    return [view for i, view in enumerate(views) if i % HELD_OUT_EVERY != phase], list(views[phase::HELD_OUT_EVERY])
 
 
 def prediction_error(rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"], scale: float = 0.1) -> float:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -20,6 +21,10 @@ from shinypartial.dataset.read import read_view
 from shinypartial.dataset.schema import Dataset
 from shinypartial.errors import InputError
 from shinypartial.progress import Progress
+
+#: Of the views, this one in turn is held out to judge by.
+HELD_OUT_EVERY = 5
+Each = TypeVar("Each")
 
 
 @dataclass(frozen=True)
@@ -147,6 +152,12 @@ def views_of(photographs: Sequence[Photograph]) -> Views:
         for each in photographs
     )
     return Views(train, normalization, near)
+
+
+def split_held_out(views: Sequence[Each]) -> tuple[list[Each], list[Each]]:
+    """Things that stand for the views: four fifths to solve from, and every fifth to predict."""
+    phase = HELD_OUT_EVERY // 2
+    return [view for i, view in enumerate(views) if i % HELD_OUT_EVERY != phase], list(views[phase::HELD_OUT_EVERY])
 
 
 def _block_means(image: Float[np.ndarray, "H W *C"], side: int) -> Float[np.ndarray, "h w *C"]:

@@ -14,6 +14,7 @@ from panoless.observation import (
     PRIOR_TRUST,
     finest_resolution,
     observed_rays,
+    of_mean_trust_one,
     prediction_error,
     solved_environment,
     surfel_trust,
@@ -160,3 +161,17 @@ def test_the_prediction_error_is_that_of_the_rays_that_are_trusted() -> None:
     assert prediction_error([exact, replace(off, trust=torch.zeros(500))], environment) == pytest.approx(0, abs=1e-9)
     nothing = Rays(directions[:0], directions[:0])
     assert prediction_error([nothing], environment) == prediction_error([], environment) == 1
+
+
+def test_a_map_does_not_depend_on_how_far_all_rays_are_trusted_alike() -> None:
+    """A thousandth of the trust in units of its mean is the same; as it is, gaps and pulls would take the map over."""
+    truth = clipped_environment(cubemap_directions(16)).permute(0, 3, 1, 2).contiguous()
+    directions = torch.nn.functional.normalize(torch.randn(4000, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    trust = 0.5 + 0.5 * torch.rand(4000, generator=torch.Generator().manual_seed(2))
+    rays = Rays(directions, sample_cubemap(truth, directions), trust)
+    faint = replace(rays, trust=trust / 1000)
+    usual, same = (solve_environment(of_mean_trust_one([each]), 16) for each in (rays, faint))
+    torch.testing.assert_close(usual, same)
+    washed_out = solve_environment([faint], 16)
+    assert (usual - truth).abs().mean() < (washed_out - truth).abs().mean() / 2
+    assert float(of_mean_trust_one([faint])[0].initial_weight().mean()) == pytest.approx(1.0, rel=1e-5)

@@ -63,7 +63,9 @@ def test_derivatives_of_contour_distances_are_finite_differences(truth: Sheet, v
     weights = robust_weights(here, ALL_VOTE)
     gradient, _ = edge_equations(contours, truth, ALL_VOTE)
     difference = (half_sum_of_squares(1) - half_sum_of_squares(-1)) / (2 * step)
-    scale = np.sqrt((weights * here.pixels**2).sum() * (direction @ edge_equations(contours, truth, ALL_VOTE)[1] @ direction))
+    scale = np.sqrt(
+        (weights * here.pixels**2).sum() * (direction @ edge_equations(contours, truth, ALL_VOTE)[1] @ direction)
+    )
     assert abs(gradient @ direction - difference) < 0.02 * scale
 
 
