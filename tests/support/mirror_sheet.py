@@ -46,5 +46,3 @@ def normal_errors_deg(found: Sheet, truth: Sheet, camera: RasterCamera) -> Float
     rays = pixel_rays(camera, pixels)
     normals = [sheet.hits(*rays).normals @ sheet.frame for sheet in (found, truth)]
     return np.degrees(2 * np.arcsin(np.linalg.norm(normals[0] - normals[1], axis=1).clip(max=2) / 2))
-
-
