@@ -40,8 +40,8 @@ class Round:
 
 
 ROUNDS = (Round(16, 0.5, 60_000, 4), Round(32, 0.3, 60_000, 3), Round(64, 0.3, 60_000, 3), Round(128, 0.1, 200_000, 4))
-"""From coarse to fine: the first texels are as wide as a ray turns when its normal does by 2.8°. Finer than the last was
-tried on one mirror: 0.023° instead of 0.030° for twice the time.
+"""From coarse to fine: the first texels are as wide as a ray turns when its normal does by 2.8°. Finer than the last
+was tried on one mirror: 0.023° instead of 0.030° for twice the time.
 """
 
 
