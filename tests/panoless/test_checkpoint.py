@@ -21,6 +21,7 @@ from panoless.lathe import Lathe
 from shinypartial.errors import InputError
 from tests.support.mirror_lathe import around, funnel, goblet, rays_of
 from tests.support.mirror_plane import L_SHAPE, plane_of
+from tests.support.mirror_sheet import bumpy
 from tests.support.mirror_sphere import sphere_surfels
 
 CONFIG = PRESETS["default"]
@@ -76,6 +77,22 @@ def test_a_plane_survives_the_disk(tmp_path: Path, flat: bool) -> None:
     assert isinstance(loaded.plane.offset, float)
     assert loaded.rung == "plane (asked for)"
     assert loaded.geometry is (loaded.plane if flat else loaded.surfels)
+
+
+@pytest.mark.parametrize("bent", [True, False], ids=["bent plane", "surfels that began on it"])
+def test_a_bent_plane_survives_the_disk(tmp_path: Path, bent: bool) -> None:
+    """To the last bit, with the plane of its frame; it is the geometry only when it was taken."""
+    sheet = bumpy(plane_of(L_SHAPE, rim_height=0.1 / 3, offset=1 / 7), 0.02)
+    save_state(tmp_path, replace(some_state(True), sheet=sheet, plane=sheet.plane, bent=bent))
+    loaded = load_state(tmp_path)
+    assert loaded is not None
+    assert loaded.sheet is not None
+    for first, second in ((loaded.sheet, sheet), (loaded.sheet.plane, sheet.plane)):
+        for item in fields(second):
+            if item.name != "plane":
+                np.testing.assert_array_equal(getattr(first, item.name), getattr(second, item.name))
+    assert loaded.stepless == bent
+    assert loaded.geometry is (loaded.sheet if bent else loaded.surfels)
 
 
 @pytest.mark.parametrize("turned", [True, False], ids=["revolution", "surfels that began on it"])

