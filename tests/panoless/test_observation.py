@@ -13,8 +13,8 @@ from panoless.kernels.cubemap import cubemap_directions, sample_cubemap
 from panoless.observation import (
     PRIOR_TRUST,
     finest_resolution,
-    of_mean_trust_one,
     observed_rays,
+    of_mean_trust_one,
     prediction_error,
     solved_environment,
     surfel_trust,
