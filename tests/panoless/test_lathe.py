@@ -167,6 +167,22 @@ def test_a_search_finds_the_funnel_inside() -> None:
     assert float(np.median(np.abs(seen[:, 1] - expected))) < 0.03
 
 
+def test_a_search_rises_above_the_end_of_the_outlines() -> None:
+    """The wall rises by 0.04 within the rim before it goes down: the cheapest inside does so, to a pixel (0.02)."""
+    body = goblet()
+    radius = body.profile[-2, 0]
+    way = np.linspace(0, 1, 30)
+    bead = np.stack([radius - 0.12 * way, 0.6 + 0.04 * np.sin(np.pi * way)], 1)
+    cone = np.linspace(bead[-1], [0.0, 0.35], 60)
+    truth = replace(body, profile=np.concatenate([body.profile[: body.rim], bead, cone[1:]]))
+    found = searched_inside(lathe_views(truth, around(16)), resampled(body, 0.02), environment(), 0.02)
+    inner = found.profile[found.rim :]
+    assert 0.62 < inner[:, 1].max() < 0.66
+    seen = inner[inner[:, 0] > 0.1][::-1]
+    expected = np.interp(seen[:, 0], truth.profile[: body.rim - 1 : -1, 0], truth.profile[: body.rim - 1 : -1, 1])
+    assert float(np.median(np.abs(seen[:, 1] - expected))) < 0.02
+
+
 def test_closed_contours_touch_the_true_body() -> None:
     """Distances of the contours from the lathe that made them are a small part of a pixel."""
     views = lathe_views(goblet(), around(6))
