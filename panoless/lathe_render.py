@@ -8,6 +8,7 @@ which neighboring pixels see the environment tell those in between,
 with central differences and |a|, |b| < ½; rays are traced only where neighbors disagree.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +28,7 @@ OFFSETS = tuple((i + 0.5) / SUBPIXELS for i in range(SUBPIXELS))
 
 
 @dataclass(frozen=True)
-class _Continued:
+class Continued:
     """Directions of pixels and their differences along columns (x) and rows (y)."""
 
     center: Float[np.ndarray, "P 3"]
@@ -36,6 +37,14 @@ class _Continued:
     xx: Float[np.ndarray, "P 3"]
     yy: Float[np.ndarray, "P 3"]
     xy: Float[np.ndarray, "P 3"]
+
+    def within(self, offsets: Sequence[float]) -> Iterator[Float[Tensor, "P 3"]]:
+        """Directions, about unit, at all pairs of offsets from the pixels' centers."""
+        center, x, y, xx, yy, xy = (torch.from_numpy(each).float() for each in vars(self).values())
+        for b in offsets:
+            in_row, slope = center + b * y + b * b / 2 * yy, x + b * xy
+            for a in offsets:
+                yield in_row + a * slope + a * a / 2 * xx
 
 
 def mean_light(
@@ -46,27 +55,28 @@ def mean_light(
     A ray that has not left after sixteen reflections is black.
     """
     places = pixels.cpu().numpy()
-    directions, bounces = np.zeros((camera.height * camera.width, 3)), np.zeros(camera.height * camera.width, np.int64)
-    escapes = followed(lathe, *pixel_rays(camera, places), DEEPEST)
-    directions[places], bounces[places] = escapes.directions, escapes.bounces
-    shape = camera.height, camera.width
-    continued, smooth = _continued(directions.reshape(*shape, 3), bounces.reshape(shape), places)
+    at, smooth = smooth_pixels(lathe, camera, places, DEEPEST)
     light = torch.zeros(len(places), 3, device=environment.device)
-    light[torch.from_numpy(smooth)] = _interpolated(environment, continued)
+    light[torch.from_numpy(smooth)] = _interpolated(environment, at)
     light[torch.from_numpy(~smooth)] = _traced(lathe, environment, camera, places[~smooth])
     return light
 
 
-def _interpolated(environment: Float[Tensor, "6 3 L L"], at: _Continued) -> Float[Tensor, "P 3"]:
-    terms = [torch.from_numpy(each).float().to(environment.device) for each in vars(at).values()]
-    center, x, y, xx, yy, xy = terms
-    total = torch.zeros_like(center)
-    for row in OFFSETS:
-        b = row - 0.5
-        in_row, slope = center + b * y + b * b / 2 * yy, x + b * xy
-        for column in OFFSETS:
-            a = column - 0.5
-            total += sample_cubemap(environment, in_row + a * slope + a * a / 2 * xx)
+def smooth_pixels(
+    lathe: Lathe, camera: RasterCamera, pixels: Int[np.ndarray, "P"], most: int
+) -> tuple[Continued, Bool[np.ndarray, "P"]]:
+    """Those of the pixels whose directions continue smoothly to their neighbors, by up to `most` reflections."""
+    count = camera.height * camera.width
+    directions, bounces = np.zeros((count, 3)), np.zeros(count, np.int64)
+    escapes = followed(lathe, *pixel_rays(camera, pixels), most)
+    directions[pixels], bounces[pixels] = escapes.directions, escapes.bounces
+    return _continued(directions, bounces.reshape(camera.height, camera.width), pixels)
+
+
+def _interpolated(environment: Float[Tensor, "6 3 L L"], at: Continued) -> Float[Tensor, "P 3"]:
+    total = torch.zeros(len(at.center), 3, device=environment.device)
+    for directions in at.within([offset - 0.5 for offset in OFFSETS]):
+        total += sample_cubemap(environment, directions.to(environment.device))
     return total / SUBPIXELS**2
 
 
@@ -85,8 +95,8 @@ def _traced(
 
 
 def _continued(
-    directions: Float[np.ndarray, "H W 3"], bounces: Int[np.ndarray, "H W"], pixels: Int[np.ndarray, "P"]
-) -> tuple[_Continued, Bool[np.ndarray, "P"]]:
+    directions: Float[np.ndarray, "N 3"], bounces: Int[np.ndarray, "H W"], pixels: Int[np.ndarray, "P"]
+) -> tuple[Continued, Bool[np.ndarray, "P"]]:
     """Differences at those of the pixels that continue smoothly to all eight neighbors, and which these are."""
     height, width = bounces.shape
     row, column = np.divmod(pixels, width)
@@ -96,10 +106,10 @@ def _continued(
     for shift in (-width - 1, -width, -width + 1, -1, 1, width - 1, width, width + 1):
         alike &= bounces.ravel()[pixels[inside] + shift] == own
     chosen = inside[alike]
-    flat, at = directions.reshape(-1, 3), pixels[chosen]
-    center, left, right, above, below = (flat[at + shift] for shift in (0, -1, 1, -width, width))
-    corners = [flat[at + shift] for shift in (width + 1, width - 1, -width + 1, -width - 1)]
-    found = _Continued(
+    at = pixels[chosen]
+    center, left, right, above, below = (directions[at + shift] for shift in (0, -1, 1, -width, width))
+    corners = [directions[at + shift] for shift in (width + 1, width - 1, -width + 1, -width - 1)]
+    found = Continued(
         center,
         (right - left) / 2,
         (below - above) / 2,
@@ -112,4 +122,4 @@ def _continued(
         straight &= (second**2).sum(1) < LARGEST_BEND**2
     smooth = np.zeros(len(pixels), bool)
     smooth[chosen[straight]] = True
-    return _Continued(*(each[straight] for each in vars(found).values())), smooth
+    return Continued(*(each[straight] for each in vars(found).values())), smooth

@@ -13,6 +13,7 @@ from panoless.cubemap import Rays, robust_weight, solve_environment
 from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap
 from panoless.kernels.rasterize import Channels, RasterBuffers
 from panoless.lathe import Lathe, lathe_rays
+from panoless.lathe_map import sharpened_map
 from panoless.plane import Plane, plane_buffers
 from panoless.shading import ALPHA_FLOOR, rasterize_surfels, reflection_directions_world, tiles_of
 from panoless.sheet import Sheet, sheet_rays
@@ -76,12 +77,16 @@ def solved_environment(
 
     A trial map says which surfels to trust, and held-out views how fine the map should be, unless the configuration
     does; then all rays are solved. Exact surfaces need no trial: their map starts from nothing, because a coarse start
-    would reject what is finer.
+    would reject what is finer. That of a surface of revolution is sharpened, unless its radiance is encoded, whose mean
+    over a pixel is not that of radiance.
     """
     if not isinstance(geometry, Surfels):
         rays = list(observed_rays(views, geometry, config, config.environment.rays))
         resolution = config.environment.solve_resolution or densest_resolution(rays)
-        return solve_environment(of_mean_trust_one(rays), resolution), rays
+        found = solve_environment(of_mean_trust_one(rays), resolution)
+        if isinstance(geometry, Lathe) and config.environment.range != "hdr":
+            found = sharpened_map(views, geometry, found)
+        return found, rays
     seen = [
         (view, *_surfel_rays(view, geometry, config, pixels))
         for view, pixels in _chosen_pixels(views, config.environment.rays)
