@@ -102,7 +102,9 @@ def refine_lathe(views: Views, start: Lathe) -> Lathe:
         progress.advance()
     lathe = refined_in_pixels(views, contours, lathe, pixel)
     progress.advance()
-    lathe = refined_in_pixels(views, contours, with_searched_inside(views, lathe, pixel), pixel)
+    inside = with_searched_inside(views, lathe, pixel)
+    if inside is not lathe:
+        lathe = refined_in_pixels(views, contours, inside, pixel)
     progress.advance()
     return lathe
 

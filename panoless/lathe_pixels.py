@@ -38,7 +38,7 @@ ROUNDS = (Round(32, 0.5, 1.5, 4), Round(64, 0.4, 1.5, 4), Round(128, 0.3, 1.0, 4
 BENDING = (1e-4, 1e-4, 1e-4, 1e-5)
 MAP_RAYS = 2_000_000
 MAP_RESOLUTION = 256
-PIXELS = 60_000
+PIXELS, LARGEST_SHARE = 60_000, 1 / 3
 LOOKED_AT = 2_000_000
 CURVED_RAD = np.radians(2.0)
 """Where the profile turns by more within two pixels a pixel is taken preferably: elsewhere one ray tells as much."""
@@ -165,7 +165,8 @@ def refined_in_pixels(views: Views, contours: ContourRays, lathe: Lathe, pixel: 
     kept, held_out = split_held_out(views.train)
     with torch.no_grad():
         finest = solved_map(views, lathe, MAP_RAYS, MAP_RESOLUTION)
-        chosen = telling_pixels(kept, lathe, PIXELS, pixel)
+        most = min(PIXELS, int(LARGEST_SHARE * sum(len(view.solid) for view in kept)))
+        chosen = telling_pixels(kept, lathe, most, pixel)
         found = resampled(lathe, SPACING_PX * pixel)
         for each, bending in zip(ROUNDS, BENDING, strict=True):
             environment = avg_pool2d(finest, MAP_RESOLUTION // each.resolution)
