@@ -104,7 +104,7 @@ def refine_lathe(views: Views, start: Lathe) -> Lathe:
     progress.advance()
     inside = with_searched_inside(views, lathe, pixel)
     if inside is not lathe:
-        lathe = refined_in_pixels(views, contours, inside, pixel)
+        lathe = refined_in_pixels(views, contours, inside, pixel, otherwise=lathe)
     progress.advance()
     return lathe
 
