@@ -108,7 +108,9 @@ def refine_lathe(views: Views, start: Lathe) -> Lathe:
             lathe = found_base(views, lathe, environment)
     else:
         lathe = refined_in_pixels(views, contours, lathe, pixel)
-        lathe = refined_in_pixels(views, contours, with_searched_inside(views, lathe, pixel), pixel)
+        inside = with_searched_inside(views, lathe, pixel)
+        if inside is not lathe:
+            lathe = refined_in_pixels(views, contours, inside, pixel, otherwise=lathe)
     progress.advance()
     return lathe
 
