@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from panoless.cubemap import Rays
-from panoless.kernels.cpu.lathe import first_hits
+from panoless.kernels.cpu.lathe import first_hits, follow
 from panoless.kernels.rasterize import RasterCamera
 from panoless.shading import SurfaceBuffers
 from panoless.views import TrainView, pose_of
@@ -236,18 +236,13 @@ def followed(
     lathe: Lathe, origins: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"], most: int = 1
 ) -> Escapes:
     """Mirror rays at the lathe up to `most` times."""
-    first = hits = lathe.hits(origins, directions)
+    first = lathe.hits(origins, directions)
+    met = np.flatnonzero(first.met)
+    points = (first.points[met] - lathe.origin) @ lathe.frame.T
+    places = first.side[met], first.along[met]
+    ways, times = follow(points, directions[met] @ lathe.frame.T, places, lathe.profile, lathe.angles, LEAVING, most)
     final, bounces = np.zeros((len(origins), 3)), np.zeros(len(origins), dtype=np.int64)
-    alive = np.flatnonzero(hits.met)
-    points, normals, incoming = hits.points[alive], hits.normals[alive], directions[alive]
-    for bounce in range(1, most + 1):
-        outgoing = mirrored(incoming, normals)
-        outgoing /= np.linalg.norm(outgoing, axis=1, keepdims=True)
-        hits = lathe.hits(points + LEAVING * outgoing, outgoing)
-        free = ~hits.met
-        final[alive[free]], bounces[alive[free]] = outgoing[free], bounce
-        alive, incoming = alive[hits.met], outgoing[hits.met]
-        points, normals = hits.points[hits.met], hits.normals[hits.met]
+    final[met], bounces[met] = ways @ lathe.frame, times
     return Escapes(final, bounces, first)
 
 

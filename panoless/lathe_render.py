@@ -74,10 +74,8 @@ def smooth_pixels(
 
 
 def _interpolated(environment: Float[Tensor, "6 3 L L"], at: Continued) -> Float[Tensor, "P 3"]:
-    total = torch.zeros(len(at.center), 3, device=environment.device)
-    for directions in at.within([offset - 0.5 for offset in OFFSETS]):
-        total += sample_cubemap(environment, directions.to(environment.device))
-    return total / SUBPIXELS**2
+    directions = torch.cat(list(at.within([offset - 0.5 for offset in OFFSETS])))
+    return sample_cubemap(environment, directions.to(environment.device)).view(SUBPIXELS**2, -1, 3).mean(0)
 
 
 def _traced(
@@ -85,12 +83,14 @@ def _traced(
 ) -> Float[Tensor, "P 3"]:
     total, count = torch.zeros(len(pixels), 3, device=environment.device), np.zeros(len(pixels))
     for row in OFFSETS:
-        for column in OFFSETS:
-            escapes = followed(lathe, *pixel_rays(camera, pixels, (column, row)), DEEPEST)
-            left = escapes.bounces > 0
-            ways = torch.from_numpy(escapes.directions[left]).float().to(environment.device)
-            total[torch.from_numpy(left)] += sample_cubemap(environment, ways)
-            count += escapes.first.met
+        rays = [pixel_rays(camera, pixels, (column, row)) for column in OFFSETS]
+        origins, directions = (np.concatenate([each[part] for each in rays]) for part in (0, 1))
+        escapes = followed(lathe, origins, directions, DEEPEST)
+        left = torch.from_numpy(escapes.bounces > 0)
+        light = torch.zeros(len(left), 3, device=environment.device)
+        light[left] = sample_cubemap(environment, torch.from_numpy(escapes.directions).to(light)[left])
+        total += light.view(SUBPIXELS, -1, 3).sum(0)
+        count += escapes.first.met.reshape(SUBPIXELS, -1).sum(0)
     return total / torch.from_numpy(np.maximum(count, 1)).to(total)[:, None]
 
 

@@ -9,7 +9,7 @@ import torch
 from panoless.initialize import surfels_on_lathe
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.kernels.reference.rasterize import rotation_matrices
-from panoless.lathe import Lathe, followed, lathe_buffers
+from panoless.lathe import LEAVING, Lathe, followed, lathe_buffers, mirrored
 from panoless.lathe_contours import contour_rays, touches
 from panoless.lathe_fit import fit_lathe
 from panoless.lathe_inside import searched_inside
@@ -54,6 +54,28 @@ def test_two_mirrors_pass_a_ray_on() -> None:
     np.testing.assert_array_equal(escapes.bounces, [2, 0])
     np.testing.assert_allclose(escapes.directions[0], [0, 0, 1], atol=1e-6)
     assert not escapes.directions[1].any()
+
+
+def test_a_ray_is_followed_as_if_hit_and_mirrored_one_by_one() -> None:
+    """In a funnel, until it leaves or six reflections have been."""
+    lathe = funnel()
+    origins, directions = rays_of(around(4, 60)[3])
+    escapes = followed(lathe, origins, directions, 6)
+    assert (escapes.bounces == 1).sum() > 50
+    assert (escapes.bounces > 1).sum() > 50
+    for ray in np.flatnonzero(escapes.first.met):
+        start, way, times = origins[ray], directions[ray], 0
+        while times < 7 and (hit := lathe.hits(start[None], way[None])).met[0]:
+            times += 1
+            way = mirrored(way[None], hit.normals)[0]
+            way /= np.linalg.norm(way)
+            start = hit.points[0] + LEAVING * way
+        if escapes.bounces[ray]:
+            assert times == escapes.bounces[ray]
+            np.testing.assert_allclose(escapes.directions[ray], way, atol=1e-9)
+        else:
+            assert times == 7
+            assert not escapes.directions[ray].any()
 
 
 def test_surfels_of_a_ball_have_its_normals_and_curvature() -> None:

@@ -11,7 +11,7 @@ from numba import njit
 from panoless.kernels.cpu.simd_memory import fetch_add
 from panoless.kernels.cpu.workers import run_shared
 
-RAYS_PER_CLAIM = 4096
+RAYS_PER_CLAIM = 2048
 EXACT = {"nogil": True, "cache": True, "error_model": "numpy"}
 FLAT = 1e-7
 DEEPEST = 64
@@ -30,6 +30,28 @@ def first_hits(
     profile = np.ascontiguousarray(profile, dtype=np.float64)
     run_shared(_trace, *rays, profile, _tree(profile), distance, side, along)
     return distance, side, along
+
+
+def follow(
+    points: Float[np.ndarray, "P 3"],
+    directions: Float[np.ndarray, "P 3"],
+    hits: tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"]],
+    profile: Float[np.ndarray, "N 2"],
+    angles: Float[np.ndarray, "S 2"],
+    leaving: float,
+    most: int,
+) -> tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, "P"]]:
+    """Unit directions in which rays leave the surface for good, and after how many reflections; zeros for those that
+    have not after `most`.
+
+    Rays come in `directions` and meet the surface at `points`, on that side and place of it; each next one starts
+    `leaving` from its point. `angles` are the profile's directions at both ends of every side (rad).
+    """
+    final, bounces = np.zeros((len(points), 3)), np.zeros(len(points), dtype=np.int64)
+    rays = np.ascontiguousarray(points, dtype=np.float64), np.ascontiguousarray(directions, dtype=np.float64)
+    profile = np.ascontiguousarray(profile, dtype=np.float64)
+    run_shared(_follow, *rays, hits, profile, _tree(profile), angles, leaving, most, final, bounces)
+    return final, bounces
 
 
 @njit(**EXACT)
@@ -112,32 +134,69 @@ def _meets(r0, z0, r1, z1, a, b, c, h0, h1, limit):
 
 
 @njit(**EXACT)
-def _trace(counter, origins, directions, profile, tree, distance, side, along):
+def _nearest(x, y, h0, dx, dy, h1, profile, tree, stack):
+    """Distance, side and place on it of the first hit of one ray."""
     leaves = (len(tree) + 1) // 2
+    a, b, c = dx * dx + dy * dy, x * dx + y * dy, x * x + y * y
+    best, hit, where = np.inf, -1, 0.0
+    stack[0] = 0
+    depth = 1
+    while depth > 0:
+        depth -= 1
+        node = stack[depth]
+        if not _enters(tree[node], a, b, c, h0, h1, best):
+            continue
+        if node < leaves - 1:
+            stack[depth], stack[depth + 1] = 2 * node + 1, 2 * node + 2
+            depth += 2
+            continue
+        i = node - (leaves - 1)
+        t, u = _meets(profile[i, 0], profile[i, 1], profile[i + 1, 0], profile[i + 1, 1], a, b, c, h0, h1, best)
+        if u >= 0 and t < best:
+            best, hit, where = t, i, u
+    return best, hit, where
+
+
+@njit(**EXACT)
+def _trace(counter, origins, directions, profile, tree, distance, side, along):
     stack = np.empty(DEEPEST, dtype=np.int64)
     while True:
         begin = fetch_add(counter, RAYS_PER_CLAIM)
         if begin >= len(origins):
             return
         for ray in range(begin, min(begin + RAYS_PER_CLAIM, len(origins))):
-            ox, oy, h0 = origins[ray]
-            dx, dy, h1 = directions[ray]
-            a, b, c = dx * dx + dy * dy, ox * dx + oy * dy, ox * ox + oy * oy
-            best, hit, where = np.inf, -1, 0.0
-            stack[0] = 0
-            depth = 1
-            while depth > 0:
-                depth -= 1
-                node = stack[depth]
-                if not _enters(tree[node], a, b, c, h0, h1, best):
-                    continue
-                if node < leaves - 1:
-                    stack[depth], stack[depth + 1] = 2 * node + 1, 2 * node + 2
-                    depth += 2
-                    continue
-                i = node - (leaves - 1)
-                r0, z0, r1, z1 = profile[i, 0], profile[i, 1], profile[i + 1, 0], profile[i + 1, 1]
-                t, u = _meets(r0, z0, r1, z1, a, b, c, h0, h1, best)
-                if u >= 0 and t < best:
-                    best, hit, where = t, i, u
-            distance[ray], side[ray], along[ray] = best, hit, where
+            x, y, h = origins[ray]
+            dx, dy, dh = directions[ray]
+            distance[ray], side[ray], along[ray] = _nearest(x, y, h, dx, dy, dh, profile, tree, stack)
+
+
+@njit(**EXACT)
+def _follow(counter, points, ways, alive, profile, tree, angles, leaving, most, final, bounces):
+    """Mirror rays that lie on the surface on, from their first side and the place on it."""
+    side, along = alive
+    stack = np.empty(DEEPEST, dtype=np.int64)
+    while True:
+        begin = fetch_add(counter, RAYS_PER_CLAIM)
+        if begin >= len(points):
+            return
+        for ray in range(begin, min(begin + RAYS_PER_CLAIM, len(points))):
+            i, u = side[ray], along[ray]
+            x, y, h = points[ray]
+            dx, dy, dh = ways[ray]
+            bounce = 0
+            while i >= 0 and bounce < most:
+                bounce += 1
+                angle = angles[i, 0] + u * (angles[i, 1] - angles[i, 0])
+                radius = max(np.sqrt(x * x + y * y), 1e-12)
+                nx, ny, nh = np.sin(angle) * x / radius, np.sin(angle) * y / radius, -np.cos(angle)
+                twice = 2 * (dx * nx + dy * ny + dh * nh)
+                dx, dy, dh = dx - twice * nx, dy - twice * ny, dh - twice * nh
+                length = np.sqrt(dx * dx + dy * dy + dh * dh)
+                dx, dy, dh = dx / length, dy / length, dh / length
+                x, y, h = x + leaving * dx, y + leaving * dy, h + leaving * dh
+                t, i, u = _nearest(x, y, h, dx, dy, dh, profile, tree, stack)
+                if i >= 0:
+                    x, y, h = x + t * dx, y + t * dy, h + t * dh
+            if i < 0:
+                final[ray, 0], final[ray, 1], final[ray, 2] = dx, dy, dh
+                bounces[ray] = bounce
