@@ -1,7 +1,7 @@
 """A surface of revolution from photographs: outside by outlines, inside by search, then all by what it mirrors."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
