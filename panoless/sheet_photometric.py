@@ -48,9 +48,14 @@ def observations(views: Views, sheet: Sheet, most: int) -> Observations:
 def photometric_equations(
     seen: Observations, sheet: Sheet, environment: Float[Tensor, "6 3 L L"], robust: float
 ) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
-    """Gradient and matrix over the coefficients, the map eliminated, in units of the radiance's deviation."""
+    """Gradient and matrix over the coefficients, the map eliminated, in units of the radiance's deviation.
+
+    Zero when there are no rays, as where a high frame is mirrored everywhere.
+    """
     from scipy import sparse
 
+    if not len(seen.rays.radiance):
+        return np.zeros(sheet.coefficients.size), np.zeros((sheet.coefficients.size,) * 2)
     residual, by_slope = _residuals(seen, sheet, environment)
     index, basis = sheet.basis(seen.hits.places)
     _, _, _, h_uu, h_uv, h_vv = (basis * sheet.coefficients.ravel()[index]).sum(2)

@@ -139,3 +139,12 @@ def test_a_bent_and_tilted_mirror_is_recovered(truth: Sheet) -> None:
         np.mean(normal_errors_deg(found, truth, camera))
         < np.mean(normal_errors_deg(flat_sheet(TILTED, 4), truth, camera)) / 10
     )
+
+
+def test_photographs_of_nothing_but_the_frame_say_nothing(views: Views) -> None:
+    """A frame so high that every mirrored ray meets it: outlines alone decide, and the sheet is finite."""
+    walled = flat_sheet(replace(PLANE, rim_height=1e3), 4)
+    seen = observations(views, walled, 10_000)
+    assert len(seen.rays.radiance) == 0
+    for part in photometric_equations(seen, walled, torch.zeros(6, 3, 16, 16), 0.3):
+        assert not part.any()
