@@ -126,8 +126,8 @@ TABLES = {
     ),
     "counts": Table(
         "Surfels, flat and curved",
-        "`--model surfels` with fewer and more surfels, with and without a linear normal field each. The charts are those of "
-        "`shinypartial chart predictions/ablations/counts-* --size primitives`.\n\n"
+        "`--model surfels` with fewer and more surfels, with and without a linear normal field each. The charts are "
+        "those of `shinypartial chart predictions/ablations/counts-* --size primitives`.\n\n"
         "![Environment PSNR (sRGB) against the number of surfels](images/chart-counts.svg)\n"
         "![Median normal error against the number of surfels](images/chart-counts-normals.svg)",
         tuple(
