@@ -1,7 +1,7 @@
 """The environment as a cubemap: lookup with its activation, the closed-form robust map, and the fill of gaps."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -145,17 +145,30 @@ def _sharpen(
     weights: Sequence[Tensor],
 ) -> Float[Tensor, "6 3 L L"]:
     """A few preconditioned conjugate-gradient steps; a unit-weight pull to the start keeps thin texels stable."""
-    precondition = 1 / (total + CONFIDENT_WEIGHT)
-    result = start.clone()
-    residual = right_side - _normal_product(start, rays, weights)
+    return conjugate_gradients(
+        lambda image: _normal_product(image, rays, weights) + CONFIDENT_WEIGHT * image,
+        start,
+        right_side - _normal_product(start, rays, weights),
+        1 / (total + CONFIDENT_WEIGHT),
+    )
+
+
+def conjugate_gradients(
+    product: Callable[[Float[Tensor, "6 C L L"]], Float[Tensor, "6 C L L"]],
+    start: Float[Tensor, "6 C L L"],
+    residual: Float[Tensor, "6 C L L"],
+    precondition: Float[Tensor, "6 1 L L"],
+) -> Float[Tensor, "6 C L L"]:
+    """Six steps on A x = b from a start, with its residual b − A x and the inverse of a diagonal near to A's."""
+    result, residual = start.clone(), residual.clone()
     scaled = precondition * residual
     direction = scaled.clone()
     energy = (residual * scaled).sum()
     for _ in range(CONJUGATE_GRADIENT_STEPS):
-        product = _normal_product(direction, rays, weights) + CONFIDENT_WEIGHT * direction
-        step = energy / (direction * product).sum().clamp(min=1e-12)
+        ahead = product(direction)
+        step = energy / (direction * ahead).sum().clamp(min=1e-12)
         result += step * direction
-        residual -= step * product
+        residual -= step * ahead
         scaled = precondition * residual
         new_energy = (residual * scaled).sum()
         direction = scaled + (new_energy / energy.clamp(min=1e-12)) * direction

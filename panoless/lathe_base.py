@@ -14,7 +14,7 @@ from torch import Tensor
 
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.lathe import LEAVING, Lathe, followed, mirrored, pixel_rays
-from panoless.views import Views
+from panoless.views import Views, spread_pixels
 
 DEEPEST = 10
 FEWEST_PIXELS, MOST_PIXELS = 200, 2500
@@ -85,10 +85,8 @@ def _cubic(x: Float[np.ndarray, "N"], rise: float, slope: float) -> Float[np.nda
 
 def base_rays(views: Views, lathe: Lathe) -> BaseRays | None:
     """Rays of pixels whose path meets the bottom; None when there are hardly any."""
-    stride = max(1, sum(len(view.solid) for view in views.train) // LOOKED_AT)
     parts = []
-    for index, view in enumerate(views.train):
-        pixels = view.solid[index % stride :: stride]
+    for view, pixels in spread_pixels(views, LOOKED_AT):
         seen = pixels.cpu().numpy()[_meets_base(lathe, *pixel_rays(view.camera, pixels.cpu().numpy()))]
         offsets = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS
         rays = [pixel_rays(view.camera, seen, (x, y)) for y in offsets for x in offsets]

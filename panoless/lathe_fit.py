@@ -25,7 +25,7 @@ from panoless.lathe_photometric import Round, observations, photometric_step, so
 from panoless.lathe_pixels import refined_in_pixels
 from panoless.lathe_profile import resampled
 from panoless.lathe_rim import clear_of_rim, open_lathe, with_rim
-from panoless.views import Views
+from panoless.views import Views, spread_pixels
 from shinypartial.progress import Progress
 
 LARGEST_START_COST = 0.6
@@ -151,10 +151,8 @@ def best_inside(views: Views, lathe: Lathe, environment: Tensor, candidates: Seq
 def inside_error(views: Views, closed: Lathe, environment: Tensor, candidate: Lathe) -> float:
     """Mean of ‖e‖²/(‖e‖² + s²), 1 for rays that never leave, over pixels that see the lid of `closed`."""
     summed, count = 0.0, 0
-    stride = max(1, sum(len(view.solid) for view in views.train) // MAP_RAYS)
     with torch.no_grad():
-        for index, view in enumerate(views.train):
-            pixels = view.solid[index % stride :: stride]
+        for view, pixels in spread_pixels(views, MAP_RAYS):
             origin_hits = closed.hits(*pixel_rays(view.camera, pixels.cpu().numpy()))
             lid = pixels[torch.from_numpy(origin_hits.side >= closed.rim).to(pixels.device)]
             if not len(lid):

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from panoless.cubemap import robust_weight
+from panoless.cubemap import conjugate_gradients, robust_weight
 from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap
 from panoless.lathe import Lathe
 from panoless.lathe_render import smooth_pixels
@@ -20,7 +20,6 @@ from panoless.views import Views
 OFFSETS = (-0.25, 0.25)
 MOST_PIXELS = 3_500_000
 ROBUST_SCALE = 0.08
-STEPS = 6
 PULL = 0.2
 """λ, in rays."""
 BATCH_VIEWS = 4
@@ -59,20 +58,11 @@ def sharpened_map(views: Views, lathe: Lathe, environment: Float[Tensor, "6 3 L 
             found += each.spread(each.seen(image) * weight, resolution)
         return found
 
-    precondition = PULL + sum(each.spread(weight, resolution) for each, weight in zip(areas, weights, strict=True))
-    residual = torch.zeros_like(environment)
+    diagonal, residual = torch.full_like(environment[:, :1], PULL), torch.zeros_like(environment)
     for each, weight in zip(areas, weights, strict=True):
+        diagonal += each.spread(weight, resolution)
         residual += each.spread((each.radiance - each.seen(environment)) * weight, resolution)
-    result, scaled = environment.clone(), residual / precondition
-    direction, energy = scaled.clone(), (residual * scaled).sum()
-    for _ in range(STEPS):
-        product = normal(direction)
-        step = energy / (direction * product).sum().clamp(min=1e-12)
-        result += step * direction
-        residual -= step * product
-        scaled = residual / precondition
-        before, energy = energy, (residual * scaled).sum()
-        direction = scaled + energy / before.clamp(min=1e-12) * direction
+    result = conjugate_gradients(normal, environment, residual, 1 / diagonal)
     return result.clamp(0, max([1.0, *(float(each.radiance.max()) for each in areas)]))
 
 

@@ -27,7 +27,7 @@ from panoless.lathe_contours import (
     solved,
 )
 from panoless.lathe_profile import ProfileSplines, moved
-from panoless.views import Views
+from panoless.views import Views, spread_pixels
 
 LEAST_COSINE = 0.05
 """Rays that graze the surface more than this say little and amplify every error."""
@@ -57,10 +57,8 @@ class Observations:
 
 def observations(views: Views, lathe: Lathe, most: int) -> Observations:
     """About `most` pixels of all views, evenly."""
-    stride = max(1, sum(len(view.solid) for view in views.train) // most)
     parts = []
-    for index, view in enumerate(views.train):
-        pixels = view.solid[index % stride :: stride]
+    for view, pixels in spread_pixels(views, most):
         rays, hits = lathe_rays(lathe, view, pixels)
         way = hits.points - view.position
         parts.append((way / hits.distance[:, None], rays.radiance, hits))
@@ -72,8 +70,7 @@ def solved_map(
     views: Views, lathe: Lathe, most: int, resolution: int, start: Tensor | None = None
 ) -> Float[Tensor, "6 3 L L"]:
     """The closed-form map for a lathe."""
-    stride = max(1, sum(len(view.solid) for view in views.train) // most)
-    rays = [lathe_rays(lathe, view, view.solid[i % stride :: stride])[0] for i, view in enumerate(views.train)]
+    rays = [lathe_rays(lathe, *chosen)[0] for chosen in spread_pixels(views, most)]
     return solve_environment(rays, resolution, start)
 
 

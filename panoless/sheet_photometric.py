@@ -18,7 +18,7 @@ from panoless.kernels.cubemap import sample_cubemap
 from panoless.lathe import mirrored
 from panoless.lathe_photometric import RADIANCE_SIGMA
 from panoless.sheet import Sheet, SheetHits, sightings
-from panoless.views import Views
+from panoless.views import Views, spread_pixels
 from shinypartial.sphere import directions_to_cube
 
 
@@ -34,8 +34,7 @@ class Observations:
 
 def observations(views: Views, sheet: Sheet, most: int) -> Observations:
     """About `most` pixels of all views, evenly."""
-    stride = max(1, sum(len(view.solid) for view in views.train) // most)
-    seen = [sightings(sheet, view, view.solid[i % stride :: stride]) for i, view in enumerate(views.train)]
+    seen = [sightings(sheet, *chosen) for chosen in spread_pixels(views, most)]
     radiance = [view.radiance.flatten(1)[:, each.pixels].T for view, each in zip(views.train, seen, strict=True)]
     outgoing = torch.from_numpy(np.concatenate([each.outgoing for each in seen])).float()
     return Observations(

@@ -1,7 +1,7 @@
 """Dataset folder → training views: cropped tensors with cameras in a normalized frame."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
@@ -158,6 +158,13 @@ def split_held_out(views: Sequence[Each]) -> tuple[list[Each], list[Each]]:
     """Things that stand for the views: four fifths to solve from, and every fifth to predict."""
     phase = HELD_OUT_EVERY // 2
     return [view for i, view in enumerate(views) if i % HELD_OUT_EVERY != phase], list(views[phase::HELD_OUT_EVERY])
+
+
+def spread_pixels(views: Views, most: int) -> Iterator[tuple[TrainView, Int[Tensor, "P"]]]:
+    """About `most` pixels of all views that lie wholly on the object: every k-th, beginning elsewhere in each view."""
+    stride = max(1, sum(len(view.solid) for view in views.train) // most)
+    for index, view in enumerate(views.train):
+        yield view, view.solid[index % stride :: stride]
 
 
 def _block_means(image: Float[np.ndarray, "H W *C"], side: int) -> Float[np.ndarray, "h w *C"]:
