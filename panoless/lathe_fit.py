@@ -20,6 +20,7 @@ from panoless.lathe_contours import (
     refine_outer,
     touches,
 )
+from panoless.lathe_end import refined_end
 from panoless.lathe_inside import searched_inside
 from panoless.lathe_photometric import Round, observations, photometric_step, solved_map
 from panoless.lathe_pixels import refined_in_pixels
@@ -105,7 +106,7 @@ def refine_lathe(views: Views, start: Lathe) -> Lathe:
         progress.advance()
     if lathe.is_open:
         with torch.no_grad():
-            lathe = found_base(views, lathe, environment)
+            lathe = refined_end(views, found_base(views, lathe, environment), environment, pixel)
     else:
         lathe = refined_in_pixels(views, contours, lathe, pixel)
         inside = with_searched_inside(views, lathe, pixel)

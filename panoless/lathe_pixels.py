@@ -28,10 +28,9 @@ from panoless.lathe_photometric import (
     step_on_equations,
 )
 from panoless.lathe_profile import ProfileSplines, resampled
+from panoless.lathe_render import SUBRAYS
 from panoless.views import TrainView, Views, split_held_out
 
-SUBRAYS = ((0.125, 0.625), (0.375, 0.125), (0.625, 0.875), (0.875, 0.375))
-"""Column and row within a pixel: four distinct ones of either."""
 SPACING_PX = 1 / 3
 """Of the vertices: an edge is as sharp as they are dense."""
 ROUNDS = (Round(32, 0.5, 1.5, 4), Round(64, 0.4, 1.5, 4), Round(128, 0.3, 1.0, 4), Round(256, 0.2, 0.7, 4))

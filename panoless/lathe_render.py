@@ -19,11 +19,15 @@ from torch import Tensor
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.rasterize import RasterCamera
 from panoless.lathe import SUBPIXELS, Lathe, followed, pixel_rays
+from panoless.views import TrainView
 
 DEEPEST = 16
 """Reflections that a render follows."""
 LARGEST_BEND = 0.05
 """Second differences of directions (rad per pixel²) up to which they are interpolated."""
+SUBRAYS = ((0.125, 0.625), (0.375, 0.125), (0.625, 0.875), (0.875, 0.375))
+"""Column and row within a pixel: four distinct ones of either."""
+ERROR_SCALE = 0.1
 OFFSETS = tuple((i + 0.5) / SUBPIXELS for i in range(SUBPIXELS))
 
 
@@ -45,6 +49,49 @@ class Continued:
             in_row, slope = center + b * y + b * b / 2 * yy, x + b * xy
             for a in offsets:
                 yield in_row + a * slope + a * a / 2 * xx
+
+
+@dataclass(frozen=True)
+class DeepPixels:
+    """Pixels as bundles of 2×2 rays in distinct columns and rows, pixel after pixel, and the radiance they saw."""
+
+    origins: Float[np.ndarray, "R 3"]
+    directions: Float[np.ndarray, "R 3"]
+    radiance: Float[np.ndarray, "P 3"]
+
+    @classmethod
+    def of(cls, view: TrainView, pixels: Int[np.ndarray, "P"]) -> "DeepPixels":
+        """The given pixels (flat indices) of a view."""
+        rays = [pixel_rays(view.camera, pixels, shift) for shift in SUBRAYS]
+        origins, directions = (np.stack([each[part] for each in rays], 1).reshape(-1, 3) for part in (0, 1))
+        seen = view.radiance.flatten(1)[:, torch.from_numpy(pixels).to(view.radiance.device)]
+        return cls(origins, directions, seen.T.cpu().numpy().astype(np.float64))
+
+    @classmethod
+    def joined(cls, parts: Sequence["DeepPixels"]) -> "DeepPixels":
+        """All pixels of the parts."""
+        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})
+
+    def every(self, stride: int) -> "DeepPixels":
+        """Every stride-th pixel."""
+        rays = (each.reshape(-1, len(SUBRAYS), 3)[::stride].reshape(-1, 3) for each in (self.origins, self.directions))
+        return DeepPixels(*rays, self.radiance[::stride])
+
+    def shown(self, lathe: Lathe, environment: Float[Tensor, "6 3 L L"]) -> Float[np.ndarray, "P 3"]:
+        """The mean of what the rays of each pixel see; black where they miss or have not left after sixteen
+        reflections.
+        """
+        escapes = followed(lathe, self.origins, self.directions, DEEPEST)
+        left = escapes.bounces > 0
+        light = np.zeros((len(left), 3))
+        directions = torch.from_numpy(escapes.directions[left]).float().to(environment.device)
+        light[left] = sample_cubemap(environment, directions).cpu().numpy()
+        return light.reshape(-1, len(SUBRAYS), 3).mean(1)
+
+    def error(self, lathe: Lathe, environment: Float[Tensor, "6 3 L L"]) -> float:
+        """Mean of ‖e‖²/(‖e‖² + s²), s = 0.1, over pixels."""
+        squared = ((self.shown(lathe, environment) - self.radiance) ** 2).sum(1)
+        return float((squared / (squared + ERROR_SCALE**2)).mean())
 
 
 def mean_light(

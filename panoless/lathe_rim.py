@@ -9,8 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from panoless.kernels.rasterize import RasterCamera
 from panoless.lathe import Lathe
 from panoless.lathe_contours import ContourRays, in_axis_frame, robust_scale, touches
 from panoless.lathe_profile import resampled
@@ -98,27 +99,29 @@ def _ended(closed: Lathe, kept: int, tip: Float[np.ndarray, "2"], pixel: float) 
 
 def clear_of_rim(views: Views, lathe: Lathe) -> Views:
     """The views without the pixels beside the rim of an open lathe, which mix two surfaces: a lid's doesn't matter."""
-    if not lathe.is_open:
-        return views
+    return replace(views, train=tuple(_clear(view, lathe) for view in views.train)) if lathe.is_open else views
+
+
+def _clear(view: TrainView, lathe: Lathe) -> TrainView:
+    mixed = beside_rim(view.camera, lathe, CLEARANCE_PX).ravel()
+    return replace(view, solid=view.solid[torch.from_numpy(~mixed).to(view.solid.device)[view.solid]])
+
+
+def beside_rim(camera: RasterCamera, lathe: Lathe, reach_px: int) -> Bool[np.ndarray, "H W"]:
+    """Pixels whose center is nearer than that to the image of the rim."""
     turn = 2 * np.pi * np.arange(AROUND) / AROUND
-    radius, height = lathe.profile[-1]
+    radius, height = lathe.profile[lathe.rim]
     ring = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(AROUND, height)], 1) @ lathe.frame
-    ring += lathe.origin
-    return replace(views, train=tuple(_clear(view, ring) for view in views.train))
-
-
-def _clear(view: TrainView, ring: Float[np.ndarray, "A 3"]) -> TrainView:
-    camera = view.camera
     rotation, center = pose_of(camera)
-    seen = (ring - center) @ rotation.T
+    seen = (ring + lathe.origin - center) @ rotation.T
     x, y = (seen[:, k] / seen[:, 2] * f + c for k, f, c in ((0, camera.fx, camera.cx), (1, camera.fy, camera.cy)))
-    reach = np.arange(-CLEARANCE_PX, CLEARANCE_PX + 1)
+    reach = np.arange(-reach_px, reach_px + 1)
     column, row = np.floor(x)[:, None, None] + reach, np.floor(y)[:, None, None] + reach[:, None]
     apart = np.hypot(column + 0.5 - x[:, None, None], row + 0.5 - y[:, None, None])
-    near = (apart < CLEARANCE_PX) & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
-    mixed = np.zeros(camera.height * camera.width, bool)
-    mixed[(row * camera.width + column)[near].astype(np.int64)] = True
-    return replace(view, solid=view.solid[torch.from_numpy(~mixed).to(view.solid.device)[view.solid]])
+    near = (apart < reach_px) & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
+    beside = np.zeros(camera.height * camera.width, bool)
+    beside[(row * camera.width + column)[near].astype(np.int64)] = True
+    return beside.reshape(camera.height, camera.width)
 
 
 def with_rim(contours: ContourRays, lathe: Lathe, pixel: float) -> Lathe:

@@ -6,8 +6,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from panoless.kernels.cubemap import cubemap_directions
 from panoless.kernels.rasterize import RasterCamera
 from panoless.lathe import Lathe
+from panoless.lathe_render import mean_light
 from panoless.views import Normalization, Views, pose_of, unit_rays_camera
 from tests.support.mirror_plane import camera_at, train_view
 from tests.support.synthetic_dataset import environment_radiance
@@ -73,6 +75,24 @@ def lathe_views(lathe: Lathe, cameras: list[RasterCamera], subpixels: int = 4) -
         image = radiance.T.reshape(3, camera.height, camera.width)
         views.append(replace(view, radiance=torch.from_numpy(np.ascontiguousarray(image)).float()))
     return Views(tuple(views), Normalization(np.zeros(3), 1.0), 0.3)
+
+
+def known_environment(resolution: int = 64) -> Float[torch.Tensor, "6 3 L L"]:
+    """The environment of the synthetic dataset as a cubemap, clipped to [0, 1]."""
+    directions = cubemap_directions(resolution).double().numpy()
+    return torch.from_numpy(environment_radiance(directions).clip(0, 1).transpose(0, 3, 1, 2).copy()).float()
+
+
+def deep_views(lathe: Lathe, environment: Float[torch.Tensor, "6 3 L L"], cameras: list[RasterCamera]) -> Views:
+    """Views in which every pixel is the mean over its area, many reflections deep."""
+    plain = lathe_views(lathe, cameras)
+    views = []
+    for view in plain.train:
+        pixels = torch.nonzero(view.mask.flatten() > 0)[:, 0]
+        radiance = torch.zeros(3, view.mask.numel())
+        radiance[:, pixels] = mean_light(lathe, environment, view.camera, pixels).T * view.mask.flatten()[pixels]
+        views.append(replace(view, radiance=radiance.reshape(view.radiance.shape)))
+    return replace(plain, train=tuple(views))
 
 
 def rays_of(camera: RasterCamera) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]]:
