@@ -192,7 +192,7 @@ def export_snapshots(dataset: Dataset, run: Path, config: FitConfig, prediction:
             continue
         if views is None:
             loaded = load_views(dataset, config.crop_margin_px, config.downscale, light_of(config))
-            views = clear_views(loaded, state)
+            views = clear_views(loaded, state, config)
         complete(state, views, config)
         claim_prediction(target)
         export_prediction(dataset, state, config, target, snapshot=True)

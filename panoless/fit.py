@@ -26,7 +26,7 @@ from panoless.ladder import choose_rung, without_mirrored_frame
 from panoless.lathe_rim import clear_of_rim
 from panoless.light import light_of
 from panoless.losses import photometric_paper
-from panoless.observation import observed_rays, reflections, solved_environment
+from panoless.observation import observed_rays, reflections, solved_environment, without_fill
 from panoless.optimizer import SurfelOptimizer
 from panoless.schedule import Phase, Schedule, phase_of
 from panoless.shading import ALPHA_FLOOR, compose, rasterize_surfels
@@ -302,6 +302,8 @@ def complete(state: FitState, views: Views, config: FitConfig) -> None:
         # No steps are taken with what is no set of surfels, so there is no other map of it.
         if config.environment.solve or state.stepless:
             state.final_environment, rays = solved_environment(views, state.geometry, config)
+            if not config.environment.fill:
+                state.final_environment = without_fill(rays, state.final_environment)
         else:
             rays = list(observed_rays(views, state.geometry, config, config.environment.rays))
             sigmoid = config.environment.activation == "sigmoid"
@@ -361,7 +363,7 @@ def fit(
             state = _first_state(views, config)
             state.seconds = {"read views": loaded - start, "initialize": time.monotonic() - loaded}
             print(f"Model: {state.rung}", file=sys.stderr)
-        views, state = clear_views(views, state), state.to(device)
+        views, state = clear_views(views, state, config), state.to(device)
         if state.stepless:
             complete(state, views, config)
             _note_peak_memory(state)
@@ -405,14 +407,14 @@ def _first_state(views: Views, config: FitConfig) -> FitState:
     return state
 
 
-def clear_views(views: Views, state: FitState) -> Views:
+def clear_views(views: Views, state: FitState, config: FitConfig) -> Views:
     """The views without pixels that show more than one reflection of a state's geometry: those that mirror the frame of
-    a planar outline, and those beside the rim of a wall without thickness.
+    a planar outline, if the configuration has it so, and those beside the rim of a wall without thickness.
     """
     if state.turned and state.lathe is not None:
         return clear_of_rim(views, state.lathe)
     mirror = state.sheet or state.plane
-    return views if mirror is None else without_mirrored_frame(views, mirror)
+    return without_mirrored_frame(views, mirror) if mirror is not None and config.environment.trace else views
 
 
 def _trial(views: Views, config: FitConfig, start: Surfels) -> Surfels:

@@ -235,8 +235,12 @@ class Escapes:
 def followed(
     lathe: Lathe, origins: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"], most: int = 1
 ) -> Escapes:
-    """Mirror rays at the lathe up to `most` times."""
+    """Mirror rays at the lathe up to `most` times; once, whatever they meet then, if that is 0."""
     first = lathe.hits(origins, directions)
+    if most == 0:
+        once = mirrored(directions, first.normals)
+        once *= (first.met / np.linalg.norm(once, axis=1))[:, None]
+        return Escapes(once, first.met.astype(np.int64), first)
     met = np.flatnonzero(first.met)
     points = (first.points[met] - lathe.origin) @ lathe.frame.T
     places = first.side[met], first.along[met]
@@ -249,8 +253,8 @@ def followed(
 def lathe_rays(
     lathe: Lathe, view: TrainView, pixels: Tensor, most: int = 1, *, weighted: bool = False
 ) -> tuple[Rays, Hits]:
-    """What pixels (flat indices) of a view observed of the environment by at most that many reflections, and where
-    they met the lathe.
+    """What pixels (flat indices) of a view observed of the environment by at most that many reflections (see
+    `followed`), and where they met the lathe.
 
     If `weighted`, rays have the trust 1/(1 + a/t): a is the square of the larger angle to the next of the given pixels
     by row and by column, t the solid angle of a texel of 0.7°. A pixel near the rim sees a long strip, which says

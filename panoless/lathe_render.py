@@ -75,7 +75,7 @@ class DeepPixels:
     def every(self, stride: int) -> "DeepPixels":
         """Every stride-th pixel."""
         rays = (each.reshape(-1, len(SUBRAYS), 3)[::stride].reshape(-1, 3) for each in (self.origins, self.directions))
-        return DeepPixels(*rays, self.radiance[::stride])
+        return DeepPixels(next(rays), next(rays), self.radiance[::stride])
 
     def shown(self, lathe: Lathe, environment: Float[Tensor, "6 3 L L"]) -> Float[np.ndarray, "P 3"]:
         """The mean of what the rays of each pixel see; black where they miss or have not left after sixteen

@@ -34,6 +34,7 @@ TRUST_SCALE = 0.15
 #: Pixels' worth of an opinion that every surfel starts with, so that one that is hardly seen is hardly believed.
 PRIOR_PIXELS, PRIOR_TRUST = 1.0, 0.2
 TRUST_POWER = 4
+GRAY = 0.5
 
 Geometry = Surfels | Plane | Sheet | Lathe
 
@@ -50,7 +51,8 @@ def observed_rays(views: Views, geometry: Geometry, config: FitConfig, max_rays:
         elif isinstance(geometry, Sheet):
             yield sheet_rays(geometry, view, pixels)
         elif isinstance(geometry, Lathe):
-            yield lathe_rays(geometry, view, pixels, weighted=len(pixels) == len(view.solid))[0]
+            most = 1 if config.environment.trace else 0
+            yield lathe_rays(geometry, view, pixels, most, weighted=len(pixels) == len(view.solid))[0]
         else:
             yield _surfel_rays(view, geometry, config, pixels)[0]
 
@@ -105,6 +107,14 @@ def _thinned(rays: Sequence[Rays], most: float) -> list[Rays]:
     """About `most` of the rays at most: every k-th, beginning elsewhere in each batch."""
     stride = max(1, math.ceil(sum(len(batch.directions) for batch in rays) / most))
     return [batch.every(stride, index % stride) for index, batch in enumerate(rays)]
+
+
+def without_fill(rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"]) -> Float[Tensor, "6 3 L L"]:
+    """A map that is gray where none of the rays fell."""
+    count = torch.zeros_like(environment[:, :1])
+    for batch in rays:
+        count += scatter_cubemap(torch.ones_like(batch.radiance[:, :1]), batch.directions, environment.shape[-1])
+    return torch.where(count > 0, environment, GRAY)
 
 
 def of_mean_trust_one(rays: Sequence[Rays]) -> list[Rays]:

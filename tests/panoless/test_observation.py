@@ -10,7 +10,9 @@ from torch import Tensor
 
 from panoless.cubemap import Rays, solve_environment
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap
+from panoless.lathe import followed, mirrored, pixel_rays
 from panoless.observation import (
+    GRAY,
     PRIOR_TRUST,
     finest_resolution,
     observed_rays,
@@ -18,9 +20,11 @@ from panoless.observation import (
     prediction_error,
     solved_environment,
     surfel_trust,
+    without_fill,
 )
 from panoless.surfels import Surfels
 from panoless.views import Views
+from tests.support.mirror_lathe import around, funnel, lathe_views
 from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
 from tests.support.mirror_sphere import clipped_environment, sphere_surfels, tiny_config
 
@@ -175,3 +179,27 @@ def test_a_map_does_not_depend_on_how_far_all_rays_are_trusted_alike() -> None:
     washed_out = solve_environment([faint], 16)
     assert (usual - truth).abs().mean() < (washed_out - truth).abs().mean() / 2
     assert float(of_mean_trust_one([faint])[0].initial_weight().mean()) == pytest.approx(1.0, rel=1e-5)
+
+
+def test_without_the_fill_only_what_no_ray_met_is_gray() -> None:
+    """The rest is as it was, bit by bit."""
+    filled = torch.rand(6, 3, 16, 16, generator=torch.Generator().manual_seed(3))
+    directions = cubemap_directions(16)[4].reshape(-1, 3).contiguous()
+    bare = without_fill([Rays(directions, directions)], filled)
+    assert torch.equal(bare[4], filled[4])
+    assert (bare[[0, 1, 2, 3, 5], :, 2:-2, 2:-2] == GRAY).all()
+
+
+def test_what_mirrors_itself_votes_only_if_nothing_is_traced() -> None:
+    """In a funnel: traced, the pixels whose mirrored ray leaves; else all that meet it, in its mirrored direction."""
+    views = lathe_views(funnel(), around(4)[2:])
+    whether = [replace(CONFIG, environment=replace(CONFIG.environment, trace=trace)) for trace in (True, False)]
+    traced, blind = ([*observed_rays(views, funnel(), each, 10**6)] for each in whether)
+    for view, some, every in zip(views.train, traced, blind, strict=True):
+        origins, ways = pixel_rays(view.camera, view.solid.numpy())
+        normals = funnel().hits(origins, ways).normals
+        expected = torch.nn.functional.normalize(torch.from_numpy(mirrored(ways, normals)), dim=1)
+        torch.testing.assert_close(every.directions.double(), expected, atol=1e-6, rtol=0)
+        assert len(some.directions) < len(every.directions) == len(view.solid)
+        leaves = torch.from_numpy(followed(funnel(), origins, ways).bounces == 1)
+        torch.testing.assert_close(some.directions, every.directions[leaves], atol=1e-6, rtol=0)
