@@ -117,11 +117,20 @@ TABLES = {
     ),
     "levers": Table(
         "One lever less",
-        "The default without one of its parts, on the scene that is fitted with free surfels; and the ladder, on the "
-        "scenes in which it takes another rung.",
+        "The default without one of its parts, on the scene that is fitted with free surfels; and the ladder, "
+        "self-reflection and fill on the scenes in which it takes another rung, where they act. Their default is in "
+        "*Figures*; what takes part in these models does not depend on the seed.",
         (
             *(Row(name, "sculpture", arguments) for name, arguments in LEVERS),
             *(Row("no ladder", scene, ("--model", "surfels")) for scene in SCENES[:-1]),
+            *(
+                Row(name, scene, (f"--config.environment.no-{option}",), one_seed=True)
+                for name, option, scenes in (
+                    ("self-reflecting pixels vote in the map", "trace", SCENES[:-1]),
+                    ("no fill", "fill", ("mirror", "deformed-mirror")),
+                )
+                for scene in scenes
+            ),
         ),
     ),
     "counts": Table(
