@@ -9,8 +9,9 @@ light above s is told by pixels that see a lamp in part.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -33,9 +34,9 @@ SATURATED = 0.998
 """Share of the largest value from which a pixel or a texel counts as saturated."""
 CEILING = 4.0
 """Largest radiance of a map, over that of views."""
-TRACED_EVERY = 4
-COARSE_RESOLUTION, COARSE_ROUNDS, COARSE_STEPS = 16, 2, 6
-COARSE_SCALE = 0.3
+MOST_TRACED = 60_000
+COARSE_RESOLUTION, COARSE_ROUNDS, COARSE_STEPS = 8, 2, 6
+COARSE_SCALE = 0.5
 """Of robust weights; where a lamp is too dark by its half, pixels that see it in part must keep their votes."""
 
 Linear = Callable[[Tensor], Tensor]
@@ -75,26 +76,25 @@ def sharpened_map(
     It lies between 0 and that, or four times that where pixels are saturated. Before each round of steps of the whole
     map, coarse ones brighten what is saturated in E₀ and around: there neighbors tell texels that nothing does.
     """
-    chosen = _chosen_views(views)
-    areas = _smooth_areas(chosen, lathe)
-    if not areas:
+    pixels = _divided(views, lathe)
+    if not pixels.smooth:
         return environment
     saturation = saturation.to(environment)
-    lit = torch.stack([(each.radiance >= SATURATED * saturation).any(0) for each in areas]).any(0)
+    lit = torch.stack([(each.radiance >= SATURATED * saturation).any(0) for each in pixels.smooth]).any(0)
     highest = (saturation * torch.where(lit, CEILING, 1.0))[:, None, None]
     inner = _eroded(environment >= SATURATED * saturation[:, None, None])
-    traced = [_traced_areas(chosen[::TRACED_EVERY], lathe)] if inner.any() else []
+    others = pixels.traced(lathe) if inner.any() else None
     for _ in range(ROUNDS):
-        if traced:
-            environment = _brightened(environment, traced, inner, saturation).minimum(highest)
-        change = _change(environment, areas, saturation, ROBUST_SCALE, STEPS)
+        if others is not None:
+            environment = _brightened(environment, others, inner, saturation).minimum(highest)
+        change = _change(environment, pixels.smooth, saturation, ROBUST_SCALE, STEPS)
         environment = (environment + change).clamp(min=0).minimum(highest)
     return environment
 
 
 def _brightened(
     environment: Float[Tensor, "6 3 L L"],
-    areas: Sequence[Areas],
+    areas: Areas,
     inner: Float[Tensor, "6 3 L L"],
     saturation: Float[Tensor, "3"],
 ) -> Float[Tensor, "6 3 L L"]:
@@ -110,7 +110,7 @@ def _brightened(
 
     lowest = environment.minimum(saturation[:, None, None])
     for _ in range(COARSE_ROUNDS):
-        change = _change(environment, areas, saturation, COARSE_SCALE, COARSE_STEPS, finer, coarser)
+        change = _change(environment, [areas], saturation, COARSE_SCALE, COARSE_STEPS, finer, coarser)
         environment = (environment + change).maximum(lowest)
     return environment
 
@@ -130,14 +130,15 @@ def _change(
 ) -> Float[Tensor, "6 3 L L"]:
     """min_X Σ w ‖A (E + B X) − c‖² + λ ‖X‖²: steps of conjugate gradients from zero; B X.
 
-    B is `finer` and `coarser` its adjoint. The sums of the rows precondition.
+    B is `finer` and `coarser` its adjoint. The weight that lies on each texel preconditions.
     """
     resolution = environment.shape[-1]
-    weights, residual = [], torch.zeros_like(environment)
+    weights, residual, total = [], torch.zeros_like(environment), torch.zeros_like(environment)
     for each in areas:
         seen = each.seen(environment)
         weights.append(each.weights(seen, saturation, scale))
         residual += each.spread((each.radiance - seen) * weights[-1], resolution)
+        total += each.spread(weights[-1], resolution)
 
     def normal(change: Tensor) -> Tensor:
         image = finer(change)
@@ -147,7 +148,7 @@ def _change(
         return PULL * change + coarser(found)
 
     right_side = coarser(residual)
-    precondition = 1 / normal(torch.ones_like(right_side))
+    precondition = 1 / (PULL + coarser(total))
     return finer(conjugate_gradients(normal, torch.zeros_like(right_side), right_side, precondition, steps))
 
 
@@ -156,33 +157,39 @@ def _eroded(mask: Tensor) -> Float[Tensor, "6 3 L L"]:
     return -max_pool2d(-mask.float(), 3, 1, 1)
 
 
-def _chosen_views(views: Views) -> Sequence[TrainView]:
-    """Evenly chosen views that hold no more than `MOST_PIXELS`."""
+@dataclass(frozen=True)
+class Divided:
+    """Pixels of some views by whether the directions over their areas are known from those of their neighbors."""
+
+    views: Sequence[TrainView]
+    smooth: list[Areas]
+    """Of those that see the environment at once, a few views to a batch."""
+    others: list[Int[np.ndarray, "_"]]
+    """Flat indices, a view each."""
+
+    def traced(self, lathe: Lathe) -> Areas:
+        """About `MOST_TRACED` of the others, as far as all of their rays leave, however often they are mirrored."""
+        stride = -(-sum(map(len, self.others)) // MOST_TRACED)
+        chosen = [pixels[index % stride :: stride] for index, pixels in enumerate(self.others)]
+        found, device = pixel_areas(self.views, lathe, chosen), self.views[0].radiance.device
+        directions = torch.from_numpy(found.outgoing.reshape(-1, len(SUBRAYS), 3)).float().to(device)
+        return Areas(directions, torch.from_numpy(found.radiance).float().to(device))
+
+
+def _divided(views: Views, lathe: Lathe) -> Divided:
+    """All pixels of evenly chosen views."""
     stride = -(-sum(len(view.solid) for view in views.train) // MOST_PIXELS)
-    return views.train[:: max(stride, 1)]
-
-
-def _smooth_areas(views: Sequence[TrainView], lathe: Lathe) -> list[Areas]:
-    """All smooth pixels that see the environment at once, a few views to a batch."""
-    found = []
-    for view in views:
-        at, smooth = smooth_pixels(lathe, view.camera, view.solid.cpu().numpy(), 1)
+    chosen = views.train[:: max(stride, 1)]
+    found, others = [], []
+    for view in chosen:
+        places = view.solid.cpu().numpy()
+        at, smooth = smooth_pixels(lathe, view.camera, places, 1)
         pixels = view.solid[torch.from_numpy(smooth).to(view.solid.device)]
         directions = torch.stack(list(at.within(OFFSETS)), 1).to(view.radiance.device)
         found.append(Areas(directions, view.radiance.flatten(1)[:, pixels].T.contiguous()))
+        others.append(places[~smooth])
     joined = [_joined(found[first : first + BATCH_VIEWS]) for first in range(0, len(found), BATCH_VIEWS)]
-    return [each for each in joined if len(each.radiance)]
-
-
-def _traced_areas(views: Sequence[TrainView], lathe: Lathe) -> Areas:
-    """All other pixels, as far as all of their rays leave, however often they are mirrored."""
-    pixels = []
-    for view in views:
-        places = view.solid.cpu().numpy()
-        pixels.append(places[~smooth_pixels(lathe, view.camera, places, 1)[1]])
-    found, device = pixel_areas(views, lathe, pixels), views[0].radiance.device
-    directions = torch.from_numpy(found.outgoing.reshape(-1, len(SUBRAYS), 3)).float().to(device)
-    return Areas(directions, torch.from_numpy(found.radiance).float().to(device))
+    return Divided(chosen, [each for each in joined if len(each.radiance)], others)
 
 
 def _joined(areas: Sequence[Areas]) -> Areas:
