@@ -30,8 +30,8 @@ PULL = 0.2
 BATCH_VIEWS = 4
 ROUNDS, STEPS = 4, 2
 """Weights are found anew in every round of so many steps."""
-SATURATED = 0.998
-"""Share of the largest value from which a pixel or a texel counts as saturated."""
+SATURATED, LIT = 0.998, 0.95
+"""Shares of the largest value from which a pixel, and a texel of E₀, count as saturated."""
 CEILING = 4.0
 """Largest radiance of a map, over that of views."""
 MOST_TRACED = 60_000
@@ -82,7 +82,7 @@ def sharpened_map(
     saturation = saturation.to(environment)
     lit = torch.stack([(each.radiance >= SATURATED * saturation).any(0) for each in pixels.smooth]).any(0)
     highest = (saturation * torch.where(lit, CEILING, 1.0))[:, None, None]
-    inner = _eroded(environment >= SATURATED * saturation[:, None, None])
+    inner = _eroded(environment >= LIT * saturation[:, None, None])
     others = pixels.traced(lathe) if inner.any() else None
     for _ in range(ROUNDS):
         if others is not None:
