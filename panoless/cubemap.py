@@ -157,14 +157,15 @@ def conjugate_gradients(
     product: Callable[[Float[Tensor, "6 C L L"]], Float[Tensor, "6 C L L"]],
     start: Float[Tensor, "6 C L L"],
     residual: Float[Tensor, "6 C L L"],
-    precondition: Float[Tensor, "6 1 L L"],
+    precondition: Float[Tensor, "6 _ L L"],
+    steps: int = CONJUGATE_GRADIENT_STEPS,
 ) -> Float[Tensor, "6 C L L"]:
-    """Six steps on A x = b from a start, with its residual b − A x and the inverse of a diagonal near to A's."""
+    """Steps on A x = b from a start, with its residual b − A x and the inverse of a diagonal near to A's."""
     result, residual = start.clone(), residual.clone()
     scaled = precondition * residual
     direction = scaled.clone()
     energy = (residual * scaled).sum()
-    for _ in range(CONJUGATE_GRADIENT_STEPS):
+    for _ in range(steps):
         ahead = product(direction)
         step = energy / (direction * ahead).sum().clamp(min=1e-12)
         result += step * direction

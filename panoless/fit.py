@@ -311,7 +311,8 @@ def complete(state: FitState, views: Views, config: FitConfig) -> None:
         if config.visibility == "online" and not state.stepless:
             state.visibility = visibility_from_evidence(state.evidence)
         else:
-            state.visibility = visibility_from_agreement(agreement(rays, state.final_environment))
+            found = agreement(rays, state.final_environment, light_of(config).saturation)
+            state.visibility = visibility_from_agreement(found)
         state.final_environment = light_of(config).decoded(state.final_environment)
 
 

@@ -1,21 +1,26 @@
 """The map of a surface of revolution, sharpened: a pixel saw the mean over its area, not the light of one direction.
 
 For pixels whose directions are known over their whole area, min_E Σ w ‖mean_k E(ω_k) − c‖² + λ ‖E − E₀‖², over 2×2
-directions ω_k of each and with E₀ the map of pixel centers, by conjugate gradients.
+directions ω_k of each, by conjugate gradients from the map E₀ of pixel centers. What a view shows as its largest value s
+was at least that: c = min(s, mean_k E(ω_k)). So a saturated pixel has no error while its prediction saturates too, and
+light above s is told by pixels that see a lamp in part.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
-from panoless.cubemap import conjugate_gradients, robust_weight
-from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap
+from panoless.cubemap import conjugate_gradients, resample, robust_weight
+from panoless.kernels.cubemap import cubemap_directions, sample_cubemap, scatter_cubemap
 from panoless.lathe import Lathe
+from panoless.lathe_pixels import SUBRAYS, pixel_areas
 from panoless.lathe_render import smooth_pixels
-from panoless.views import Views
+from panoless.views import TrainView, Views
 
 OFFSETS = (-0.25, 0.25)
 MOST_PIXELS = 3_500_000
@@ -23,60 +28,168 @@ ROBUST_SCALE = 0.08
 PULL = 0.2
 """λ, in rays."""
 BATCH_VIEWS = 4
+ROUNDS, STEPS = 4, 2
+"""Weights are found anew in every round of so many steps."""
+SATURATED, LIT = 0.998, 0.95
+"""Shares of the largest value from which a pixel, and a texel of E₀, count as saturated."""
+CEILING = 4.0
+"""Largest radiance of a map, over that of views."""
+MOST_TRACED = 60_000
+COARSE_RESOLUTION, COARSE_ROUNDS, COARSE_STEPS = 8, 2, 6
+COARSE_SCALE = 0.5
+"""Of robust weights; where a lamp is too dark by its half, pixels that see it in part must keep their votes."""
+
+Linear = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
 class Areas:
-    """Directions over the area of each pixel, and the mean radiance seen there."""
+    """K directions over the area of each pixel, and the mean radiance seen there."""
 
-    directions: Float[Tensor, "P 4 3"]
+    directions: Float[Tensor, "P K 3"]
     radiance: Float[Tensor, "P 3"]
 
     def seen(self, environment: Float[Tensor, "6 C L L"]) -> Float[Tensor, "P C"]:
         """Means of the map over the areas."""
-        return sample_cubemap(environment, self.directions.flatten(0, 1)).unflatten(0, (-1, 4)).mean(1)
+        count = self.directions.shape[1]
+        return sample_cubemap(environment, self.directions.flatten(0, 1)).unflatten(0, (-1, count)).mean(1)
 
     def spread(self, values: Float[Tensor, "P C"], resolution: int) -> Float[Tensor, "6 C L L"]:
         """The adjoint of `seen`."""
-        each = (values[:, None] / 4).expand(-1, 4, -1).flatten(0, 1).contiguous()
+        count = self.directions.shape[1]
+        each = (values[:, None] / count).expand(-1, count, -1).flatten(0, 1).contiguous()
         return scatter_cubemap(each, self.directions.flatten(0, 1), resolution)
 
+    def weights(
+        self, seen: Float[Tensor, "P 3"], saturation: Float[Tensor, "3"], scale: float
+    ) -> Float[Tensor, "P 3"]:
+        """Robust weights of the errors of what is seen of a map; zero where it and the pixel are saturated."""
+        weight = robust_weight(seen.minimum(saturation) - self.radiance, scale)[:, None]
+        return weight * ~(seen.minimum(self.radiance) >= SATURATED * saturation)
 
-def sharpened_map(views: Views, lathe: Lathe, environment: Float[Tensor, "6 3 L L"]) -> Float[Tensor, "6 3 L L"]:
-    """The map E₀ of pixel centers, sharpened; texels that no area touches stay. It lies between 0 and the brightest
-    pixel, or 1 where that is more.
+
+def sharpened_map(
+    views: Views, lathe: Lathe, environment: Float[Tensor, "6 3 L L"], saturation: Float[Tensor, "3"]
+) -> Float[Tensor, "6 3 L L"]:
+    """The map E₀ of pixel centers, sharpened; texels that no area touches stay. Views are clipped at `saturation`.
+
+    It lies between 0 and that, or four times that where pixels are saturated. Before each round of steps of the whole
+    map, coarse ones brighten what is saturated in E₀ and around: there neighbors tell texels that nothing does.
     """
-    areas = _areas(views, lathe)
-    if not areas:
+    pixels = _divided(views, lathe)
+    if not pixels.smooth:
         return environment
-    resolution = environment.shape[-1]
-    weights = [robust_weight(each.seen(environment) - each.radiance, ROBUST_SCALE)[:, None] for each in areas]
+    saturation = saturation.to(environment)
+    lit = torch.stack([(each.radiance >= SATURATED * saturation).any(0) for each in pixels.smooth]).any(0)
+    highest = (saturation * torch.where(lit, CEILING, 1.0))[:, None, None]
+    inner = _eroded(environment >= LIT * saturation[:, None, None])
+    others = pixels.traced(lathe) if inner.any() else None
+    for _ in range(ROUNDS):
+        if others is not None:
+            environment = _brightened(environment, others, inner, saturation).minimum(highest)
+        change = _change(environment, pixels.smooth, saturation, ROBUST_SCALE, STEPS)
+        environment = (environment + change).clamp(min=0).minimum(highest)
+    return environment
 
-    def normal(image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "6 C L L"]:
-        found = PULL * image
+
+def _brightened(
+    environment: Float[Tensor, "6 3 L L"],
+    areas: Areas,
+    inner: Float[Tensor, "6 3 L L"],
+    saturation: Float[Tensor, "3"],
+) -> Float[Tensor, "6 3 L L"]:
+    """The map plus what a coarse one adds within saturated regions; nothing there falls below saturation for it."""
+    resolution = environment.shape[-1]
+    texels = cubemap_directions(resolution, device=environment.device).reshape(-1, 3)
+
+    def finer(coarse: Float[Tensor, "6 C M M"]) -> Float[Tensor, "6 C L L"]:
+        return inner * resample(coarse, resolution)
+
+    def coarser(image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "6 C M M"]:
+        return scatter_cubemap((inner * image).permute(0, 2, 3, 1).reshape(len(texels), -1), texels, COARSE_RESOLUTION)
+
+    lowest = environment.minimum(saturation[:, None, None])
+    for _ in range(COARSE_ROUNDS):
+        change = _change(environment, [areas], saturation, COARSE_SCALE, COARSE_STEPS, finer, coarser)
+        environment = (environment + change).maximum(lowest)
+    return environment
+
+
+def _same(image: Tensor) -> Tensor:
+    return image
+
+
+def _change(
+    environment: Float[Tensor, "6 3 L L"],
+    areas: Sequence[Areas],
+    saturation: Float[Tensor, "3"],
+    scale: float,
+    steps: int,
+    finer: Linear = _same,
+    coarser: Linear = _same,
+) -> Float[Tensor, "6 3 L L"]:
+    """min_X Σ w ‖A (E + B X) − c‖² + λ ‖X‖²: steps of conjugate gradients from zero; B X.
+
+    B is `finer` and `coarser` its adjoint. The weight that lies on each texel preconditions.
+    """
+    resolution = environment.shape[-1]
+    weights, residual, total = [], torch.zeros_like(environment), torch.zeros_like(environment)
+    for each in areas:
+        seen = each.seen(environment)
+        weights.append(each.weights(seen, saturation, scale))
+        residual += each.spread((each.radiance - seen) * weights[-1], resolution)
+        total += each.spread(weights[-1], resolution)
+
+    def normal(change: Tensor) -> Tensor:
+        image = finer(change)
+        found = torch.zeros_like(image)
         for each, weight in zip(areas, weights, strict=True):
             found += each.spread(each.seen(image) * weight, resolution)
-        return found
+        return PULL * change + coarser(found)
 
-    diagonal, residual = torch.full_like(environment[:, :1], PULL), torch.zeros_like(environment)
-    for each, weight in zip(areas, weights, strict=True):
-        diagonal += each.spread(weight, resolution)
-        residual += each.spread((each.radiance - each.seen(environment)) * weight, resolution)
-    result = conjugate_gradients(normal, environment, residual, 1 / diagonal)
-    return result.clamp(0, max([1.0, *(float(each.radiance.max()) for each in areas)]))
+    right_side = coarser(residual)
+    precondition = 1 / (PULL + coarser(total))
+    return finer(conjugate_gradients(normal, torch.zeros_like(right_side), right_side, precondition, steps))
 
 
-def _areas(views: Views, lathe: Lathe) -> list[Areas]:
-    """All smooth pixels of evenly chosen views that see the environment at once, a few views to a batch."""
+def _eroded(mask: Tensor) -> Float[Tensor, "6 3 L L"]:
+    """1 where a texel and its eight neighbors on the same face are in a mask, and 0 elsewhere."""
+    return -max_pool2d(-mask.float(), 3, 1, 1)
+
+
+@dataclass(frozen=True)
+class Divided:
+    """Pixels of some views by whether the directions over their areas are known from those of their neighbors."""
+
+    views: Sequence[TrainView]
+    smooth: list[Areas]
+    """Of those that see the environment at once, a few views to a batch."""
+    others: list[Int[np.ndarray, "_"]]
+    """Flat indices, a view each."""
+
+    def traced(self, lathe: Lathe) -> Areas:
+        """About `MOST_TRACED` of the others, as far as all of their rays leave, however often they are mirrored."""
+        stride = -(-sum(map(len, self.others)) // MOST_TRACED)
+        chosen = [pixels[index % stride :: stride] for index, pixels in enumerate(self.others)]
+        found, device = pixel_areas(self.views, lathe, chosen), self.views[0].radiance.device
+        directions = torch.from_numpy(found.outgoing.reshape(-1, len(SUBRAYS), 3)).float().to(device)
+        return Areas(directions, torch.from_numpy(found.radiance).float().to(device))
+
+
+def _divided(views: Views, lathe: Lathe) -> Divided:
+    """All pixels of evenly chosen views."""
     stride = -(-sum(len(view.solid) for view in views.train) // MOST_PIXELS)
-    found = []
-    for view in views.train[:: max(stride, 1)]:
-        at, smooth = smooth_pixels(lathe, view.camera, view.solid.cpu().numpy(), 1)
+    chosen = views.train[:: max(stride, 1)]
+    found, others = [], []
+    for view in chosen:
+        places = view.solid.cpu().numpy()
+        at, smooth = smooth_pixels(lathe, view.camera, places, 1)
         pixels = view.solid[torch.from_numpy(smooth).to(view.solid.device)]
         directions = torch.stack(list(at.within(OFFSETS)), 1).to(view.radiance.device)
         found.append(Areas(directions, view.radiance.flatten(1)[:, pixels].T.contiguous()))
+        others.append(places[~smooth])
     joined = [_joined(found[first : first + BATCH_VIEWS]) for first in range(0, len(found), BATCH_VIEWS)]
-    return [each for each in joined if len(each.radiance)]
+    return Divided(chosen, [each for each in joined if len(each.radiance)], others)
 
 
 def _joined(areas: Sequence[Areas]) -> Areas:

@@ -1,5 +1,6 @@
 """The light in which a fit works: how the radiance of pixels is encoded before it, and the map's decoded after it."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,6 +47,11 @@ class Light:
         if not self.high_dynamic_range:
             return radiance
         return np.where(radiance > 1, 1 + np.log(np.maximum(radiance, 1)), radiance)
+
+    @property
+    def saturation(self) -> Float[Tensor, "3"]:
+        """The largest encoded radiance that a view can show: 1/F, or ∞ with a high dynamic range."""
+        return torch.full((3,), math.inf) if self.high_dynamic_range else 1 / torch.tensor(self.tint)
 
     def decoded(self, environment: Float[Tensor, "6 3 L L"]) -> Float[Tensor, "6 3 L L"]:
         """f⁻¹ of a map: the radiance of the environment itself, before any mirror."""

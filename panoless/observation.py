@@ -14,6 +14,7 @@ from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap
 from panoless.kernels.rasterize import Channels, RasterBuffers
 from panoless.lathe import Lathe, lathe_rays
 from panoless.lathe_map import sharpened_map
+from panoless.light import light_of
 from panoless.plane import Plane, plane_buffers
 from panoless.shading import ALPHA_FLOOR, rasterize_surfels, reflection_directions_world, tiles_of
 from panoless.sheet import Sheet, sheet_rays
@@ -86,8 +87,9 @@ def solved_environment(
         rays = list(observed_rays(views, geometry, config, config.environment.rays))
         resolution = config.environment.solve_resolution or densest_resolution(rays)
         found = solve_environment(of_mean_trust_one(rays), resolution)
-        if isinstance(geometry, Lathe) and config.environment.range != "hdr":
-            found = sharpened_map(views, geometry, found)
+        light = light_of(config)
+        if isinstance(geometry, Lathe) and not light.high_dynamic_range:
+            found = sharpened_map(views, geometry, found, light.saturation)
         return found, rays
     seen = [
         (view, *_surfel_rays(view, geometry, config, pixels))

@@ -1,5 +1,6 @@
 """How well each direction of the environment was observed (paper Sec. 3.5)."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -58,13 +59,19 @@ def visibility_from_evidence(evidence: Float[Tensor, "6 L L"]) -> Float[Tensor, 
     return (density / torch.quantile(observed[:: max(1, len(observed) // 100_000)], SATURATING_QUANTILE)).clamp(0, 1)
 
 
-def agreement(rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"]) -> Agreement:
-    """Weigh each ray by t (1 + ‖e‖²/s²)⁻², t its trust and s = 0.05 (linear); average its sRGB residual by texel."""
+def agreement(
+    rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"], saturation: Float[Tensor, "3"] | None = None
+) -> Agreement:
+    """Weigh each ray by t (1 + ‖e‖²/s²)⁻², t its trust and s = 0.05 (linear); average its sRGB residual by texel.
+
+    Rays end at `saturation`, if given: there a map may be brighter and agrees.
+    """
+    saturation = environment.new_full((3,), math.inf) if saturation is None else saturation.to(environment)
     resolution = environment.shape[-1]
     votes = environment.new_zeros(6, resolution, resolution)
     residual, trusted = torch.zeros_like(votes), torch.zeros_like(votes)
     for batch in rays:
-        seen = sample_cubemap(environment, batch.directions)
+        seen = sample_cubemap(environment, batch.directions).minimum(saturation)
         trust = batch.initial_weight()
         weight = trust * robust_weight(seen - batch.radiance, VOTE_SCALE)
         difference = (_srgb(seen) - _srgb(batch.radiance)).abs().mean(1)
@@ -73,7 +80,7 @@ def agreement(rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"]) -> Ag
         residual += summed[:, 1]
         trusted += summed[:, 2]
     share = (votes / trusted.clamp(min=1e-6)).clamp(max=1)
-    return Agreement(votes, share, residual / votes.clamp(min=1e-6), _contrast(environment.mean(1)))
+    return Agreement(votes, share, residual / votes.clamp(min=1e-6), _contrast(environment.minimum(saturation[:, None, None]).mean(1)))
 
 
 def _contrast(radiance: Float[Tensor, "6 L L"]) -> Float[Tensor, "6 L L"]:

@@ -52,6 +52,20 @@ def test_the_encoding_is_smooth_increasing_and_the_identity_up_to_one() -> None:
     assert np.abs(np.diff(slope)).max() < 0.002
 
 
+def test_no_view_is_brighter_than_saturation(tmp_path: Path) -> None:
+    """Encoded radiance ends at 1/F of each channel with a low dynamic range, and nowhere with a high one."""
+    dataset = make_sphere_dataset(tmp_path)
+    for light in (USUAL, Light(tint=TINT), HDR):
+        frame = dataset.train[0]
+        view = read_view(frame)
+        bright = replace(view, radiance=4 * np.ones_like(view.radiance))
+        encoded = torch.from_numpy(light.encoded(light.clipped(frame, bright))).float()
+        if light.high_dynamic_range:
+            assert bool(light.saturation.isinf().all())
+        else:
+            torch.testing.assert_close(encoded.amax((0, 1)), light.saturation)
+
+
 def test_the_usual_light_changes_nothing() -> None:
     radiance = np.random.default_rng(0).random((4, 5, 3)).astype(np.float32)
     environment = torch.rand(6, 3, 4, 4)

@@ -148,3 +148,15 @@ def test_rays_that_the_others_outvote_lower_the_confidence() -> None:
     alone, disputed = (visibility_from_agreement(agreement(rays, environment)) for rays in ([batch], [batch, wrong]))
     seen = alone > 0
     assert bool((disputed[seen] < 0.6 * alone[seen]).all())
+
+
+def test_a_map_brighter_than_rays_can_show_agrees_with_them() -> None:
+    """Rays end at 1. What lies above says nothing against a map: not by votes, nor by disagreement, nor by contrast."""
+    batch, environment = agreeing_rays(0.0)
+    clipped = replace(batch, radiance=torch.ones_like(batch.radiance))
+    environment[:] = 1.0
+    brighter = environment + torch.rand(environment.shape, generator=torch.Generator().manual_seed(2))
+    ended, bright = (agreement([clipped], each, torch.ones(3)) for each in (environment, brighter))
+    for name in vars(ended):
+        assert torch.equal(getattr(bright, name), getattr(ended, name))
+    assert float(agreement([clipped], brighter).disagreement.max()) > 0.1
