@@ -24,7 +24,7 @@ from shinypartial.dataset.read import read_view
 from shinypartial.dataset.schema import Dataset
 from shinypartial.errors import InputError
 from tests.panoless.conftest import FinishedFit
-from tests.support.mirror_sphere import clipped_environment, sphere_surfels, tiny_config
+from tests.support.mirror_sphere import clipped_environment, tiny_config
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -251,23 +251,12 @@ def test_rates_and_sizes_are_those_of_the_scene_that_they_are_shares_of(tmp_path
     for fitter in (first, second):
         fitter._step(0)
     steps = [
-        (fitter.optimizer.surfels.means - start).abs().amax()
+        float((fitter.optimizer.surfels.means.detach() - start).abs().amax())
         for fitter, start in zip((first, second), moved, strict=True)
     ]
-    ratios.append(float(steps[0] / steps[1]))
+    ratios.append(steps[0] / steps[1])
     assert ratios == pytest.approx([views.camera_extent] * 3, rel=1e-3)
     assert views.camera_extent > 1.5
-
-
-def test_surfels_come_back_from_a_reset(tmp_path: Path, views: Views) -> None:
-    """A round of pruning a hundred steps after an opacity reset must not remove what was opaque before."""
-    config = tiny_config("paper", iterations=45_000, count=60)
-    config = replace(config, density=PRESETS["paper"].density, crop_margin_px=12)
-    state = new_state(views, config, sphere_surfels(300))
-    fitter = Fitter(views, config, tmp_path, state)
-    for iteration in range(3000, 3101):
-        fitter._step(iteration)
-    assert fitter.optimizer.surfels.count >= 150
 
 
 def test_a_loss_that_is_not_finite_stops_the_fit(tmp_path: Path, sphere_dataset: Dataset, monkeypatch) -> None:

@@ -44,6 +44,7 @@ def test_the_paper_preset_has_the_published_schedule() -> None:
     assert events(config, "opacity_reset") == [3000, 6000, 9000]
     assert (schedule.lambda_silhouette(2999), schedule.lambda_silhouette(3000)) == (1.0, 0.0)
     assert schedule.geometry_moves(0)
+    assert (config.rates.square_memory, config.scene_radius) == (0.999, "cameras")
     assert {schedule.rate_factor(iteration) for iteration in (0, 20_000, 44_999)} == {1.0}
 
 
