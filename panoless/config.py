@@ -97,12 +97,16 @@ class DensityConfig:
     """Mean screen-space gradient (per half image width) above which a surfel is cloned or split."""
     dense_share: float = 0.01
     """Surfels larger than this share of the scene's radius are split, smaller ones cloned."""
+    prune_share: float = 0.5
+    """Surfels larger than this share of the scene's radius are removed."""
     prune_opacity: float = 0.1
     """Surfels below this opacity are removed."""
     reset_every: float = 3000 / 45000
     """Share of the iterations between two opacity resets."""
     propagate_every: float = 1000 / 45000
     """Share of the iterations between two rounds of normal propagation; 0 turns it off."""
+    propagate_until: float = 3000 / 45000
+    """Share of the iterations after which there is none: it widens outlines, which only the silhouette term undoes."""
     max_surfels: int = 100_000
     """Growth stops at this number."""
 
@@ -112,6 +116,7 @@ class RateConfig:
     """Learning rates of Adam, in the normalized frame; constant at first, then falling, which improves the normals."""
 
     means: float = 1e-4
+    """In units of the scene's radius."""
     quats: float = 2e-3
     log_scales: float = 3e-3
     opacity_logits: float = 2e-2
@@ -123,6 +128,10 @@ class RateConfig:
     """Share of the iterations after which every rate falls geometrically."""
     drop_factor: float = 0.01
     """Factor of the rates at the last iteration."""
+    means_fall_until: float = 0.0
+    """Share of the iterations over which the means' rate falls to a hundredth; 0: it does not."""
+    square_memory: float = 0.99
+    """β₂ of Adam, the decay of the mean squared gradient that steps are divided by."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +161,9 @@ class FitConfig:
     """Work on the mask's bounding box with this margin; −1 works on whole images."""
     visibility: Literal["final", "online"] = "final"
     """`online`: evidence of every iteration, as in the paper; `final`: how far rays of the converged geometry agree."""
+    scene_radius: Literal["object", "cameras"] = "object"
+    """What the means' rate and the sizes of density control are shares of: the radius of the object, or 1.1 × the
+    largest distance of a camera from the cameras' mean (Kerbl et al. 2023)."""
     visibility_alpha: float = 0.5
     """τ: only pixels with alpha above it count as observations."""
     surfels: SurfelConfig = field(default_factory=SurfelConfig)
@@ -169,6 +181,7 @@ _PAPER = FitConfig(
     alpha_applied="paper",
     crop_margin_px=-1,
     visibility="online",
+    scene_radius="cameras",
     surfels=SurfelConfig(initial="random", count=100_000, curved=False),
     environment=EnvironmentConfig(activation="sigmoid", warmup=0.0, solve=False),
     loss=LossConfig(
@@ -177,7 +190,7 @@ _PAPER = FitConfig(
         silhouette_until=3000 / 45000,
         random_background=True,
     ),
-    density=DensityConfig(enabled=True, max_surfels=200_000),
+    density=DensityConfig(enabled=True, prune_share=0.1, max_surfels=200_000),
     rates=RateConfig(
         means=1.6e-4,
         quats=1e-3,
@@ -186,6 +199,8 @@ _PAPER = FitConfig(
         albedo=2.5e-3,
         environment=2e-2,
         drop_at=1.0,
+        means_fall_until=30000 / 45000,
+        square_memory=0.999,
     ),
 )
 
@@ -272,6 +287,8 @@ def check_config(config: FitConfig) -> None:
             low = 0
             open_ended = name.startswith(("rates.", "loss.lambda_")) and name not in (
                 "rates.drop_at",
+                "rates.means_fall_until",
+                "rates.square_memory",
                 "loss.lambda_ssim",
             )
             high = math.inf if open_ended else 1

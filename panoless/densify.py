@@ -16,7 +16,6 @@ SPLIT_SHRINK = 0.8 * SPLIT_INTO
 RESET_OPACITY = 0.01
 PROPAGATED_OPACITY = 0.9
 PROPAGATION_GROWTH = 1.5
-LARGEST_SCALE = 0.5
 
 
 @dataclass
@@ -79,7 +78,7 @@ def grow_and_prune(
     merged = Surfels(**{name: torch.cat([part.named()[name] for part in parts]) for name in surfels.named()})
     source = torch.cat([kept, clones, children])
     unchanged = torch.arange(len(source), device=source.device) < len(kept)
-    alive = merged.scales.amax(1) < LARGEST_SCALE
+    alive = merged.scales.amax(1) < config.prune_share
     if prune_faint:
         alive &= merged.opacities >= config.prune_opacity
     if not alive.any():

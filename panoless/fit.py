@@ -16,7 +16,7 @@ from torch import Tensor
 from panoless.checkpoint import FitState, claim_run, load_state, save_state
 from panoless.config import FitConfig, check_config
 from panoless.cubemap import initial_environment, look_up, resample, solve_environment
-from panoless.densify import DensityStatistics, Edit, grow_and_prune, propagate_normals, reset_opacities
+from panoless.densify import DensityStatistics, grow_and_prune, propagate_normals, reset_opacities
 from panoless.initialize import initial_surfels, surfels_on_lathe, surfels_on_plane, surfels_on_sheet
 from panoless.kernels.adam import UNBOUNDED
 from panoless.kernels.backend import gpu_kernels_installed
@@ -80,7 +80,11 @@ class Fitter:
         self._epoch, self._order = -1, list[int]()
         self._phases = dict[tuple[bool, float], Phase]()
         self._brightest = max(1.0, *(float(view.radiance.max()) for view in views.train))
-        self.optimizer = SurfelOptimizer(state.surfels, state.environment, config.rates)
+        unit = views.camera_extent if config.scene_radius == "cameras" else 1.0
+        rates = replace(config.rates, means=config.rates.means * unit)
+        shares = config.density.dense_share * unit, config.density.prune_share * unit
+        self._density = replace(config.density, dense_share=shares[0], prune_share=shares[1])
+        self.optimizer = SurfelOptimizer(state.surfels, state.environment, rates)
         if state.optimizer:
             self.optimizer.load_state_dict(state.optimizer)
         self.statistics = DensityStatistics(state.gradient_sum, state.gradient_count)
@@ -90,8 +94,7 @@ class Fitter:
             "roughness_logits": config.loss.roughness_weighted,
         }
         self._frozen = frozenset(name for name, learned in frozen.items() if not learned)
-        for name in self._frozen:
-            getattr(self.optimizer.surfels, name).requires_grad_(False)
+        self._freeze()
 
     def run(self) -> None:
         """Optimize to the last iteration and complete the state."""
@@ -142,6 +145,7 @@ class Fitter:
             self.schedule.rate_factor(iteration),
             geometry=phase.geometry_moves,
             frozen=self._frozen,
+            means_factor=self.schedule.means_factor(iteration),
             environment_bounds=(0, self._brightest) if self.config.environment.activation == "clamp" else UNBOUNDED,
         )
         if observed is not None:
@@ -236,16 +240,16 @@ class Fitter:
         if self.schedule.density_round(iteration):
             generator = self._generator(iteration, 2)
             prune_faint = self.schedule.opacities_recovered(iteration)
-            edit = grow_and_prune(surfels, self.statistics, self.config.density, generator, prune_faint=prune_faint)
-            self._apply(edit)
+            edit = grow_and_prune(surfels, self.statistics, self._density, generator, prune_faint=prune_faint)
+            self.optimizer.edit_surfels(edit.surfels, edit.source, edit.unchanged)
             self.statistics = DensityStatistics.empty(self.optimizer.surfels.count, surfels.means.device)
         if self.schedule.opacity_reset(iteration):
-            self._apply(_whole(reset_opacities(self.optimizer.surfels)))
+            self.optimizer.set_values(reset_opacities(self.optimizer.surfels))
         elif self.schedule.propagation(iteration):
-            self._apply(_whole(propagate_normals(self.optimizer.surfels)))
+            self.optimizer.set_values(propagate_normals(self.optimizer.surfels))
+        self._freeze()
 
-    def _apply(self, edit: Edit) -> None:
-        self.optimizer.edit_surfels(edit.surfels, edit.source, edit.unchanged)
+    def _freeze(self) -> None:
         for name in self._frozen:
             getattr(self.optimizer.surfels, name).requires_grad_(False)
 
@@ -278,12 +282,6 @@ class Fitter:
 def _note_peak_memory(state: FitState) -> None:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     state.peak_memory_bytes = max(state.peak_memory_bytes, peak)
-
-
-def _whole(surfels: Surfels) -> Edit:
-    """An edit that changes values in place: all rows stay, all moments restart."""
-    everything = torch.arange(surfels.count, device=surfels.means.device)
-    return Edit(surfels, everything, torch.zeros_like(everything, dtype=torch.bool))
 
 
 @contextmanager

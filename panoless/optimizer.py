@@ -1,5 +1,6 @@
 """Adam over named parameters whose surfel rows can be edited during the fit."""
 
+import math
 from dataclasses import asdict
 from typing import Any
 
@@ -10,8 +11,9 @@ from panoless.config import RateConfig
 from panoless.kernels.adam import UNBOUNDED, AdamTensor, adam_step
 from panoless.surfels import Surfels
 
-BETAS = (0.9, 0.99)
+MOMENTUM = 0.9
 EPSILON = 1e-12
+NOT_NEGATIVE = (0.0, math.inf)
 MOMENTS = ("exp_avg", "exp_avg_sq")
 ENVIRONMENT = "environment"
 
@@ -27,7 +29,8 @@ class SurfelOptimizer:
             {"params": [value.detach().clone().requires_grad_()], "lr": base[name], "name": name, "base": base[name]}
             for name, value in named.items()
         ]
-        self._adam = torch.optim.Adam(groups, betas=BETAS, eps=EPSILON)
+        self._betas = MOMENTUM, rates.square_memory
+        self._adam = torch.optim.Adam(groups, betas=self._betas, eps=EPSILON)
         self._index()
 
     def _index(self) -> None:
@@ -44,12 +47,16 @@ class SurfelOptimizer:
         *,
         geometry: bool,
         frozen: frozenset[str],
+        means_factor: float = 1.0,
         environment_bounds: tuple[float, float] = UNBOUNDED,
     ) -> None:
-        """One step with every rate times `factor`; without `geometry` only the environment moves, in its bounds."""
+        """One step with every rate times `factor`, that of the means times `means_factor`, too.
+
+        Without `geometry` only the environment moves, in its bounds. Albedo is light and stays at 0 or above.
+        """
         tensors = []
         for name, group in self._groups.items():
-            group["lr"] = group["base"] * factor
+            group["lr"] = group["base"] * factor * (means_factor if name == "means" else 1.0)
             parameter = group["params"][0]
             gradient, parameter.grad = parameter.grad, None
             if gradient is None or name in frozen or (name != ENVIRONMENT and not geometry):
@@ -60,11 +67,11 @@ class SurfelOptimizer:
                 state.update({moment: torch.zeros_like(parameter) for moment in MOMENTS})
             state["step"] += 1
             mean, square = (state[moment] for moment in MOMENTS)
-            bounds = environment_bounds if name == ENVIRONMENT else UNBOUNDED
+            bounds = {ENVIRONMENT: environment_bounds, "albedo": NOT_NEGATIVE}.get(name, UNBOUNDED)
             tensors.append(
                 AdamTensor(parameter.detach(), gradient, mean, square, group["lr"], int(state["step"]), bounds)
             )
-        adam_step(tensors, BETAS, EPSILON)
+        adam_step(tensors, self._betas, EPSILON)
 
     def edit_surfels(self, surfels: Surfels, source: Tensor, keep_moments: Tensor) -> None:
         """Take `surfels`; row i inherits the moments of old row `source[i]` where `keep_moments[i]`, else zeros."""
@@ -76,6 +83,16 @@ class SurfelOptimizer:
                 if key in state
             }
             self._replace(name, value, {"step": state["step"], **moments} if moments else None)
+        self._index()
+
+    def set_values(self, surfels: Surfels) -> None:
+        """Take the values of as many surfels. Parameters that change restart their moments, the others keep them."""
+        for name, value in surfels.named().items():
+            parameter = self._groups[name]["params"][0]
+            if not torch.equal(value, parameter):
+                state = self._adam.state.get(parameter)
+                restarted = state and {"step": state["step"], **{key: torch.zeros_like(value) for key in MOMENTS}}
+                self._replace(name, value, restarted)
         self._index()
 
     def _replace(self, name: str, value: Tensor, state: dict[str, Tensor] | None) -> None:

@@ -7,6 +7,7 @@ from panoless.kernels.objective import ObjectiveTerms
 from panoless.kernels.rasterize import Channels
 
 RECOVERY_STEPS = 100
+MEANS_FALL = 0.01
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,11 @@ class Schedule:
         if iteration < begin:
             return 1.0
         return rates.drop_factor ** ((iteration + 1 - begin) / max(end - begin, 1))
+
+    def means_factor(self, iteration: int) -> float:
+        """What the rate of the means is multiplied by besides: a geometric fall to MEANS_FALL, where it stays."""
+        share = self.config.rates.means_fall_until
+        return MEANS_FALL ** min(iteration / max(self._iteration(share), 1), 1.0) if share > 0 else 1.0
 
     def lambda_silhouette(self, iteration: int) -> float:
         """The weight of Eq. 13, zero when its time is over ([t < 3000] in Eq. 14)."""
@@ -62,8 +68,9 @@ class Schedule:
 
     def propagation(self, iteration: int) -> bool:
         """Whether normals are propagated after this iteration; an opacity reset has precedence."""
-        due = self._density_active(iteration) and self._due(iteration, self.config.density.propagate_every)
-        return due and not self.opacity_reset(iteration)
+        density = self.config.density
+        active = self._density_active(iteration) and iteration < self._iteration(density.propagate_until)
+        return active and self._due(iteration, density.propagate_every) and not self.opacity_reset(iteration)
 
 
 @dataclass(frozen=True)

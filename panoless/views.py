@@ -108,6 +108,12 @@ class Views:
     near: float
     """Near plane in normalized units: a tenth of the smallest camera distance."""
 
+    @property
+    def camera_extent(self) -> float:
+        """1.1 × the largest distance of a camera from the cameras' mean (Kerbl et al. 2023), in normalized units."""
+        positions = np.stack([view.position for view in self.train])
+        return 1.1 * float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
+
     def to(self, device: torch.device) -> "Views":
         """The same views on a device."""
         return replace(self, train=tuple(view.to(device) for view in self.train))

@@ -65,7 +65,8 @@ def test_every_option_is_read(section: str) -> None:
 
 def test_every_parameter_has_a_rate() -> None:
     rates = {item.name for item in fields(RateConfig)}
-    assert rates - {"drop_at", "drop_factor"} == {item.name for item in fields(Surfels)} | {"environment"}
+    others = {"drop_at", "drop_factor", "means_fall_until", "square_memory"}
+    assert rates - others == {item.name for item in fields(Surfels)} | {"environment"}
 
 
 def with_value(config: FitConfig, name: str, value: float) -> FitConfig:

@@ -237,6 +237,28 @@ def test_every_epoch_sees_every_view_once(tmp_path: Path, views: Views) -> None:
     assert orders[0] != orders[1] != orders[2]
 
 
+def test_rates_and_sizes_are_those_of_the_scene_that_they_are_shares_of(tmp_path: Path, views: Views) -> None:
+    """The paper's code counts in the extent of its cameras, of which the object is a part."""
+    here = tiny_config("paper", count=60)
+    assert here.scene_radius == "cameras"
+    there = replace(here, scene_radius="object")
+    first, second = (Fitter(views, config, tmp_path, new_state(views, config)) for config in (here, there))
+    ratios = [
+        first._density.dense_share / second._density.dense_share,
+        first._density.prune_share / second._density.prune_share,
+    ]
+    moved = [fitter.optimizer.surfels.means.detach().clone() for fitter in (first, second)]
+    for fitter in (first, second):
+        fitter._step(0)
+    steps = [
+        float((fitter.optimizer.surfels.means.detach() - start).abs().amax())
+        for fitter, start in zip((first, second), moved, strict=True)
+    ]
+    ratios.append(steps[0] / steps[1])
+    assert ratios == pytest.approx([views.camera_extent] * 3, rel=1e-3)
+    assert views.camera_extent > 1.5
+
+
 def test_a_loss_that_is_not_finite_stops_the_fit(tmp_path: Path, sphere_dataset: Dataset, monkeypatch) -> None:
     objective = fit_module.mirror_objective
 

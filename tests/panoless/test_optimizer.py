@@ -1,16 +1,19 @@
 """The optimizer: what moves, how far, and that a restored one takes the same next step."""
 
 import copy
+import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from panoless.config import RateConfig
 from panoless.kernels.adam import AdamTensor, adam_step
-from panoless.optimizer import BETAS, EPSILON, SurfelOptimizer
+from panoless.optimizer import EPSILON, MOMENTUM, SurfelOptimizer
 from tests.support.mirror_sphere import sphere_surfels
 
 RATES = RateConfig()
+BETAS = (MOMENTUM, RATES.square_memory)
 
 
 def make() -> SurfelOptimizer:
@@ -60,6 +63,58 @@ def test_the_first_step_is_the_rate_times_the_factor(factor: float) -> None:
     for name, value in snapshot(optimizer).items():
         step = value - before[name]
         torch.testing.assert_close(step, torch.full_like(step, factor * getattr(RATES, name)), rtol=0.02, atol=1e-6)
+
+
+@pytest.mark.parametrize("square_memory", [0.9, 0.99, 0.999])
+def test_a_restarted_moment_steps_farther_the_longer_squares_are_remembered(square_memory: float) -> None:
+    """Long after the start, when no bias is corrected any more, the first step is (1 − β₁)/√(1 − β₂) rates long.
+
+    So with 0.999 opacities come back from a reset three times as fast as with 0.99.
+    """
+    rates = replace(RATES, square_memory=square_memory)
+    optimizer = SurfelOptimizer(sphere_surfels(5), torch.rand(6, 3, 4, 4), rates)
+    pull(optimizer)
+    optimizer.step(1.0, geometry=True, frozen=frozenset())
+    for state in optimizer.state_dict()["state"].values():
+        state["step"].fill_(1e6)
+    surfels = optimizer.surfels.detached()
+    reset = replace(surfels, opacity_logits=surfels.opacity_logits - 3)
+    optimizer.set_values(reset)
+    pull(optimizer)
+    optimizer.step(1.0, geometry=True, frozen=frozenset())
+    step = optimizer.surfels.opacity_logits - reset.opacity_logits
+    expected = rates.opacity_logits * (1 - MOMENTUM) / math.sqrt(1 - square_memory)
+    torch.testing.assert_close(step, torch.full_like(step, expected), rtol=1e-3, atol=1e-6)
+
+
+def test_only_the_means_take_the_factor_of_the_means() -> None:
+    optimizer = make()
+    before = snapshot(optimizer)
+    pull(optimizer)
+    optimizer.step(1.0, geometry=True, frozen=frozenset(), means_factor=0.25)
+    for name, value in snapshot(optimizer).items():
+        factor = 0.25 if name == "means" else 1.0
+        step = value - before[name]
+        torch.testing.assert_close(step, torch.full_like(step, factor * getattr(RATES, name)), rtol=0.02, atol=1e-6)
+
+
+def test_values_that_stay_keep_their_moments_and_others_restart() -> None:
+    optimizer = make()
+    for _ in range(3):
+        pull(optimizer)
+        optimizer.step(1.0, geometry=True, frozen=frozenset({"albedo"}))
+    before = copy.deepcopy(optimizer.state_dict()["state"])
+    names = [group["name"] for group in optimizer.state_dict()["param_groups"]]
+    surfels = optimizer.surfels.detached()
+    optimizer.set_values(replace(surfels, opacity_logits=surfels.opacity_logits - 3))
+    assert torch.equal(optimizer.surfels.opacity_logits, surfels.opacity_logits - 3)
+    for index, state in optimizer.state_dict()["state"].items():
+        for key in ("exp_avg", "exp_avg_sq"):
+            if names[index] == "opacity_logits":
+                assert not state[key].any()
+            else:
+                assert torch.equal(state[key], before[index][key]), names[index]
+        assert state["step"] == 3
 
 
 def test_gradients_do_not_pile_up() -> None:

@@ -44,13 +44,30 @@ def test_the_paper_preset_has_the_published_schedule() -> None:
     assert events(config, "opacity_reset") == [3000, 6000, 9000]
     assert (schedule.lambda_silhouette(2999), schedule.lambda_silhouette(3000)) == (1.0, 0.0)
     assert schedule.geometry_moves(0)
+    assert (config.rates.square_memory, config.scene_radius) == (0.999, "cameras")
     assert {schedule.rate_factor(iteration) for iteration in (0, 20_000, 44_999)} == {1.0}
+
+
+def test_normals_propagate_only_while_the_outline_is_held() -> None:
+    """Every round widens the outline, and after the silhouette term nothing takes that back."""
+    schedule = Schedule(PRESETS["paper"])
+    assert all(schedule.lambda_silhouette(iteration) > 0 for iteration in events(PRESETS["paper"], "propagation"))
+
+
+def test_the_means_slow_down_to_a_hundredth_as_in_the_papers_code() -> None:
+    schedule, default = Schedule(PRESETS["paper"]), Schedule(PRESETS["default"])
+    found = [schedule.means_factor(iteration) for iteration in (0, 15_000, 30_000, 44_999)]
+    assert found == pytest.approx([1.0, 0.1, 0.01, 0.01])
+    assert {default.means_factor(iteration) for iteration in (0, 500, 999)} == {1.0}
 
 
 def test_propagation_never_meets_a_reset() -> None:
     config = PRESETS["paper"]
     propagations = events(config, "propagation")
-    assert propagations[:4] == [1000, 2000, 4000, 5000]
+    assert propagations == [1000, 2000]
+    longer = replace(config, density=replace(config.density, propagate_until=1.0))
+    propagations = events(longer, "propagation")
+    assert propagations == [1000, 2000, 4000, 5000, 7000, 8000, 10_000, 11_000]
     assert not set(propagations) & set(events(config, "opacity_reset"))
 
 

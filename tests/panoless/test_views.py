@@ -96,6 +96,12 @@ def test_the_scale_and_origin_of_the_world_do_not_matter(sphere_dataset: Dataset
         torch.testing.assert_close(first.camera.world_to_camera, second.camera.world_to_camera, rtol=0, atol=1e-5)
 
 
+def test_the_camera_extent_counts_from_the_middle_of_the_cameras(views: Views) -> None:
+    shifted = replace(views, train=tuple(view for view in views.train[:2]))
+    apart = float(np.linalg.norm(shifted.train[0].position - shifted.train[1].position))
+    assert shifted.camera_extent == pytest.approx(1.1 * apart / 2)
+
+
 def test_radiance_is_premultiplied_and_clipped(sphere_dataset: Dataset) -> None:
     truth = read_view(sphere_dataset.train[0])
     assert truth.radiance.max() > 1
