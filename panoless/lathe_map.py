@@ -60,23 +60,26 @@ class Areas:
         each = (values[:, None] / count).expand(-1, count, -1).flatten(0, 1).contiguous()
         return scatter_cubemap(each, self.directions.flatten(0, 1), resolution)
 
-    def weights(
-        self, seen: Float[Tensor, "P 3"], saturation: Float[Tensor, "3"], scale: float
-    ) -> Float[Tensor, "P 3"]:
+    def weights(self, seen: Float[Tensor, "P 3"], saturation: Float[Tensor, "3"], scale: float) -> Float[Tensor, "P 3"]:
         """Robust weights of the errors of what is seen of a map; zero where it and the pixel are saturated."""
         weight = robust_weight(seen.minimum(saturation) - self.radiance, scale)[:, None]
         return weight * ~(seen.minimum(self.radiance) >= SATURATED * saturation)
 
 
 def sharpened_map(
-    views: Views, lathe: Lathe, environment: Float[Tensor, "6 3 L L"], saturation: Float[Tensor, "3"]
+    views: Views,
+    lathe: Lathe,
+    environment: Float[Tensor, "6 3 L L"],
+    saturation: Float[Tensor, "3"],
+    most: int = 1,
 ) -> Float[Tensor, "6 3 L L"]:
-    """The map E₀ of pixel centers, sharpened; texels that no area touches stay. Views are clipped at `saturation`.
+    """The map E₀ of pixel centers, sharpened; texels that no area touches stay. Views are clipped at `saturation`, and
+    pixels taken that are mirrored up to `most` times (see `lathe.followed`).
 
     It lies between 0 and that, or four times that where pixels are saturated. Before each round of steps of the whole
     map, coarse ones brighten what is saturated in E₀ and around: there neighbors tell texels that nothing does.
     """
-    pixels = _divided(views, lathe)
+    pixels = _divided(views, lathe, most)
     if not pixels.smooth:
         return environment
     saturation = saturation.to(environment)
@@ -176,14 +179,14 @@ class Divided:
         return Areas(directions, torch.from_numpy(found.radiance).float().to(device))
 
 
-def _divided(views: Views, lathe: Lathe) -> Divided:
+def _divided(views: Views, lathe: Lathe, most: int = 1) -> Divided:
     """All pixels of evenly chosen views."""
     stride = -(-sum(len(view.solid) for view in views.train) // MOST_PIXELS)
     chosen = views.train[:: max(stride, 1)]
     found, others = [], []
     for view in chosen:
         places = view.solid.cpu().numpy()
-        at, smooth = smooth_pixels(lathe, view.camera, places, 1)
+        at, smooth = smooth_pixels(lathe, view.camera, places, most)
         pixels = view.solid[torch.from_numpy(smooth).to(view.solid.device)]
         directions = torch.stack(list(at.within(OFFSETS)), 1).to(view.radiance.device)
         found.append(Areas(directions, view.radiance.flatten(1)[:, pixels].T.contiguous()))

@@ -52,10 +52,15 @@ def observed_rays(views: Views, geometry: Geometry, config: FitConfig, max_rays:
         elif isinstance(geometry, Sheet):
             yield sheet_rays(geometry, view, pixels)
         elif isinstance(geometry, Lathe):
-            most = 1 if config.environment.trace else 0
-            yield lathe_rays(geometry, view, pixels, most, weighted=len(pixels) == len(view.solid))[0]
+            weighted = len(pixels) == len(view.solid)
+            yield lathe_rays(geometry, view, pixels, _mirrored_at_most(config), weighted=weighted)[0]
         else:
             yield _surfel_rays(view, geometry, config, pixels)[0]
+
+
+def _mirrored_at_most(config: FitConfig) -> int:
+    """What `lathe.followed` calls so: pixels that see the object again take part only if nothing is traced."""
+    return 1 if config.environment.trace else 0
 
 
 def _chosen_pixels(views: Views, most: int) -> Iterator[tuple[TrainView, Tensor]]:
@@ -89,7 +94,7 @@ def solved_environment(
         found = solve_environment(of_mean_trust_one(rays), resolution)
         light = light_of(config)
         if isinstance(geometry, Lathe) and not light.high_dynamic_range:
-            found = sharpened_map(views, geometry, found, light.saturation)
+            found = sharpened_map(views, geometry, found, light.saturation, _mirrored_at_most(config))
         return found, rays
     seen = [
         (view, *_surfel_rays(view, geometry, config, pixels))
