@@ -1,9 +1,9 @@
 """The map of a surface of revolution, sharpened: a pixel saw the mean over its area, not the light of one direction.
 
 For pixels whose directions are known over their whole area, min_E Σ w ‖mean_k E(ω_k) − c‖² + λ ‖E − E₀‖², over 2×2
-directions ω_k of each, by conjugate gradients from the map E₀ of pixel centers. What a view shows as its largest value s
-was at least that: c = min(s, mean_k E(ω_k)). So a saturated pixel has no error while its prediction saturates too, and
-light above s is told by pixels that see a lamp in part.
+directions ω_k of each, by conjugate gradients from the map E₀ of pixel centers. Views are clipped at some largest
+radiance s, c = min(s, mean_k E(ω_k)): a saturated pixel has no error while its prediction is saturated too, and light
+above s is told by pixels that see a lamp in part.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +24,7 @@ from panoless.views import TrainView, Views
 
 OFFSETS = (-0.25, 0.25)
 MOST_PIXELS = 3_500_000
-ROBUST_SCALE = 0.08
+ROBUST_SCALE = 0.16
 PULL = 0.2
 """λ, in rays."""
 BATCH_VIEWS = 4
@@ -36,8 +36,8 @@ CEILING = 4.0
 """Largest radiance of a map, over that of views."""
 MOST_TRACED = 60_000
 COARSE_RESOLUTION, COARSE_ROUNDS, COARSE_STEPS = 8, 2, 6
-COARSE_SCALE = 0.5
-"""Of robust weights; where a lamp is too dark by its half, pixels that see it in part must keep their votes."""
+COARSE_SCALE = 1.0
+"""Of robust weights: while a lamp is far too dark, pixels that see it in part must keep their votes."""
 
 Linear = Callable[[Tensor], Tensor]
 
@@ -76,8 +76,9 @@ def sharpened_map(
     """The map E₀ of pixel centers, sharpened; texels that no area touches stay. Views are clipped at `saturation`, and
     pixels taken that are mirrored up to `most` times (see `lathe.followed`).
 
-    It lies between 0 and that, or four times that where pixels are saturated. Before each round of steps of the whole
-    map, coarse ones brighten what is saturated in E₀ and around: there neighbors tell texels that nothing does.
+    It lies between 0 and that, or `CEILING` times that in channels in which pixels are saturated. Before each round,
+    pixels that bend the light much, or mirror it often, and so see wide parts of it, tell how bright the inside of
+    saturated regions is, coarsely.
     """
     pixels = _divided(views, lathe, most)
     if not pixels.smooth:

@@ -80,12 +80,8 @@ def agreement(
         residual += summed[:, 1]
         trusted += summed[:, 2]
     share = (votes / trusted.clamp(min=1e-6)).clamp(max=1)
-    return Agreement(
-        votes,
-        share,
-        residual / votes.clamp(min=1e-6),
-        _contrast(environment.minimum(saturation[:, None, None]).mean(1)),
-    )
+    contrast = _contrast(environment.minimum(saturation[:, None, None]).mean(1))
+    return Agreement(votes, share, residual / votes.clamp(min=1e-6), contrast)
 
 
 def _contrast(radiance: Float[Tensor, "6 L L"]) -> Float[Tensor, "6 L L"]:

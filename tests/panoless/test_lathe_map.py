@@ -14,7 +14,6 @@ from panoless.lathe_render import mean_light
 from panoless.views import Views
 from tests.support.mirror_lathe import around, bowl, lathe_views
 
-
 ONE = torch.ones(3)
 
 
