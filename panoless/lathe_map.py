@@ -173,7 +173,7 @@ class Divided:
 
     def traced(self, lathe: Lathe) -> Areas:
         """About `MOST_TRACED` of the others, as far as all of their rays leave, however often they are mirrored."""
-        stride = -(-sum(map(len, self.others)) // MOST_TRACED)
+        stride = max(1, -(-sum(map(len, self.others)) // MOST_TRACED))
         chosen = [pixels[index % stride :: stride] for index, pixels in enumerate(self.others)]
         found, device = pixel_areas(self.views, lathe, chosen), self.views[0].radiance.device
         directions = torch.from_numpy(found.outgoing.reshape(-1, len(SUBRAYS), 3)).float().to(device)
