@@ -89,9 +89,9 @@ def solved_environment(
     over a pixel is not that of radiance.
     """
     if not isinstance(geometry, Surfels):
-        rays = list(observed_rays(views, geometry, config, config.environment.rays))
+        rays = of_mean_trust_one(list(observed_rays(views, geometry, config, config.environment.rays)))
         resolution = config.environment.solve_resolution or densest_resolution(rays)
-        found = solve_environment(of_mean_trust_one(rays), resolution)
+        found = solve_environment(rays, resolution)
         light = light_of(config)
         if isinstance(geometry, Lathe) and not light.high_dynamic_range:
             found = sharpened_map(views, geometry, found, light.saturation, _mirrored_at_most(config))
