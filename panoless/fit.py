@@ -412,8 +412,8 @@ def clear_views(views: Views, state: FitState, config: FitConfig) -> Views:
     """
     if state.turned and state.lathe is not None:
         return clear_of_rim(views, state.lathe)
-    mirror = state.sheet or state.plane
-    return without_mirrored_frame(views, mirror) if mirror is not None and config.environment.trace else views
+    mirror = state.sheet or (state.plane if config.environment.trace else None)
+    return views if mirror is None else without_mirrored_frame(views, mirror)
 
 
 def _trial(views: Views, config: FitConfig, start: Surfels) -> Surfels:

@@ -128,7 +128,7 @@ TABLES = {
             *(
                 Row(name, scene, (f"--config.environment.no-{option}",), one_seed=True)
                 for name, option, scenes in (
-                    ("self-reflecting pixels vote in the map", "trace", SCENES[:-1]),
+                    ("self-reflecting pixels vote in the map", "trace", SCENES[:3]),
                     ("no fill", "fill", ("mirror", "deformed-mirror")),
                 )
                 for scene in scenes
