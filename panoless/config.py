@@ -49,8 +49,8 @@ class EnvironmentConfig:
     fill: bool = True
     """Fill directions that no ray of the closed-form map met from what is known around them; else they stay gray."""
     trace: bool = True
-    """Leave pixels out of the closed-form map whose mirrored ray meets a plane's frame or a surface of revolution again;
-    a bent plane always does, surfels can't tell."""
+    """Leave pixels out of the closed-form map whose mirrored ray meets a plane's frame, or a surface of revolution
+    again; a bent plane always does, surfels can't tell."""
     solve_resolution: int = 0
     """Texels along a face side of the closed-form map that is exported; 0 lets held-out views choose 64, 128 or 256."""
 
