@@ -94,7 +94,8 @@ class Fitter:
             "roughness_logits": config.loss.roughness_weighted,
         }
         self._frozen = frozenset(name for name, learned in frozen.items() if not learned)
-        self._freeze()
+        for name in self._frozen:
+            getattr(self.optimizer.surfels, name).requires_grad_(False)
 
     def run(self) -> None:
         """Optimize to the last iteration and complete the state."""
@@ -247,11 +248,6 @@ class Fitter:
             self.optimizer.set_values(reset_opacities(self.optimizer.surfels))
         elif self.schedule.propagation(iteration):
             self.optimizer.set_values(propagate_normals(self.optimizer.surfels))
-        self._freeze()
-
-    def _freeze(self) -> None:
-        for name in self._frozen:
-            getattr(self.optimizer.surfels, name).requires_grad_(False)
 
     def _record(self, iteration: int, terms: LossTerms) -> None:
         point = {

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from panoless.lathe import LEAVING, Lathe, mirrored, pixel_rays
 from panoless.lathe_render import DEEPEST, DeepPixels
-from panoless.views import Views, spread_pixels
+from panoless.views import Views, concatenated, spread_pixels
 
 FEWEST_PIXELS, MOST_PIXELS = 200, 2500
 LOOKED_AT = 400_000
@@ -76,7 +76,7 @@ def base_pixels(views: Views, lathe: Lathe) -> DeepPixels | None:
     for view, pixels in spread_pixels(views, LOOKED_AT):
         places = pixels.cpu().numpy()
         parts.append(DeepPixels.of(view, places[_meets_base(lathe, *pixel_rays(view.camera, places))]))
-    found = DeepPixels.joined(parts)
+    found = concatenated(parts)
     if len(found.radiance) < FEWEST_PIXELS:
         return None
     return found.every(max(1, len(found.radiance) // MOST_PIXELS))

@@ -19,7 +19,7 @@ from torch import Tensor
 from panoless.lathe import Lathe, followed, pixel_rays
 from panoless.lathe_render import DEEPEST, DeepPixels
 from panoless.lathe_rim import beside_rim
-from panoless.views import TrainView, Views, split_held_out
+from panoless.views import TrainView, Views, concatenated, split_held_out
 
 LENGTH_PX, KNOT_PX = 20, 3
 """Of the wall before the rim that is refined, and of its cubic B-splines."""
@@ -102,7 +102,7 @@ def _pixels(views: Sequence[TrainView], lathe: Lathe, most: int) -> DeepPixels:
     for view, *groups in zip(views, near, deep, strict=True):
         drawn = [group[generator.random(len(group)) < share] for group, share in zip(groups, shares, strict=True)]
         bundles.append(DeepPixels.of(view, np.unique(np.concatenate(drawn))))
-    return DeepPixels.joined(bundles)
+    return concatenated(bundles)
 
 
 def _mirrored_again(view: TrainView, lathe: Lathe) -> Int[np.ndarray, "P"]:

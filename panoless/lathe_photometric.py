@@ -27,7 +27,7 @@ from panoless.lathe_contours import (
     solved,
 )
 from panoless.lathe_profile import ProfileSplines, moved
-from panoless.views import Views, spread_pixels
+from panoless.views import Views, concatenated, spread_pixels
 
 LEAST_COSINE = 0.05
 """Rays that graze the surface more than this say little and amplify every error."""
@@ -62,8 +62,8 @@ def observations(views: Views, lathe: Lathe, most: int) -> Observations:
         rays, hits = lathe_rays(lathe, view, pixels)
         way = hits.points - view.position
         parts.append((way / hits.distance[:, None], rays.radiance, hits))
-    joined = Hits(**{name: np.concatenate([getattr(part[2], name) for part in parts]) for name in vars(parts[0][2])})
-    return Observations(np.concatenate([part[0] for part in parts]), torch.cat([part[1] for part in parts]), joined)
+    ways, radiance, met = zip(*parts, strict=True)
+    return Observations(np.concatenate(ways), torch.cat(radiance), concatenated(met))
 
 
 def solved_map(

@@ -28,8 +28,8 @@ from panoless.lathe_photometric import (
     step_on_equations,
 )
 from panoless.lathe_profile import ProfileSplines, resampled
-from panoless.lathe_render import SUBRAYS
-from panoless.views import TrainView, Views, split_held_out
+from panoless.lathe_render import SUBRAYS, bounded_error
+from panoless.views import TrainView, Views, concatenated, split_held_out
 
 SPACING_PX = 1 / 3
 """Of the vertices: an edge is as sharp as they are dense."""
@@ -42,7 +42,6 @@ LOOKED_AT = 2_000_000
 CURVED_RAD = np.radians(2.0)
 """Where the profile turns by more within two pixels a pixel is taken preferably: elsewhere one ray tells as much."""
 CURVED_SHARE = 0.75
-ERROR_SCALE = 0.1
 LEAST_GAIN = 0.02
 """Of the error on held-out views: a smooth profile is told as well by single rays, with less noise."""
 
@@ -68,10 +67,10 @@ class PixelAreas:
 def pixel_areas(views: Sequence[TrainView], lathe: Lathe, pixels: Sequence[Int[np.ndarray, "_"]]) -> PixelAreas:
     """The given pixels of each view (flat indices) as areas of a lathe."""
     parts = [_areas_of(view, lathe, chosen) for view, chosen in zip(views, pixels, strict=True)]
-    joined = {name: np.concatenate([getattr(part.hits, name) for part in parts]) for name in vars(parts[0].hits)}
     names = ("directions", "outgoing", "once", "radiance")
     return PixelAreas(
-        hits=Hits(**joined), **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        hits=concatenated([part.hits for part in parts]),
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names},
     )
 
 
@@ -154,8 +153,7 @@ def area_equations(
 
 def area_error(areas: PixelAreas, environment: Float[Tensor, "6 3 L L"]) -> float:
     """Mean of ‖e‖²/(‖e‖² + s²) over pixels."""
-    squared = ((areas.shown(environment) - areas.radiance) ** 2).sum(1)
-    return float((squared / (squared + ERROR_SCALE**2)).mean()) if len(squared) else 1.0
+    return bounded_error(areas.shown(environment) - areas.radiance)
 
 
 def refined_in_pixels(

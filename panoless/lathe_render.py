@@ -67,11 +67,6 @@ class DeepPixels:
         seen = view.radiance.flatten(1)[:, torch.from_numpy(pixels).to(view.radiance.device)]
         return cls(origins, directions, seen.T.cpu().numpy().astype(np.float64))
 
-    @classmethod
-    def joined(cls, parts: Sequence["DeepPixels"]) -> "DeepPixels":
-        """All pixels of the parts."""
-        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})
-
     def every(self, stride: int) -> "DeepPixels":
         """Every stride-th pixel."""
         rays = (each.reshape(-1, len(SUBRAYS), 3)[::stride].reshape(-1, 3) for each in (self.origins, self.directions))
@@ -90,8 +85,13 @@ class DeepPixels:
 
     def error(self, lathe: Lathe, environment: Float[Tensor, "6 3 L L"]) -> float:
         """Mean of ‖e‖²/(‖e‖² + s²), s = 0.1, over pixels."""
-        squared = ((self.shown(lathe, environment) - self.radiance) ** 2).sum(1)
-        return float((squared / (squared + ERROR_SCALE**2)).mean())
+        return bounded_error(self.shown(lathe, environment) - self.radiance)
+
+
+def bounded_error(error: Float[np.ndarray, "P 3"]) -> float:
+    """Mean of ‖e‖²/(‖e‖² + s²), s = 0.1, over pixels; 1 if there are none."""
+    squared = (error**2).sum(1)
+    return float((squared / (squared + ERROR_SCALE**2)).mean()) if len(squared) else 1.0
 
 
 def mean_light(

@@ -118,10 +118,7 @@ def _thinned(rays: Sequence[Rays], most: float) -> list[Rays]:
 
 def without_fill(rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"]) -> Float[Tensor, "6 3 L L"]:
     """A map that is gray where none of the rays fell."""
-    count = torch.zeros_like(environment[:, :1])
-    for batch in rays:
-        count += scatter_cubemap(torch.ones_like(batch.radiance[:, :1]), batch.directions, environment.shape[-1])
-    return torch.where(count > 0, environment, GRAY)
+    return torch.where(_ray_counts(rays, environment.shape[-1]) > 0, environment, GRAY)
 
 
 def of_mean_trust_one(rays: Sequence[Rays]) -> list[Rays]:
@@ -187,13 +184,18 @@ def densest_resolution(rays: Sequence[Rays]) -> int:
     For geometry whose normals are as exact as their pixels: then no held-out view speaks against detail.
     """
     coarsest = RESOLUTIONS[0]
-    device = rays[0].directions.device if rays else None
-    count = torch.zeros(6, 1, coarsest, coarsest, device=device)
-    for batch in rays:
-        count += scatter_cubemap(torch.ones_like(batch.radiance[:, :1]), batch.directions, coarsest)
+    count = _ray_counts(rays, coarsest)
     observed = count[count >= 1]
     usual = float(observed.median()) if len(observed) else 0.0
     return max((each for each in RESOLUTIONS if usual * (coarsest / each) ** 2 >= RAYS_A_TEXEL), default=coarsest)
+
+
+def _ray_counts(rays: Sequence[Rays], resolution: int) -> Float[Tensor, "6 1 L L"]:
+    """How many rays fell on each texel."""
+    count = torch.zeros(6, 1, resolution, resolution, device=rays[0].directions.device if rays else None)
+    for batch in rays:
+        count += scatter_cubemap(torch.ones_like(batch.radiance[:, :1]), batch.directions, resolution)
+    return count
 
 
 def prediction_error(rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"], scale: float = 0.1) -> float:

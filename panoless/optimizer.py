@@ -98,7 +98,7 @@ class SurfelOptimizer:
     def _replace(self, name: str, value: Tensor, state: dict[str, Tensor] | None) -> None:
         group = self._groups[name]
         self._adam.state.pop(group["params"][0], None)
-        leaf = value.detach().clone().requires_grad_()
+        leaf = value.detach().clone().requires_grad_(group["params"][0].requires_grad)
         group["params"] = [leaf]
         if state:
             self._adam.state[leaf] = state

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from panoless.plane import Plane
-from panoless.views import Views, pose_of
+from panoless.views import Views, concatenated, pose_of
 from shinypartial.conventions import PIXEL_CENTER
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def view_contours(views: Views) -> Contours:
         parts.append(Contours(np.full(len(x), index), np.tile(center, (len(x), 1)), rays, columns, rows))
     if not parts:
         return Contours(np.zeros(0, dtype=np.int64), *(np.zeros((0, 3)) for _ in range(4)))
-    return Contours(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Contours)))
+    return concatenated(parts)
 
 
 def carried(contours: Contours, plane: Plane) -> tuple[Float[np.ndarray, "P 2"], Bool[np.ndarray, "P"]]:

@@ -18,7 +18,7 @@ from panoless.kernels.cubemap import sample_cubemap
 from panoless.lathe import mirrored
 from panoless.lathe_photometric import RADIANCE_SIGMA
 from panoless.sheet import Sheet, SheetHits, sightings
-from panoless.views import Views, spread_pixels
+from panoless.views import Views, concatenated, spread_pixels
 from shinypartial.sphere import directions_to_cube
 
 
@@ -39,7 +39,7 @@ def observations(views: Views, sheet: Sheet, most: int) -> Observations:
     outgoing = torch.from_numpy(np.concatenate([each.outgoing for each in seen])).float()
     return Observations(
         np.concatenate([each.ways for each in seen]),
-        SheetHits(*(np.concatenate([getattr(each.hits, name) for each in seen]) for name in vars(seen[0].hits))),
+        concatenated([each.hits for each in seen]),
         Rays(outgoing.to(radiance[0]), torch.cat(radiance)),
     )
 

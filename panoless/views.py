@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TypeVar
 
@@ -158,6 +158,12 @@ def views_of(photographs: Sequence[Photograph]) -> Views:
         for each in photographs
     )
     return Views(train, normalization, near)
+
+
+def concatenated(parts: Sequence[Each]) -> Each:
+    """Dataclasses of arrays as one: each field's arrays one after the other."""
+    names = [item.name for item in fields(parts[0])]  # type: ignore[arg-type]
+    return type(parts[0])(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
 def split_held_out(views: Sequence[Each]) -> tuple[list[Each], list[Each]]:
