@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from panoless.config import PRESETS, FitConfig
-from shinypartial.errors import EXIT_BAD_INPUT, InputError, run_command
+from panoless.config import FitConfig
+from panoless.presets import PRESETS
+from shinypartial.core.errors import EXIT_BAD_INPUT, InputError, run_command
 
 if TYPE_CHECKING:
-    from panoless.checkpoint import FitState
+    from panoless.reconstruct.state import FitState
 
 RUNS = Path("runs")
 
@@ -38,12 +39,12 @@ class Fit:
     def run(self) -> None:
         """Load, fit, export and say what to do next."""
         _prepare_threads()
-        from panoless.export import export_prediction
-        from panoless.fit import find_device, fit
-        from panoless.snapshots import marks_of
+        from panoless.export.prediction import export_prediction
+        from panoless.reconstruct.fit import find_device, fit
+        from panoless.reconstruct.snapshots import snapshot_schedule
         from shinypartial.dataset.read import newest_dataset, open_dataset
-        from shinypartial.files import only_writer
-        from shinypartial.prediction import claim_prediction
+        from shinypartial.io.files import folder_lock
+        from shinypartial.prediction.format import acquire_prediction
 
         _announce_compilation()
         root = self.dataset
@@ -55,10 +56,10 @@ class Fit:
         prediction = self.output or Path("predictions") / name
         run_folder = RUNS / prediction.resolve().name
         device = find_device(self.device)
-        marks = marks_of(self.snapshots, self.snapshot_seconds, self.config.iterations)
+        marks = snapshot_schedule(self.snapshots, self.snapshot_seconds, self.config.iterations)
         _refuse_run_folder(prediction, run_folder)
-        with only_writer(prediction):
-            claim_prediction(prediction)
+        with folder_lock(prediction):
+            acquire_prediction(prediction)
             state = fit(dataset, self.config, run_folder, marks, device)
             export_prediction(dataset, state, self.config, prediction)
         print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
@@ -82,11 +83,11 @@ class Export:
     def run(self) -> None:
         """Read the checkpoint and export it."""
         _prepare_threads()
-        from panoless.checkpoint import CHECKPOINT, DESCRIPTION, load_state, read_description
-        from panoless.export import export_prediction, export_snapshots
+        from panoless.export.prediction import export_prediction, export_snapshots
+        from panoless.reconstruct.state import CHECKPOINT, DESCRIPTION, load_state, read_description
         from shinypartial.dataset.read import open_dataset
-        from shinypartial.files import newest_folder, only_writer
-        from shinypartial.prediction import claim_prediction
+        from shinypartial.io.files import folder_lock, newest_folder
+        from shinypartial.prediction.format import acquire_prediction
 
         _announce_compilation()
         folder = self.run_folder or newest_folder(RUNS, DESCRIPTION, "a run", "Make one: `panoless fit`.")
@@ -110,8 +111,8 @@ class Export:
             )
         prediction = self.output or Path("predictions") / folder.resolve().name
         _refuse_run_folder(prediction, folder)
-        with only_writer(prediction):
-            claim_prediction(prediction)
+        with folder_lock(prediction):
+            acquire_prediction(prediction)
             dataset = open_dataset(description.dataset)
             export_prediction(dataset, state, description.config, prediction)
             if self.snapshots:

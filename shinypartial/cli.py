@@ -8,7 +8,7 @@ from typing import Literal
 
 import tyro
 
-from shinypartial.errors import EXIT_BAD_INPUT, InputError, run_command
+from shinypartial.core.errors import EXIT_BAD_INPUT, InputError, run_command
 
 
 @dataclass(frozen=True)
@@ -148,14 +148,14 @@ class Validate:
     def run(self) -> None:
         """Print every break; raise InputError when there is one."""
         from shinypartial.dataset.read import newest_dataset
-        from shinypartial.dataset.release import is_release, validate_release
         from shinypartial.dataset.validate import unscored, validate
+        from shinypartial.release.release import is_release, validate_release
 
         folder = self.folder or _chosen("dataset", newest_dataset())
-        breaks = (validate_release if is_release(folder) else validate)(folder, progress=True)
-        for each in breaks:
+        violations = (validate_release if is_release(folder) else validate)(folder, progress=True)
+        for each in violations:
             print(f"{'warning: ' if each.warning else ''}{each.file}: {each.problem}. {each.remedy}")
-        broken = sum(not each.warning for each in breaks)
+        broken = sum(not each.warning for each in violations)
         if broken:
             raise InputError(
                 expected=f"every promise of the format kept in {folder}",
@@ -185,9 +185,9 @@ class Evaluate:
 
     def run(self) -> None:
         """Score and print the summary."""
-        from shinypartial.evaluate import evaluate
-        from shinypartial.prediction import newest_prediction, snapshot_folders
-        from shinypartial.report import summary_lines
+        from shinypartial.evaluation.evaluate import evaluate
+        from shinypartial.prediction.format import newest_prediction, snapshot_folders
+        from shinypartial.report.page import summary_lines
 
         prediction = self.prediction or _chosen("prediction", newest_prediction())
         snapshots = snapshot_folders(prediction) if self.snapshots else []
@@ -217,10 +217,10 @@ class Oracle:
     def run(self) -> None:
         """Solve, score and print the summary."""
         from shinypartial.dataset.read import newest_dataset
-        from shinypartial.evaluate import evaluate
-        from shinypartial.oracle import make_oracle
-        from shinypartial.prediction import DEFAULT_FOLDER, ORACLE_SUFFIX
-        from shinypartial.report import summary_lines
+        from shinypartial.evaluation.evaluate import evaluate
+        from shinypartial.oracle.baseline import make_oracle
+        from shinypartial.prediction.format import DEFAULT_FOLDER, ORACLE_SUFFIX
+        from shinypartial.report.page import summary_lines
 
         dataset = self.dataset or _chosen("dataset", newest_dataset())
         output = self.output or DEFAULT_FOLDER / (dataset.resolve().name + ORACLE_SUFFIX)
@@ -248,8 +248,8 @@ class Postprocess:
 
     def run(self) -> None:
         """Blur and say how much of the sphere it concerned."""
-        from shinypartial.postprocess import BlurOptions, postprocess
-        from shinypartial.prediction import newest_prediction
+        from shinypartial.prediction.format import newest_prediction
+        from shinypartial.prediction.postprocess import BlurOptions, postprocess
 
         prediction = self.prediction or _chosen("prediction", newest_prediction())
         output = self.output or prediction.resolve().with_name(f"{prediction.resolve().name}-blurred")
@@ -273,7 +273,7 @@ class Compare:
 
     def run(self) -> None:
         """Print the table and write the files."""
-        from shinypartial.comparison import compare, comparison_lines, write_comparison
+        from shinypartial.comparison.paired import compare, comparison_lines, write_comparison
 
         comparison = compare(self.group, self.against, self.seed)
         print("\n".join(comparison_lines(comparison)))
@@ -293,7 +293,7 @@ class Weights:
 
     def run(self) -> None:
         """Store the weights and say where."""
-        from shinypartial.weights import install_weights
+        from shinypartial.evaluation.lpips_weights import install_weights
 
         for path in install_weights(self.file, self.folder):
             print(f"Wrote {path}")
@@ -310,8 +310,8 @@ class Report:
 
     def run(self) -> None:
         """Write the report, print the summary and where the page lies."""
-        from shinypartial.prediction import newest_prediction
-        from shinypartial.report import summary_lines, write_report
+        from shinypartial.prediction.format import newest_prediction
+        from shinypartial.report.page import summary_lines, write_report
 
         prediction = self.prediction or _chosen("prediction", newest_prediction())
         page = write_report(prediction, self.output)
@@ -344,8 +344,8 @@ class Release:
         """Make the release and say what to do next."""
         import datetime
 
-        from shinypartial.dataset.publication import Publication
-        from shinypartial.dataset.release import recorded_date, release
+        from shinypartial.release.publication import Publication
+        from shinypartial.release.release import recorded_date, release
 
         date = self.date or recorded_date(self.output) or datetime.datetime.now(datetime.UTC).date().isoformat()
         name = self.name or self.output.resolve().name
@@ -367,12 +367,12 @@ class Leaderboard:
 
     def run(self) -> None:
         """Write page and table, and name what could not be compared."""
-        from shinypartial.leaderboard import PAGE, write_leaderboard
+        from shinypartial.report.leaderboard import PAGE, write_leaderboard
 
         board = write_leaderboard(self.predictions, self.output)
         for group in board.groups:
             print(f"{group.dataset}: {len(group.lines)} {'prediction' if len(group.lines) == 1 else 'predictions'}")
-        for one in board.apart:
+        for one in board.excluded:
             print(f"not compared: {one.folder}: {one.reason}. {one.remedy}")
         print(f"Leaderboard: {self.output / PAGE}")
 
@@ -394,13 +394,13 @@ class Chart:
 
     def run(self) -> None:
         """Write page, pictures and table, and name what could not be drawn."""
-        from shinypartial.chart import PAGE, write_chart
+        from shinypartial.report.chart import PAGE, write_chart
 
         drawn = write_chart(self.predictions, self.output, dataset=self.dataset, hardware=self.hardware, size=self.size)
         runs = sum(len(point.folders) for point in drawn.points)
         snapshots = sum(moment.iteration is not None for p in drawn.points for curve in p.curves for moment in curve)
         print(f"{drawn.dataset}: {len(drawn.points)} points of {runs} predictions, {snapshots} snapshots")
-        for one in drawn.apart:
+        for one in drawn.excluded:
             print(f"not drawn: {one.folder}: {one.reason}. {one.remedy}")
         print(f"Chart: {self.output / PAGE}")
 

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from shinypartial import __version__
-from shinypartial.blender.crew import Crew, CrewClosed, open_crew
 from shinypartial.blender.runtime import check_blender
-from shinypartial.camera_plot import CAMERA_PLOT, plot_cameras
-from shinypartial.contact_sheet import write_contact_sheet
+from shinypartial.blender.worker_pool import PoolClosed, WorkerPool, open_pool
+from shinypartial.core.trajectory import plan_cameras
+from shinypartial.dataset.camera_plot import CAMERA_PLOT, plot_cameras
 from shinypartial.dataset.schema import (
     CHECKSUMS,
     ENVIRONMENT_LATLONG,
@@ -33,12 +33,12 @@ from shinypartial.dataset.write import (
     write_transforms,
     write_view,
 )
-from shinypartial.files import only_writer, remove_partial_files
-from shinypartial.images import read_exr_rgb
-from shinypartial.progress import Progress
+from shinypartial.io.files import folder_lock, remove_partial_files
+from shinypartial.io.images import read_exr_rgb
+from shinypartial.io.progress import Progress
+from shinypartial.release.contact_sheet import write_contact_sheet
+from shinypartial.release.statistics import dataset_statistics
 from shinypartial.scene import FileWorld, SceneSpec
-from shinypartial.statistics import dataset_statistics
-from shinypartial.trajectory import plan_cameras
 
 STUDIO_LIGHT_SOURCE = "Blender's studio lights, by Greg Zaal (Poly Haven, https://polyhaven.com)"
 
@@ -63,7 +63,7 @@ def generate(spec: SceneSpec, root: Path) -> Generated:
     recipe = {**spec.recipe(), "hemisphere_axis": trajectory.hemisphere_axis.tolist()}
     if not _is_complete(root, every):
         check_blender()
-    with only_writer(root):
+    with folder_lock(root):
         claim_folder(root, recipe, _generator(), FORMAT_MINOR)
         if _is_complete(root, every):
             return Generated(root, 0, len(every))
@@ -102,25 +102,25 @@ def _is_complete(root: Path, frames: Sequence[Frame]) -> bool:
 def _render_frames(spec: SceneSpec, frames: Sequence[Frame], total: int) -> None:
     """Render and write; while a thread writes its frame, another's is being rendered."""
     progress = Progress("Rendering", total, total - len(frames))
-    with open_crew(spec) as crew, ThreadPoolExecutor(crew.plan.workers + 1) as pool:
-        results = [pool.submit(_make_frame, crew, frame) for frame in frames]
+    with open_pool(spec) as pool, ThreadPoolExecutor(pool.plan.workers + 1) as pool:
+        results = [pool.submit(_make_frame, pool, frame) for frame in frames]
         try:
             for done in as_completed(results):
                 done.result()
                 progress.advance()
         except BaseException as error:
-            crew.close()
+            pool.close()
             pool.shutdown(cancel_futures=True)
-            if not isinstance(error, CrewClosed):
+            if not isinstance(error, PoolClosed):
                 raise
             failures = [each.exception() for each in results if not each.cancelled()]
-            raise next((each for each in failures if each and not isinstance(each, CrewClosed)), error) from None
+            raise next((each for each in failures if each and not isinstance(each, PoolClosed)), error) from None
 
 
-def _make_frame(crew: Crew, frame: Frame) -> None:
+def _make_frame(pool: WorkerPool, frame: Frame) -> None:
     """One frame from camera to files; where it fails nothing else is begun."""
     try:
-        rendered = crew.render(frame.camera, frame.name)
+        rendered = pool.render(frame.camera, frame.name)
         view = View(
             rendered.radiance,
             rendered.alpha,
@@ -131,7 +131,7 @@ def _make_frame(crew: Crew, frame: Frame) -> None:
         )
         write_view(frame, view)
     except BaseException:
-        crew.close()
+        pool.close()
         raise
 
 

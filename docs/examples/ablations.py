@@ -19,9 +19,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from shinypartial.files import whole_file, write_json
-from shinypartial.prediction import read_info
-from shinypartial.scores import Scores, read_scores
+from shinypartial.evaluation.scores import Scores, read_scores
+from shinypartial.io.files import atomic_write, write_json
+from shinypartial.prediction.format import read_info
 
 PAGE = Path("docs/ablations.md")
 NUMBERS = Path("docs/results/ablations.json")
@@ -304,7 +304,7 @@ def markdown(table: str, seeds: list[int]) -> Iterator[str]:
 
 def collect(seeds: list[int]) -> None:
     """Write the page and the numbers behind it."""
-    numbers = {
+    num_parameters = {
         table: [
             {"name": row.name, "scene": row.scene, "arguments": row.arguments, "fits": [asdict(f) for f in figures]}
             for row in content.rows
@@ -312,13 +312,13 @@ def collect(seeds: list[int]) -> None:
         ]
         for table, content in TABLES.items()
     }
-    write_json(NUMBERS, numbers)
+    write_json(NUMBERS, num_parameters)
     introduction = PAGE.read_text(encoding="utf-8").split("\n## ")[0].rstrip() if PAGE.exists() else "# Ablations"
     lines = [introduction, ""]
     for table in TABLES:
-        if numbers[table]:
+        if num_parameters[table]:
             lines.extend(markdown(table, seeds))
-    with whole_file(PAGE) as temporary:
+    with atomic_write(PAGE) as temporary:
         temporary.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
 
 

@@ -14,9 +14,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from shinypartial.camera import Camera, look_at, opencv_to_opengl, ray_directions_world
-from shinypartial.conventions import FACE_AXES, FACES
-from shinypartial.sphere import cube_directions, directions_to_latlong, latlong_directions
+from shinypartial.core.camera import Camera, look_at, opencv_to_opengl, ray_directions_world
+from shinypartial.core.conventions import FACE_AXES, FACES
+from shinypartial.core.sphere import cube_directions, directions_to_latlong, latlong_directions
 
 AXIS_COLORS = ("#d62728", "#2ca02c", "#1f77b4")
 AXIS_NAMES = ("X", "Y", "Z")

@@ -11,9 +11,9 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from shinypartial.dataset.read import open_dataset, read_environment, read_view
-from shinypartial.files import whole_file
-from shinypartial.pictures import Scale, normal_picture, radiance_picture, scalar_picture
-from shinypartial.prediction import prediction_frame, read_environment_map, read_visibility
+from shinypartial.evaluation.pictures import Scale, normal_picture, radiance_picture, scalar_picture
+from shinypartial.io.files import atomic_write
+from shinypartial.prediction.format import prediction_frame, read_environment_map, read_visibility
 
 ROW = 250
 GAP = 10
@@ -63,7 +63,7 @@ def main(prediction: Path, dataset_root: Path, output: Path) -> None:
             canvas.paste(image, (x, y))
             draw.text((x, y + ROW + 2), caption, fill="black", font=font)
             x += image.width + GAP
-    with whole_file(output) as temporary:
+    with atomic_write(output) as temporary:
         canvas.save(temporary, format="JPEG", quality=88)
 
 

@@ -16,13 +16,13 @@ import scipy.sparse as sparse
 import torch
 from scipy.sparse.linalg import splu
 
-from panoless import cubemap
+from panoless.environment import solve as cubemap
 from panoless.kernels.cubemap import cubemap_solid_angles, scatter_cubemap
+from shinypartial.core.sphere import latlong_to_cube
 from shinypartial.dataset.read import open_dataset
-from shinypartial.files import write_json
-from shinypartial.images import read_exr_rgb
-from shinypartial.oracle import rays_of_view
-from shinypartial.sphere import latlong_to_cube
+from shinypartial.io.files import write_json
+from shinypartial.io.images import read_exr_rgb
+from shinypartial.oracle.baseline import rays_of_view
 
 RESOLUTION = 64
 TEXELS = 6 * RESOLUTION**2

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from shinypartial.dataset.read import open_dataset
-from shinypartial.files import write_json
-from shinypartial.prediction import DEFAULT_FOLDER, read_info
-from shinypartial.scores import Scores, read_scores
+from shinypartial.evaluation.scores import Scores, read_scores
+from shinypartial.io.files import write_json
+from shinypartial.prediction.format import DEFAULT_FOLDER, read_info
 
 
 def method_row(folder: Path) -> dict[str, Any] | None:
@@ -50,7 +50,7 @@ def method_row(folder: Path) -> dict[str, Any] | None:
 
 
 def main(output: Path, roots: list[Path]) -> None:
-    """Write the JSON file, copy contact sheets beside it and print the table."""
+    """Write the JSON file, copy contact height fields beside it and print the table."""
     scenes = {}
     for root in roots:
         dataset = open_dataset(root)
@@ -59,9 +59,9 @@ def main(output: Path, roots: list[Path]) -> None:
             "statistics": dataset.manifest.get("statistics"),
             "methods": [row for row in rows if row],
         }
-        sheets = [path for path in root.glob("contact_sheet.*")]
-        for sheet in sheets:
-            shutil.copyfile(sheet, output.parent / f"{dataset.name}-contact-sheet{sheet.suffix}")
+        height_fields = [path for path in root.glob("contact_sheet.*")]
+        for height_field in height_fields:
+            shutil.copyfile(height_field, output.parent / f"{dataset.name}-contact-height field{height_field.suffix}")
     write_json(output, scenes)
     print("| Dataset | Method | Environment, all / observed / resolved dB | Normals, mean / median ° | Render dB | s |")
     print("| --- | --- | --- | --- | --- | --- |")

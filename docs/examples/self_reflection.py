@@ -17,17 +17,18 @@ import numpy as np
 import torch
 from scipy.ndimage import binary_dilation
 
-from panoless.checkpoint import load_state
+from panoless.capture.rays import pixel_rays
+from panoless.capture.views import TrainView, Views, load_views
 from panoless.config import FitConfig
-from panoless.initialize import initial_surfels
+from panoless.geometry.revolution.model import SurfaceOfRevolution, trace_reflections
+from panoless.geometry.surfels.model import Surfels
+from panoless.geometry.surfels.placement import initial_surfels
 from panoless.kernels.cpu.trace import Picture
-from panoless.lathe import Lathe, followed, pixel_rays
-from panoless.surfels import Surfels
+from panoless.reconstruct.state import load_state
 from panoless.trace import first_hits, fuse_pictures, fuse_surface, sees_itself, surface_points
-from panoless.views import TrainView, Views, load_views
 from shinypartial.dataset.read import open_dataset, read_view
 from shinypartial.dataset.schema import Dataset, View
-from shinypartial.files import read_json, write_json
+from shinypartial.io.files import read_json, write_json
 
 MARGINS_PX = (0, 1, 2)
 MARGIN = FitConfig().crop_margin_px
@@ -50,7 +51,7 @@ def main() -> None:
         state = load_state(run)
         if state is None:
             parser.error(f"no checkpoint in {run}")
-        seen = _from_lathe(state.lathe) if state.turned and state.lathe else _from_surfels(views, state.surfels)
+        seen = _from_lathe(state.surface) if state.turned and state.surface else _from_surfels(views, state.surfels)
         found[f"fitted, {run.name}"] = _score(dataset, views, options.every, seen)
     everything = read_json(options.output, "scores of the tracer") if options.output.exists() else {}
     write_json(options.output, {**everything, dataset.name: found})
@@ -66,11 +67,11 @@ def _from_surfels(views: Views, surfels: Surfels) -> Seen:
     return lambda _, view: sees_itself(surface, view, surfels, curved=True).numpy()
 
 
-def _from_lathe(lathe: Lathe) -> Seen:
+def _from_lathe(surface: SurfaceOfRevolution) -> Seen:
     """A surface of revolution is traced itself."""
 
     def seen(_: int, view: TrainView) -> np.ndarray:
-        escapes = followed(lathe, *pixel_rays(view.camera, np.arange(view.mask.numel())))
+        escapes = trace_reflections(surface, *pixel_rays(view.camera, np.arange(view.mask.numel())))
         again = escapes.first.met & (escapes.bounces == 0)
         return np.asarray(again.reshape(view.mask.shape))
 
@@ -84,14 +85,14 @@ def _from_truth(dataset: Dataset, views: Views) -> Seen:
         cropped = _cropped(read_view(dataset.train[index]), view)
         assert cropped.depth is not None
         assert cropped.normals_world is not None
-        return cropped.depth / np.float32(views.normalization.radius), cropped.normals_world
+        return cropped.depth / np.float32(views.object_frame.radius), cropped.normals_world
 
     def picture(index: int, view: TrainView) -> Picture:
         depth, normals_world = truth(index, view)
         pose, camera = view.camera.world_to_camera.numpy(), view.camera
-        numbers = tuple(np.float32(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+        num_parameters = tuple(np.float32(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy))
         normals_camera = np.ascontiguousarray(normals_world @ pose[:3, :3].T)
-        return Picture(np.ascontiguousarray(depth), normals_camera, np.ascontiguousarray(pose), numbers)
+        return Picture(np.ascontiguousarray(depth), normals_camera, np.ascontiguousarray(pose), num_parameters)
 
     surface = fuse_pictures([picture(index, view) for index, view in enumerate(views.train)][::2])
 

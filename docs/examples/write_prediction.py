@@ -59,9 +59,9 @@ def learn_environment(dataset: Path) -> tuple[np.ndarray, np.ndarray]:
         red, green, blue, alpha = (picture[name].pixels.astype(float) for name in "RGBA")
         origin, directions, _ = camera_rays(cameras, frame)
         hit, normals = meet_sphere(origin, directions)
-        mirrored = directions - 2 * (directions * normals).sum(-1, keepdims=True) * normals
+        reflect = directions - 2 * (directions * normals).sum(-1, keepdims=True) * normals
         inside = hit & (alpha > 0.99)
-        place = latlong_pixel(mirrored[inside])
+        place = latlong_pixel(reflect[inside])
         np.add.at(total, place, np.stack([red, green, blue], -1)[inside])
         np.add.at(count, place, 1)
     mean = total.sum((0, 1)) / max(count.sum(), 1)  # Directions that no view mirrors get the mean of the others.
@@ -77,8 +77,8 @@ def main(dataset: Path, prediction: Path) -> None:
     for frame in cameras["frames"]:
         origin, directions, axis = camera_rays(cameras, frame)
         hit, normals = meet_sphere(origin, directions)
-        mirrored = directions - 2 * (directions * normals).sum(-1, keepdims=True) * normals
-        radiance = environment[latlong_pixel(mirrored)] * hit[..., None]  # Premultiplied by alpha.
+        reflect = directions - 2 * (directions * normals).sum(-1, keepdims=True) * normals
+        radiance = environment[latlong_pixel(reflect)] * hit[..., None]  # Premultiplied by alpha.
         channels = dict(zip("RGB", np.moveaxis(radiance, -1, 0), strict=True)) | {"A": hit}
         channels |= {f"normal.{name}": normals[..., i] for i, name in enumerate("XYZ")}
         channels["depth.Z"] = ((normals - origin) @ axis) * hit  # Along the camera's axis, not the distance.

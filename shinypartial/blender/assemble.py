@@ -12,10 +12,10 @@ from shinypartial.blender.objects import mesh_of, place_objects
 from shinypartial.blender.output import add_passes, set_file
 from shinypartial.blender.runtime import choose_device, studio_light
 from shinypartial.blender.self_reflection import assemble_probe
-from shinypartial.errors import InputError
-from shinypartial.images import read_exr_rgb
+from shinypartial.core.errors import InputError
+from shinypartial.core.trajectory import CameraPath
+from shinypartial.io.images import read_exr_rgb
 from shinypartial.scene import FileWorld, Render, SceneSpec, Sphere, StudioWorld
-from shinypartial.trajectory import CameraPath
 
 BOUNCES = 16
 #: Measured in Blender's own maps: −0.0022 (forest), beside radiance up to 1400.

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from shinypartial.blender.materials import make_material
 from shinypartial.blender.mesh import Mesh, deformed
-from shinypartial.errors import InputError
+from shinypartial.core.errors import InputError
 from shinypartial.scene import BlendFile, Material, SceneSpec
 
 #: Kinds of objects that have a surface. Lights, cameras and the world of the file are not used.

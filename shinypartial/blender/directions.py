@@ -25,7 +25,7 @@ from shinypartial.blender.passes import (
     stacked,
 )
 from shinypartial.blender.region import Region, set_border
-from shinypartial.camera import Camera
+from shinypartial.core.camera import Camera
 from shinypartial.scene import BlendFile, SceneSpec
 
 DIRECTIONS = "directions"

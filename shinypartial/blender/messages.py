@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from shinypartial.errors import InputError
+from shinypartial.core.errors import InputError
 from shinypartial.scene import SceneSpec
 
 

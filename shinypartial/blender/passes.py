@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from shinypartial.blender.materials import DEPTH_PASS
-from shinypartial.errors import InputError
+from shinypartial.core.errors import InputError
 
 DEPTH_CHANNEL = f"{DEPTH_PASS}.X"
 COLOR_CHANNELS = tuple(f"Combined.{name}" for name in "RGB")

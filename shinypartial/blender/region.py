@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from shinypartial.camera import Camera, project
+from shinypartial.core.camera import Camera, project
 
 #: Pixels kept around the projected vertices.
 MARGIN_PX = 2

@@ -36,12 +36,12 @@ from shinypartial.blender.passes import (
     read_passes,
     stacked,
 )
-from shinypartial.blender.picked import assemble_picked, nearest_depth, render_picked
 from shinypartial.blender.region import SMALLEST_DEPTH, Region, image_region, set_border, world_vertices
 from shinypartial.blender.runtime import import_blender, interrupts_deferred, quiet, set_threads
 from shinypartial.blender.self_reflection import render_probe
-from shinypartial.camera import Camera, opencv_to_opengl
-from shinypartial.errors import InputError
+from shinypartial.blender.sparse_pixels import assemble_sparse, nearest_depth, render_sparse
+from shinypartial.core.camera import Camera, opencv_to_opengl
+from shinypartial.core.errors import InputError
 from shinypartial.scene import BlendFile, SceneSpec
 
 PROBE_PASSES = (COLOR_CHANNELS[0],)
@@ -116,7 +116,7 @@ class Renderer:
         unsure = np.zeros((camera.height, camera.width), bool)
         unsure[inside] = _near_the_object(paths) & ~light.smooth
         if unsure.any():
-            picked = render_picked(self.bpy, self.scratch / "picked.exr", unsure, depth)
+            picked = render_sparse(self.bpy, self.scratch / "picked.exr", unsure, depth)
             for name in PASSES:
                 passes[name][unsure] = picked[name]
         meets_scene = np.zeros(unsure.shape, bool)
@@ -158,7 +158,7 @@ def _prepare_mirror(bpy: Any, spec: SceneSpec, body: Float[np.ndarray, "P 3"], t
     """Add the two scenes that a perfect mirror needs."""
     props = [world_vertices(bpy, each) for each in props_of(bpy.context.scene)]
     assemble_directions(bpy, spec, BOUNCES)
-    assemble_picked(bpy, spec.camera)
+    assemble_sparse(bpy, spec.camera)
     return _Mirror(FarWorld(world_radiance(spec.world, spec.render.exposure)), np.concatenate([body, *props]), threads)
 
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from shinypartial.errors import InputError
+from shinypartial.core.errors import InputError
 
 PYTHON_OF_BPY = (3, 11)
 INSTALL = "pip install 'panoless[blender]'"

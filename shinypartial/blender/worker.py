@@ -1,4 +1,4 @@
-"""A process that renders what its parent asks for: `python -m shinypartial.blender.worker`, started by `crew`.
+"""A process that renders what its parent asks for: `python -m shinypartial.blender.worker`, started by `pool`.
 
 Blender keeps memory that it no longer uses, must not be forked and may crash; in a process of its own it does no harm.
 """
@@ -15,7 +15,7 @@ from typing import IO, Any
 
 from shinypartial.blender.messages import Ready, Refused, Start, receive, send
 from shinypartial.blender.render import open_renderer
-from shinypartial.errors import InputError, from_os_error
+from shinypartial.core.errors import InputError, from_os_error
 
 
 def main() -> None:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from shinypartial.camera import Camera
-from shinypartial.errors import InputError
+from shinypartial.core.camera import Camera
+from shinypartial.core.errors import InputError
 
 #: A path counts as closed when its ends are nearer than this many typical steps.
 CLOSED_STEPS = 3.0

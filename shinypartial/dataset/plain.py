@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from shinypartial.camera import ray_directions_world
-from shinypartial.conventions import SOLID_ALPHA
-from shinypartial.dataset.breaks import Break, break_of
+from shinypartial.core.camera import ray_directions_world
+from shinypartial.core.conventions import SOLID_ALPHA
+from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import image_size, image_stem, read_entry, read_view, refuse_distortion
 from shinypartial.dataset.schema import CHECKSUMS, ENVIRONMENT_LATLONG, LICENSES, MANIFEST, Frame, View
-from shinypartial.errors import InputError
-from shinypartial.files import read_json
-from shinypartial.images import read_png
+from shinypartial.dataset.violations import Violation, violation_of
+from shinypartial.io.files import read_json
+from shinypartial.io.images import read_png
 
 RESTORE = "Restore the file from the original dataset."
 DISPARITY_SUFFIX = "_disp.tiff"
@@ -41,7 +41,7 @@ def is_plain(root: Path, manifest: dict[str, Any]) -> bool:
     return (root / "transforms_train.json").exists() and not any((root / name).exists() for name in rendered)
 
 
-def read_plain_frames(root: Path, split: str) -> tuple[list[Frame], int, list[Break]]:
+def read_plain_frames(root: Path, split: str) -> tuple[list[Frame], int, list[Violation]]:
     """The frames whose camera can be read, how many are listed, and what is wrong with `transforms_SPLIT.json`."""
     file = f"transforms_{split}.json"
     if split == "test" and not (root / file).exists():
@@ -50,22 +50,22 @@ def read_plain_frames(root: Path, split: str) -> tuple[list[Frame], int, list[Br
         content = read_json(root / file, f"the cameras of the {split} split")
         entries = content.get("frames") if isinstance(content, dict) else None
         if not isinstance(entries, list) or not entries:
-            return [], 0, [Break(file, "`frames` is not a list with at least one frame", RESTORE)]
+            return [], 0, [Violation(file, "`frames` is not a list with at least one frame", RESTORE)]
         refuse_distortion(content, root / file)
         width, height = _first_size(root, content, root / file)
     except InputError as error:
-        return [], 0, [break_of(file, error, error.remedy)]
+        return [], 0, [violation_of(file, error, error.remedy)]
     angle = content.get("camera_angle_x")
     if "fl_x" not in content and isinstance(angle, int | float) and not 0 < angle < math.pi:
         problem = f"expected `camera_angle_x` between 0 and π, in radians, found {angle}"
-        return [], 0, [Break(file, problem, RESTORE)]
-    frames, breaks = [], []
+        return [], 0, [Violation(file, problem, RESTORE)]
+    frames, violations = [], []
     for entry in entries:
         try:
             frames.append(read_entry(root, entry, content, width, height, root / file))
         except InputError as error:
-            breaks.append(break_of(file, error, error.remedy))
-    return frames, len(entries), breaks
+            violations.append(violation_of(file, error, error.remedy))
+    return frames, len(entries), violations
 
 
 def _first_size(root: Path, content: dict[str, Any], path: Path) -> tuple[int, int]:
@@ -80,22 +80,24 @@ def _first_size(root: Path, content: dict[str, Any], path: Path) -> tuple[int, i
     raise failure
 
 
-def check_plain_frame(root: Path, frame: Frame) -> Iterator[Break]:
+def check_plain_frame(root: Path, frame: Frame) -> Iterator[Violation]:
     """Every broken promise of a frame without an EXR."""
     name = _name(root, frame.png)
     if not frame.png.is_file():
-        yield Break(name, "the file is missing", RESTORE)
+        yield Violation(name, "the file is missing", RESTORE)
         return
     try:
         view = read_view(frame)
     except InputError as error:
-        yield break_of(name, error, error.remedy)
+        yield violation_of(name, error, error.remedy)
         return
     inside = view.alpha > 0
     if not inside.any():
-        yield Break(name, "the mask is empty: the object is not in the picture", "Leave the frame out.")
+        yield Violation(name, "the mask is empty: the object is not in the picture", "Leave the frame out.")
     elif inside[[0, -1]].any() or inside[:, [0, -1]].any():
-        yield Break(name, "the object touches the border of the picture", "Accept it, or leave it out.", warning=True)
+        yield Violation(
+            name, "the object touches the border of the picture", "Accept it, or leave it out.", warning=True
+        )
     solid = view.alpha > SOLID_ALPHA
     if frame.alpha_png.exists():
         yield from _check_alpha(root, frame, view)
@@ -110,24 +112,24 @@ def _name(root: Path, path: Path) -> str:
     return (path.relative_to(root) if path.is_relative_to(root) else path).as_posix()
 
 
-def _check_alpha(root: Path, frame: Frame, view: View) -> Iterator[Break]:
+def _check_alpha(root: Path, frame: Frame, view: View) -> Iterator[Violation]:
     name = _name(root, frame.alpha_png)
     try:
         levels = read_png(frame.alpha_png)[..., 0].astype(np.float64)
     except InputError as error:
-        yield break_of(name, error, RESTORE)
+        yield violation_of(name, error, RESTORE)
         return
     if levels.shape != view.alpha.shape:
-        yield Break(name, f"{levels.shape[1]}×{levels.shape[0]} pixels, other than {frame.png.name}", RESTORE)
+        yield Violation(name, f"{levels.shape[1]}×{levels.shape[0]} pixels, other than {frame.png.name}", RESTORE)
         return
     difference = np.abs(levels - 255.0 * view.alpha)
     wrong = int((difference > LEVEL_TOLERANCE + 1e-3).sum())
     if wrong:
         problem = f"{wrong} pixels differ from the alpha of {frame.png.name} by up to {difference.max():.0f} of 255"
-        yield Break(name, problem, RESTORE)
+        yield Violation(name, problem, RESTORE)
 
 
-def _check_normals(root: Path, frame: Frame, solid: Bool[np.ndarray, "H W"]) -> Iterator[Break]:
+def _check_normals(root: Path, frame: Frame, solid: Bool[np.ndarray, "H W"]) -> Iterator[Violation]:
     """Unit world normals that face the camera, but at creases and outlines; `read_view` has judged the file."""
     name = _name(root, frame.normal_png)
     decoded: Float[np.ndarray, "P 3"] = read_png(frame.normal_png)[solid][:, :3] * (2 / 255) - 1
@@ -140,25 +142,25 @@ def _check_normals(root: Path, frame: Frame, solid: Bool[np.ndarray, "H W"]) -> 
     for what, wrong in found.items():
         if wrong.mean() > TOLERATED_SHARE:
             remedy = "Restore the file, or remove all of that split: normals are then not scored."
-            yield Break(name, f"{wrong.mean():.0%} of the object's pixels have {what}", remedy)
+            yield Violation(name, f"{wrong.mean():.0%} of the object's pixels have {what}", remedy)
 
 
-def _check_disparity(name: str, path: Path, solid: Bool[np.ndarray, "H W"]) -> Iterator[Break]:
+def _check_disparity(name: str, path: Path, solid: Bool[np.ndarray, "H W"]) -> Iterator[Violation]:
     """Finite on the object, with one channel or several. Nothing here reads it otherwise."""
     try:
         values = _read_tiff(path)
     except ImportError as error:
-        yield Break(name, f"can't be checked: {error}", "Nothing needs it; other readers may.", warning=True)
+        yield Violation(name, f"can't be checked: {error}", "Nothing needs it; other readers may.", warning=True)
         return
     except InputError as error:
-        yield break_of(name, error, RESTORE)
+        yield violation_of(name, error, RESTORE)
         return
     if values.shape[:2] != solid.shape:
-        yield Break(name, f"an array of shape {values.shape}, other than the picture's size", RESTORE)
+        yield Violation(name, f"an array of shape {values.shape}, other than the picture's size", RESTORE)
         return
     infinite = int((~np.isfinite(values[solid])).sum())
     if infinite:
-        yield Break(name, f"{infinite} values on the object are NaN or infinite", RESTORE)
+        yield Violation(name, f"{infinite} values on the object are NaN or infinite", RESTORE)
 
 
 def _read_tiff(path: Path) -> Float[np.ndarray, "H W *C"]:
@@ -180,13 +182,13 @@ def _read_tiff(path: Path) -> Float[np.ndarray, "H W *C"]:
         raise InputError(expected=f"a complete TIFF at {path}", found=f"{error}", remedy=RESTORE) from None
 
 
-def check_normals_of_split(split: str, frames: Sequence[Frame]) -> Iterator[Break]:
+def check_normals_of_split(split: str, frames: Sequence[Frame]) -> Iterator[Violation]:
     """Scores need the normals of every view of a split or of none."""
     lacking = [frame for frame in frames if not _has_normals(frame)]
     if 0 < len(lacking) < len(frames):
         remedy = f"Restore them, or remove every `*_normal.png` of {split}: normals are then not scored."
         problem = f"{len(lacking)} of {len(frames)} views have no normals, {lacking[0].name} for one"
-        yield Break(split, problem, remedy)
+        yield Violation(split, problem, remedy)
 
 
 def _has_normals(frame: Frame) -> bool:

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from shinypartial.camera import Camera, check_pose, opengl_to_opencv
-from shinypartial.color import srgb_to_linear
+from shinypartial.core.camera import Camera, check_pose, opengl_to_opencv
+from shinypartial.core.color import srgb_to_linear
+from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import (
     COLOR_CHANNELS,
     DEPTH_CHANNEL,
@@ -23,9 +24,8 @@ from shinypartial.dataset.schema import (
     Frame,
     View,
 )
-from shinypartial.errors import InputError
-from shinypartial.files import newest_folder, read_json
-from shinypartial.images import read_exr, read_exr_rgb, read_png, stack_channels
+from shinypartial.io.files import newest_folder, read_json
+from shinypartial.io.images import read_exr, read_exr_rgb, read_png, stack_channels
 
 DEFAULT_FOLDER = Path("datasets")
 DISTORTION_FIELDS = ("k1", "k2", "k3", "k4", "p1", "p2")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from shinypartial.camera import Camera
+from shinypartial.core.camera import Camera
 
 FORMAT = "shinypartial-dataset"
 FORMAT_VERSION = 1

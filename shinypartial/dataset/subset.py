@@ -13,22 +13,15 @@ import numpy as np
 from jaxtyping import Float
 
 from shinypartial import __version__
-from shinypartial.camera_plot import CAMERA_PLOT, plot_cameras
+from shinypartial.core.errors import InputError
+from shinypartial.core.trajectory import Trajectory, unit_vectors
+from shinypartial.dataset.camera_plot import CAMERA_PLOT, plot_cameras
 from shinypartial.dataset.crossing import angles_rad, find_crossings, look_at_point
 from shinypartial.dataset.read import open_dataset
 from shinypartial.dataset.schema import CHECKSUMS, SPLITS, Dataset, Frame
 from shinypartial.dataset.write import claim_folder, complete_dataset
-from shinypartial.errors import InputError
-from shinypartial.files import (
-    only_writer,
-    place_file,
-    read_json,
-    remove_partial_files,
-    sha256_of,
-    write_json,
-)
-from shinypartial.progress import Progress
-from shinypartial.trajectory import Trajectory, unit_vectors
+from shinypartial.io.files import copy_or_link, folder_lock, read_json, remove_partial_files, sha256_of, write_json
+from shinypartial.io.progress import Progress
 
 #: Share of the kept cameras that is for training, in percent, as Partial Shiny Blender has it.
 TRAIN_PERCENT = 40
@@ -175,7 +168,7 @@ def make_subset(source: Path, root: Path, options: SubsetOptions, *, link: bool 
     contents = {split: _renamed(dataset, split, getattr(selection, split)) for split in SPLITS}
     without_normals = tuple(split for split in SPLITS if _has_some_normals(getattr(selection, split)))
     files = [pair for split in SPLITS for pair in _copies(root, split, getattr(selection, split))]
-    with only_writer(root):
+    with folder_lock(root):
         claim_folder(root, _recipe(dataset, selection, options), {"shinypartial": __version__})
         missing = [(old, new) for old, new in files if not new.exists()]
         if (root / CHECKSUMS).exists() and not missing:
@@ -184,7 +177,7 @@ def make_subset(source: Path, root: Path, options: SubsetOptions, *, link: bool 
         remove_partial_files(root)
         progress = Progress("Linking" if link else "Copying", len(files), len(files) - len(missing))
         for old, new in missing:
-            place_file(old, new, link)
+            copy_or_link(old, new, link)
             progress.advance()
         for split in SPLITS:
             write_json(root / f"transforms_{split}.json", contents[split])

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from shinypartial.camera import Camera, check_pose, opengl_to_opencv
-from shinypartial.conventions import FACES
-from shinypartial.dataset.breaks import REMAKE, Break, break_of
+from shinypartial.core.camera import Camera, check_pose, opengl_to_opencv
+from shinypartial.core.conventions import FACES
+from shinypartial.core.errors import InputError
+from shinypartial.core.sphere import latlong_to_cube
 from shinypartial.dataset.plain import (
     check_normals_of_split,
     check_plain_frame,
@@ -33,12 +34,11 @@ from shinypartial.dataset.schema import (
     Frame,
 )
 from shinypartial.dataset.validate_frame import check_frame
+from shinypartial.dataset.violations import REMAKE, Violation, violation_of
 from shinypartial.dataset.write import latlong_to_y_up
-from shinypartial.errors import InputError
-from shinypartial.files import read_json, sha256_of
-from shinypartial.images import has_envmap_tag, read_exr_rgb
-from shinypartial.progress import Progress
-from shinypartial.sphere import latlong_to_cube
+from shinypartial.io.files import read_json, sha256_of
+from shinypartial.io.images import has_envmap_tag, read_exr_rgb
+from shinypartial.io.progress import Progress
 
 RESTORE = "Restore the file from the released dataset, or generate the dataset again."
 CONTINUE = "Run the `shinypartial generate` that began the folder again: it continues where it stopped."
@@ -48,7 +48,7 @@ ANGLE_TOLERANCE_RAD = 1e-6
 RADIANCE_TOLERANCE = 2e-3
 
 
-def validate(root: Path, progress: bool = False) -> list[Break]:
+def validate(root: Path, progress: bool = False) -> list[Violation]:
     """Every promise that the folder breaks, warnings last; empty when it keeps them all.
 
     A folder in the plain layout (`plain.is_plain`) promises less: `unscored` says what it lacks. Raises InputError when
@@ -61,30 +61,32 @@ def validate(root: Path, progress: bool = False) -> list[Break]:
             remedy="Check the path, or make one: `shinypartial generate --scene vase`.",
         )
     original = is_plain(root, {})
-    manifest, breaks = ({}, []) if original else _check_manifest(root)
+    manifest, violations = ({}, []) if original else _check_manifest(root)
     plain = original or is_plain(root, manifest)
     frames = []
     for split in SPLITS:
         found, problems = (_check_plain_split if plain else _check_transforms)(root, split, manifest)
         frames += found
-        breaks += problems
+        violations += problems
     counter = Progress("Validating", len(frames)) if progress and frames else None
     minor = manifest.get("format_minor", 0)
     complete = isinstance(minor, int) and minor >= 1
     for frame in frames:
         if plain and not frame.exr.exists():
-            breaks += check_plain_frame(root, frame)
+            violations += check_plain_frame(root, frame)
         else:
-            breaks += check_frame(root, frame, self_reflection=complete)
+            violations += check_frame(root, frame, self_reflection=complete)
         if counter:
             counter.advance()
     if not plain or (root / ENVIRONMENT_LATLONG).exists():
-        breaks += _check_environment(root)
+        violations += _check_environment(root)
     if not original:
-        breaks += [*_check_licenses(root), *_check_checksums(root)]
+        violations += [*_check_licenses(root), *_check_checksums(root)]
     if plain:  # What made it, and so what makes it again.
-        breaks = [replace(each, remedy=each.remedy.replace("`shinypartial generate`", SUBSET)) for each in breaks]
-    return sorted(breaks, key=lambda each: each.warning)
+        violations = [
+            replace(each, remedy=each.remedy.replace("`shinypartial generate`", SUBSET)) for each in violations
+        ]
+    return sorted(violations, key=lambda each: each.warning)
 
 
 def unscored(root: Path) -> str | None:
@@ -93,51 +95,55 @@ def unscored(root: Path) -> str | None:
     return what_is_absent(root, dataset.train, dataset.test) if is_plain(root, dataset.manifest) else None
 
 
-def _check_plain_split(root: Path, split: str, manifest: dict[str, Any]) -> tuple[list[Frame], list[Break]]:
-    frames, listed, breaks = read_plain_frames(root, split)
+def _check_plain_split(root: Path, split: str, manifest: dict[str, Any]) -> tuple[list[Frame], list[Violation]]:
+    frames, listed, violations = read_plain_frames(root, split)
     problems = [*_set_problems(frames, listed, split, manifest)]
     if manifest:  # An original folder is photographed from all around.
         problems += _hemisphere_problems(frames, manifest)
     file = f"transforms_{split}.json"
-    return frames, [*breaks, *(Break(file, each, RESTORE) for each in problems), *check_normals_of_split(split, frames)]
+    return frames, [
+        *violations,
+        *(Violation(file, each, RESTORE) for each in problems),
+        *check_normals_of_split(split, frames),
+    ]
 
 
-def _check_manifest(root: Path) -> tuple[dict[str, Any], list[Break]]:
+def _check_manifest(root: Path) -> tuple[dict[str, Any], list[Violation]]:
     try:
         manifest = read_json(root / MANIFEST, "the manifest")
     except InputError as error:
-        return {}, [break_of(MANIFEST, error, RESTORE)]
+        return {}, [violation_of(MANIFEST, error, RESTORE)]
     if not isinstance(manifest, dict):
-        return {}, [Break(MANIFEST, "expected a table at the top", RESTORE)]
-    breaks = []
+        return {}, [Violation(MANIFEST, "expected a table at the top", RESTORE)]
+    violations = []
     if (manifest.get("format"), manifest.get("format_version")) != (FORMAT, FORMAT_VERSION):
         found = f"{manifest.get('format')} version {manifest.get('format_version')}"
-        breaks.append(Break(MANIFEST, f"expected {FORMAT} version {FORMAT_VERSION}, found {found}", RESTORE))
+        violations.append(Violation(MANIFEST, f"expected {FORMAT} version {FORMAT_VERSION}, found {found}", RESTORE))
     if manifest.get("complete") is not True:
-        breaks.append(Break(MANIFEST, "the dataset is not complete", CONTINUE))
+        violations.append(Violation(MANIFEST, "the dataset is not complete", CONTINUE))
     for key in ("recipe", "generator"):
         if not isinstance(manifest.get(key), dict) or not manifest[key]:
-            breaks.append(Break(MANIFEST, f"`{key}` is missing: how the dataset was made", RESTORE))
+            violations.append(Violation(MANIFEST, f"`{key}` is missing: how the dataset was made", RESTORE))
             manifest[key] = {}
     if not isinstance(manifest.get("statistics", {}), dict):
-        breaks.append(Break(MANIFEST, "`statistics` is not a table", RESTORE))
+        violations.append(Violation(MANIFEST, "`statistics` is not a table", RESTORE))
         manifest["statistics"] = {}
-    return manifest, breaks
+    return manifest, violations
 
 
-def _check_transforms(root: Path, split: str, manifest: dict[str, Any]) -> tuple[list[Frame], list[Break]]:
+def _check_transforms(root: Path, split: str, manifest: dict[str, Any]) -> tuple[list[Frame], list[Violation]]:
     """The frames whose camera can be read, and what is wrong with the file."""
     file = f"transforms_{split}.json"
     try:
         content = read_json(root / file, f"the cameras of the {split} split")
     except InputError as error:
-        return [], [break_of(file, error, RESTORE)]
+        return [], [violation_of(file, error, RESTORE)]
     entries = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(entries, list) or not entries:
-        return [], [Break(file, "`frames` is not a list with at least one frame", RESTORE)]
+        return [], [Violation(file, "`frames` is not a list with at least one frame", RESTORE)]
     problems = list(_intrinsics_problems(content))
     if problems:  # Without intrinsics the images can't be judged.
-        return [], [Break(file, problem, RESTORE) for problem in problems]
+        return [], [Violation(file, problem, RESTORE) for problem in problems]
     frames = []
     for i, entry in enumerate(entries):
         problem = _entry_problem(entry, split)
@@ -146,7 +152,7 @@ def _check_transforms(root: Path, split: str, manifest: dict[str, Any]) -> tuple
         else:
             frames.append(_make_frame(root, entry, content))
     problems += [*_set_problems(frames, len(entries), split, manifest), *_hemisphere_problems(frames, manifest)]
-    return frames, [Break(file, problem, RESTORE) for problem in problems]
+    return frames, [Violation(file, problem, RESTORE) for problem in problems]
 
 
 def _set_problems(frames: list[Frame], listed: int, split: str, manifest: dict[str, Any]) -> Iterator[str]:
@@ -218,16 +224,16 @@ def _vector(values: Any) -> Float[np.ndarray, "3"]:
     return vector if vector.shape == (3,) else np.full(3, np.nan)
 
 
-def _check_environment(root: Path) -> Iterator[Break]:
+def _check_environment(root: Path) -> Iterator[Violation]:
     file = ENVIRONMENT_LATLONG.as_posix()
     try:
         latlong = read_exr_rgb(root / ENVIRONMENT_LATLONG)
     except InputError as error:
-        yield break_of(file, error)
+        yield violation_of(file, error)
         return
     height, width = latlong.shape[:2]
     if width != 2 * height or not np.isfinite(latlong).all() or latlong.min() < 0:
-        yield Break(file, f"expected a finite map ≥ 0, twice as wide as high, found {width}×{height}", REMAKE)
+        yield Violation(file, f"expected a finite map ≥ 0, twice as wide as high, found {width}×{height}", REMAKE)
         return
     faces = [ENVIRONMENT_CUBE / f"{name}.exr" for name in FACES]
     maps: dict[Path, np.ndarray] = {}
@@ -235,18 +241,18 @@ def _check_environment(root: Path) -> Iterator[Break]:
         try:
             maps[path] = read_exr_rgb(root / path)
         except InputError as error:
-            yield break_of(path.as_posix(), error)
+            yield violation_of(path.as_posix(), error)
     for path in (ENVIRONMENT_LATLONG, *maps):
         expected = path == ENVIRONMENT_LATLONG_Y_UP
         if has_envmap_tag(root / path) != expected:
             problem = f"the EXR attribute `envmap`, which means +Y up, is {'missing' if expected else 'set'}"
-            yield Break(path.as_posix(), problem, REMAKE)
+            yield Violation(path.as_posix(), problem, REMAKE)
     yield from _check_resampled(latlong, maps, faces)
 
 
 def _check_resampled(
     latlong: Float[np.ndarray, "H W 3"], maps: dict[Path, np.ndarray], faces: list[Path]
-) -> Iterator[Break]:
+) -> Iterator[Violation]:
     """Cube and Y-up map must be what the lat-long map gives when it is resampled."""
     present = [path for path in faces if path in maps]
     resolution = maps[present[0]].shape[0] if present else 0
@@ -256,31 +262,31 @@ def _check_resampled(
         truth = expected[path]
         if found.shape != truth.shape:
             problem = f"expected {truth.shape[1]}×{truth.shape[0]} texels, found {found.shape[1]}×{found.shape[0]}"
-            yield Break(path.as_posix(), problem, REMAKE)
+            yield Violation(path.as_posix(), problem, REMAKE)
         elif not np.allclose(found, truth, rtol=RADIANCE_TOLERANCE, atol=1e-6):
             wrong = int((~np.isclose(found, truth, rtol=RADIANCE_TOLERANCE, atol=1e-6)).any(-1).sum())
-            yield Break(path.as_posix(), f"{wrong} texels differ from {ENVIRONMENT_LATLONG.as_posix()}", REMAKE)
+            yield Violation(path.as_posix(), f"{wrong} texels differ from {ENVIRONMENT_LATLONG.as_posix()}", REMAKE)
 
 
-def _check_licenses(root: Path) -> Iterator[Break]:
+def _check_licenses(root: Path) -> Iterator[Violation]:
     try:
         rows = read_json(root / LICENSES, "the licenses")
     except InputError as error:
-        yield break_of(LICENSES, error, RESTORE)
+        yield violation_of(LICENSES, error, RESTORE)
         return
     if not isinstance(rows, list) or not rows:
-        yield Break(LICENSES, "expected a list with a row for each asset", RESTORE)
+        yield Violation(LICENSES, "expected a list with a row for each asset", RESTORE)
         return
     for i, row in enumerate(rows):
         texts = [row.get(key) if isinstance(row, dict) else None for key in ("license", "source")]
         if not all(isinstance(text, str) and text.strip() for text in texts):
-            yield Break(LICENSES, f"row {i} does not name a license and a source", "Add what is missing.")
+            yield Violation(LICENSES, f"row {i} does not name a license and a source", "Add what is missing.")
 
 
-def _check_checksums(root: Path) -> Iterator[Break]:
+def _check_checksums(root: Path) -> Iterator[Violation]:
     listing = root / CHECKSUMS
     if not listing.is_file():
-        yield Break(CHECKSUMS, "the list of checksums is missing", CONTINUE)
+        yield Violation(CHECKSUMS, "the list of checksums is missing", CONTINUE)
         return
     listed: dict[str, str] = {}
     # Split at line feeds only: a damaged byte may become one of the other separators that `splitlines` knows.
@@ -288,14 +294,16 @@ def _check_checksums(root: Path) -> Iterator[Break]:
     for number, line in enumerate(lines, 1):
         digest, separator, name = line.partition("  ")
         if len(digest) != 64 or not separator or not name:
-            yield Break(CHECKSUMS, f"line {number} is not `SHA-256  FILE`", RESTORE)
+            yield Violation(CHECKSUMS, f"line {number} is not `SHA-256  FILE`", RESTORE)
         else:
             listed[name] = digest
     present = {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()} - {CHECKSUMS}
     for name in sorted(present - listed.keys()):
-        yield Break(name, f"the file is not listed in {CHECKSUMS}", "Delete it if it doesn't belong to the dataset.")
+        yield Violation(
+            name, f"the file is not listed in {CHECKSUMS}", "Delete it if it doesn't belong to the dataset."
+        )
     for name in sorted(listed.keys() - present):
-        yield Break(name, f"the file is listed in {CHECKSUMS} but missing", REMAKE)
+        yield Violation(name, f"the file is listed in {CHECKSUMS} but missing", REMAKE)
     for name in sorted(listed.keys() & present):
         if sha256_of(root / name) != listed[name]:
-            yield Break(name, f"the content has changed since {CHECKSUMS} was written", REMAKE)
+            yield Violation(name, f"the content has changed since {CHECKSUMS} was written", REMAKE)

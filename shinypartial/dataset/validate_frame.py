@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from shinypartial.camera import ray_directions_world
-from shinypartial.dataset.breaks import REMAKE, Break, break_of
+from shinypartial.core.camera import ray_directions_world
+from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import (
     COLOR_CHANNELS,
     DEPTH_CHANNEL,
@@ -16,9 +16,9 @@ from shinypartial.dataset.schema import (
     Frame,
     View,
 )
+from shinypartial.dataset.violations import REMAKE, Violation, violation_of
 from shinypartial.dataset.write import display_rgba, encode_normals, encode_unit
-from shinypartial.errors import InputError
-from shinypartial.images import read_exr, read_png, stack_channels
+from shinypartial.io.images import read_exr, read_png, stack_channels
 
 #: Float32 rounding of a renormalized vector is 1e-7; a normal read from 8 bits would be off by 1e-2.
 UNIT_TOLERANCE = 1e-4
@@ -30,20 +30,20 @@ LEVEL_TOLERANCE = 1
 COMPARED_ALPHA = 1 / 64
 
 
-def check_frame(root: Path, frame: Frame, self_reflection: bool = False) -> Iterator[Break]:
+def check_frame(root: Path, frame: Frame, self_reflection: bool = False) -> Iterator[Violation]:
     """Every broken promise of a frame's files; without `self_reflection` it may have that or not."""
     expected = (*frame.files, frame.self_png) if self_reflection else frame.files
     missing = [path for path in expected if not path.is_file()]
-    yield from (Break(_name(root, path), "the file is missing", REMAKE) for path in missing)
+    yield from (Violation(_name(root, path), "the file is missing", REMAKE) for path in missing)
     if frame.exr in missing:
         return
     try:
         channels = read_exr(frame.exr)
         view, problems = _read_view(frame, channels, self_reflection or SELF_REFLECTION_CHANNEL in channels)
     except InputError as error:
-        yield break_of(_name(root, frame.exr), error)
+        yield violation_of(_name(root, frame.exr), error)
         return
-    yield from (Break(_name(root, frame.exr), problem, REMAKE) for problem in problems)
+    yield from (Violation(_name(root, frame.exr), problem, REMAKE) for problem in problems)
     if view is None:
         return
     yield from _check_values(_name(root, frame.exr), frame, view)
@@ -81,7 +81,7 @@ def _read_view(frame: Frame, channels: dict[str, np.ndarray], self_reflection: b
     return (None if infinite else view), problems + infinite
 
 
-def _check_values(file: str, frame: Frame, view: View) -> Iterator[Break]:
+def _check_values(file: str, frame: Frame, view: View) -> Iterator[Violation]:
     assert view.normals_world is not None
     assert view.depth is not None
     inside = view.alpha > 0
@@ -103,16 +103,18 @@ def _check_values(file: str, frame: Frame, view: View) -> Iterator[Break]:
         counts["self-reflection where alpha is zero"] = ~inside & (view.self_reflection != 0)
     for what, wrong in counts.items():
         if wrong.any():
-            yield Break(file, f"{int(wrong.sum())} pixels have {what}", REMAKE)
+            yield Violation(file, f"{int(wrong.sum())} pixels have {what}", REMAKE)
     if not inside.any():
-        yield Break(file, "the mask is empty: the object is not in the picture", "Correct the camera path or the mask.")
+        yield Violation(
+            file, "the mask is empty: the object is not in the picture", "Correct the camera path or the mask."
+        )
     elif inside[[0, -1]].any() or inside[:, [0, -1]].any():
-        yield Break(
+        yield Violation(
             file, "the object touches the border of the picture", "Move the camera back, or accept it.", warning=True
         )
 
 
-def _check_companions(root: Path, frame: Frame, view: View, missing: list[Path]) -> Iterator[Break]:
+def _check_companions(root: Path, frame: Frame, view: View, missing: list[Path]) -> Iterator[Violation]:
     assert view.normals_world is not None
     compared = view.alpha >= COMPARED_ALPHA
     expected: dict[Path, np.ndarray] = {
@@ -129,17 +131,17 @@ def _check_companions(root: Path, frame: Frame, view: View, missing: list[Path])
 
 def _compare_picture(
     name: str, path: Path, expected: UInt8[np.ndarray, "H W C"], compared: Bool[np.ndarray, "H W"]
-) -> Iterator[Break]:
+) -> Iterator[Violation]:
     try:
         found = read_png(path)
     except InputError as error:
-        yield break_of(name, error)
+        yield violation_of(name, error)
         return
     if found.shape != expected.shape:
-        yield Break(name, f"expected an image of shape {expected.shape}, found {found.shape}", REMAKE)
+        yield Violation(name, f"expected an image of shape {expected.shape}, found {found.shape}", REMAKE)
         return
     difference: Float[np.ndarray, "H W C"] = np.abs(found.astype(np.float64) - expected)
     difference[~compared, :3] = 0 if found.shape[2] == 4 else difference[~compared, :3]
     wrong = int((difference.max(-1) > LEVEL_TOLERANCE).sum())
     if wrong:
-        yield Break(name, f"{wrong} pixels differ from the EXR by up to {difference.max():g} of 255 levels", REMAKE)
+        yield Violation(name, f"{wrong} pixels differ from the EXR by up to {difference.max():g} of 255 levels", REMAKE)

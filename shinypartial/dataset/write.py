@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from shinypartial.camera import Camera, opencv_to_opengl
-from shinypartial.color import to_display
-from shinypartial.conventions import FACES
+from shinypartial.core.camera import Camera, opencv_to_opengl
+from shinypartial.core.color import to_display
+from shinypartial.core.conventions import FACES
+from shinypartial.core.errors import InputError
+from shinypartial.core.sphere import latlong_directions, latlong_to_cube, sample_latlong
 from shinypartial.dataset.schema import (
     CHECKSUMS,
     COLOR_CHANNELS,
@@ -27,10 +29,8 @@ from shinypartial.dataset.schema import (
     Frame,
     View,
 )
-from shinypartial.errors import InputError
-from shinypartial.files import PARTIAL_PREFIX, read_json, sha256_of, write_json, write_text
-from shinypartial.images import read_exr_rgb, write_exr, write_exr_rgb, write_png
-from shinypartial.sphere import latlong_directions, latlong_to_cube, sample_latlong
+from shinypartial.io.files import PARTIAL_PREFIX, read_json, sha256_of, write_json, write_text
+from shinypartial.io.images import read_exr_rgb, write_exr, write_exr_rgb, write_png
 
 
 def make_frames(root: Path, split: str, cameras: Sequence[Camera]) -> tuple[Frame, ...]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from shinypartial.sphere import cube_solid_angles, directions_to_cube, latlong_directions
+from shinypartial.core.sphere import cube_solid_angles, directions_to_cube, latlong_directions
 
 #: Directions are counted in the cells of a cubemap with faces of 32 × 32: about 2.8° wide, nearly equal in solid angle.
 CELLS_PER_SIDE = 32

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from shinypartial.color import linear_to_srgb
+from shinypartial.core.color import linear_to_srgb
+from shinypartial.core.sphere import latlong_directions, latlong_solid_angles, sample_latlong
 from shinypartial.metrics.image import SSIM_RADIUS, l1, psnr, ssim, ssim_map, weighted_mean
-from shinypartial.sphere import latlong_directions, latlong_solid_angles, sample_latlong
 
 PROTOCOL_HEIGHT = 256
 #: Added to radiance before the logarithm, so that black texels do not decide the HDR error.

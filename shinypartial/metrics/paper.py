@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from shinypartial.color import linear_to_srgb
+from shinypartial.core.color import linear_to_srgb
 from shinypartial.metrics.angular import angular_statistics
 from shinypartial.metrics.environment import to_protocol_size
 from shinypartial.metrics.image import l1, psnr, ssim

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from shinypartial.errors import InputError
+from shinypartial.core.errors import InputError
 
 if TYPE_CHECKING:
     import torch

@@ -5,12 +5,12 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from shinypartial.errors import InputError
+from shinypartial.core.errors import InputError
+from shinypartial.core.trajectory import SWEPT_PATHS
 from shinypartial.scene.check import check_scene
 from shinypartial.scene.shapes import BlendFile, Material
 from shinypartial.scene.spec import STUDIO_LIGHTS, FileWorld, SceneSpec
 from shinypartial.scene.tables import Place, parse_table
-from shinypartial.trajectory import SWEPT_PATHS
 
 SCENES = Path(__file__).resolve().parents[2] / "blender_scenes"
 RECIPE = "scene.toml"

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 
-from shinypartial.trajectory import limits
+from shinypartial.core.trajectory import limits
 
 
 @dataclass(frozen=True)

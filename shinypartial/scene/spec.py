@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from shinypartial.files import sha256_of
+from shinypartial.core.trajectory import CameraPath, limits
+from shinypartial.io.files import sha256_of
 from shinypartial.scene.shapes import (
     Assembly,
     BlendFile,
@@ -18,7 +19,6 @@ from shinypartial.scene.shapes import (
     SurfaceOfRevolution,
     Tube,
 )
-from shinypartial.trajectory import CameraPath, limits
 
 FORMAT_VERSION = 1
 STUDIO_LIGHTS = ("city", "courtyard", "forest", "interior", "night", "studio", "sunrise", "sunset")

@@ -6,7 +6,7 @@ import typing
 from dataclasses import dataclass
 from typing import Any
 
-from shinypartial.errors import InputError
+from shinypartial.core.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 
+from shinypartial.core.sphere import directions_to_latlong
 from shinypartial.dataset.schema import View
-from shinypartial.sphere import directions_to_latlong
 from tests.architecture.source import ROOT, source_files, undocumented
 from tests.conftest import checked_modules
 

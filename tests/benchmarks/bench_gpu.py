@@ -166,11 +166,12 @@ def time_gsplat(surfels: Vase, camera: RasterCamera, device: torch.device) -> Ro
 
 def time_fit(surfels: Vase, camera: RasterCamera, device: torch.device) -> Row:
     """Whole steps of a fit of the default preset on one view: lookup, losses, backward and Adam."""
-    from panoless.checkpoint import FitState
+    from panoless.capture.object_frame import ObjectFrame
+    from panoless.capture.views import TrainView, Views
     from panoless.config import FitConfig
-    from panoless.fit import Fitter
-    from panoless.surfels import Surfels
-    from panoless.views import Normalization, TrainView, Views
+    from panoless.geometry.surfels.model import Surfels
+    from panoless.geometry.surfels.train import Fitter
+    from panoless.reconstruct.state import FitState
 
     with torch.no_grad():
         picture = drawn(placed(surfels, device), camera, True)
@@ -204,7 +205,7 @@ def time_fit(surfels: Vase, camera: RasterCamera, device: torch.device) -> Row:
         center=[0.0, 0.0, 0.0],
         radius=1.0,
     )
-    views = Views((view,), Normalization(torch.zeros(3).numpy(), 1.0), camera.near)
+    views = Views((view,), ObjectFrame(torch.zeros(3).numpy(), 1.0), camera.near)
     with tempfile.TemporaryDirectory() as folder:
         fitter = Fitter(views, config, Path(folder), state)
         warm = round(config.environment.warmup * config.iterations) + 1
@@ -249,8 +250,8 @@ def main(arguments: list[str] | None = None) -> int:
         camera = vase_camera(pixels)
         surfels, _, _ = calibrated_vase(count, camera)
         if device.type == "cuda":
-            apart = largest_disagreement(surfels, camera, device)
-            print(f"{pixels} px, {count} surfels: largest relative difference from the CPU kernels {apart:.1e}")
+            excluded = largest_disagreement(surfels, camera, device)
+            print(f"{pixels} px, {count} surfels: largest relative difference from the CPU kernels {excluded:.1e}")
         rows += [time_rasterizer(surfels, camera, device, curved, what) for curved, what in KINDS]
         if device.type == "cuda":
             rows += sweep(surfels, camera, device) if options.sweep else []

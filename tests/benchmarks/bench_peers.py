@@ -34,8 +34,8 @@ from torch import Tensor
 
 from panoless.kernels.backend import Backend
 from panoless.kernels.rasterize import RasterBuffers, RasterCamera, rasterize
-from shinypartial.errors import InputError
-from shinypartial.files import write_json
+from shinypartial.core.errors import InputError
+from shinypartial.io.files import write_json
 from tests.benchmarks.bench_rasterize import CASES, Vase, calibrated_vase, vase_camera
 
 REPOSITORY = Path(__file__).resolve().parents[2]

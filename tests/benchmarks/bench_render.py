@@ -19,15 +19,15 @@ from typing import Any
 
 import numpy as np
 
-from shinypartial.blender.crew import CrewPlan, open_crew
 from shinypartial.blender.passes import ALPHA_CHANNEL, COLOR_CHANNELS, PASSES, read_passes, stacked
-from shinypartial.blender.picked import PICKED
 from shinypartial.blender.region import Region, image_region, set_border
 from shinypartial.blender.render import RenderedView, Renderer, open_renderer
 from shinypartial.blender.runtime import quiet
-from shinypartial.camera import Camera, opencv_to_opengl
+from shinypartial.blender.sparse_pixels import PICKED
+from shinypartial.blender.worker_pool import PoolPlan, open_pool
+from shinypartial.core.camera import Camera, opencv_to_opengl
+from shinypartial.core.trajectory import plan_cameras
 from shinypartial.scene import SceneSpec, load_scene, override, scene_names
-from shinypartial.trajectory import plan_cameras
 
 PLAIN_SAMPLES = 128
 REFERENCE_SAMPLES = 1024
@@ -226,13 +226,13 @@ def measure_scene(name: str, resolution: int, error_resolution: int, views: int)
     )
 
 
-def time_crew(spec: SceneSpec, plan: CrewPlan, frames: int) -> float:
+def time_crew(spec: SceneSpec, plan: PoolPlan, frames: int) -> float:
     """Seconds for that many frames once every process has rendered one."""
     cameras = plan_cameras(spec.camera, spec.render.resolution).train
-    with open_crew(spec, plan) as crew, ThreadPoolExecutor(plan.workers + 1) as pool:
+    with open_pool(spec, plan) as pool, ThreadPoolExecutor(plan.workers + 1) as pool:
 
         def one(index: int) -> RenderedView:
-            return crew.render(cameras[index % len(cameras)], "a view")
+            return pool.render(cameras[index % len(cameras)], "a view")
 
         one(0)  # The first tells its device, after which the others start.
         list(pool.map(one, range(3 * plan.workers)))
@@ -245,7 +245,7 @@ def time_crew(spec: SceneSpec, plan: CrewPlan, frames: int) -> float:
 def measure_crews(name: str, resolution: int, frames: int) -> list[CrewResult]:
     """One process with all threads against several with a share of them."""
     cores = os.cpu_count() or 1
-    plans = [CrewPlan(n, cores // n) for n in (1, 2, 4, 8) if n <= cores]
+    plans = [PoolPlan(n, cores // n) for n in (1, 2, 4, 8) if n <= cores]
     spec = override(load_scene(name), resolution=resolution)
     times: list[list[float]] = [[] for _ in plans]
     for _ in range(REPEATS):
@@ -270,16 +270,16 @@ def measure_memory(name: str, frames: int, frames_per_worker: int, resolution: i
     cameras = plan_cameras(spec.camera, resolution).train
     worker: list[float] = []
     parent: list[float] = []
-    with open_crew(spec, CrewPlan(1, 1, frames_per_worker)) as crew:
+    with open_pool(spec, PoolPlan(1, 1, frames_per_worker)) as pool:
         for i in range(frames):
             if i % (frames // 10) == 0:
                 worker.append(0.0)
                 parent.append(0.0)
-            crew.render(cameras[i % len(cameras)], "a view")
-            for each in crew._live:
+            pool.render(cameras[i % len(cameras)], "a view")
+            for each in pool._live:
                 worker[-1] = max(worker[-1], round(resident_mib(each.process.pid), 1))
             parent[-1] = max(parent[-1], round(resident_mib(os.getpid()), 1))
-        return MemoryResult(frames, frames_per_worker, crew.started, worker, parent)
+        return MemoryResult(frames, frames_per_worker, pool.started, worker, parent)
 
 
 def main() -> None:
@@ -304,8 +304,8 @@ def main() -> None:
         result["memory"] = [asdict(each) for each in kept]
         save()
     if options.frames:
-        crews = measure_crews(options.scene[0], options.resolution // 2, options.frames)
-        result["crews"] = [asdict(each) for each in crews]
+        pools = measure_crews(options.scene[0], options.resolution // 2, options.frames)
+        result["pools"] = [asdict(each) for each in pools]
         save()
     result["scenes"] = []
     for name in options.scene:

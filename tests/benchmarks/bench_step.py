@@ -24,12 +24,13 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import numpy as np
 import torch
 
-from panoless import fit as fit_module
-from panoless.config import PRESETS
-from panoless.fit import Fitter, new_state
-from panoless.optimizer import SurfelOptimizer
-from panoless.views import Views, cropped, views_of
-from shinypartial.camera import Camera
+from panoless.capture.views import Views, cropped, views_of
+from panoless.geometry.surfels.optimizer import SurfelOptimizer
+from panoless.geometry.surfels.train import Fitter
+from panoless.presets import PRESETS
+from panoless.reconstruct import fit as fit_module
+from panoless.reconstruct.fit import new_state
+from shinypartial.core.camera import Camera
 from shinypartial.dataset.read import open_dataset, read_view
 
 CASES = ((200, 5_000), (400, 8_000), (800, 50_000))
@@ -53,7 +54,7 @@ class StepTiming:
     """Wall time by stage; the rest is the step's own bookkeeping."""
 
 
-def resampled(image: np.ndarray, size: int) -> np.ndarray:
+def resample_profile(image: np.ndarray, size: int) -> np.ndarray:
     """A square image at another size: means of blocks, or bilinear."""
     stack = torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1)[None]
     if size < image.shape[0]:
@@ -72,7 +73,7 @@ def resampled_views(dataset: Path, size: int, crop_margin_px: int, count: int = 
         old, scale = frame.camera, size / frame.camera.width
         intrinsics = (scale * old.fx, scale * old.fy, scale * old.cx, scale * old.cy)
         camera = Camera(old.camera_to_world, *intrinsics, size, size)
-        images = (resampled(image.clip(0, 1), size) for image in (view.radiance, view.alpha))
+        images = (resample_profile(image.clip(0, 1), size) for image in (view.radiance, view.alpha))
         photographs.append(cropped(camera, *images, crop_margin_px))
     return views_of(photographs)
 

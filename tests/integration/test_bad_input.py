@@ -17,7 +17,7 @@ from panoless.cli import main
 from shinypartial.dataset.read import open_dataset, read_view
 from shinypartial.dataset.schema import Dataset
 from shinypartial.dataset.write import write_view
-from shinypartial.images import read_exr, write_exr, write_png
+from shinypartial.io.images import read_exr, write_exr, write_png
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = [

@@ -7,15 +7,15 @@ import sys
 import time
 from pathlib import Path
 
-from panoless.checkpoint import load_state
+from panoless.reconstruct.state import load_state
 from shinypartial.dataset.schema import Dataset
-from shinypartial.prediction import read_info
+from shinypartial.prediction.format import read_info
 
 ROOT = Path(__file__).resolve().parents[2]
 ITERATIONS = 400
 PROGRAM = """
 import sys
-import panoless.fit
+import panoless.reconstruct.fit
 from panoless.cli import main
 panoless.fit.CHECKPOINT_INTERVAL_S = 0.05
 sys.exit(main(sys.argv[1:]))

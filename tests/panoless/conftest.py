@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from panoless.checkpoint import FitState
+from panoless.capture.views import Views
 from panoless.config import FitConfig
-from panoless.views import Views
+from panoless.reconstruct.state import FitState
 from shinypartial.dataset.schema import Dataset
 
 
@@ -32,7 +32,7 @@ def many_views_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.fixture(scope="session")
 def views(many_views_dataset: Dataset) -> Views:
     """Its views, cropped."""
-    from panoless.views import load_views
+    from panoless.capture.views import load_views
 
     return load_views(many_views_dataset, crop_margin_px=3)
 
@@ -40,7 +40,7 @@ def views(many_views_dataset: Dataset) -> Views:
 @pytest.fixture(scope="session")
 def finished(many_views_dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> FinishedFit:
     """A fit of the default preset, a second long."""
-    from panoless.fit import fit
+    from panoless.reconstruct.fit import fit
     from tests.support.mirror_sphere import tiny_config
 
     config, folder = tiny_config(), tmp_path_factory.mktemp("runs") / "sphere"

@@ -9,7 +9,8 @@ from typing import get_args, get_type_hints
 import pytest
 
 from panoless.cli import _announce_compilation, main
-from panoless.config import PRESETS, FitConfig
+from panoless.config import FitConfig
+from panoless.presets import PRESETS
 from shinypartial.dataset.schema import Dataset
 
 TINY = ["--config.iterations", "4", "--config.surfels.count", "40", "--config.surfels.hull-resolution", "24"]
@@ -99,7 +100,7 @@ def test_a_model_that_is_asked_for_is_taken_and_saved(
 ) -> None:
     """Even a plane for a sphere, which is a surface of revolution; the run says so, and so does the prediction."""
     monkeypatch.chdir(tmp_path)
-    tables = {"plane": "plane.ply", "revolution": "lathe.ply", "surfels": "surfels.ply"}
+    tables = {"plane": "plane.ply", "revolution": "surface.ply", "surfels": "surfels.ply"}
     coarse = ["--config.environment.resolution", "16", "--config.environment.solve-resolution", "16"]
     for model in tables:
         assert main(["fit", str(many_views_dataset.root), *TINY, *coarse, "--model", model, "--output", model]) == 0

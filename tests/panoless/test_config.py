@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 import panoless
-from panoless.config import PRESETS, FitConfig, RateConfig, check_config, config_from_dict
-from panoless.surfels import Surfels
-from shinypartial.errors import InputError
+from panoless.config import FitConfig, RateConfig, check_config, config_from_dict
+from panoless.geometry.surfels.model import Surfels
+from panoless.presets import PRESETS
+from shinypartial.core.errors import InputError
 
 ROOT = Path(panoless.__file__).parent
 SECTIONS = {item.name: item.default_factory for item in fields(FitConfig) if is_dataclass(item.default_factory)}  # type: ignore[arg-type]

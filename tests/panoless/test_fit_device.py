@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from panoless import cubemap
-from panoless import fit as fit_module
 from panoless.config import FitConfig
-from panoless.fit import find_device, fit
+from panoless.environment import solve as cubemap
+from panoless.geometry.plane.model import plane_buffers, unoccluded_share
 from panoless.kernels import backend
-from panoless.plane import plane_buffers, unobstructed
+from panoless.reconstruct import fit as fit_module
+from panoless.reconstruct.fit import find_device, fit
+from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
-from shinypartial.errors import InputError
 from tests.support.mirror_plane import RECTANGLE, arc, make_plane_dataset, plane_of
 from tests.support.mirror_sphere import tiny_config
 from tests.support.second_device import second_device
@@ -71,18 +71,18 @@ def test_the_ladder_on_another_device_takes_the_same_rung(tmp_path: Path, defini
     torch.testing.assert_close(there.visibility, here.visibility)
 
 
-@pytest.mark.parametrize("rim_height", [0.0, 0.1])
-def test_a_plane_is_seen_on_the_device_of_the_camera(rim_height: float) -> None:
-    plane, camera = plane_of(RECTANGLE, rim_height), arc(1, size=24)[0]
+@pytest.mark.parametrize("frame_height", [0.0, 0.1])
+def test_a_plane_is_seen_on_the_device_of_the_camera(frame_height: float) -> None:
+    plane, camera = plane_of(RECTANGLE, frame_height), arc(1, size=24)[0]
     behind = replace(plane, normal=-plane.normal, offset=-plane.offset)
     for each in (plane, behind):
-        here, clear = plane_buffers(each, camera), unobstructed(each, camera)
+        here, clear = plane_buffers(each, camera), unoccluded_share(each, camera)
         with second_device() as device:
             moved = replace(camera, world_to_camera=camera.world_to_camera.to(device))
-            there = {**vars(plane_buffers(each, moved)), "unobstructed": unobstructed(each, moved)}
+            there = {**vars(plane_buffers(each, moved)), "unoccluded_share": unoccluded_share(each, moved)}
             assert {value.device for value in there.values()} == {device}
             there = {name: value.to("cpu") for name, value in there.items()}
-        for name, value in {**vars(here), "unobstructed": clear}.items():
+        for name, value in {**vars(here), "unoccluded_share": clear}.items():
             torch.testing.assert_close(there[name], value, msg=name)
 
 

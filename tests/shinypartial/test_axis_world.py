@@ -13,10 +13,10 @@ from jaxtyping import Float
 
 from shinypartial.blender.assemble import world_radiance
 from shinypartial.blender.render import open_renderer
-from shinypartial.camera import ray_directions_world, reflect
-from shinypartial.conventions import SOLID_ALPHA
-from shinypartial.sphere import latlong_to_cube, sample_cube, sample_latlong
-from shinypartial.trajectory import plan_cameras
+from shinypartial.core.camera import ray_directions_world, reflect
+from shinypartial.core.conventions import SOLID_ALPHA
+from shinypartial.core.sphere import latlong_to_cube, sample_cube, sample_latlong
+from shinypartial.core.trajectory import plan_cameras
 from tests.support.tiny_scene import tiny_scene
 
 pytest.importorskip("bpy")

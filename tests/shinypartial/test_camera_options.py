@@ -8,9 +8,9 @@ import pytest
 
 from shinypartial import generate as generate_module
 from shinypartial.cli import CameraOptions, main
-from shinypartial.errors import InputError
+from shinypartial.core.errors import InputError
+from shinypartial.core.trajectory import PATHS, PLACEMENTS, SWEPT_PATHS, CameraPath
 from shinypartial.scene import SceneSpec, load_scene, override
-from shinypartial.trajectory import PATHS, PLACEMENTS, SWEPT_PATHS, CameraPath
 
 
 @pytest.fixture

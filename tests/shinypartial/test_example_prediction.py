@@ -9,7 +9,13 @@ import pytest
 
 from shinypartial.dataset.read import read_environment, read_view
 from shinypartial.dataset.schema import Dataset
-from shinypartial.prediction import dataset_hash, prediction_frame, read_environment_map, read_info, read_visibility
+from shinypartial.prediction.format import (
+    dataset_hash,
+    prediction_frame,
+    read_environment_map,
+    read_info,
+    read_visibility,
+)
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs/examples/write_prediction.py"
 #: That is three pixels or more: the texel's mean is then over most of its 5.6°.

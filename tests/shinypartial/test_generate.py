@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shinypartial.camera_plot import CAMERA_PLOT
+from shinypartial.core.errors import InputError
+from shinypartial.dataset.camera_plot import CAMERA_PLOT
 from shinypartial.dataset.read import open_dataset, read_environment, read_view
 from shinypartial.dataset.schema import CHECKSUMS, CONTACT_SHEET, LICENSES, MANIFEST
 from shinypartial.dataset.validate import validate
-from shinypartial.errors import InputError
-from shinypartial.files import PARTIAL_PREFIX
 from shinypartial.generate import generate
+from shinypartial.io.files import PARTIAL_PREFIX
 from shinypartial.scene import SceneSpec, load_scene
 from tests.support.tiny_scene import WORLD_HEIGHT, direction_colors, tiny_scene, write_recipe
 
@@ -347,7 +347,7 @@ def test_a_finished_dataset_needs_no_blender(made: Path, spec: SceneSpec, monkey
 
 
 def test_a_world_that_is_no_latlong_map_is_refused(tmp_path: Path) -> None:
-    from shinypartial.images import write_exr_rgb
+    from shinypartial.io.images import write_exr_rgb
 
     recipe = write_recipe(tmp_path)
     write_exr_rgb(tmp_path / "world.exr", np.ones((8, 8, 3), np.float32))

@@ -1,4 +1,4 @@
-"""A planar mirror with an outline, flat or bent within it, as views and as a dataset, traced in numpy."""
+"""A planar mirror with an boundary, flat or bent within it, as views and as a dataset, traced in numpy."""
 
 import math
 from dataclasses import replace
@@ -9,11 +9,13 @@ import torch
 from jaxtyping import Bool, Float
 from matplotlib.path import Path as PolygonPath
 
+from panoless.capture.object_frame import ObjectFrame
+from panoless.capture.rays import pose_of, unit_rays_camera
+from panoless.capture.views import TrainView, Views
+from panoless.geometry.plane.model import Plane
 from panoless.kernels.rasterize import RasterCamera
-from panoless.plane import Plane
-from panoless.views import Normalization, TrainView, Views, pose_of, unit_rays_camera
-from shinypartial.camera import Camera, look_at
-from shinypartial.conventions import SOLID_ALPHA
+from shinypartial.core.camera import Camera, look_at
+from shinypartial.core.conventions import SOLID_ALPHA
 from shinypartial.dataset.read import open_dataset
 from shinypartial.dataset.schema import Dataset, View
 from shinypartial.dataset.write import (
@@ -33,10 +35,10 @@ L_SHAPE = np.array([[-0.6, -0.5], [0.6, -0.5], [0.6, 0.1], [0.0, 0.1], [0.0, 0.5
 RECTANGLE = np.array([[-0.65, -0.5], [0.65, -0.5], [0.65, 0.5], [-0.65, 0.5]])
 
 
-def plane_of(outline: Float[np.ndarray, "N 2"], rim_height: float = 0.0, offset: float = 0.07) -> Plane:
+def plane_of(boundary: Float[np.ndarray, "N 2"], frame_height: float = 0.0, offset: float = 0.07) -> Plane:
     tangent_u = np.cross([0.0, 0.0, 1.0], NORMAL)
     tangent_u /= np.linalg.norm(tangent_u)
-    return Plane(NORMAL, offset, tangent_u, np.cross(NORMAL, tangent_u), outline, rim_height)
+    return Plane(NORMAL, offset, tangent_u, np.cross(NORMAL, tangent_u), boundary, frame_height)
 
 
 def camera_at(position: Float[np.ndarray, "3"], size: int = SIZE_PX) -> RasterCamera:
@@ -64,11 +66,11 @@ def seen(plane: Plane, camera: RasterCamera, subpixels: int = SUBPIXELS) -> Bool
     y = ((np.arange(camera.height * subpixels) + 0.5) / subpixels - camera.cy) / camera.fy
     rays = np.stack([*np.meshgrid(x, y), np.ones((len(y), len(x)))], -1).reshape(-1, 3) @ rotation
     inside = np.ones(len(rays), dtype=bool)
-    for height in {0.0, plane.rim_height}:
+    for height in {0.0, plane.frame_height}:
         depth = (plane.offset + height - center @ plane.normal) / (rays @ plane.normal)
         hit = center + depth[:, None] * rays
         coordinates = np.stack([hit @ plane.tangent_u, hit @ plane.tangent_v], 1)
-        inside &= PolygonPath(plane.outline).contains_points(coordinates) & (depth > 0)
+        inside &= PolygonPath(plane.boundary).contains_points(coordinates) & (depth > 0)
     return inside.reshape(len(y), len(x))
 
 
@@ -87,7 +89,7 @@ def mirror_views(plane: Plane, cameras: list[RasterCamera]) -> Views:
     for camera in cameras:
         fine = seen(plane, camera).reshape(camera.height, SUBPIXELS, camera.width, SUBPIXELS)
         views.append(train_view(camera, fine.mean((1, 3))))
-    return Views(tuple(views), Normalization(np.zeros(3), 1.0), 0.3)
+    return Views(tuple(views), ObjectFrame(np.zeros(3), 1.0), 0.3)
 
 
 def reflecting_views(plane: Plane, cameras: list[RasterCamera], bend: float = 0.0) -> Views:
@@ -102,7 +104,7 @@ def reflecting_views(plane: Plane, cameras: list[RasterCamera], bend: float = 0.
 
 def traced(plane: Plane, camera: RasterCamera, alpha: Float[np.ndarray, "H W"], bend: float = 0.0) -> View:
     """What a camera sees of the mirror. At plane coordinates p its normal is n + bend·(p₁ t_u + p₂ t_v), made unit:
-    that of a shallow dome, which the outline does not tell.
+    that of a shallow dome, which the boundary does not tell.
     """
     rotation, center = pose_of(camera)
     rays = unit_rays_camera(camera).numpy().astype(np.float64).transpose(1, 2, 0)
@@ -113,10 +115,10 @@ def traced(plane: Plane, camera: RasterCamera, alpha: Float[np.ndarray, "H W"], 
         (hit @ tangent)[..., None] * tangent for tangent in (plane.tangent_u, plane.tangent_v)
     )
     normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
-    mirrored = world - 2 * (world * normals).sum(-1, keepdims=True) * normals
+    reflect = world - 2 * (world * normals).sum(-1, keepdims=True) * normals
     covered = alpha > 0
     images = (
-        environment_radiance(mirrored) * alpha[..., None],
+        environment_radiance(reflect) * alpha[..., None],
         alpha,
         normals * covered[..., None],
         distance * rays[..., 2] * covered,

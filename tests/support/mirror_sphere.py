@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from panoless.config import PRESETS, FitConfig
-from panoless.surfels import Surfels
+from panoless.config import FitConfig
+from panoless.geometry.surfels.model import Surfels
+from panoless.presets import PRESETS
 from tests.support.synthetic_dataset import environment_radiance
 
 

@@ -19,20 +19,20 @@ class SecondDeviceTensor(torch.Tensor):
     """Numbers in main memory under another device's name."""
 
     @staticmethod
-    def __new__(cls, numbers: torch.Tensor) -> "SecondDeviceTensor":
+    def __new__(cls, num_parameters: torch.Tensor) -> "SecondDeviceTensor":
         """Wrap plain numbers."""
         return torch.Tensor._make_wrapper_subclass(
             cls,
-            numbers.shape,
-            strides=numbers.stride(),
-            storage_offset=numbers.storage_offset(),
-            dtype=numbers.dtype,
+            num_parameters.shape,
+            strides=num_parameters.stride(),
+            storage_offset=num_parameters.storage_offset(),
+            dtype=num_parameters.dtype,
             device=SECOND_DEVICE,
         )
 
-    def __init__(self, numbers: torch.Tensor) -> None:
+    def __init__(self, num_parameters: torch.Tensor) -> None:
         """Keep them."""
-        self.numbers = numbers
+        self.num_parameters = num_parameters
 
     @classmethod
     def __torch_dispatch__(cls, function, types, arguments=(), options=None):
@@ -78,9 +78,11 @@ def _computed(function, arguments, options):
     if target is not None:
         options = {**options, "device": torch.device("cpu")}
     placed = torch.device(target).type == SECOND_DEVICE.type if target is not None else bool(there)
-    plain = tree_map(lambda item: item.numbers if isinstance(item, SecondDeviceTensor) else item, (arguments, options))
+    plain = tree_map(
+        lambda item: item.num_parameters if isinstance(item, SecondDeviceTensor) else item, (arguments, options)
+    )
     result = function(*plain[0], **plain[1])
-    originals = {id(tensor.numbers): tensor for tensor in there}
+    originals = {id(tensor.num_parameters): tensor for tensor in there}
     return tree_map(lambda item: _wrapped(item, originals), result) if placed else result
 
 

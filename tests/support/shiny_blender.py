@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from shinypartial.camera import Camera, look_at, opencv_to_opengl
-from shinypartial.color import linear_to_srgb
+from shinypartial.core.camera import Camera, look_at, opencv_to_opengl
+from shinypartial.core.color import linear_to_srgb
 from shinypartial.dataset.read import open_dataset
 from shinypartial.dataset.schema import Dataset, View
 from shinypartial.dataset.write import encode_normals, encode_unit
-from shinypartial.files import write_json
-from shinypartial.images import write_png
+from shinypartial.io.files import write_json
+from shinypartial.io.images import write_png
 from tests.support.synthetic_dataset import CAMERA_DISTANCE, FIELD_OF_VIEW_RAD, render_sphere
 
 AZIMUTH_REACH_DEG = 150.0

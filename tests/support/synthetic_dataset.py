@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from shinypartial.camera import Camera, look_at, opencv_to_opengl, ray_directions_world, reflect
-from shinypartial.color import linear_to_srgb
+from shinypartial.core.camera import Camera, look_at, opencv_to_opengl, ray_directions_world, reflect
+from shinypartial.core.color import linear_to_srgb
+from shinypartial.core.sphere import latlong_directions
 from shinypartial.dataset.read import open_dataset
 from shinypartial.dataset.schema import Dataset, Frame, View
 from shinypartial.dataset.write import (
@@ -23,9 +24,8 @@ from shinypartial.dataset.write import (
     write_transforms,
     write_view,
 )
-from shinypartial.files import write_json
-from shinypartial.images import write_png
-from shinypartial.sphere import latlong_directions
+from shinypartial.io.files import write_json
+from shinypartial.io.images import write_png
 
 CAMERA_DISTANCE = 4.0
 FIELD_OF_VIEW_RAD = math.radians(36.0)

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from shinypartial.images import write_exr_rgb
+from shinypartial.core.sphere import latlong_directions
+from shinypartial.io.images import write_exr_rgb
 from shinypartial.scene import SceneSpec, load_scene
-from shinypartial.sphere import latlong_directions
 
 WORLD_HEIGHT = 64
 RECIPE = """

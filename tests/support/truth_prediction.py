@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
+from shinypartial.core.sphere import latlong_directions
 from shinypartial.dataset.read import read_environment, read_view
 from shinypartial.dataset.schema import ENVIRONMENT_LATLONG, Dataset
-from shinypartial.prediction import (
+from shinypartial.prediction.format import (
     PredictionInfo,
     dataset_hash,
     prediction_frame,
@@ -15,7 +16,6 @@ from shinypartial.prediction import (
     write_test_view,
     write_visibility,
 )
-from shinypartial.sphere import latlong_directions
 
 CURVES = {"iteration": [0.0, 10.0, 20.0, 30.0], "loss": [1.0, 0.3, 0.1, 0.01], "psnr_train": [10.0, 15.0, 20.0, 22.0]}
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from panoless import cubemap
-from panoless.fit import fit
+from panoless.environment import solve as cubemap
 from panoless.kernels import backend
+from panoless.reconstruct.fit import fit
 from shinypartial.dataset.schema import Dataset
 from tests.support.mirror_sphere import tiny_config
 

@@ -1,0 +1,3 @@
+"""Photographs to training views: cameras, masks, rays and encodings. Imports config, numeric, kernels and
+shinypartial's formats.
+"""

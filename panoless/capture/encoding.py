@@ -1,0 +1,69 @@
+"""The light in which a fit works: how the radiance of pixels is encoded before it, and the map's decoded after it."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from panoless.config import FitConfig
+from shinypartial.core.errors import InputError
+from shinypartial.dataset.schema import Frame, View
+
+NO_TINT = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class RadianceEncoding:
+    """Encoding c ↦ f(c/F) of the radiance c of a mirror with the tint F, so that residuals mean the same everywhere.
+
+    With a low dynamic range c is clipped to [0, 1], as photographs are, and f(x) = x. With a high one f(x) = x up to 1
+    and 1 + ln x above: below 1 a fit works as ever, above it a residual is a relative one. f is increasing with a
+    continuous derivative, f(x) ≤ x.
+    """
+
+    high_dynamic_range: bool = False
+    tint: tuple[float, float, float] = NO_TINT
+
+    def clipped(self, frame: Frame, view: View) -> Float[np.ndarray, "H W 3"]:
+        """Radiance of a view, not encoded, without what its range excludes.
+
+        Raises InputError when a high dynamic range is asked of an 8-bit image.
+        """
+        if self.high_dynamic_range and not view.high_dynamic_range:
+            raise InputError(
+                expected=f"radiance above 1 for --config.environment.range hdr: an EXR of {frame.name}",
+                found="an 8-bit image",
+                remedy="Leave the option out, or add the EXR images.",
+            )
+        return np.clip(view.radiance, 0, None if self.high_dynamic_range else 1)
+
+    def encoded(self, radiance: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
+        """f(c/F)."""
+        if self.tint != NO_TINT:
+            radiance = radiance / np.array(self.tint, radiance.dtype)
+        if not self.high_dynamic_range:
+            return radiance
+        return np.where(radiance > 1, 1 + np.log(np.maximum(radiance, 1)), radiance)
+
+    @property
+    def saturation(self) -> Float[Tensor, "3"]:
+        """The largest encoded radiance that a view can show: 1/F, or ∞ with a high dynamic range."""
+        return torch.full((3,), math.inf) if self.high_dynamic_range else 1 / torch.tensor(self.tint)
+
+    def decoded(self, environment: Float[Tensor, "6 3 L L"]) -> Float[Tensor, "6 3 L L"]:
+        """f⁻¹ of a map: the radiance of the environment itself, before any mirror."""
+        if not self.high_dynamic_range:
+            return environment
+        return torch.where(environment > 1, torch.exp(environment.clamp(min=1) - 1), environment)
+
+
+#: Photographs in a mirror without color.
+LDR = RadianceEncoding()
+
+
+def encoding_of(config: FitConfig) -> RadianceEncoding:
+    """The light of a configuration."""
+    return RadianceEncoding(config.environment.range == "hdr", config.tint)

@@ -1,0 +1,130 @@
+"""Silhouettes: sub-pixel contours of masks, as curves and as signed distances."""
+
+import math
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from panoless.capture.rays import pose_of
+from panoless.capture.views import TrainView, Views, concatenated
+from panoless.kernels.rasterize import RasterCamera
+from shinypartial.core.conventions import PIXEL_CENTER
+
+if TYPE_CHECKING:
+    pass
+
+
+OUTLINE_LEVEL = 0.5
+#: Within this distance the curve itself is measured; beyond, pixels are.
+EXACT_BAND_PX = 3.0
+CURVE_STEP_PX = 0.5
+
+
+@dataclass(frozen=True)
+class MaskDistance:
+    """How far each pixel center of a view lies outside its mask's curve, in pixels; negative inside."""
+
+    camera: RasterCamera
+    distance_px: Float[Tensor, "H W"]
+
+    @property
+    def pixel(self) -> float:
+        """Size of a pixel at the origin of the normalized frame."""
+        return float(np.linalg.norm(pose_of(self.camera)[1])) / self.camera.fx
+
+    def distances(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
+        """Signed distance of points from the outline's cone, to first order: pixels · depth / focal length."""
+        camera = self.camera
+        seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        depth = seen[:, 2].clamp(min=camera.near)
+        column = seen[:, 0] / depth * camera.fx + (camera.cx - PIXEL_CENTER)
+        row = seen[:, 1] / depth * camera.fy + (camera.cy - PIXEL_CENTER)
+        inner_column, inner_row = column.clamp(0, camera.width - 1), row.clamp(0, camera.height - 1)
+        beyond = torch.hypot(column - inner_column, row - inner_row)
+        left, top = inner_column.floor().clamp(max=camera.width - 2), inner_row.floor().clamp(max=camera.height - 2)
+        across, down = inner_column - left, inner_row - top
+        index = (top * camera.width + left).long()
+        values = self.distance_px.flatten()
+        upper = torch.lerp(values[index], values[index + 1], across)
+        lower = torch.lerp(values[index + camera.width], values[index + camera.width + 1], across)
+        # Behind a camera nothing is known to be outside but that it can't be in the picture.
+        outside = torch.where(seen[:, 2] > camera.near, torch.lerp(upper, lower, down) + beyond, beyond + camera.width)
+        return outside * depth / camera.fx
+
+
+def mask_distance(view: TrainView) -> MaskDistance:
+    """The outline of a view's mask."""
+    distance = torch.from_numpy(mask_distance_px(view.mask.cpu().numpy())).to(view.mask.device)
+    return MaskDistance(view.camera, distance)
+
+
+def mask_distance_px(mask: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    """Signed distance, positive outside, of pixel centers from the curve where the interpolated mask is one half.
+
+    Beyond six pixels it is counted from pixel centers. A mask of one kind only is half its size away from a curve.
+    """
+    from scipy.ndimage import distance_transform_edt
+    from scipy.spatial import cKDTree
+    from skimage.measure import find_contours
+
+    inside: np.ndarray = mask >= OUTLINE_LEVEL
+    if inside.all() or not inside.any():
+        return np.full(mask.shape, (0.5 - inside.flat[0]) * sum(mask.shape), dtype=np.float32)
+    distance = np.where(inside, 0.5 - distance_transform_edt(inside), distance_transform_edt(~inside) - 0.5)
+    # Beyond the picture there is no object.
+    curves = find_contours(np.pad(mask.astype(np.float64), 1), OUTLINE_LEVEL)
+    points = np.concatenate([_refined(curve - 1) for curve in curves])
+    near = np.nonzero(np.abs(distance) < EXACT_BAND_PX)
+    found, _ = cKDTree(points).query(np.stack(near, 1).astype(np.float64))
+    distance[near] = np.where(inside[near], -found, found)
+    return distance.astype(np.float32)
+
+
+def _refined(curve: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "Q 2"]:
+    """Points along a curve whose sides are at most a pixel's diagonal, a quarter of a pixel apart or less."""
+    parts = math.ceil(math.sqrt(2) / CURVE_STEP_PX)
+    shares = (np.arange(parts) / parts)[:, None, None]
+    return (curve[:-1] * (1 - shares) + curve[1:] * shares).reshape(-1, 2)
+
+
+CONTOUR_LEVEL = 0.5
+
+
+@dataclass(frozen=True)
+class MaskContours:
+    """Contour points: rays of camera depth one, and how far a shift in space moves their pixel, times depth."""
+
+    view: Int[np.ndarray, "P"]
+    centers: Float[np.ndarray, "P 3"]
+    rays: Float[np.ndarray, "P 3"]
+    columns: Float[np.ndarray, "P 3"]
+    rows: Float[np.ndarray, "P 3"]
+
+    def every(self, stride: int) -> "MaskContours":
+        """Every stride-th point."""
+        return MaskContours(*(getattr(self, field.name)[::stride] for field in fields(self)))
+
+
+def mask_contours(views: Views) -> MaskContours:
+    """The longest closed or open contour of each mask."""
+    from skimage.measure import find_contours
+
+    parts = []
+    for index, view in enumerate(views.train):
+        found = find_contours(view.mask.cpu().numpy().astype(np.float64), CONTOUR_LEVEL)
+        if not found:
+            continue
+        pixels, camera = max(found, key=len)[:-1, ::-1] + PIXEL_CENTER, view.camera
+        rotation, center = pose_of(camera)
+        x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
+        rays = np.stack([x, y, np.ones_like(x)], 1) @ rotation
+        columns = camera.fx * (rotation[0] - x[:, None] * rotation[2])
+        rows = camera.fy * (rotation[1] - y[:, None] * rotation[2])
+        parts.append(MaskContours(np.full(len(x), index), np.tile(center, (len(x), 1)), rays, columns, rows))
+    if not parts:
+        return MaskContours(np.zeros(0, dtype=np.int64), *(np.zeros((0, 3)) for _ in range(4)))
+    return concatenated(parts)

@@ -1,0 +1,197 @@
+"""Dataset folder → training views: cropped tensors with cameras in a normalized frame."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from panoless.capture.encoding import LDR, RadianceEncoding
+from panoless.capture.object_frame import ObjectFrame, estimate_object_frame
+from panoless.capture.rays import pose_of, raster_camera, unit_rays_camera
+from panoless.kernels.objective import MirrorView
+from panoless.kernels.rasterize import RasterCamera, tiles_of
+from shinypartial.core.camera import Camera
+from shinypartial.core.conventions import SOLID_ALPHA
+from shinypartial.core.errors import InputError
+from shinypartial.dataset.read import read_view
+from shinypartial.dataset.schema import Dataset
+from shinypartial.io.progress import Progress
+
+#: Of the views, this one in turn is held out to judge by.
+HELD_OUT_EVERY = 5
+Each = TypeVar("Each")
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A picture around its object, in world coordinates. Radiance is as in `TrainView`."""
+
+    camera: Camera
+    radiance: Float[Tensor, "3 H W"]
+    mask: Float[Tensor, "H W"]
+
+
+@dataclass(frozen=True)
+class TrainView:
+    """One cropped training view. Radiance is linear, premultiplied, clipped to [0, 1].
+
+    Under another `RadianceEncoding` than the usual one its encoding stands in place of radiance.
+    """
+
+    camera: RasterCamera
+    radiance: Float[Tensor, "3 H W"]
+    mask: Float[Tensor, "H W"]
+    solid: Int[Tensor, "P"]
+    """Flat indices of the pixels that lie wholly on the object."""
+
+    def to(self, device: torch.device) -> "TrainView":
+        """The same view on a device."""
+        return TrainView(
+            camera=replace(self.camera, world_to_camera=self.camera.world_to_camera.to(device)),
+            radiance=self.radiance.to(device),
+            mask=self.mask.to(device),
+            solid=self.solid.to(device),
+        )
+
+    @property
+    def rays_camera(self) -> Float[Tensor, "3 H W"]:
+        """Unit ray directions in the camera frame through pixel centers, made anew: a view is 16 bytes a pixel."""
+        return unit_rays_camera(self.camera).to(self.mask.device)
+
+    @cached_property
+    def mirror(self) -> MirrorView:
+        """What the objective compares with."""
+        camera, rotation = self.camera, self.camera_to_world_rotation.contiguous()
+        intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+        return MirrorView(self.radiance, self.mask, rotation, *intrinsics, solid_alpha=SOLID_ALPHA)
+
+    @cached_property
+    def solid_tiles(self) -> Bool[Tensor, "tile_rows tile_columns"]:
+        """Tiles of the rasterizer with a pixel that lies wholly on the object."""
+        return tiles_of(self.mask > SOLID_ALPHA)
+
+    @cached_property
+    def mask_tiles(self) -> Bool[Tensor, "tile_rows tile_columns"]:
+        """Tiles of the rasterizer within a pixel of the mask."""
+        return tiles_of(self.mask > 0, margin_px=1)
+
+    @property
+    def camera_to_world_rotation(self) -> Float[Tensor, "3 3"]:
+        """Rotates camera directions into the world: R of the pose."""
+        return self.camera.world_to_camera[:3, :3].T
+
+    @property
+    def position(self) -> Float[np.ndarray, "3"]:
+        """Camera center in the normalized frame."""
+        return pose_of(self.camera)[1]
+
+
+@dataclass(frozen=True)
+class Views:
+    """All training views of a dataset and the frame they live in."""
+
+    train: tuple[TrainView, ...]
+    object_frame: ObjectFrame
+    near: float
+    """Near plane in normalized units: a tenth of the smallest camera distance."""
+
+    @property
+    def camera_extent(self) -> float:
+        """1.1 × the largest distance of a camera from the cameras' mean (Kerbl et al. 2023), in normalized units."""
+        positions = np.stack([view.position for view in self.train])
+        return 1.1 * float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
+
+    def to(self, device: torch.device) -> "Views":
+        """The same views on a device."""
+        return replace(self, train=tuple(view.to(device) for view in self.train))
+
+
+def load_views(dataset: Dataset, crop_margin_px: int, downscale: int = 1, light: RadianceEncoding = LDR) -> Views:
+    """Read the training split, averaged over blocks of `downscale` pixels a side, in the encoding of a light.
+
+    Raises InputError for unreadable images and for masks that are all empty.
+    """
+    progress = Progress("reading views", len(dataset.train))
+    photographs = []
+    for frame in dataset.train:
+        view = read_view(frame)
+        if not (view.alpha >= 0.5).any():
+            raise InputError(
+                expected=f"the object in {frame.name}: some mask pixel of at least one half",
+                found="an empty mask",
+                remedy="Correct the mask, or remove the frame from transforms_train.json.",
+            )
+        radiance = light.encoded(_block_means(light.clipped(frame, view), downscale))
+        alpha = _block_means(np.clip(view.alpha, 0, 1), downscale)
+        photographs.append(cropped(frame.camera.downscaled(downscale), radiance, alpha, crop_margin_px))
+        progress.advance()
+    return views_of(photographs)
+
+
+def views_of(photographs: Sequence[Photograph]) -> Views:
+    """The same pictures in the normalized frame that their masks determine."""
+    object_frame = estimate_object_frame([(each.camera, each.mask.numpy()) for each in photographs])
+    near = 0.1 * min(
+        float(np.linalg.norm(each.camera.position_world - object_frame.center)) / object_frame.radius
+        for each in photographs
+    )
+    train = tuple(
+        TrainView(
+            camera=raster_camera(each.camera, object_frame, near),
+            radiance=each.radiance,
+            mask=each.mask,
+            solid=torch.nonzero(each.mask.flatten() > SOLID_ALPHA)[:, 0],
+        )
+        for each in photographs
+    )
+    return Views(train, object_frame, near)
+
+
+def concatenated(parts: Sequence[Each]) -> Each:
+    """Dataclasses of arrays as one: each field's arrays one after the other."""
+    names = [item.name for item in fields(parts[0])]  # type: ignore[arg-type]
+    return type(parts[0])(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
+def split_held_out(views: Sequence[Each]) -> tuple[list[Each], list[Each]]:
+    """Things that stand for the views: four fifths to solve from, and every fifth to predict."""
+    phase = HELD_OUT_EVERY // 2
+    return [view for i, view in enumerate(views) if i % HELD_OUT_EVERY != phase], list(views[phase::HELD_OUT_EVERY])
+
+
+def every_kth_pixel(views: Views, most: int) -> Iterator[tuple[TrainView, Int[Tensor, "P"]]]:
+    """About `most` pixels of all views that lie wholly on the object: every k-th, beginning elsewhere in each view."""
+    stride = max(1, sum(len(view.solid) for view in views.train) // most)
+    for index, view in enumerate(views.train):
+        yield view, view.solid[index % stride :: stride]
+
+
+def _block_means(image: Float[np.ndarray, "H W *C"], side: int) -> Float[np.ndarray, "h w *C"]:
+    """Means over squares of `side` pixels; what is left over at the right and at the bottom is cut off."""
+    if side == 1:
+        return image
+    height, width = (size // side for size in image.shape[:2])
+    whole = image[: height * side, : width * side]
+    return whole.reshape(height, side, width, side, *image.shape[2:]).mean((1, 3))
+
+
+def cropped(
+    camera: Camera, radiance: Float[np.ndarray, "H W 3"], alpha: Float[np.ndarray, "H W"], margin_px: int
+) -> Photograph:
+    """The picture around its object, which a negative margin leaves whole."""
+    if margin_px >= 0:
+        rows, columns = np.nonzero(alpha.any(1))[0], np.nonzero(alpha.any(0))[0]
+        top, left = (max(int(places[0]) - margin_px, 0) for places in (rows, columns))
+        bottom = min(int(rows[-1]) + 1 + margin_px, camera.height)
+        right = min(int(columns[-1]) + 1 + margin_px, camera.width)
+        radiance, alpha = radiance[top:bottom, left:right], alpha[top:bottom, left:right]
+        center = camera.cx - left, camera.cy - top
+        camera = Camera(camera.camera_to_world, camera.fx, camera.fy, *center, right - left, bottom - top)
+    # Copies, so that nothing keeps the whole picture.
+    planes, mask = (np.array(image, np.float32, order="C") for image in (radiance.transpose(2, 0, 1), alpha))
+    return Photograph(camera, torch.from_numpy(planes), torch.from_numpy(mask))

@@ -1,0 +1,33 @@
+"""The cubemap: its start, look-up and resampling."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from panoless.config import EnvironmentConfig
+from panoless.kernels.cubemap import cubemap_directions, sample_cubemap
+
+INITIAL_LOGIT = 5.0
+
+
+def initial_environment(config: EnvironmentConfig, generator: torch.Generator) -> Float[Tensor, "6 3 L L"]:
+    """Gray radiance for `clamp`; logits uniform in ±5 for `sigmoid`."""
+    shape = (6, 3, config.resolution, config.resolution)
+    if config.activation == "sigmoid":
+        return (torch.rand(shape, generator=generator) * 2 - 1) * INITIAL_LOGIT
+    return torch.full(shape, 0.5)
+
+
+def look_up(
+    environment: Float[Tensor, "6 3 L L"], directions: Float[Tensor, "P 3"], activation: str
+) -> Float[Tensor, "P 3"]:
+    """Specular radiance: σ(E(ω)) for `sigmoid` (Eq. 7), E(ω) for `clamp`; bilinear and seamless."""
+    value = sample_cubemap(environment, directions)
+    return torch.sigmoid(value) if activation == "sigmoid" else value
+
+
+def resample(environment: Float[Tensor, "6 C L L"], resolution: int) -> Float[Tensor, "6 C M M"]:
+    """The map at the texel centers of another resolution, bilinear and seamless."""
+    directions = cubemap_directions(resolution, dtype=environment.dtype, device=environment.device).reshape(-1, 3)
+    sampled = sample_cubemap(environment, directions)
+    return sampled.view(6, resolution, resolution, -1).permute(0, 3, 1, 2).contiguous()

@@ -1,0 +1,28 @@
+"""Rays: what was seen of the environment, in which direction, and how far it is to be trusted."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Observations of the environment: unit world directions and the linear radiance seen along them.
+
+    `trust` says how far each is believed beforehand, in [0, 1]; None: all alike.
+    """
+
+    directions: Float[Tensor, "P 3"]
+    radiance: Float[Tensor, "P 3"]
+    trust: Float[Tensor, "P"] | None = None
+
+    def initial_weight(self) -> Float[Tensor, "P"]:
+        """The trust, or ones."""
+        return torch.ones_like(self.radiance[:, 0]) if self.trust is None else self.trust.clone()
+
+    def every(self, stride: int, first: int) -> "Rays":
+        """Every stride-th ray from the first."""
+        part = slice(first, None, stride)
+        return Rays(self.directions[part], self.radiance[part], None if self.trust is None else self.trust[part])

@@ -1,0 +1,104 @@
+"""The environment as a cubemap: lookup with its activation, the closed-form robust map, and the fill of gaps."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from panoless.environment.cubemap import resample
+from panoless.environment.fill import fill_unobserved
+from panoless.environment.rays import Rays
+from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap
+from panoless.numeric.conjugate_gradients import conjugate_gradients
+from panoless.numeric.robust import robust_weight
+
+ROBUST_SCALES = (None, 0.3, 0.15, 0.08, 0.05)
+REFINING_SCALES = (0.08, 0.05)
+CONFIDENT_WEIGHT = 1.0
+MERGED_RAYS = 1_000_000
+
+
+def solve_environment(
+    rays: Sequence[Rays], resolution: int, start: Float[Tensor, "6 3 M M"] | None = None
+) -> Float[Tensor, "6 3 L L"]:
+    """Robust least squares of the map for fixed geometry: min_E Σ t w ‖E(ω) − c‖², gaps filled smoothly.
+
+    Rounds of iteratively re-weighted least squares with the rays' trust t and Geman–McClure weights
+    w = 1/(1 + ‖e‖²/s²)², so that pixels which see the object itself or a wrong normal lose their vote. Each round
+    starts from the weighted splat Eᵀ(t w c)/Eᵀ(t w) and sharpens it by conjugate gradients on the normal equations.
+    From a `start`, a map of the same rays at any resolution, only the last scales are needed. The map lies between 0
+    and the brightest ray, or 1 where that is more.
+    """
+    rays = _merged(rays)
+    weights = [batch.initial_weight() for batch in rays]
+    device = rays[0].directions.device if rays else None
+    environment = torch.zeros(6, 3, resolution, resolution, device=device)
+    if start is not None:
+        environment = resample(start, resolution)
+    for scale in ROBUST_SCALES if start is None else REFINING_SCALES:
+        if scale is not None:
+            for batch, weight in zip(rays, weights, strict=True):
+                error = sample_cubemap(environment, batch.directions) - batch.radiance
+                weight.copy_(batch.initial_weight() * robust_weight(error, scale))
+        total = _normal_product(torch.ones_like(environment[:, :1]), rays, weights)
+        right_side = _right_side(rays, weights, environment)
+        splat = fill_unobserved(right_side / total.clamp(min=1e-9), total[:, 0])
+        environment = _sharpen(splat, right_side, total, rays, weights)
+    brightest = max([1.0, *(float(batch.radiance.max()) for batch in rays if batch.radiance.numel())])
+    return environment.clamp(0, brightest)
+
+
+def _merged(rays: Sequence[Rays]) -> list[Rays]:
+    """The same rays in batches of about a million: a lookup of ten thousand costs six times as much a ray."""
+    groups: list[list[Rays]] = [[]]
+    for batch in rays:
+        if sum(len(each.directions) for each in groups[-1]) >= MERGED_RAYS:
+            groups.append([])
+        groups[-1].append(batch)
+    return [
+        Rays(
+            torch.cat([each.directions for each in group]),
+            torch.cat([each.radiance for each in group]),
+            torch.cat([each.initial_weight() for each in group]),
+        )
+        for group in groups
+        if group
+    ]
+
+
+def _right_side(
+    rays: Sequence[Rays], weights: Sequence[Tensor], environment: Float[Tensor, "6 3 L L"]
+) -> Float[Tensor, "6 3 L L"]:
+    """Eᵀ(w c), of the size and on the device of a map."""
+    result = torch.zeros_like(environment)
+    for batch, weight in zip(rays, weights, strict=True):
+        result += scatter_cubemap(batch.radiance * weight[:, None], batch.directions, environment.shape[-1])
+    return result
+
+
+def _normal_product(
+    environment: Float[Tensor, "6 C L L"], rays: Sequence[Rays], weights: Sequence[Tensor]
+) -> Float[Tensor, "6 C L L"]:
+    """EᵀWE applied to a map: look up, weigh, scatter."""
+    result = torch.zeros_like(environment)
+    for batch, weight in zip(rays, weights, strict=True):
+        seen = sample_cubemap(environment, batch.directions) * weight[:, None]
+        result += scatter_cubemap(seen, batch.directions, environment.shape[-1])
+    return result
+
+
+def _sharpen(
+    start: Float[Tensor, "6 3 L L"],
+    right_side: Float[Tensor, "6 3 L L"],
+    total: Float[Tensor, "6 1 L L"],
+    rays: Sequence[Rays],
+    weights: Sequence[Tensor],
+) -> Float[Tensor, "6 3 L L"]:
+    """A few preconditioned conjugate-gradient steps; a unit-weight pull to the start keeps thin texels stable."""
+    return conjugate_gradients(
+        lambda image: _normal_product(image, rays, weights) + CONFIDENT_WEIGHT * image,
+        start,
+        right_side - _normal_product(start, rays, weights),
+        1 / (total + CONFIDENT_WEIGHT),
+    )

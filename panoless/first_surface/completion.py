@@ -1,0 +1,85 @@
+"""The first surface: the visual hull where silhouettes touch the object, a thin plate where none does.
+
+From cameras on one side, most outlines' rays run on past the object, so the hull bulges there: a can seen over ±55°
+has a wedge in front, with normals up to 35° wrong, and a flat mirror has a roof. Those parts are told by their
+contact with the outlines and replaced by the smoothest surface that continues the parts that are right.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from panoless.capture.views import Views
+from panoless.first_surface.contact import TOLERANCE_PX, TRUST_FLOOR, outline_contact
+from panoless.first_surface.mesh import TriangleMesh, cotangent_laplacian, vertex_areas
+from panoless.first_surface.visual_hull import HULL_HALF_SIDE, Hull
+
+#: The thin plate smooths the trusted hull over this length.
+PLATE_LENGTH_PX = 5.0
+#: Of sharper images than this, a grid shows the shape no finer.
+MOST_PIXELS_A_VOXEL = 4.5
+#: A plate that leaves the hull by more is held on it, as if outlines touched it there.
+OBSTACLE_PX = 0.25
+OBSTACLE_TRUST = 0.5
+OBSTACLE_ROUNDS = 3
+PROJECTION_STEPS = 3
+LEAST_SLOPE = 0.5
+
+
+def hull_surface(hull: Hull) -> TriangleMesh:
+    """The hull's zero level by marching cubes."""
+    from skimage.measure import marching_cubes
+
+    vertices, triangles, _, _ = marching_cubes(hull.distance, 0.0)
+    return TriangleMesh(vertices * hull.voxel - HULL_HALF_SIDE, triangles.astype(np.int64))
+
+
+def completed_surface(hull: Hull, views: Views) -> TriangleMesh:
+    """The hull where outlines touch the object, continued as a thin plate that stays inside the hull.
+
+    The plate is an obstacle problem: vertices that it would lift out of the hull are put on the hull, and held there
+    while it is solved again; what is left outside is moved onto the hull.
+    """
+    surface = hull_surface(hull)
+    pixel = max(hull.pixel, hull.voxel / MOST_PIXELS_A_VOXEL)
+    trust = outline_contact(surface, views).trust(TOLERANCE_PX * pixel) + TRUST_FLOOR
+    target, plate = surface.vertices, surface
+    for _ in range(OBSTACLE_ROUNDS):
+        plate = thin_plate(surface, trust, PLATE_LENGTH_PX * pixel, target)
+        inside = _moved_inside(hull, plate.vertices)
+        out = np.linalg.norm(inside - plate.vertices, axis=1) > OBSTACLE_PX * hull.pixel
+        trust, target = np.where(out, np.maximum(trust, OBSTACLE_TRUST), trust), np.where(out[:, None], inside, target)
+    return TriangleMesh(_moved_inside(hull, plate.vertices), surface.triangles)
+
+
+def _moved_inside(hull: Hull, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+    """Points outside the hull on its surface, the others where they are: Newton steps along the gradient."""
+    for _ in range(PROJECTION_STEPS):
+        value, gradient = hull.sample(points)
+        step = np.maximum(value, 0) / np.maximum((gradient**2).sum(1), LEAST_SLOPE**2)
+        points = points - step[:, None] * gradient
+    return points
+
+
+def thin_plate(
+    surface: TriangleMesh,
+    trust: Float[np.ndarray, "V"],
+    length: float,
+    target: Float[np.ndarray, "V 3"] | None = None,
+) -> TriangleMesh:
+    """Vertices x that minimize Σ A t ‖x − x₀‖² + ℓ⁴ Σ A ‖Δx‖², the bending of a plate through the trusted ones.
+
+    x₀ are the targets, or else the given vertices; A are vertex areas, t the trust, Δ the cotangent Laplacian of the
+    given mesh. Where t is 1, details shorter than ℓ are smoothed; where it is 0, the plate continues its surroundings'
+    position and slope.
+    """
+    from scipy import sparse
+    from scipy.sparse.linalg import splu
+
+    areas = vertex_areas(surface)
+    laplacian = cotangent_laplacian(surface)
+    data = areas * trust
+    goals = surface.vertices if target is None else target
+    system = length**4 * (laplacian.T @ sparse.diags(1 / areas) @ laplacian) + sparse.diags(data)
+    factors = splu(system.tocsc())
+    moved = np.stack([factors.solve(data * column) for column in goals.T.astype(np.float64)], 1)
+    return TriangleMesh(moved, surface.triangles)

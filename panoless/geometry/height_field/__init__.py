@@ -1,0 +1,1 @@
+"""A bent mirror: a B-spline height over a plane."""

@@ -1,0 +1,219 @@
+"""A mirror that bends: a plane with an boundary and a smooth height over it, and what a camera sees of it.
+
+Like `plane` and `surface`, it needs no blending: rays are intersected with the surface itself.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from panoless.capture.rays import pixel_rays, pose_of, reflect
+from panoless.capture.views import TrainView
+from panoless.environment.rays import Rays
+from panoless.geometry.plane.model import Plane
+from panoless.geometry.surfels.rendering import SurfaceBuffers
+from panoless.kernels.cpu.height_field import first_hits
+from panoless.kernels.rasterize import RasterCamera
+from panoless.numeric.bspline import cubic_bspline_basis
+from panoless.numeric.polygon import depth_inside, projected_coverage
+
+ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+"""Derivatives along u and v: height, slopes, bending."""
+STEPS_A_CELL = 4
+"""Straight pieces of the mirror's edge, for its coverage: cubic pieces are this smooth to a thousandth of a pixel."""
+CLEAR_PX = 1.0
+"""A mirrored ray has to pass the frame at least this far away: pixels are no points."""
+
+
+@dataclass(frozen=True)
+class HeightFieldHits:
+    """Where rays of camera depth 1 meet a height field: depth (infinite for misses), plane coordinates and slopes
+    there.
+    """
+
+    distance: Float[np.ndarray, "P"]
+    places: Float[np.ndarray, "P 2"]
+    slopes: Float[np.ndarray, "P 2"]
+
+    @property
+    def met(self) -> Bool[np.ndarray, "P"]:
+        """Which rays meet the surface."""
+        return np.isfinite(self.distance)
+
+    @property
+    def normals(self) -> Float[np.ndarray, "P 3"]:
+        """Unit, in the axes of the plane: (−h_u, −h_v, 1) to scale."""
+        normals = np.concatenate([-self.slopes, np.ones((len(self.slopes), 1))], 1)
+        return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+@dataclass(frozen=True)
+class HeightField:
+    """x(u, v) = plane point (u, v) + h(u, v) n, with h a uniform cubic B-spline of M × N coefficients.
+
+    The coefficient of row i and column j has its peak at `low` + spacing·(i − 1, j − 1), in plane coordinates. Within
+    the knots h is the spline, beyond them it goes on straight. The plane is that of the frame: the mirror's edge lies
+    at h over the boundary, a frame at the plane's frame height.
+    """
+
+    plane: Plane
+    low: Float[np.ndarray, "2"]
+    spacing: float
+    coefficients: Float[np.ndarray, "M N"]
+
+    @property
+    def num_parameters(self) -> int:
+        """How many numbers it is made of: those of the plane and its boundary, and the coefficients."""
+        return self.plane.num_parameters + self.coefficients.size
+
+    @property
+    def frame(self) -> Float[np.ndarray, "3 3"]:
+        """Rows t_u, t_v, n: rotates the normalized frame into the axes of the plane."""
+        return np.stack([self.plane.tangent_u, self.plane.tangent_v, self.plane.normal])
+
+    def basis(self, places: Float[np.ndarray, "P 2"]) -> tuple[Int[np.ndarray, "P 16"], Float[np.ndarray, "6 P 16"]]:
+        """Which coefficients act at plane coordinates, and by how much on h, h_u, h_v, h_uu, h_uv and h_vv there."""
+        rows, columns = self.coefficients.shape
+        place = (places - self.low) / self.spacing
+        cell = np.clip(np.floor(place), 0, [rows - 4, columns - 4]).astype(np.int64)
+        along_u, along_v = (cubic_bspline_basis((place - cell)[:, axis]) for axis in (0, 1))
+        row, column = (cell[:, axis, None] + np.arange(4) for axis in (0, 1))
+        index = (row[:, :, None] * columns + column[:, None]).reshape(-1, 16)
+        weights = [(along_u[i][:, :, None] * along_v[j][:, None]) / self.spacing ** (i + j) for i, j in ORDERS]
+        return index, np.stack(weights).reshape(6, -1, 16)
+
+    def heights(self, places: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "6 P"]:
+        """h, h_u, h_v, h_uu, h_uv and h_vv at plane coordinates."""
+        index, weights = self.basis(places)
+        return (weights * self.coefficients.ravel()[index]).sum(2)
+
+    def quadrilaterals(self) -> tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, "F 4"]]:
+        """Points in the normalized frame, over a grid of the boundary's box, and the faces within the boundary."""
+        low, high = self.plane.boundary.min(0), self.plane.boundary.max(0)
+        steps = np.ceil(STEPS_A_CELL * (high - low) / self.spacing).astype(np.int64)
+        u, v = (np.linspace(low[axis], high[axis], steps[axis] + 1) for axis in (0, 1))
+        places = np.stack(np.meshgrid(u, v, indexing="ij"), -1).reshape(-1, 2)
+        index = np.arange(len(places)).reshape(steps + 1)
+        faces = np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]], -1).reshape(-1, 4)
+        within = depth_inside(places[faces].mean(1), self.plane.boundary) > 0
+        return self.plane.points(places) + self.heights(places)[0][:, None] * self.plane.normal, faces[within]
+
+    def bending(self) -> Float[np.ndarray, "D D"]:
+        """B with cᵀ B c the sum of squared second differences of the coefficients c: Σ c_uu² + 2 c_uv² + c_vv²."""
+        rows, columns = (np.eye(count) for count in self.coefficients.shape)
+        differences = (
+            np.kron(np.diff(rows, 2, axis=0), columns),
+            np.kron(rows, np.diff(columns, 2, axis=0)),
+            np.sqrt(2) * np.kron(np.diff(rows, axis=0), np.diff(columns, axis=0)),
+        )
+        whole = np.concatenate(differences)
+        return whole.T @ whole
+
+    def hits(self, origins: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"]) -> HeightFieldHits:
+        """Where rays meet the front of the height field, also beside its boundary."""
+        starts, directions_local = origins @ self.frame.T - [*self.low, self.plane.offset], directions @ self.frame.T
+        distance, slopes = first_hits(
+            starts / self.spacing, directions_local / self.spacing, self.coefficients / self.spacing
+        )
+        places = (starts + np.where(np.isfinite(distance), distance, 0.0)[:, None] * directions_local)[:, :2] + self.low
+        return HeightFieldHits(distance, places, slopes)
+
+
+def flat_height_field(plane: Plane, cells: int) -> HeightField:
+    """A height field without height, of that many cells along the longer side of the boundary."""
+    low, extent = plane.boundary.min(0), np.ptp(plane.boundary, 0)
+    spacing = float(extent.max()) / cells
+    rows, columns = (int(np.ceil(length / spacing - 1e-9)) + 3 for length in extent)
+    return HeightField(plane, low, spacing, np.zeros((rows, columns)))
+
+
+@dataclass(frozen=True)
+class VisibleReflections:
+    """Pixels of a view (flat indices) that see the environment by way of a height field, and how."""
+
+    pixels: Int[Tensor, "P"]
+    directions_local: Float[np.ndarray, "P 3"]
+    """Rays of camera depth 1, in the axes of the plane."""
+    hits: HeightFieldHits
+    outgoing: Float[np.ndarray, "P 3"]
+    """Unit, in the normalized frame."""
+
+
+def visible_reflections(height_field: HeightField, view: TrainView, pixels: Int[Tensor, "P"]) -> VisibleReflections:
+    """Those of the given pixels whose mirrored rays pass the frame of the frame, if there is one, by a pixel or
+    more.
+    """
+    origins, directions = pixel_rays(view.camera, pixels.cpu().numpy())
+    hits, directions_local = height_field.hits(origins, directions), directions @ height_field.frame.T
+    outgoing = reflect(directions_local, hits.normals)
+    kept = hits.met & (outgoing[:, 2] > 0)
+    if height_field.plane.frame_height > 0:
+        height = np.where(
+            kept,
+            (origins @ height_field.plane.normal - height_field.plane.offset) + hits.distance * directions_local[:, 2],
+            0.0,
+        )
+        rise = np.maximum(height_field.plane.frame_height - height, 0.0) / np.where(kept, outgoing[:, 2], 1.0)
+        passed = hits.places + rise[:, None] * outgoing[:, :2]
+        pixel = np.where(kept, hits.distance + rise, 0.0) / view.camera.fx
+        kept &= depth_inside(passed, height_field.plane.boundary) > CLEAR_PX * pixel
+    chosen = HeightFieldHits(*(values[kept] for values in vars(hits).values()))
+    outgoing = outgoing[kept] / np.linalg.norm(outgoing[kept], axis=1, keepdims=True)
+    return VisibleReflections(
+        pixels[torch.from_numpy(kept).to(pixels.device)], directions_local[kept], chosen, outgoing @ height_field.frame
+    )
+
+
+def height_field_rays(height_field: HeightField, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
+    """What pixels of a view observed of the environment."""
+    seen = visible_reflections(height_field, view, pixels)
+    outgoing = torch.from_numpy(seen.outgoing).float().to(view.radiance.device)
+    return Rays(outgoing, view.radiance.flatten(1)[:, seen.pixels].T.contiguous())
+
+
+def height_field_buffers(height_field: HeightField, camera: RasterCamera) -> SurfaceBuffers:
+    """The height field as surfels would be seen: alpha is the area of each pixel within the mirror's edge and the
+    frame, depth and normal those of the ray through its center. The three depths agree.
+    """
+    shape, (rotation, center) = (camera.height, camera.width), pose_of(camera)
+    alpha = np.zeros(shape)
+    height_above = float(height_field.plane.normal @ center) - height_field.plane.offset
+    if height_above > 0:
+        alpha = projected_coverage((edge_points(height_field) - center) @ rotation.T, camera)
+        if 0 < height_field.plane.frame_height < height_above:
+            frame = (
+                height_field.plane.points(height_field.plane.boundary)
+                + height_field.plane.frame_height * height_field.plane.normal
+            )
+            alpha = np.minimum(alpha, projected_coverage((frame - center) @ rotation.T, camera))
+    pixels = np.flatnonzero(alpha)
+    hits = height_field.hits(*pixel_rays(camera, pixels))
+    alpha.ravel()[pixels[~hits.met]] = 0
+    depth, normals = np.zeros(alpha.size), np.zeros((alpha.size, 3))
+    depth[pixels] = np.where(hits.met, hits.distance, 0.0)
+    normals[pixels] = hits.normals @ height_field.frame @ rotation.T
+    device = camera.world_to_camera.device
+    covered, distance = (torch.from_numpy(image.reshape(shape)).float().to(device) for image in (alpha, depth))
+    return SurfaceBuffers(
+        albedo=covered.new_zeros(3, *shape),
+        alpha=covered,
+        raster_normals_camera=torch.from_numpy(normals.T.reshape(3, *shape)).float().to(device) * covered,
+        expected_depth=distance,
+        median_depth=distance,
+        surface_depth=distance,
+        distortion=torch.zeros_like(covered),
+        in_frustum=(covered > 0).any()[None],
+    )
+
+
+def edge_points(height_field: HeightField) -> Float[np.ndarray, "E 3"]:
+    """Points of the mirror's edge in the normalized frame, closely around the boundary."""
+    following, parts = np.roll(height_field.plane.boundary, -1, 0), []
+    for start, end in zip(height_field.plane.boundary, following, strict=True):
+        pieces = int(np.ceil(STEPS_A_CELL * np.linalg.norm(end - start) / height_field.spacing)) or 1
+        parts.append(start + np.arange(pieces)[:, None] / pieces * (end - start))
+    places = np.concatenate(parts)
+    return height_field.plane.points(places) + height_field.heights(places)[0][:, None] * height_field.plane.normal

@@ -1,0 +1,1 @@
+"""A flat mirror: a plane with a boundary polygon."""

@@ -1,0 +1,109 @@
+"""A planar mirror: one plane with an boundary, and what a camera sees of it.
+
+A surface of one normal needs neither surfels nor blending: coverage and depth are exact.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from panoless.capture.rays import pose_of
+from panoless.geometry.surfels.rendering import SurfaceBuffers
+from panoless.kernels.rasterize import RasterCamera
+from panoless.numeric.polygon import projected_coverage
+from shinypartial.core.conventions import PIXEL_CENTER
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A one-sided mirror: x = d n + p₁ t_u + p₂ t_v in the normalized frame with (p₁, p₂) inside the boundary.
+
+    The normal n = t_u × t_v is unit and faces the cameras; d is the offset, n·x = d. The boundary is one closed polygon
+    without holes, convex or not, counterclockwise for who looks at the mirror; its last vertex is joined to its first.
+    """
+
+    normal: Float[np.ndarray, "3"]
+    offset: float
+    tangent_u: Float[np.ndarray, "3"]
+    tangent_v: Float[np.ndarray, "3"]
+    boundary: Float[np.ndarray, "N 2"]
+    frame_height: float = 0.0
+    """How far the frame stands out in front of the mirror: it hides what the boundary, moved by this along the normal,
+    does not let through. Zero: no frame, or a flat one.
+    """
+
+    @property
+    def num_parameters(self) -> int:
+        """How many numbers it is made of: normal and offset; the boundary's vertices; the frame."""
+        return 3 + self.boundary.size + (self.frame_height > 0)
+
+    def points(self, coordinates: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P 3"]:
+        """Plane coordinates to points in space."""
+        return self.offset * self.normal + coordinates @ np.stack([self.tangent_u, self.tangent_v])
+
+
+def plane_buffers(plane: Plane, camera: RasterCamera) -> SurfaceBuffers:
+    """The plane as surfels would be seen: alpha is the covered area of each pixel, depths are those of its center.
+
+    Normals are alpha times the plane's normal in camera axes; the three depths agree, and where a pixel's center lies
+    beside the plane they stay within the depths of the boundary. All is zero where alpha is, and everywhere for a
+    camera behind the mirror. `in_frustum` has one element. With a frame, alpha is the smaller of the coverages of the
+    boundary and of the frame, which is exact but for pixels that both outlines cut.
+    """
+    rotation, center = pose_of(camera)
+    height_above = float(plane.normal @ center) - plane.offset
+    if height_above <= 0:
+        nothing = np.zeros((camera.height, camera.width))
+        return _buffers(nothing, nothing, np.zeros(3), camera)
+    corners = (plane.points(plane.boundary) - center) @ rotation.T
+    normal = rotation @ plane.normal
+    alpha = projected_coverage(corners, camera)
+    if 0 < plane.frame_height < height_above:
+        alpha = np.minimum(alpha, projected_coverage(corners + plane.frame_height * normal, camera))
+    x = (np.arange(camera.width) + PIXEL_CENTER - camera.cx) / camera.fx
+    y = (np.arange(camera.height) + PIXEL_CENTER - camera.cy) / camera.fy
+    slope = -(normal[0] * x + (normal[1] * y + normal[2])[:, None])
+    nearest, farthest = max(corners[:, 2].min(), camera.near), max(corners[:, 2].max(), camera.near)
+    depth = np.where(slope > 0, height_above / np.maximum(slope, 1e-12), farthest).clip(nearest, farthest)
+    return _buffers(alpha, depth * (alpha > 0), normal, camera)
+
+
+def unoccluded_share(plane: Plane, camera: RasterCamera) -> Float[Tensor, "H W"]:
+    """Share of each pixel that sees the environment in the mirror, not the frame from within; 1 beside the mirror.
+
+    A reflected ray passes the frame where the straight ray behind the mirror passes the frame's mirror image, which is
+    the boundary moved by the frame's height against the normal. Without a frame it is 1 everywhere.
+    """
+    rotation, center = pose_of(camera)
+    if plane.frame_height <= 0 or plane.normal @ center <= plane.offset:
+        return camera.world_to_camera.new_ones(camera.height, camera.width)
+    boundary = (plane.points(plane.boundary) - center) @ rotation.T
+    image = projected_coverage(boundary - plane.frame_height * (rotation @ plane.normal), camera)
+    return _tensor(np.where(projected_coverage(boundary, camera) > 0, image, 1.0), camera)
+
+
+def _buffers(
+    alpha: Float[np.ndarray, "H W"],
+    depth: Float[np.ndarray, "H W"],
+    normal_camera: Float[np.ndarray, "3"],
+    camera: RasterCamera,
+) -> SurfaceBuffers:
+    covered, distance = _tensor(alpha, camera), _tensor(depth, camera)
+    return SurfaceBuffers(
+        albedo=covered.new_zeros(3, *covered.shape),
+        alpha=covered,
+        raster_normals_camera=_tensor(normal_camera, camera)[:, None, None] * covered,
+        expected_depth=distance,
+        median_depth=distance,
+        surface_depth=distance,
+        distortion=torch.zeros_like(covered),
+        in_frustum=(covered > 0).any()[None],
+    )
+
+
+def _tensor(values: Float[np.ndarray, "*S"], camera: RasterCamera) -> Float[Tensor, "*S"]:
+    """In float32, on the device of a camera."""
+    return torch.from_numpy(values).float().to(camera.world_to_camera.device)

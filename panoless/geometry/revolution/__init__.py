@@ -1,0 +1,1 @@
+"""A surface of revolution: an axis and a profile."""

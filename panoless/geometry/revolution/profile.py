@@ -1,0 +1,137 @@
+"""Changing the profile of a surface of revolution: even sampling, and cubic splines of its shift along the normals."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from panoless.geometry.revolution.model import SurfaceOfRevolution
+
+LEAST_ANGLE_SINE = 0.5
+LARGEST_SHIFT_STEPS = 1.5
+"""A vertex moves by at most this many times the spacing of the profile."""
+
+
+def resample_profile(surface: SurfaceOfRevolution, spacing: float) -> SurfaceOfRevolution:
+    """The same surface with vertices about `spacing` apart outside and inside; base and lip stay where they are."""
+    outer, inner = surface.profile[1 : surface.lip + 1], surface.profile[surface.lip :]
+    outer, inner = _even(outer, spacing), _even(inner, spacing)
+    profile = np.concatenate([[[0.0, outer[0, 1]]], outer, inner[1:]])
+    return replace(surface, profile=profile, lip=len(outer))
+
+
+def _even(points: Float[np.ndarray, "N 2"], spacing: float) -> Float[np.ndarray, "M 2"]:
+    """A polyline at equal steps of its length."""
+    if len(points) < 2:
+        return points
+    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    where = np.linspace(0, length[-1], max(int(np.ceil(length[-1] / spacing)), 1) + 1)
+    kept = np.append(True, np.diff(length) > 1e-12)
+    return np.stack([np.interp(where, length[kept], column[kept]) for column in points.T], 1)
+
+
+@dataclass(frozen=True)
+class ProfileSplines:
+    """Uniform cubic B-splines over the arc length of the outer and of the inner profile, each with its own ones."""
+
+    surface: SurfaceOfRevolution
+    starts: tuple[float, float]
+    knots: tuple[float, float]
+    counts: tuple[int, int]
+
+    @classmethod
+    def of(cls, surface: SurfaceOfRevolution, knot: float) -> "ProfileSplines":
+        """Splines with knots about `knot` apart. The base has none: it moves with the outer profile."""
+        length = surface.arc_lengths
+        bounds = (length[1], length[surface.lip], length[-1])
+        pieces = [max(round((bounds[i + 1] - bounds[i]) / knot), 1) for i in (0, 1)]
+        open_ended = surface.lip == len(surface.profile) - 1
+        return cls(
+            surface,
+            (float(bounds[0]), float(bounds[1])),
+            (
+                float((bounds[1] - bounds[0]) / pieces[0]),
+                1.0 if open_ended else float((bounds[2] - bounds[1]) / pieces[1]),
+            ),
+            (pieces[0] + 3, 0 if open_ended else pieces[1] + 3),
+        )
+
+    @property
+    def count(self) -> int:
+        """Number of coefficients."""
+        return sum(self.counts)
+
+    def values(
+        self, side: Int[np.ndarray, "P"], along: Float[np.ndarray, "P"], derivative: bool = False
+    ) -> tuple[Float[np.ndarray, "P 4"], Int[np.ndarray, "P 4"]]:
+        """Values, or derivatives by arc length, of the four splines that act at a place, and which they are.
+
+        On the base they are zero.
+        """
+        length = self.surface.arc_lengths
+        place = length[side] + along * (length[side + 1] - length[side])
+        inner = (side >= self.surface.lip).astype(np.int64)
+        start, knot = np.array(self.starts)[inner], np.array(self.knots)[inner]
+        pieces = np.array(self.counts)[inner] - 3
+        x = np.clip((place - start) / knot, 0, pieces)
+        first = np.minimum(np.floor(x).astype(np.int64), np.maximum(pieces - 1, 0))
+        values = _cubic_derivative(x - first) / knot[:, None] if derivative else _cubic(x - first)
+        values = np.where((side == 0)[:, None], 0.0, values)
+        return values, np.where((side == 0)[:, None], 0, (first + inner * self.counts[0])[:, None]) + np.arange(4)
+
+    def bending(self, weight: float) -> Float[np.ndarray, "C C"]:
+        """Matrix of weight · Σ (second differences)², within each piece."""
+        matrix = np.zeros((self.count, self.count))
+        begin = 0
+        for count in self.counts:
+            if count:
+                second = np.diff(np.eye(count), 2, axis=0)
+                matrix[begin : begin + count, begin : begin + count] = weight * second.T @ second
+            begin += count
+        return matrix
+
+
+def _cubic(u: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P 4"]:
+    return np.stack([(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3], 1) / 6
+
+
+def _cubic_derivative(u: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P 4"]:
+    return np.stack([-((1 - u) ** 2), 3 * u**2 - 4 * u, -3 * u**2 + 2 * u + 1, u**2], 1) / 2
+
+
+def apply_step(
+    surface: SurfaceOfRevolution, splines: ProfileSplines, step: Float[np.ndarray, "D"]
+) -> SurfaceOfRevolution:
+    """The surface after a turn and a shift of its axis (four numbers) and a shift of its profile (coefficients)."""
+    turn, shift = step[:2] @ surface.frame[:2], step[2:4] @ surface.frame[:2]
+    axis = surface.axis + np.cross(turn, surface.axis)
+    profile, last = surface.profile.copy(), len(surface.profile) - 1
+    spacing = float(np.median(np.linalg.norm(np.diff(profile[1:], axis=0), axis=1)))
+    limit = LARGEST_SHIFT_STEPS * spacing
+    sides = np.arange(last)
+    normal = np.stack([np.sin(surface.angles), -np.cos(surface.angles)], 2)
+    shifts = []
+    for end in (0, 1):
+        values, index = splines.values(sides, np.full(last, float(end)))
+        shifts.append(np.clip((values * step[4:][index]).sum(1), -limit, limit))
+    # A vertex between two sides takes the mean; over an edge, the corner of both shifted sides.
+    before, after = normal[:-1, 1], normal[1:, 0]
+    sine = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    corner = np.abs(sine) > LEAST_ANGLE_SINE
+    a, b, divisor = shifts[1][:-1], shifts[0][1:], np.where(corner, sine, 1.0)
+    exact = np.stack([a * after[:, 1] - b * before[:, 1], b * before[:, 0] - a * after[:, 0]], 1) / divisor[:, None]
+    mean = (before * a[:, None] + after * b[:, None]) / 2
+    profile[1:-1] += np.where(corner[:, None], exact, mean)
+    profile[1] = surface.profile[1] + normal[1, 0] * shifts[0][1]
+    # Beyond a thin lip nothing holds a spline: it takes the shift of the vertex before.
+    profile[-1] += normal[-1, 1] * (shifts[1][-1] if splines.counts[1] else shifts[0][-1])
+    profile[:, 0] = np.maximum(profile[:, 0], 0.0)
+    profile[0] = 0.0, profile[1, 1]
+    if surface.profile[-1, 0] < 1e-9:
+        profile[-1, 0] = 0.0
+    return SurfaceOfRevolution(
+        surface.origin + shift,
+        axis / np.linalg.norm(axis),
+        profile,
+        surface.lip,
+    )

@@ -1,0 +1,1 @@
+"""Curved Gaussian surfels, fitted by gradient descent."""

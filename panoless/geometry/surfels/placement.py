@@ -1,0 +1,270 @@
+"""First surfels: on the first surface of `hull`, or at random as the paper's code starts."""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from panoless.capture.views import Views
+from panoless.config import SurfelConfig
+from panoless.first_surface.completion import completed_surface, hull_surface
+from panoless.first_surface.mesh import unit
+from panoless.first_surface.visual_hull import Hull, carve_hull
+from panoless.geometry.height_field.model import HeightField
+from panoless.geometry.plane.model import Plane
+from panoless.geometry.revolution.model import SurfaceOfRevolution
+from panoless.geometry.surfels.model import Surfels
+
+OVERLAP = 0.8
+#: A surfel's disk may leave the first surface, or the hull, by so much at twice its radius.
+SAG_PX = 1.0
+LEAST_RADIUS_PX = 1.5
+SHRINKING_STEPS, SHRINKAGE = 6, 0.75
+CANDIDATES = 8
+RELAXATION_ROUNDS = 3
+TIE_TOLERANCE = 1e-6
+INITIAL_OPACITY_LOGIT = 2.2
+INITIAL_ROUGHNESS_LOGIT = -2.2
+RANDOM_OPACITY = 0.1
+
+
+def hull_surfels(views: Views, config: SurfelConfig, seed: int) -> Surfels:
+    """Surfels over the part of the first surface that faces some camera, curved as it is, within the outlines.
+
+    `thin-plate` takes the completed hull, `hull` the hull itself. Axes follow the principal directions; a radius is
+    at most that of `_reach`, so that strong curvature gets smaller surfels, and more of them.
+    """
+    hull = carve_hull(views, config.hull_resolution, config.hull_votes)
+    surface = completed_surface(hull, views) if config.initial == "thin-plate" else hull_surface(hull)
+    vertex_normals, tensors = surface.vertex_normals(), surface.shape_tensors()
+    corners = surface.vertices[surface.triangles]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    facing = _faces_some_camera(corners.mean(1), vertex_normals[surface.triangles].sum(1), views)
+    areas = np.where(facing, np.linalg.norm(cross, axis=1) / 2, 0)
+    face_normals = unit(vertex_normals[surface.triangles].sum(1))
+    bends, _ = _principal(tensors[surface.triangles].mean(1), _tangent_frames(face_normals))
+    radii, largest = _radii(areas, bends, config.count, hull.pixel)
+    rng = np.random.default_rng(seed)
+    expected = np.cumsum(areas / radii.prod(1))
+    # Stratified over the cumulative number, and more than are needed, so that they can be spread.
+    candidates = CANDIDATES * config.count
+    picks = np.searchsorted(expected, (np.arange(candidates) + rng.random(candidates)) * expected[-1] / candidates)
+    faces = surface.triangles[np.minimum(picks, len(corners) - 1)]
+    shares = rng.dirichlet([1.0, 1.0, 1.0], candidates)
+    points = np.einsum("kv,kvi->ki", shares, surface.vertices[faces])
+    chosen = _spread(points, config.count)
+    points, faces, shares = points[chosen], faces[chosen], shares[chosen]
+    normals, tensors = (np.einsum("kv,kv...->k...", shares, values[faces]) for values in (vertex_normals, tensors))
+    bends, frames = _principal(tensors, _tangent_frames(unit(normals)))
+    scales = _within_hull(hull, points, frames, np.minimum(_reach(bends, hull.pixel), largest))
+    return _surfels(points, frames, scales, _shape_operators(tensors, frames), INITIAL_OPACITY_LOGIT)
+
+
+def _radii(
+    areas: Float[np.ndarray, "T"], bends: Float[np.ndarray, "T 2"], count: int, pixel: float
+) -> tuple[Float[np.ndarray, "T 2"], float]:
+    """Radii of `count` overlapping surfels on faces of these principal curvatures, and the largest of them.
+
+    The largest radius r solves Σ A/(min(r, l_u) min(r, l_v)) = n/OVERLAP², l the limit by curvature.
+    """
+    limits = _reach(bends, pixel)
+    low, high = 1e-6, OVERLAP * math.sqrt(areas.sum() / count) * 100
+    for _ in range(60):
+        middle = math.sqrt(low * high)
+        needed = (areas / np.minimum(limits, middle).prod(1)).sum() * OVERLAP**2
+        low, high = (middle, high) if needed > count else (low, middle)
+    return np.minimum(limits, high), high
+
+
+def _reach(bends: Float[np.ndarray, "K 2"], pixel: float) -> Float[np.ndarray, "K 2"]:
+    """The radius s at which a disk leaves a surface of curvature κ by SAG_PX at 2 s, at least LEAST_RADIUS_PX."""
+    limit = np.sqrt(SAG_PX * pixel / 2 / np.maximum(np.abs(bends), 1e-9))
+    return np.maximum(limit, LEAST_RADIUS_PX * pixel)
+
+
+def _within_hull(
+    hull: Hull,
+    points: Float[np.ndarray, "K 3"],
+    frames: Float[np.ndarray, "K 3 3"],
+    radii: Float[np.ndarray, "K 2"],
+) -> Float[np.ndarray, "K 2"]:
+    """Radii, shrunk until the disk at twice the radius leaves the hull by no more than SAG_PX, along either axis.
+
+    What lies outside the hull is seen outside the masks, where it would be a halo.
+    """
+    radii = radii.copy()
+    for _ in range(SHRINKING_STEPS):
+        tips = 2 * radii[:, :, None] * frames[:, :, :2].transpose(0, 2, 1)
+        excess = np.maximum(hull.at(points[:, None] + tips), hull.at(points[:, None] - tips))
+        radii = np.where(
+            excess > SAG_PX * hull.pixel, np.maximum(SHRINKAGE * radii, LEAST_RADIUS_PX * hull.pixel), radii
+        )
+    return radii
+
+
+def _spread(points: Float[np.ndarray, "C 3"], count: int) -> Int[np.ndarray, "K"]:
+    """Indices of `count` of the points, spread evenly among them: Lloyd's relaxation of a regular choice."""
+    from scipy.spatial import cKDTree
+
+    centers = points[:: max(len(points) // count, 1)][:count]
+    for _ in range(RELAXATION_ROUNDS):
+        _, owner = cKDTree(centers).query(points)
+        total = np.bincount(owner, minlength=count)
+        sums = np.stack([np.bincount(owner, column, minlength=count) for column in points.T], 1)
+        centers = np.where(total[:, None] > 0, sums / np.maximum(total, 1)[:, None], centers)
+    distances, nearest = cKDTree(points).query(centers, k=2)
+    # The middle of two points is as near to one as to the other: not rounding decides then, but their order.
+    tied = distances[:, 1] <= (1 + TIE_TOLERANCE) * distances[:, 0]
+    return np.where(tied, nearest.min(1), nearest[:, 0])
+
+
+def _principal(
+    tensors: Float[np.ndarray, "K 3 3"], frames: Float[np.ndarray, "K 3 3"]
+) -> tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, "K 3 3"]]:
+    """Principal curvatures of shape tensors, and the frames turned about their normals to the principal directions."""
+    tangents = frames[:, :, :2]
+    shape = np.einsum("kiu,kij,kjv->kuv", tangents, tensors, tangents)
+    bends, directions = np.linalg.eigh((shape + shape.transpose(0, 2, 1)) / 2)
+    tangent_u = np.einsum("kiu,ku->ki", tangents, directions[:, :, 0])
+    return bends, np.stack([tangent_u, np.cross(frames[:, :, 2], tangent_u), frames[:, :, 2]], 2)
+
+
+def surfels_on_plane(plane: Plane, count: int, seed: int) -> Surfels:
+    """Flat surfels evenly within the boundary of a plane: about `count`, on a hexagonal grid shifted by the seed."""
+    places, radius = _places_within(plane.boundary, count, seed)
+    frames = np.broadcast_to(np.stack([plane.tangent_u, plane.tangent_v, plane.normal], 1), (len(places), 3, 3))
+    scales, curvatures = np.full((len(places), 2), radius), np.zeros((len(places), 3))
+    return _surfels(plane.points(places), frames, scales, curvatures, INITIAL_OPACITY_LOGIT)
+
+
+def surfels_on_height_field(height_field: HeightField, count: int, seed: int) -> Surfels:
+    """Surfels over the same places of a bent plane, tilted and curved as it is.
+
+    Curvatures are D²h/√(1 + |∇h|²), which is the shape operator but for terms of second order in the slope.
+    """
+    places, radius = _places_within(height_field.plane.boundary, count, seed)
+    h, h_u, h_v, *bends = height_field.heights(places)
+    points = height_field.plane.points(places) + h[:, None] * height_field.plane.normal
+    norm, zero = np.sqrt(1 + h_u**2 + h_v**2), np.zeros_like(h)
+    normals = np.stack([-h_u, -h_v, zero + 1], 1) / norm[:, None]
+    tangents = np.stack([zero + 1, zero, h_u], 1) / np.sqrt(1 + h_u**2)[:, None]
+    frames = np.einsum("iw,pij->pwj", height_field.frame, np.stack([tangents, np.cross(normals, tangents), normals], 2))
+    scales = np.full((len(places), 2), radius)
+    return _surfels(points, frames, scales, np.stack(bends, 1) / norm[:, None], INITIAL_OPACITY_LOGIT)
+
+
+def _places_within(boundary: Float[np.ndarray, "N 2"], count: int, seed: int) -> tuple[Float[np.ndarray, "K 2"], float]:
+    """Points of a hexagonal grid within an boundary, and the radius of surfels there."""
+    from skimage.measure import points_in_poly
+
+    low, extent = boundary.min(0), np.ptp(boundary, 0)
+    x, y = boundary.T
+    area = abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
+    across = math.sqrt(area / count / math.sin(math.pi / 3))
+    up = across * math.sin(math.pi / 3)
+    shift = np.random.default_rng(seed).random(2) - 1
+    row, column = np.indices((math.ceil(extent[1] / up) + 2, math.ceil(extent[0] / across) + 2)).reshape(2, -1)
+    grid = low + np.stack([(column + row % 2 / 2 + shift[0]) * across, (row + shift[1]) * up], 1)
+    return grid[points_in_poly(grid, boundary)], OVERLAP * math.sqrt(area / count)
+
+
+def surfels_on_revolution(surface: SurfaceOfRevolution, count: int) -> Surfels:
+    """About `count` surfels in rings around a surface of revolution, curved as it is: half as long along the profile
+    as around.
+    """
+    profile, ends = surface.profile, surface.angles
+    steps = np.diff(surface.arc_lengths)
+    areas = math.pi * steps * (profile[:-1, 0] + profile[1:, 0])
+    # A ring of radius ρ and width w holds 2πρ/2w surfels.
+    width = math.sqrt(areas.sum() / count / 2)
+    rings = max(round(surface.arc_lengths[-1] / width), 1)
+    place = (np.arange(rings) + 0.5) * surface.arc_lengths[-1] / rings
+    side = np.clip(np.searchsorted(surface.arc_lengths, place) - 1, 0, len(steps) - 1)
+    along = (place - surface.arc_lengths[side]) / np.maximum(steps[side], 1e-12)
+    radius, height = (profile[side] + along[:, None] * (profile[side + 1] - profile[side])).T
+    angle = ends[side, 0] + along * (ends[side, 1] - ends[side, 0])
+    bend = (ends[side, 1] - ends[side, 0]) / np.maximum(steps[side], 1e-12)
+    around = np.maximum(np.round(math.pi * radius / width), 3).astype(np.int64)
+    ring = np.repeat(np.arange(rings), around)
+    first = np.cumsum(around) - around
+    turn = 2 * math.pi * (np.arange(len(ring)) - first[ring] + ring % 2 / 2) / around[ring]
+    cos, sin, zero = np.cos(turn), np.sin(turn), np.zeros(len(ring))
+    along_radius, along_axis = np.cos(angle[ring]), np.sin(angle[ring])
+    local = np.stack([radius[ring] * cos, radius[ring] * sin, height[ring]], 1)
+    meridian = np.stack([along_radius * cos, along_radius * sin, along_axis], 1)
+    azimuth = np.stack([-sin, cos, zero], 1)
+    frames = np.stack([azimuth, meridian, np.cross(azimuth, meridian)], 2)
+    frames = np.einsum("ji,kjl->kil", surface.frame, frames)
+    # n = n₀ − S·(x − x₀): the normal turns with the profile, and by n_ρ/ρ around the axis.
+    curvatures = np.stack([-along_axis / np.maximum(radius[ring], width / 2), zero, -bend[ring]], 1)
+    spacing = np.stack([2 * math.pi * radius[ring] / around[ring], np.full(len(ring), width)], 1)
+    scales = OVERLAP * np.maximum(spacing, 1e-6)
+    return _surfels(surface.origin + local @ surface.frame, frames, scales, curvatures, INITIAL_OPACITY_LOGIT)
+
+
+def random_surfels(config: SurfelConfig, seed: int) -> Surfels:
+    """Surfels uniformly in the normalized cube with random orientation, sized by their mean distance."""
+    from scipy.spatial.transform import Rotation
+
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (config.count, 3))
+    frames = Rotation.random(config.count, random_state=rng).as_matrix()
+    scale = 0.55 * 2 / config.count ** (1 / 3)
+    logit = math.log(RANDOM_OPACITY / (1 - RANDOM_OPACITY))
+    return _surfels(points, frames, np.full((config.count, 2), scale), np.zeros((config.count, 3)), logit)
+
+
+def initial_surfels(views: Views, config: SurfelConfig, seed: int) -> Surfels:
+    """The surfels that a fit starts from, on the device of the views."""
+    surfels = random_surfels(config, seed) if config.initial == "random" else hull_surfels(views, config, seed)
+    return surfels.to(views.train[0].mask.device)
+
+
+def _surfels(
+    points: Float[np.ndarray, "K 3"],
+    frames: Float[np.ndarray, "K 3 3"],
+    scales: Float[np.ndarray, "K 2"],
+    curvatures: Float[np.ndarray, "K 3"],
+    opacity_logit: float,
+) -> Surfels:
+    from scipy.spatial.transform import Rotation
+
+    quats = Rotation.from_matrix(frames).as_quat()[:, [3, 0, 1, 2]]
+
+    def tensor(array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
+
+    return Surfels(
+        means=tensor(points),
+        quats=tensor(quats),
+        log_scales=tensor(np.log(scales)),
+        opacity_logits=torch.full((len(points),), opacity_logit),
+        albedo=torch.zeros(len(points), 3),
+        curvatures=tensor(curvatures),
+        roughness_logits=torch.full((len(points),), INITIAL_ROUGHNESS_LOGIT),
+    )
+
+
+def _faces_some_camera(points: Float[np.ndarray, "P 3"], normals: Float[np.ndarray, "P 3"], views: Views) -> np.ndarray:
+    facing = np.zeros(len(points), dtype=bool)
+    for view in views.train:
+        facing |= ((view.position - points) * normals).sum(1) > 0
+    return facing
+
+
+def _tangent_frames(normals: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3 3"]:
+    helper = np.where(np.abs(normals[:, :1]) < 0.8, [[1.0, 0, 0]], [[0, 1.0, 0]])
+    tangent_u = np.cross(helper, normals)
+    tangent_u /= np.linalg.norm(tangent_u, axis=1, keepdims=True)
+    return np.stack([tangent_u, np.cross(normals, tangent_u), normals], 2)
+
+
+def _shape_operators(
+    tensors: Float[np.ndarray, "K 3 3"], frames: Float[np.ndarray, "K 3 3"]
+) -> Float[np.ndarray, "K 3"]:
+    """(a, b, c) in the tangent frame of S, dn = S dx: the normal field is n₀ − …, hence a = −t_uᵀ S t_u."""
+    tangents = frames[:, :, :2]
+    shape = -np.einsum("kiu,kij,kjv->kuv", tangents, tensors, tangents)
+    return np.stack([shape[:, 0, 0], (shape[:, 0, 1] + shape[:, 1, 0]) / 2, shape[:, 1, 1]], 1)

@@ -1,0 +1,1 @@
+"""Mathematics without a subject: robust weights, solvers, splines, polygons. Imports kernels at most."""

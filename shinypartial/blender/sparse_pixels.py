@@ -1,0 +1,126 @@
+"""Path tracing of chosen pixels alone: packed into a small image by a ray portal before the camera.
+
+The scene is the main one with a plane close to the camera in it. Each pixel of the small image finds on the plane which
+pixel of the view it stands for, and the plane sends its rays on from where those of that pixel would be. Cycles spreads
+samples over a pixel of the small image as over any other, so every pass is what a render of the whole view has there,
+but for noise.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from shinypartial.blender.passes import PASSES, read_passes
+from shinypartial.core.camera import Camera, project
+from shinypartial.core.trajectory import CameraPath
+
+PICKED, PORTAL, PIXELS = "picked", "portal", "picked pixels"
+#: The plane's distance, and that at which rays go on, as shares of the nearest surface's depth.
+PLANE_SHARE, EXIT_SHARE = 0.3, 0.45
+
+
+def assemble_sparse(bpy: Any, spec: CameraPath) -> None:
+    """Add the scene: everything of the open one, linked, and the plane."""
+    main = bpy.context.scene
+    scene = main.copy()
+    scene.name = PICKED
+    mesh = bpy.data.meshes.new(PORTAL)
+    mesh.from_pydata([(-9, -9, 0), (9, -9, 0), (9, 9, 0), (-9, 9, 0)], [], [(0, 1, 2, 3)])
+    mesh.materials.append(bpy.data.materials.new(PORTAL))
+    plane = bpy.data.objects.new(PORTAL, mesh)
+    plane.parent = main.camera
+    scene.collection.objects.link(plane)
+    for kind in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
+        setattr(plane, f"visible_{kind}", False)
+    _send_rays_on(mesh.materials[0], main.render.resolution_x, spec)
+
+
+def nearest_depth(camera: Camera, vertices_world: Float[np.ndarray, "P 3"]) -> float:
+    """That of the vertex closest to the camera's plane."""
+    return float(project(camera, vertices_world)[:, 2].min())
+
+
+def render_sparse(
+    bpy: Any, path: Path, chosen: Bool[np.ndarray, "H W"], depth: float
+) -> dict[str, Float[np.ndarray, "P"]]:
+    """Passes of the chosen pixels, row by row, of the camera's present view; nothing lies nearer than `depth`."""
+    rows, columns = np.nonzero(chosen)
+    width = int(np.ceil(np.sqrt(len(rows))))
+    height = -(-len(rows) // width)
+    scene = bpy.data.scenes[PICKED]
+    scene.render.use_border = False
+    scene.render.resolution_x, scene.render.resolution_y = width, height
+    scene.objects[PORTAL].location = (0, 0, -PLANE_SHARE * depth)
+    scene.objects[PORTAL].scale = (PLANE_SHARE * depth,) * 3
+    places = np.zeros((height * width, 4), np.float32)
+    places[: len(rows), 0], places[: len(rows), 1] = columns, rows
+    image = _upload(bpy, places.reshape(height, width, 4))
+    nodes = bpy.data.materials[PORTAL].node_tree.nodes
+    nodes["places"].image = image
+    nodes["size"].inputs[1].default_value = (width, height, 0)
+    scene.render.filepath = str(path)
+    try:
+        bpy.ops.render.render(write_still=True, scene=PICKED)
+    finally:
+        nodes["places"].image = None
+        bpy.data.images.remove(image)
+    return {name: channel.ravel()[: len(rows)] for name, channel in read_passes(path, PASSES).items()}
+
+
+def _upload(bpy: Any, places: Float[np.ndarray, "h w 4"]) -> Any:
+    """An image of Blender's, in which the first row is the lowest."""
+    height, width = places.shape[:2]
+    image = bpy.data.images.new(PIXELS, width, height, alpha=True, float_buffer=True)
+    image.colorspace_settings.name = "Non-Color"
+    image.use_half_precision = False  # It would round columns beyond 2048.
+    image.pixels.foreach_set(places[::-1].ravel())
+    image.update()
+    return image
+
+
+def _send_rays_on(material: Any, resolution: int, spec: CameraPath) -> None:
+    """Shader of the plane, whose frame is the camera's, moved and scaled so that the camera is at (0, 0, 1).
+
+    On the small image, (x, y) from the lower left in its pixels, the integer part says which pixel of the view is meant
+    and the fraction where in it the ray goes through: at column + x, row + 1 − y of the view.
+    """
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    nodes.clear()
+
+    def vector(operation: str, *inputs: Any) -> Any:
+        node = nodes.new("ShaderNodeVectorMath")
+        node.operation = operation
+        for socket, value in zip(node.inputs, inputs, strict=False):
+            if isinstance(value, tuple):
+                socket.default_value = value
+            else:
+                links.new(value, socket)
+        return node
+
+    def to_world(kind: str, local: Any) -> Any:
+        node = nodes.new("ShaderNodeVectorTransform")
+        node.vector_type, node.convert_from, node.convert_to = kind, "OBJECT", "WORLD"
+        links.new(local, node.inputs["Vector"])
+        return node.outputs["Vector"]
+
+    window = nodes.new("ShaderNodeTexCoord").outputs["Window"]
+    places = nodes.new("ShaderNodeTexImage")
+    places.name, places.interpolation, places.extension = "places", "Closest", "EXTEND"
+    links.new(window, places.inputs["Vector"])
+    size = vector("MULTIPLY", window, (1.0, 1.0, 0.0))
+    size.name = "size"
+    within = vector("FRACTION", size.outputs["Vector"]).outputs["Vector"]
+    downward = vector("MULTIPLY_ADD", within, (1.0, -1.0, 0.0), (0.0, 1.0, 0.0)).outputs["Vector"]
+    pixel = vector("ADD", places.outputs["Color"], downward).outputs["Vector"]
+    # Camera axes of Blender: +y up, −z forward; the ray (x, y, −1) in the plane's units.
+    slope = spec.sensor_mm / (spec.lens_mm * resolution)
+    middle = slope * resolution / 2
+    ray = vector("MULTIPLY_ADD", pixel, (slope, -slope, 0.0), (-middle, middle, -1.0)).outputs["Vector"]
+    reach = EXIT_SHARE / PLANE_SHARE
+    exit_point = vector("MULTIPLY_ADD", ray, (reach,) * 3, (0.0, 0.0, 1.0)).outputs["Vector"]
+    portal = nodes.new("ShaderNodeBsdfRayPortal")
+    links.new(to_world("POINT", exit_point), portal.inputs["Position"])
+    links.new(vector("NORMALIZE", to_world("VECTOR", ray)).outputs["Vector"], portal.inputs["Direction"])
+    links.new(portal.outputs["BSDF"], nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])

@@ -1,0 +1,1 @@
+"""A prediction folder against its dataset: scores and pictures. Imports prediction, metrics, dataset and below."""

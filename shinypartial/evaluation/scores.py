@@ -1,0 +1,202 @@
+"""What an evaluation found: typed scores, their file, and the flat rows that reports and tables print.
+
+The fields of the score types carry the names of `metrics.registry`, so a row knows its title, unit and direction.
+"""
+
+import dataclasses
+import types
+import typing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from shinypartial.core.errors import InputError
+from shinypartial.io.files import read_json, write_json
+from shinypartial.metrics.angular import AngularStatistics
+from shinypartial.metrics.calibration import CalibrationScores
+from shinypartial.metrics.environment import Regions, UnweightedScores
+from shinypartial.metrics.paper import PaperScores
+from shinypartial.metrics.registry import METRICS, Metric, metric
+from shinypartial.prediction.format import ORACLE_SUFFIX
+
+FORMAT = "shinypartial-scores"
+FORMAT_VERSION = 3
+PROTOCOL = "linear-v1"
+SCORES = "scores.json"
+
+
+@dataclass(frozen=True)
+class PerceptualScores:
+    """LPIPS; None where it was left out."""
+
+    lpips_alex: float | None
+    lpips_vgg: float | None
+
+
+@dataclass(frozen=True)
+class EnvironmentScores:
+    """The environment map as predicted, and after the one global exposure that brings it closest to the truth."""
+
+    as_predicted: Regions
+    exposure_stops: float
+    best_exposure: Regions
+    unweighted: UnweightedScores
+    perceptual: PerceptualScores
+
+
+@dataclass(frozen=True)
+class RenderScores:
+    """Renders of the test views: means over views, but `alpha_iou`, which pools pixels."""
+
+    psnr: float
+    psnr_foreground: float | None
+    ssim: float
+    l1: float
+    alpha_iou: float
+    lpips_alex: float | None
+
+
+@dataclass(frozen=True)
+class ViewScores:
+    """One test view, for plots and paired comparisons."""
+
+    name: str
+    psnr: float
+    ssim: float
+    mean_angular_error_deg: float | None
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A metric or a group of metrics that could not be computed, and why."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Counts:
+    """How much was compared."""
+
+    train_views: int
+    test_views: int
+    normal_pixels: int
+    normal_holes: int
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Everything that one evaluation found; None for a group that was left out, which `left_out` names.
+
+    All groups follow `protocol` but `paper`, which names its own. `oracle` is the folder of the dataset's bound when
+    it is not the usual one. `normals_environment` takes only the pixels whose mirror ray leaves the scene.
+    """
+
+    protocol: str
+    dataset: str
+    dataset_hash: str
+    dataset_hash_matches: bool
+    coverage: float | None
+    resolved_coverage: float | None
+    environment: EnvironmentScores | None
+    normals: AngularStatistics | None
+    normals_environment: AngularStatistics | None
+    render: RenderScores | None
+    calibration: CalibrationScores | None
+    paper: PaperScores | None
+    oracle: str | None
+    views: tuple[ViewScores, ...]
+    left_out: tuple[LeftOut, ...]
+    counts: Counts
+
+
+@dataclass(frozen=True)
+class ScoreRow:
+    """One number with its place in the scores, such as `environment.as_predicted.full.psnr_srgb`."""
+
+    path: str
+    metric: Metric
+    value: float | None
+
+    @property
+    def group(self) -> str:
+        """The path without the name of the metric."""
+        return self.path.rpartition(".")[0]
+
+
+def score_rows(scores: Scores) -> tuple[ScoreRow, ...]:
+    """Every registered metric found in the scores, in the order of their definition; groups left out have no rows."""
+    return tuple(_rows("", scores))
+
+
+def _rows(prefix: str, value: Any) -> list[ScoreRow]:
+    names = {entry.name for entry in METRICS}
+    rows = []
+    for field in dataclasses.fields(value):
+        child, path = getattr(value, field.name), prefix + field.name
+        if field.name in names:
+            rows.append(ScoreRow(path, metric(field.name), child))
+        elif dataclasses.is_dataclass(child):
+            rows += _rows(path + ".", child)
+    return rows
+
+
+def write_scores(prediction: Path, scores: Scores) -> None:
+    """Write PREDICTION/scores.json (strict JSON; a metric that was left out is null)."""
+    write_json(prediction / SCORES, {"format": FORMAT, "format_version": FORMAT_VERSION, **asdict(scores)})
+
+
+def read_scores(prediction: Path) -> Scores:
+    """Read PREDICTION/scores.json; raises InputError when it is missing, of another version or incomplete."""
+    path = prediction / SCORES
+    if not path.is_file():
+        raise InputError(
+            expected=f"scores at {path}",
+            found="no such file",
+            remedy=f"Evaluate first: `shinypartial evaluate {prediction}`.",
+        )
+    content = read_json(path, "the scores")
+    remedy = f"Evaluate again: `shinypartial evaluate {prediction}`."
+    if content.pop("format", None) != FORMAT or content.pop("format_version", None) != FORMAT_VERSION:
+        raise InputError(
+            expected=f"{SCORES} with format {FORMAT} version {FORMAT_VERSION}", found="another format", remedy=remedy
+        )
+    try:
+        return _restore(Scores, content)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(expected=f"complete scores in {path}", found=f"{error!r}", remedy=remedy) from None
+
+
+def read_bound(prediction: Path, scores: Scores) -> Scores | None:
+    """Scores of the dataset's oracle, from the folder that the scores name or the sibling DATASET-oracle.
+
+    None when there is no such sibling, when it is the prediction itself, or when it was made from another version of
+    the dataset; a folder that was named must hold scores of the same dataset, else InputError.
+    """
+    folder = Path(scores.oracle) if scores.oracle else prediction.resolve().parent / (scores.dataset + ORACLE_SUFFIX)
+    if folder.resolve() == prediction.resolve() or (scores.oracle is None and not (folder / SCORES).is_file()):
+        return None
+    bound = read_scores(folder)
+    if bound.dataset_hash == scores.dataset_hash and bound.dataset_hash_matches:
+        return bound
+    if scores.oracle is None:
+        return None
+    raise InputError(
+        expected=f"the oracle of {scores.dataset} (hash {scores.dataset_hash[:12]}…) in {folder}",
+        found=f"that of {bound.dataset} (hash {bound.dataset_hash[:12]}…)",
+        remedy=f"Make it: `shinypartial oracle {scores.dataset}`, or leave out --oracle.",
+    )
+
+
+def _restore(kind: Any, content: Any) -> Any:
+    """Rebuild nested frozen dataclasses, tuples of them and optional values from JSON."""
+    if content is None:
+        return None
+    if isinstance(kind, types.UnionType):
+        kind = next(option for option in typing.get_args(kind) if option is not type(None))
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+        hints = typing.get_type_hints(kind)
+        return kind(**{name: _restore(hint, content[name]) for name, hint in hints.items()})
+    if typing.get_origin(kind) is tuple:
+        return tuple(_restore(typing.get_args(kind)[0], entry) for entry in content)
+    return content

@@ -1,0 +1,1 @@
+"""Files, pictures, progress and threads. Imports core."""

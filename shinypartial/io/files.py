@@ -1,0 +1,164 @@
+"""Files appear whole or not at all: temporary names, renames, one writer a folder, checksums, the newest of a kind."""
+
+import contextlib
+import errno
+import hashlib
+import json
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from shinypartial.core.errors import InputError
+
+PARTIAL_PREFIX = ".partial-"
+
+
+@contextlib.contextmanager
+def atomic_write(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; rename it to `path` on success, delete it on any failure.
+
+    The temporary name keeps the suffix, because image writers choose their format by it.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=PARTIAL_PREFIX, suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o644)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def copy_or_link(old: Path, new: Path, link: bool) -> None:
+    """Copy or hard-link a file, whole or not at all; InputError where the file system can't link."""
+    if not link:
+        with atomic_write(new) as temporary:
+            shutil.copyfile(old, temporary)
+        return
+    new.parent.mkdir(parents=True, exist_ok=True)
+    temporary = new.with_name(f"{PARTIAL_PREFIX}{new.name}")
+    temporary.unlink(missing_ok=True)
+    try:
+        os.link(old, temporary)
+    except OSError as error:
+        if error.errno not in (errno.EXDEV, errno.EPERM, errno.ENOTSUP, errno.EMLINK):
+            raise
+        raise InputError(
+            expected=f"a file system that can link {old} into {new.parent}",
+            found=error.strerror or "a failed link",
+            remedy="Leave out --link, so that files are copied.",
+        ) from None
+    temporary.replace(new)
+
+
+def remove_partial_files(root: Path) -> None:
+    """Delete the temporary files of a process that was killed while it wrote below `root`."""
+    for path in root.rglob(f"{PARTIAL_PREFIX}*"):
+        path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def folder_lock(folder: Path) -> Iterator[None]:
+    """Hold `folder`, made where it is missing, against every other run that writes to it.
+
+    The system releases the lock however the process ends. The folder itself is locked (flock), so that nothing is
+    added to it; where no folder can be (Windows, NFS), a file among the temporary ones stands for it, which only runs
+    on the same machine see. Raises InputError when another run holds the folder or a file is in its place.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(expected=f"a folder at {folder}", found="a file", remedy="Choose another --output.")
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        handle = _open_locked_folder(folder)
+    except BlockingIOError:
+        raise InputError(
+            expected=f"to be the only run that writes to {folder}",
+            found="another run that is writing there",
+            remedy="Wait until it ends, or choose another --output.",
+        ) from None
+    try:
+        yield
+    finally:
+        os.close(handle)
+
+
+def _open_locked_folder(folder: Path) -> int:
+    try:
+        return _open_locked(folder, os.O_RDONLY)
+    except BlockingIOError:
+        raise
+    except OSError:
+        user = os.getuid() if hasattr(os, "getuid") else 0
+        digest = hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16]
+        return _open_locked(Path(tempfile.gettempdir()) / f"shinypartial-{user}-{digest}.lock", os.O_RDWR | os.O_CREAT)
+
+
+def _open_locked(path: Path, flags: int) -> int:
+    """A descriptor that holds the lock until it is closed; BlockingIOError when another one does."""
+    handle = os.open(path, flags, 0o600)
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            try:
+                msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+            except PermissionError as error:
+                raise BlockingIOError(*error.args) from None
+        else:
+            import fcntl
+
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BaseException:
+        os.close(handle)
+        raise
+    return handle
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write UTF-8 text, whole or not at all."""
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write strict JSON (no NaN or infinity), whole or not at all."""
+    write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def read_json(path: Path, what: str) -> Any:
+    """Read a JSON file; `what` names it in the message when it is missing or broken."""
+    if not path.is_file():
+        raise InputError(expected=f"{what} at {path}", found="no such file", remedy="Check the path of the folder.")
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(
+            expected=f"{what} in {path} to be JSON",
+            found=str(error),
+            remedy="Restore the file, or make the folder again.",
+        ) from None
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file's bytes, as lower-case hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def newest_folder(parent: Path, marker: str, what: str, remedy: str, unless_suffix: str | None = None) -> Path:
+    """The folder directly below `parent` whose file `marker` was written last; names with that ending don't count."""
+    found = [path.parent for path in parent.glob(f"*/{marker}")]
+    found = [folder for folder in found if unless_suffix is None or not folder.name.endswith(unless_suffix)]
+    if not found:
+        raise InputError(
+            expected=f"{what} below {parent.resolve()}",
+            found="none (no folder holds " + marker + ")",
+            remedy=remedy,
+        )
+    return max(found, key=lambda folder: (folder / marker).stat().st_mtime)

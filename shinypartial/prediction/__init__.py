@@ -1,0 +1,1 @@
+"""The prediction folder: its format, and post-processing in it. Imports dataset and below."""

@@ -1,0 +1,167 @@
+"""The prediction folder: what every method writes, and all that the evaluator reads.
+
+PREDICTION/prediction.json            method, configuration, dataset hash, seconds, hardware, parameter counts
+PREDICTION/environment.exr            lat-long, linear radiance, world frame of the dataset
+PREDICTION/visibility.exr             lat-long, channel Y in [0, 1]: how well each direction was observed
+PREDICTION/test/r_000.exr r_000.png   linear premultiplied RGBA, unit world normals, z-depth; and the picture
+PREDICTION/decomposition.jpg          optional: what a test view is made of
+PREDICTION/snapshots/000250           optional: earlier moments of the fit, each a prediction folder
+"""
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from shinypartial.core.errors import InputError
+from shinypartial.dataset.schema import CHECKSUMS, Dataset, Frame, View
+from shinypartial.dataset.write import write_view
+from shinypartial.io.files import newest_folder, read_json, sha256_of, write_json
+from shinypartial.io.images import read_exr, read_exr_rgb, stack_channels, write_exr, write_exr_rgb
+
+FORMAT = "shinypartial-prediction"
+FORMAT_VERSION = 1
+DEFAULT_FOLDER = Path("predictions")
+DESCRIPTION = "prediction.json"
+#: Moments of a fit, each a prediction folder of its own, lie below the prediction in a folder of this name.
+SNAPSHOTS = "snapshots"
+#: The bound of a dataset lies beside the predictions made from it, under the dataset's name with this ending.
+ORACLE_SUFFIX = "-oracle"
+ENVIRONMENT = "environment.exr"
+VISIBILITY = "visibility.exr"
+VISIBILITY_CHANNEL = "Y"
+#: One picture of what a test view is made of, optional.
+DECOMPOSITION = "decomposition.jpg"
+
+
+@dataclass(frozen=True)
+class PredictionInfo:
+    """Who made the prediction and at what cost; `curves` are per-iteration training series, for the report only.
+
+    `seconds` are those of making the model; their sum is its time in leaderboards and charts. `model` says what kind of
+    model was chosen and why, `primitives` is the number of surfels, Gaussians, voxels or vertices, `model_bytes` the
+    size of the files that a renderer needs, `iteration` the number of finished steps of a snapshot; each is None where
+    it is unknown or has no meaning.
+    """
+
+    method: str
+    dataset: str
+    dataset_hash: str
+    config: dict[str, Any]
+    seconds: dict[str, float]
+    hardware: dict[str, Any]
+    parameter_counts: dict[str, int]
+    peak_memory_bytes: int
+    curves: dict[str, list[float]] = field(default_factory=dict)
+    model: str | None = None
+    primitives: int | None = None
+    model_bytes: int | None = None
+    iteration: int | None = None
+
+
+def dataset_hash(dataset: Dataset) -> str:
+    """SHA-256 of the checksum list, or of the training cameras when the folder has none."""
+    listing = dataset.root / CHECKSUMS
+    return sha256_of(listing if listing.exists() else dataset.root / "transforms_train.json")
+
+
+def newest_prediction(parent: Path = DEFAULT_FOLDER) -> Path:
+    """The prediction below `parent` that was written last; bounds are passed over."""
+    remedy = "Make one: `panoless fit`, or name a folder."
+    return newest_folder(parent, DESCRIPTION, "a prediction", remedy, unless_suffix=ORACLE_SUFFIX)
+
+
+def prediction_folders(root: Path) -> list[Path]:
+    """Every prediction at or below a folder, at any depth, without the snapshots of others."""
+    return sorted(path.parent for path in root.rglob(DESCRIPTION) if not _is_snapshot(path.parent))
+
+
+def snapshot_folders(prediction: Path) -> list[Path]:
+    """The complete snapshots of a prediction, in the order of their names."""
+    return sorted(path.parent for path in (prediction / SNAPSHOTS).glob(f"*/{DESCRIPTION}"))
+
+
+def _is_snapshot(folder: Path) -> bool:
+    parent = folder.resolve().parent
+    return parent.name == SNAPSHOTS and (parent.parent / DESCRIPTION).exists()
+
+
+def prediction_frame(root: Path, frame: Frame) -> Frame:
+    """Where the prediction of a dataset's test frame lies."""
+    return Frame(frame.name, frame.camera, root / "test" / frame.stem.name)
+
+
+def acquire_prediction(root: Path) -> None:
+    """Make sure that `root` can be written; InputError when it holds something that is no prediction."""
+    begun = (root / DESCRIPTION).exists() or (root / "test").is_dir()
+    if root.exists() and (not root.is_dir() or (any(root.iterdir()) and not begun)):
+        raise InputError(
+            expected=f"a new, empty or earlier prediction folder at {root}",
+            found="files that are not a prediction",
+            remedy="Choose another --output.",
+        )
+    root.mkdir(parents=True, exist_ok=True)
+
+
+def write_info(root: Path, info: PredictionInfo) -> None:
+    """Write prediction.json; written last, it marks the folder as complete."""
+    stated = {name: value for name, value in asdict(info).items() if value is not None}
+    write_json(root / DESCRIPTION, {"format": FORMAT, "format_version": FORMAT_VERSION, **stated})
+
+
+def write_environment_map(root: Path, radiance: Float[np.ndarray, "H W 3"]) -> None:
+    """Write the predicted environment, a linear lat-long map in the dataset's world frame."""
+    write_exr_rgb(root / ENVIRONMENT, radiance)
+
+
+def write_visibility(root: Path, visibility: Float[np.ndarray, "H W"]) -> None:
+    """Write visibility in [0, 1] as a lat-long map."""
+    write_exr(root / VISIBILITY, {VISIBILITY_CHANNEL: visibility.astype(np.float32)})
+
+
+def write_test_view(root: Path, frame: Frame, view: View) -> None:
+    """Write the prediction of one test view."""
+    write_view(prediction_frame(root, frame), view)
+
+
+def read_info(root: Path) -> PredictionInfo:
+    """Read prediction.json; raises InputError when it is missing, of another version or incomplete."""
+    description = read_json(root / DESCRIPTION, "a prediction")
+    content = description if isinstance(description, dict) else {}
+    if content.pop("format", None) != FORMAT or content.pop("format_version", None) != FORMAT_VERSION:
+        raise InputError(
+            expected=f"{DESCRIPTION} with format {FORMAT} version {FORMAT_VERSION}",
+            found="another format",
+            remedy="Export the prediction again with this version.",
+        )
+    try:
+        return PredictionInfo(**content)
+    except TypeError as error:
+        raise InputError(
+            expected=f"the fields of the prediction format in {root / DESCRIPTION}",
+            found=str(error),
+            remedy="See docs/prediction-format.md.",
+        ) from None
+
+
+def read_environment_map(root: Path) -> Float[np.ndarray, "H W 3"]:
+    """Read the predicted environment; raises InputError unless it is a finite 2:1 map."""
+    radiance = read_exr_rgb(root / ENVIRONMENT)
+    height, width = radiance.shape[:2]
+    if width != 2 * height or not np.isfinite(radiance).all():
+        raise InputError(
+            expected=f"a finite lat-long map, twice as wide as high, in {root / ENVIRONMENT}",
+            found=f"{width}×{height} with {int((~np.isfinite(radiance)).sum())} values that are not finite",
+            remedy="Export the environment again.",
+        )
+    return radiance
+
+
+def read_visibility(root: Path) -> Float[np.ndarray, "H W"] | None:
+    """Read visibility, or None when the method wrote none."""
+    path = root / VISIBILITY
+    if not path.exists():
+        return None
+    return stack_channels(read_exr(path), (VISIBILITY_CHANNEL,), path)[..., 0]

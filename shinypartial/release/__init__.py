@@ -1,0 +1,1 @@
+"""Datasets as a published release: card, checksums, archive, metadata. Imports dataset and below."""

@@ -1,0 +1,447 @@
+"""What a fit leaves behind: a prediction that the evaluator reads, a PLY in world units, and renders that are right."""
+
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from panoless.capture.object_frame import ObjectFrame
+from panoless.capture.rays import raster_camera
+from panoless.export.mesh_files import (
+    PLANE_PLY_NAME,
+    PLY_NAME,
+    REVOLUTION_PLY_NAME,
+    write_height_field_ply,
+    write_plane_ply,
+    write_ply,
+)
+from panoless.export.pictures import crop_to_object
+from panoless.export.prediction import PICTURES, cube_to_latlong, export_prediction
+from panoless.export.render import render
+from panoless.geometry.revolution.model import SurfaceOfRevolution
+from panoless.geometry.surfels.placement import surfels_on_plane, surfels_on_revolution
+from panoless.kernels.cubemap import cubemap_directions
+from panoless.reconstruct.state import FitState
+from shinypartial.core.errors import InputError
+from shinypartial.core.sphere import cube_to_latlong as clamped_cube_to_latlong
+from shinypartial.core.sphere import directions_to_cube, latlong_directions
+from shinypartial.dataset.read import open_dataset, read_view
+from shinypartial.dataset.schema import Dataset
+from shinypartial.evaluation.evaluate import evaluate
+from shinypartial.io.picture_sheet import MAX_BYTES
+from shinypartial.prediction.format import (
+    DECOMPOSITION,
+    acquire_prediction,
+    dataset_hash,
+    prediction_frame,
+    read_environment_map,
+    read_info,
+    read_visibility,
+)
+from tests.panoless.conftest import FinishedFit
+from tests.support.mirror_height_field import bumpy
+from tests.support.mirror_plane import L_SHAPE, RECTANGLE, make_plane_dataset, plane_of
+from tests.support.mirror_sphere import clipped_environment, sphere_surfels, tiny_config
+from tests.support.synthetic_dataset import render_sphere, sphere_cameras
+
+UNIT_FRAME = ObjectFrame(np.zeros(3), 1.0)
+
+
+@pytest.fixture(scope="module")
+def prediction(finished: FinishedFit, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("predictions") / "sphere"
+    acquire_prediction(folder)
+    export_prediction(finished.dataset, finished.state, finished.config, folder)
+    return folder
+
+
+def test_the_readers_accept_the_prediction(prediction: Path, finished: FinishedFit) -> None:
+    info = read_info(prediction)
+    assert info.dataset_hash == dataset_hash(finished.dataset)
+    assert info.config["surfels"]["count"] == finished.config.surfels.count
+    assert info.primitives == finished.state.surfels.count
+    files = (prediction / PLY_NAME, prediction / "environment.exr")
+    assert info.model_bytes == sum(path.stat().st_size for path in files)
+    assert info.iteration is None
+    assert sum(info.parameter_counts.values()) == 13 * finished.config.surfels.count + 6 * 3 * 24 * 24
+    assert info.peak_memory_bytes > 1e7
+    assert set(info.seconds) >= {"read views", "initialize", "optimize", "solve environment"}
+    assert all(len(series) == len(info.curves["iteration"]) for series in info.curves.values())
+    environment, visibility = read_environment_map(prediction), read_visibility(prediction)
+    assert visibility is not None
+    assert environment.shape[:2] == visibility.shape == (48, 96)
+    assert 0.0 <= visibility.min() < visibility.max() <= 1.0
+    for frame in finished.dataset.test:
+        view = read_view(prediction_frame(prediction, frame))
+        assert view.normals_world is not None
+        lengths = np.linalg.norm(view.normals_world, axis=-1)
+        np.testing.assert_allclose(lengths[view.alpha > 0.01], 1, atol=1e-5)
+
+
+def test_the_written_visibility_is_that_of_the_fit(prediction: Path, finished: FinishedFit) -> None:
+    visibility, written = finished.state.visibility, read_visibility(prediction)
+    assert visibility is not None
+    assert written is not None
+    np.testing.assert_allclose(written, cube_to_latlong(visibility[:, None], 48)[..., 0], atol=1e-6)
+
+
+def test_the_evaluator_scores_it(prediction: Path, finished: FinishedFit) -> None:
+    scores = evaluate(prediction, finished.dataset.root)
+    assert (prediction / "scores.json").exists()
+    # Far below what a second of fitting reaches (3°, 25 dB), far above what a wrong axis leaves.
+    assert scores.normals is not None
+    assert scores.normals.median_angular_error_deg < 6.0
+
+
+def test_pictures_of_the_decomposition_are_there(prediction: Path) -> None:
+    names = [path.name for path in sorted((prediction / PICTURES).iterdir())]
+    assert [name[0] for name in names] == list("123456")
+    assert 5_000 < (prediction / DECOMPOSITION).stat().st_size < MAX_BYTES
+
+
+def test_the_sheet_shows_the_object_and_not_the_empty_picture() -> None:
+    """Pictures are cut to where there is alpha, whatever surrounds it; nothing at all is shown whole."""
+    rows, columns = slice(30, 42), slice(5, 17)
+    alpha = torch.zeros(80, 60)
+    alpha[rows, columns] = 1.0
+    pictures = {"1-a-b": (255 * alpha.numpy()).astype(np.uint8)}
+    (title, shown), *_ = crop_to_object(pictures, alpha).items()
+    assert title == "a b"
+    assert shown.shape == (14, 14)
+    assert (shown > 0).sum() == 144
+    assert crop_to_object(pictures, 0 * alpha)["a b"].shape == (80, 60)
+
+
+def test_nothing_half_written_stays(prediction: Path) -> None:
+    assert not list(prediction.rglob(".partial-*"))
+
+
+def test_an_export_that_fails_claims_nothing(tmp_path: Path, finished: FinishedFit, monkeypatch) -> None:
+    """An old prediction.json must not describe half of a new prediction, and the next export may take the folder."""
+    acquire_prediction(tmp_path)
+    export_prediction(finished.dataset, finished.state, finished.config, tmp_path)
+    with monkeypatch.context() as patch:
+
+        def fail(*_) -> None:
+            raise OSError(28, "No space left on device")
+
+        patch.setattr("panoless.export.prediction.write_ply", fail)
+        with pytest.raises(OSError, match="No space"):
+            export_prediction(finished.dataset, finished.state, finished.config, tmp_path)
+    with pytest.raises(InputError):
+        read_info(tmp_path)
+    acquire_prediction(tmp_path)
+    export_prediction(finished.dataset, finished.state, finished.config, tmp_path)
+    read_info(tmp_path)
+
+
+def test_an_export_killed_at_its_first_file_may_be_repeated(tmp_path: Path, finished: FinishedFit, monkeypatch) -> None:
+    folder = tmp_path / "prediction"
+    acquire_prediction(folder)
+    with monkeypatch.context() as patch:
+
+        def killed(*_) -> None:
+            (folder / ".partial-x.exr").touch()
+            raise KeyboardInterrupt
+
+        patch.setattr("panoless.export.prediction.write_visibility", killed)
+        with pytest.raises(KeyboardInterrupt):
+            export_prediction(finished.dataset, finished.state, finished.config, folder)
+    acquire_prediction(folder)
+    export_prediction(finished.dataset, finished.state, finished.config, folder)
+    assert not list(folder.rglob(".partial-*"))
+
+
+def read_ply(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a binary PLY of single-precision vertices."""
+    header, _, body = path.read_bytes().partition(b"end_header\n")
+    lines = header.decode("ascii").splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    count = int(next(line for line in lines if line.startswith("element vertex")).split()[-1])
+    names = [line.split()[-1] for line in lines if line.startswith("property float")]
+    rows = [struct.unpack_from(f"<{len(names)}f", body, 4 * len(names) * row) for row in range(count)]
+    assert len(body) == 4 * len(names) * count
+    return dict(zip(names, np.array(rows).T, strict=True))
+
+
+def test_the_ply_holds_the_surfels_in_world_units(tmp_path: Path) -> None:
+    radius, center = 2.0, np.array([10.0, -20.0, 30.0])
+    write_ply(tmp_path / "s.ply", sphere_surfels(50), ObjectFrame(center, radius))
+    table = read_ply(tmp_path / "s.ply")
+    points = np.stack([table[name] for name in "xyz"], 1)
+    normals = np.stack([table[name] for name in ("nx", "ny", "nz")], 1)
+    np.testing.assert_allclose(points, center + radius * normals, atol=1e-5)
+    np.testing.assert_allclose(np.exp(table["scale_0"]), radius * sphere_surfels(50).scales[:, 0], rtol=1e-5)
+    # A sphere of radius 2 has the curvature −1/2.
+    np.testing.assert_allclose(table["curvature_a"], -0.5, rtol=1e-6)
+    w, x, y, z = (table[f"rot_{i}"] for i in range(4))
+    axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
+    np.testing.assert_allclose(axis, normals, atol=1e-6)
+    # Black albedo as the degree-0 harmonic that viewers turn into color: 0.5 + 0.2821 f.
+    np.testing.assert_allclose(0.5 + 0.28209479 * table["f_dc_0"], 0.0, atol=1e-6)
+
+
+def test_the_exported_ply_lies_on_the_sphere(prediction: Path, finished: FinishedFit) -> None:
+    table = read_ply(prediction / PLY_NAME)
+    assert len(table["x"]) == finished.state.surfels.count
+    points = np.stack([table[name] for name in "xyz"], 1)
+    front = points[:, 0] > 0.5
+    assert abs(np.median(np.linalg.norm(points[front], axis=1)) - 1) < 0.05
+
+
+def test_a_map_colored_by_direction_shows_each_direction() -> None:
+    cube = cubemap_directions(64).permute(0, 3, 1, 2).contiguous()
+    # Area averages shorten by 0.1 %; bilinear lookups at 64 texels err by 0.03 %, more at corners.
+    np.testing.assert_allclose(cube_to_latlong(cube, 64), latlong_directions(64), atol=3e-3)
+
+
+def test_a_lat_long_map_has_no_seam_where_faces_meet() -> None:
+    """The error of resampling a smooth map jumps over an edge of the cube no more than it does within a face.
+
+    A lookup that stops at the border of a face does jump there: 2.3 times as far, measured on the second map.
+    """
+    directions, faces = latlong_directions(48), directions_to_cube(latlong_directions(48))[0]
+    across = faces[:, 1:] != faces[:, :-1]
+
+    def worst_jump(values: np.ndarray) -> tuple[float, float]:
+        jumps = np.abs(np.diff(values - np.sin(3 * directions), axis=1)).max(-1)
+        return float(jumps[across].max()), float(jumps[~across].max())
+
+    cube = torch.sin(3 * cubemap_directions(24))
+    over_edges, within = worst_jump(cube_to_latlong(cube.permute(0, 3, 1, 2).contiguous(), 48))
+    assert over_edges <= 1.5 * within
+    seam, smooth = worst_jump(clamped_cube_to_latlong(cube.numpy(), 48))
+    assert seam > 2 * smooth
+
+
+def test_a_lat_long_texel_is_the_mean_of_what_it_covers() -> None:
+    cube = torch.rand(6, 2, 4, 4)
+    fine, coarse = cube_to_latlong(cube, 64), cube_to_latlong(cube, 32)
+    blocks = fine.reshape(32, 2, 64, 2, 2).mean((1, 3))
+    # Four against sixteen samples of a piecewise bilinear function.
+    np.testing.assert_allclose(coarse, blocks, atol=0.03)
+
+
+@pytest.mark.parametrize("scale", [1.0, 30.0])
+def test_a_rendered_mirror_sphere_is_the_traced_one(scale: float) -> None:
+    """Exact surfels and the exact environment give the picture that ray tracing gives, in a world of any size."""
+    environment = clipped_environment(cubemap_directions(128)).permute(0, 3, 1, 2).contiguous()
+    camera = sphere_cameras("test", 1, 64)[0]
+    truth = render_sphere(camera)
+    pose = camera.camera_to_world.copy()
+    pose[:3, 3] *= scale
+    frame = ObjectFrame(np.zeros(3), scale)
+    raster = raster_camera(replace(camera, camera_to_world=pose), frame, 0.3)
+    parts = render(sphere_surfels(1500), environment, raster, frame, tiny_config())
+    # Blended Gaussians reach beyond a silhouette by their radius and bend its normals, so the rim is left out.
+    cosine = np.abs((truth.normals_world * (camera.position_world / 4.0)).sum(-1))
+    inner = (truth.alpha > 0.99) & (cosine > 0.6)
+    assert inner.mean() > 0.3
+    assert parts.alpha.numpy()[inner].min() > 0.99
+    angles = np.degrees(
+        np.arccos((parts.normals_world.permute(1, 2, 0).numpy() * truth.normals_world).sum(-1).clip(-1, 1))
+    )
+    # Measured with disks of radius 0.07: at most 1.0°, 0.031 in depth, 0.0033 in mean radiance.
+    assert angles[inner].max() < 2.0
+    np.testing.assert_allclose(parts.depth.numpy()[inner], scale * truth.depth[inner], atol=0.06 * scale)
+    difference = np.abs(parts.radiance.permute(1, 2, 0).numpy() - truth.radiance.clip(0, 1))
+    assert difference[inner].mean() < 0.01
+
+
+def test_only_a_finished_fit_is_exported(tmp_path: Path, finished: FinishedFit) -> None:
+    unfinished = replace(finished.state, final_environment=None)
+    with pytest.raises(ValueError, match="finished"):
+        export_prediction(finished.dataset, unfinished, finished.config, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_info_is_strict_json(prediction: Path) -> None:
+    json.loads((prediction / "prediction.json").read_text(), parse_constant=lambda name: pytest.fail(name))
+
+
+RUNG = "plane (a plane explains the outlines to 0.05 px)"
+
+
+@pytest.fixture(scope="module")
+def plane_prediction(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The exact flat mirror and the exact environment, in a frame of twice the world's unit, exported; its dataset."""
+    plane, radius, center = plane_of(RECTANGLE, offset=0.07), 2.0, np.array([0.3, -0.2, 0.1])
+    dataset = make_plane_dataset(tmp_path_factory.mktemp("datasets") / "plane", plane, train=3)
+    offset = (plane.offset - float(plane.normal @ center)) / radius
+    shift = np.array([plane.tangent_u @ center, plane.tangent_v @ center])
+    placed = replace(plane, offset=offset, boundary=(plane.boundary - shift) / radius)
+    environment = clipped_environment(cubemap_directions(64)).permute(0, 3, 1, 2).contiguous()
+    state = FitState(
+        surfels=surfels_on_plane(placed, 1, seed=0),
+        environment=environment,
+        iteration=0,
+        optimizer={},
+        gradient_sum=torch.zeros(1),
+        gradient_count=torch.zeros(1),
+        evidence=torch.zeros(6, 64, 64),
+        center=center.tolist(),
+        radius=radius,
+        final_environment=environment,
+        visibility=torch.ones(6, 64, 64),
+        plane=placed,
+        flat=True,
+        rung=RUNG,
+    )
+    folder = tmp_path_factory.mktemp("predictions") / "plane"
+    acquire_prediction(folder)
+    (folder / "test").mkdir()
+    (folder / PLY_NAME).write_text("of an earlier fit with surfels")
+    export_prediction(dataset, state, tiny_config(), folder)
+    return folder, dataset.root
+
+
+def test_an_exact_plane_scores_perfect_normals(plane_prediction: tuple[Path, Path]) -> None:
+    scores = evaluate(*plane_prediction)
+    assert scores.normals is not None
+    assert scores.normals.median_angular_error_deg < 0.01
+
+
+def test_a_plane_renders_the_traced_views(plane_prediction: tuple[Path, Path]) -> None:
+    """Alpha as traced with 36 points a pixel; depth and radiance of the mirror, in world units."""
+    folder, root = plane_prediction
+    for frame in open_dataset(root).test:
+        found, truth = read_view(prediction_frame(folder, frame)), read_view(frame)
+        np.testing.assert_allclose(found.alpha, truth.alpha, atol=0.08)
+        whole = truth.alpha == 1
+        assert whole.mean() > 0.1
+        assert found.depth is not None
+        assert truth.depth is not None
+        np.testing.assert_allclose(found.depth[whole], truth.depth[whole], atol=1e-4)
+        # Bilinear lookups in texels of 1.4°, and a sun clipped at 1.
+        difference = np.abs(found.radiance - truth.radiance.clip(0, 1))[whole]
+        assert difference.mean() < 3e-3
+
+
+def test_a_plane_is_described_as_what_it_is(plane_prediction: tuple[Path, Path]) -> None:
+    """Three numbers and four corners; one primitive; the reason in words; no surfels of an earlier fit beside it."""
+    folder, _ = plane_prediction
+    info = read_info(folder)
+    assert info.model == RUNG
+    assert info.primitives == 1
+    assert info.parameter_counts == {"plane parameters": 3 + 8, "environment parameters": 6 * 3 * 64 * 64}
+    assert info.model_bytes == sum((folder / name).stat().st_size for name in (PLANE_PLY_NAME, "environment.exr"))
+    assert not (folder / PLY_NAME).exists()
+
+
+def test_surfels_say_why_they_were_taken(prediction: Path, finished: FinishedFit, tmp_path: Path) -> None:
+    """In the words of the ladder; no other model lies beside them."""
+    assert read_info(prediction).model == finished.state.rung == "surfels (asked for)"
+    reason = "surfels (no plane explains the outlines: 7 px away, overlap 80%; no axis of revolution)"
+    for name in (PLANE_PLY_NAME, REVOLUTION_PLY_NAME):
+        (tmp_path / name).write_text("of an earlier fit")
+    export_prediction(finished.dataset, replace(finished.state, rung=reason), finished.config, tmp_path)
+    assert read_info(tmp_path).model == reason
+    for folder in (prediction, tmp_path):
+        assert (folder / PLY_NAME).exists()
+        assert not (folder / PLANE_PLY_NAME).exists()
+        assert not (folder / REVOLUTION_PLY_NAME).exists()
+
+
+@pytest.fixture(scope="module")
+def ball_prediction(tmp_path_factory: pytest.TempPathFactory, sphere_dataset: Dataset) -> Path:
+    """The traced sphere as an exact surface of revolution, in a frame of twice the world's unit, exported."""
+    radius, center, sides = 2.0, np.array([0.3, -0.2, 0.1]), 720
+    angle = np.linspace(-np.pi / 2, np.pi / 2, sides + 1)
+    profile = np.stack([np.cos(angle).clip(0), np.sin(angle)], 1) / radius
+    axis = np.array([0.6, 0.0, 0.8])
+    middle = -center / radius
+    height = float(middle @ axis)
+    surface = SurfaceOfRevolution(middle - height * axis, axis, profile + np.array([0.0, height]), sides)
+    environment = clipped_environment(cubemap_directions(64)).permute(0, 3, 1, 2).contiguous()
+    state = FitState(
+        surfels=surfels_on_revolution(surface, 40),
+        environment=environment,
+        iteration=0,
+        optimizer={},
+        gradient_sum=torch.zeros(1),
+        gradient_count=torch.zeros(1),
+        evidence=torch.zeros(6, 64, 64),
+        center=center.tolist(),
+        radius=radius,
+        final_environment=environment,
+        visibility=torch.ones(6, 64, 64),
+        surface=surface,
+        turned=True,
+        rung="revolution (asked for)",
+    )
+    folder = tmp_path_factory.mktemp("predictions") / "ball"
+    acquire_prediction(folder)
+    export_prediction(sphere_dataset, state, tiny_config(), folder)
+    return folder
+
+
+def test_an_exact_surface_of_revolution_scores_perfect_normals(ball_prediction: Path, sphere_dataset: Dataset) -> None:
+    """A side of the profile turns by a quarter of a degree, and interpolation goes between."""
+    scores = evaluate(ball_prediction, sphere_dataset.root)
+    assert scores.normals is not None
+    assert scores.normals.median_angular_error_deg < 0.02
+
+
+def test_a_surface_of_revolution_renders_the_traced_views(ball_prediction: Path, sphere_dataset: Dataset) -> None:
+    """Alpha as traced with 25 points a pixel; depth and radiance of the mirror, in world units."""
+    for frame in sphere_dataset.test:
+        found, truth = read_view(prediction_frame(ball_prediction, frame)), read_view(frame)
+        np.testing.assert_allclose(found.alpha, truth.alpha, atol=0.13)
+        whole = truth.alpha == 1
+        assert whole.mean() > 0.1
+        assert found.depth is not None
+        assert truth.depth is not None
+        np.testing.assert_allclose(found.depth[whole], truth.depth[whole], atol=1e-3)
+        difference = np.abs(found.radiance - truth.radiance.clip(0, 1))[whole]
+        assert difference.mean() < 3e-3
+
+
+def test_a_surface_of_revolution_is_described_as_what_it_is(ball_prediction: Path) -> None:
+    """One primitive, the reason in words, and a mesh whose vertices lie on the traced sphere in world units."""
+    info = read_info(ball_prediction)
+    assert info.model == "revolution (asked for)"
+    assert info.primitives == 1
+    assert info.parameter_counts == {"revolution parameters": 5 + 2 * 721, "environment parameters": 6 * 3 * 64 * 64}
+    assert not (ball_prediction / PLY_NAME).exists()
+    lines = (ball_prediction / REVOLUTION_PLY_NAME).read_text(encoding="ascii").splitlines()
+    count = next(int(line.split()[-1]) for line in lines if line.startswith("element vertex"))
+    begin = lines.index("end_header") + 1
+    vertices = np.array([[float(value) for value in line.split()] for line in lines[begin : begin + count]])
+    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1, atol=1e-6)
+    faces = np.array([[int(value) for value in line.split()] for line in lines[begin + count :]])
+    assert (faces[:, 0] == 4).all()
+    assert faces[:, 1:].min() == 0
+    assert faces[:, 1:].max() == count - 1
+
+
+def test_the_ply_of_a_plane_is_its_outline_in_world_units(tmp_path: Path) -> None:
+    plane, radius, center = plane_of(L_SHAPE), 2.0, np.array([10.0, -20.0, 30.0])
+    write_plane_ply(tmp_path / "p.ply", plane, ObjectFrame(center, radius))
+    lines = (tmp_path / "p.ply").read_text(encoding="ascii").splitlines()
+    body = lines[lines.index("end_header") + 1 :]
+    assert "element vertex 6" in lines
+    assert "element face 1" in lines
+    corners = np.array([[float(value) for value in line.split()] for line in body[:6]])
+    expected = [
+        center + radius * (plane.offset * plane.normal + u * plane.tangent_u + v * plane.tangent_v) for u, v in L_SHAPE
+    ]
+    np.testing.assert_allclose(corners, expected, atol=1e-6)
+    assert body[6:] == ["6 0 1 2 3 4 5"]
+
+
+def test_the_ply_of_a_bent_plane_is_its_mesh_in_world_units(tmp_path: Path) -> None:
+    """Every vertex lies at its height over the plane; faces name vertices that exist."""
+    height_field, object_frame = bumpy(plane_of(RECTANGLE), 0.02), ObjectFrame(np.array([1.0, -2.0, 0.5]), 3.0)
+    write_height_field_ply(tmp_path / "height field.ply", height_field, object_frame)
+    header, body = (tmp_path / "height field.ply").read_text().split("end_header\n")
+    points, faces = height_field.quadrilaterals()
+    assert f"element vertex {len(points)}\n" in header
+    assert f"element face {len(faces)}\n" in header
+    rows = body.splitlines()
+    written = np.array([row.split() for row in rows[: len(points)]], dtype=np.float64)
+    np.testing.assert_allclose((written - object_frame.center) / object_frame.radius, points, atol=1e-7)
+    assert [int(number) for number in rows[-1].split()] == [4, *faces[-1]]
