@@ -5,14 +5,17 @@ Links are written as they work in the repository; a link that leaves `docs` is r
 
 import os
 import re
+from collections.abc import Iterator
 from html import unescape
 from pathlib import Path
 
+import griffe
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
+OPTIONS = "<!-- options -->"
 ROOT = Path(__file__).resolve().parents[1]
 FORMULA = re.compile(r'<(?P<tag>div|span) class="arithmatex">\\[\[(](?P<latex>.*?)\\[\])]</(?P=tag)>', re.DOTALL)
 LINK = re.compile(r"(?P<before>\]\()(?P<path>[^)#:\s]+)(?P<anchor>#[^)\s]*)?\)")
@@ -48,7 +51,33 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         relative = os.path.relpath(address, os.path.dirname(page.file.src_uri) or ".")
         return f"{match['before']}{relative}{match['anchor'] or ''})"
 
+    if OPTIONS in markdown:
+        markdown = markdown.replace(OPTIONS, "\n".join(option_tables()))
     return LINK.sub(rewritten, markdown)
+
+
+def option_tables() -> Iterator[str]:
+    """Tables of all fields of `FitConfig`, from the source: name on the command line, default, meaning."""
+    package = griffe.load("panoless", search_paths=[ROOT], resolve_aliases=True)
+    main = package["config.FitConfig"]
+    groups = [(main, "config")]
+    for item in main.attributes.values():
+        nested = package["config"].members.get(str(item.annotation))
+        if nested is not None and nested.is_class:
+            groups.append((nested, f"config.{item.name}"))
+    names = {prefix.removeprefix("config.") for _, prefix in groups}
+    for group, prefix in groups:
+        yield f"\n### `--{prefix}.…`\n\n{text_of(group)}\n\n| Option | Default | Meaning |\n| --- | --- | --- |"
+        for item in group.attributes.values():
+            if item.name not in names and "class-attribute" in item.labels:
+                option = f"--{prefix}.{item.name}".replace("_", "-").replace("--config.model", "--model")
+                yield f"| `{option}` | `{item.value}` | {text_of(item)} |"
+
+
+def text_of(item: griffe.Object) -> str:
+    """A docstring in one line, as a cell of a table."""
+    text = item.docstring.value if item.docstring else ""
+    return " ".join(text.split()).replace("|", "\\|").replace("*", "\\*")
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
