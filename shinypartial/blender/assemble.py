@@ -17,7 +17,6 @@ from shinypartial.core.trajectory import CameraPath
 from shinypartial.io.images import read_exr_rgb
 from shinypartial.scene import FileWorld, Render, SceneSpec, Sphere, StudioWorld
 
-BOUNCES = 16
 #: Measured in Blender's own maps: −0.0022 (forest), beside radiance up to 1400.
 LOWEST_RADIANCE = -1e-2
 
@@ -69,7 +68,7 @@ def _set_sampling(scene: Any, render: Render) -> None:
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0
     cycles.light_sampling_threshold = cycles.blur_glossy = 0
     cycles.caustics_reflective = True
-    cycles.max_bounces = cycles.glossy_bounces = cycles.diffuse_bounces = BOUNCES
+    cycles.max_bounces = cycles.glossy_bounces = cycles.diffuse_bounces = render.max_bounces
     cycles.pixel_filter_type = "BOX"
     cycles.filter_width = 1.0
     cycles.film_exposure = 1.0
