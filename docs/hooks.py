@@ -16,6 +16,13 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 OPTIONS = "<!-- options -->"
+ROOMS = re.compile(r"<!-- rooms of (?P<package>\w+) -->")
+ORDER = (
+    *("api", "capture", "first_surface", "environment", "geometry", "selection", "reconstruct", "export"),
+    *("core", "io", "scene", "blender", "generate", "dataset", "release", "prediction", "oracle"),
+    *("metrics", "evaluation", "comparison", "report", "numeric", "kernels", "config", "presets"),
+)
+"""Rooms in the order of the data; others come after them."""
 ROOT = Path(__file__).resolve().parents[1]
 FORMULA = re.compile(r'<(?P<tag>div|span) class="arithmatex">\\[\[(](?P<latex>.*?)\\[\])]</(?P=tag)>', re.DOTALL)
 LINK = re.compile(r"(?P<before>\]\()(?P<path>[^)#:\s]+)(?P<anchor>#[^)\s]*)?\)")
@@ -53,7 +60,22 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
     if OPTIONS in markdown:
         markdown = markdown.replace(OPTIONS, "\n".join(option_tables()))
+    markdown = ROOMS.sub(lambda match: "\n".join(rooms(match["package"])), markdown)
     return LINK.sub(rewritten, markdown)
+
+
+def rooms(package: str) -> Iterator[str]:
+    """Directives that document every room of a package; of the kernels only the public operators."""
+    names = {path.stem for path in (ROOT / package).glob("*.py") if not path.stem.startswith("_")}
+    names |= {path.parent.name for path in (ROOT / package).glob("*/__init__.py")}
+    ranks = {name: rank for rank, name in enumerate(ORDER)}
+    for name in sorted(names - {"cli"}, key=lambda name: (ranks.get(name, len(ORDER)), name)):
+        yield f"::: {package}.{name}"
+        if name == "kernels":
+            yield "    options: {show_submodules: false}\n"
+            operators = sorted(path.stem for path in (ROOT / package / name).glob("*.py") if path.stem != "__init__")
+            yield from (f"::: {package}.{name}.{each}\n    options: {{heading_level: 3}}\n" for each in operators)
+        yield ""
 
 
 def option_tables() -> Iterator[str]:
