@@ -84,7 +84,7 @@ def choose_rung(views: Views, config: FitConfig, trial: Trial) -> Rung:
     boundary = f"a plane explains the outlines to {distance:.2g} px"
     if config.model == "plane":
         return Rung("plane", f"asked for; {boundary}", found.plane)
-    if config.model == "bent":
+    if config.model == "height_field":
         return _bent(views, config, trial, found.plane, f"asked for; {boundary}")
     start = surfels_on_plane(found.plane, config.surfels.count, config.seed)
     flat, bent = _held_out_errors(without_frame_reflections(views, found.plane), config, found.plane, start, trial)
@@ -97,7 +97,7 @@ def choose_rung(views: Views, config: FitConfig, trial: Trial) -> Rung:
 def _bent(views: Views, config: FitConfig, trial: Trial, plane: Plane, reason: str) -> Rung:
     """Heights over a plane, after `reason` spoke against the plane itself."""
     height_field = fit_height_field(views, plane)
-    if config.model == "bent":
+    if config.model == "height_field":
         return Rung("bent", reason, height_field.plane, height_field)
     start = surfels_on_height_field(height_field, config.surfels.count, config.seed)
     smooth, free = _held_out_errors(without_frame_reflections(views, height_field), config, height_field, start, trial)
