@@ -48,7 +48,7 @@ def write_exr(path: Path, channels: Channels, *, y_up_environment: bool = False)
 def _require_complete_write(temporary: Path, path: Path) -> None:
     """Both libraries buffer: a full disk can leave a short file without an error, so it is read back."""
     try:
-        read_exr(temporary) if path.suffix == ".exr" else read_picture(temporary)
+        (read_exr if path.suffix == ".exr" else read_picture)(temporary)
     except InputError:
         raise OSError(errno.ENOSPC, "the written picture can't be read back", str(path)) from None
 
