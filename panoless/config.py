@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from msgspec import Meta
 
+from panoless.selection.options import SelectionOptions
 from shinypartial.core.errors import InputError
 from shinypartial.io.records import Count, NonNegative, Positive, Share, check_record, read_record
 
@@ -151,7 +152,7 @@ class FitConfig:
     seed: int = 0
     """Seed of the initial surfels and of the order of views."""
     model: Annotated[Model, tyro.conf.arg(prefix_name=False)] = "auto"
-    """`auto`: the simplest that explains held-out views; `plane`: three numbers and an outline; `height_field`: a
+    """`auto`: the simplest that explains held-out views; `plane`: three numbers and a boundary; `height_field`: a
     smooth height over that plane; `revolution`: an axis and a profile; `surfels`: curved."""
     albedo: bool = False
     """Learn a diffuse term A (Eq. 8); a perfect mirror has none."""
@@ -176,6 +177,7 @@ class FitConfig:
     loss: LossConfig = field(default_factory=LossConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     rates: RateConfig = field(default_factory=RateConfig)
+    selection: SelectionOptions = field(default_factory=SelectionOptions)
 
 
 def renamed_arguments(arguments: list[str]) -> list[str]:
