@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from shinypartial.blender.assemble import BOUNCES, assemble, world_radiance
+from shinypartial.blender.assemble import assemble, world_radiance
 from shinypartial.blender.directions import (
     GRID,
     MISSED,
@@ -157,7 +157,7 @@ def open_renderer(
 def _prepare_mirror(bpy: Any, spec: SceneSpec, body: Float[np.ndarray, "P 3"], threads: int) -> _Mirror:
     """Add the two scenes that a perfect mirror needs."""
     props = [world_vertices(bpy, each) for each in props_of(bpy.context.scene)]
-    assemble_directions(bpy, spec, BOUNCES)
+    assemble_directions(bpy, spec)
     assemble_sparse(bpy, spec.camera)
     return _Mirror(FarWorld(world_radiance(spec.world, spec.render.exposure)), np.concatenate([body, *props]), threads)
 

@@ -9,7 +9,7 @@ from shinypartial.core.errors import InputError
 from shinypartial.core.trajectory import SWEPT_PATHS
 from shinypartial.scene.check import check_scene
 from shinypartial.scene.shapes import BlendFile, Material
-from shinypartial.scene.spec import STUDIO_LIGHTS, FileWorld, SceneSpec
+from shinypartial.scene.spec import DEVELOPMENT, HELD_OUT, STUDIO_LIGHTS, FileWorld, SceneSpec
 from shinypartial.scene.tables import Place, parse_table
 
 SCENES = Path(__file__).resolve().parents[2] / "blender_scenes"
@@ -17,9 +17,10 @@ RECIPE = "scene.toml"
 BLEND = ".blend"
 
 
-def scene_names() -> list[str]:
-    """Names of the scenes that come with the repository."""
-    return sorted(path.parent.name for path in SCENES.glob(f"*/{RECIPE}"))
+def scene_names(split: str | None = None) -> list[str]:
+    """Names of the scenes that come with the repository; only those of a split (`SPLITS`) where one is named."""
+    names = sorted(path.parent.name for path in SCENES.glob(f"*/{RECIPE}"))
+    return [name for name in names if split is None or load_scene(name).split == split]
 
 
 def find_scene(scene: str, object_name: str | None = None) -> SceneSpec:
@@ -86,6 +87,7 @@ def from_blend_file(path: Path, object_name: str | None) -> SceneSpec:
         "title": f"{object_name} of {path.name}",
         "provenance": f"Object {object_name} of the file {path.name}.",
         "license": "that of the file",
+        "split": DEVELOPMENT,
         "object": {"kind": "blend", "path": str(file), "object": object_name},
         "world": {"kind": "studiolight", "name": "interior"},
         "material": None,
@@ -169,6 +171,12 @@ def variant_name(original: SceneSpec, varied: SceneSpec) -> str:
 def parse_scene(table: dict[str, Any], source: str) -> SceneSpec:
     """Build a SceneSpec from nested tables; `source` names their origin in messages."""
     place = Place(source)
+    if "split" not in table:
+        raise InputError(
+            expected=f"`split` of {source}: whether anything may be chosen by the scores of this scene",
+            found="no such key",
+            remedy=f'Add the line split = "{DEVELOPMENT}", or split = "{HELD_OUT}" where nothing ever is.',
+        )
     spec = parse_table(SceneSpec, table, place)
     check_scene(spec, place)
     return spec

@@ -1,7 +1,7 @@
 """What Blender hands back: radiance without a display transform, exact normals, z-depth, area-averaged alpha."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +9,7 @@ import pytest
 from jaxtyping import Bool, Float
 
 from shinypartial.blender.assemble import world_radiance
-from shinypartial.blender.geometry import spline_outline
+from shinypartial.blender.geometry import profile_outlines
 from shinypartial.blender.render import RenderedView, open_renderer
 from shinypartial.core.camera import Camera, ray_directions_world, reflect
 from shinypartial.core.conventions import SOLID_ALPHA
@@ -102,7 +102,7 @@ def test_normals_are_those_of_the_smooth_surface(vase: Rendered) -> None:
 
     surface = vase.spec.object
     assert isinstance(surface, SurfaceOfRevolution)
-    outline = spline_outline(surface, 100_001)
+    (outline,) = profile_outlines(replace(surface, rings=100_000))
     points = vase.center_depth_to_points[vase.solid]
     radius = np.hypot(points[:, 0], points[:, 1])
     _, nearest = cKDTree(outline.points).query(np.stack([radius, points[:, 2]], -1))
