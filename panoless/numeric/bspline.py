@@ -12,12 +12,10 @@ def cubic_bspline_basis(t: Float[np.ndarray, "P"], derivatives: int = 2) -> Floa
 
     Closed forms, because scipy's design matrix has no derivatives.
     """
-    orders = [((1 - t) ** 3 / 6, (3 * t**3 - 6 * t**2 + 4) / 6, (-3 * t**3 + 3 * t**2 + 3 * t + 1) / 6, t**3 / 6)]
-    if derivatives > 0:
-        orders.append((-((1 - t) ** 2) / 2, (3 * t**2 - 4 * t) / 2, (-3 * t**2 + 2 * t + 1) / 2, t**2 / 2))
-    if derivatives > 1:
-        orders.append((1 - t, 3 * t - 2, 1 - 3 * t, t))
-    return np.stack([np.stack(order, 1) for order in orders])
+    values = ((1 - t) ** 3 / 6, (3 * t**3 - 6 * t**2 + 4) / 6, (-3 * t**3 + 3 * t**2 + 3 * t + 1) / 6, t**3 / 6)
+    slopes = (-((1 - t) ** 2) / 2, (3 * t**2 - 4 * t) / 2, (-3 * t**2 + 2 * t + 1) / 2, t**2 / 2)
+    bends = (1 - t, 3 * t - 2, 1 - 3 * t, t)
+    return np.stack([np.stack(order, 1) for order in (values, slopes, bends)[: derivatives + 1]])
 
 
 def cubic_bsplines_at(
