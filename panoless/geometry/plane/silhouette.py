@@ -29,8 +29,10 @@ class BoundaryResiduals:
     pixels: Float[np.ndarray, "P"]
     by_plane: Float[np.ndarray, "P 4"]
     """Derivatives by the normal along t_u and t_v, by the offset, and by the frame's height."""
-    by_foot: Float[np.ndarray, "P 2"]
-    """Derivatives by the nearest point of the boundary."""
+    by_side: Float[np.ndarray, "P 2"]
+    """Derivatives by a shift of the nearest side."""
+    end_share: Float[np.ndarray, "P"]
+    """Share of the side's second vertex in these; the first has the rest."""
     by_height: Float[np.ndarray, "P"]
     """Derivatives by the height of the mirror's edge over the plane; zero where the frame hides that edge."""
     side: Int[np.ndarray, "P"]
@@ -115,7 +117,9 @@ def boundary_residuals(
     return BoundaryResiduals(
         pixels=(outward * (coordinates - foot)).sum(1) + beyond * parallax,
         by_plane=np.stack([*by_turn.T, hit_shift + beyond / above * parallax, by_level * by_frame], 1),
-        by_foot=-(1 + parallax)[:, None] * outward,
+        by_side=-(1 + parallax)[:, None] * outward,
+        end_share=along
+        + ((camera - foot) * tangent).sum(1) * parallax / (1 + parallax) / np.maximum(lengths[side], 1e-12),
         by_height=by_level * ~by_frame,
         side=side,
         along=along,
@@ -129,8 +133,8 @@ def boundary_jacobian(residuals: BoundaryResiduals, vertices: int) -> "csr_matri
     """Derivatives of the distances by the four numbers of the plane and by two of each vertex, P rows."""
     count = len(residuals.side)
     ends = np.stack([residuals.side, (residuals.side + 1) % vertices], 1)
-    shares = np.stack([1 - residuals.along, residuals.along], 1)
-    values = shares[:, :, None] * residuals.by_foot[:, None, :]
+    shares = np.stack([1 - residuals.end_share, residuals.end_share], 1)
+    values = shares[:, :, None] * residuals.by_side[:, None, :]
     columns = 4 + 2 * ends[:, :, None] + np.arange(2)
     return jacobian_of_rows(
         np.concatenate([residuals.by_plane, values.reshape(count, 4)], 1),
