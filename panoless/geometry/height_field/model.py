@@ -14,7 +14,7 @@ from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.model import Plane
 from panoless.geometry.surfaces import buffers_from_arrays
 from panoless.geometry.surfels.rendering import SurfaceBuffers
-from panoless.kernels.cpu.height_field import first_hits
+from panoless.kernels.height_field import first_hits
 from panoless.kernels.rasterize import RasterCamera
 from panoless.numeric.bspline import cubic_bsplines_at
 from panoless.numeric.polygon import depth_inside, projected_coverage
