@@ -12,7 +12,7 @@ import pytest
 
 from shinypartial.core.errors import InputError
 from shinypartial.io.files import sha256_of
-from shinypartial.metrics import lpips_weights as weights
+from shinypartial.evaluation import lpips_weights as weights
 from shinypartial.metrics import perceptual
 
 RANDOM = np.random.default_rng(0)
