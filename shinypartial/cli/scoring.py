@@ -21,7 +21,7 @@ class Evaluate:
     protocol: Literal["both", "linear-v1"] = "both"
     """Score the benchmark's own protocol linear-v1, and paper-v1 too, which serves comparison with published tables."""
     oracle: Path | None = None
-    """Scored folder of the dataset's bound; DATASET-oracle beside the prediction, where there is one, if not given."""
+    """Scored folder of the oracle baseline; DATASET-oracle beside the prediction, where there is one, if not given."""
     snapshots: bool = False
     """Score the snapshots below the prediction, for `shinypartial chart`, and then the prediction."""
 
@@ -49,7 +49,7 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Oracle:
-    """Make and score the bound of a dataset: the best map that its training views allow with ground-truth normals."""
+    """Make and score the oracle baseline of a dataset: a map solved from training views with ground-truth normals."""
 
     dataset: tyro.conf.Positional[Path | None] = None
     """Dataset folder; the newest one below datasets/ when not given."""
@@ -72,7 +72,7 @@ class Oracle:
             print(f"{each.estimate:9s} {each.height}×{2 * each.height}  {psnr}{'  taken' * (each is made.chosen)}")
         evaluate(output, dataset)
         print("\n".join(summary_lines(output)))
-        print(f"Bound: {output}")
+        print(f"Oracle baseline: {output}")
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Postprocess:
 
 @dataclass(frozen=True)
 class Compare:
-    """Compare two groups of scored predictions: mean, spread, and paired differences with bootstrap intervals."""
+    """Compare two groups of scored predictions: mean, spread, and an exact sign-flip test of paired differences."""
 
     group: tyro.conf.Positional[tuple[Path, ...]]
     """Prediction folders of the first group, such as one method with several seeds or on several datasets."""
@@ -111,7 +111,7 @@ class Compare:
     output: Path | None = None
     """Folder to write comparison.json and comparison.csv with all metrics into; nothing is written when not given."""
     seed: int = 0
-    """Seed of the bootstrap."""
+    """Seed of the sign flips, which are drawn for more than 14 pairs and enumerated for fewer."""
 
     def run(self) -> None:
         """Print the table and write the files."""

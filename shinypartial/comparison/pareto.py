@@ -13,7 +13,7 @@ from typing import Literal
 
 from shinypartial.comparison.runs import HASH_DIGITS, Entry, Excluded, read_entry
 from shinypartial.core.errors import InputError
-from shinypartial.evaluation.scores import read_bound, score_rows
+from shinypartial.evaluation.scores import read_oracle_baseline, score_rows
 from shinypartial.metrics.registry import Direction, metric
 from shinypartial.prediction.format import DESCRIPTION, PredictionInfo, prediction_folders, snapshot_folders
 
@@ -314,7 +314,7 @@ def _oracle_line(bounds: Sequence[Entry], runs: Sequence[_Run]) -> dict[str, flo
     """The oracle's environment, from the predictions named or from beside them; normals have none but zero."""
     wanted = runs[0].entry.scores.dataset_hash
     found = [entry.scores for entry in bounds if entry.scores.dataset_hash == wanted]
-    found += [scores for run in runs if (scores := read_bound(run.folder, run.entry.scores)) is not None]
+    found += [scores for run in runs if (scores := read_oracle_baseline(run.folder, run.entry.scores)) is not None]
     if not found:
         return {}
     rows = {row.path: row.value for row in score_rows(found[0])}

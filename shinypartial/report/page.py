@@ -27,7 +27,7 @@ from shinypartial.evaluation.pictures import (
     Scale,
     ViewPictures,
 )
-from shinypartial.evaluation.scores import ScoreRow, Scores, ViewScores, read_bound, read_scores, score_rows
+from shinypartial.evaluation.scores import ScoreRow, Scores, ViewScores, read_oracle_baseline, read_scores, score_rows
 from shinypartial.io.files import write_text
 from shinypartial.io.progress import format_seconds
 from shinypartial.metrics.registry import Direction
@@ -80,7 +80,7 @@ def summary_lines(prediction: Path) -> list[str]:
     """The scores in a few lines for a terminal."""
     info, scores = read_info(prediction), read_scores(prediction)
     rows = {row.path: row for row in score_rows(scores)}
-    bounds = bounds_by_path(read_bound(prediction, scores))
+    bounds = bounds_by_path(read_oracle_baseline(prediction, scores))
     lines = [f"{info.method} on {scores.dataset}, protocol {scores.protocol}"]
     if not scores.dataset_hash_matches:
         lines.append("  warning       the prediction was made from another version of this dataset")
@@ -115,7 +115,7 @@ def summary_lines(prediction: Path) -> list[str]:
 
 def report_html(prediction: Path, info: PredictionInfo, scores: Scores) -> str:
     """The page as text."""
-    rows, bounds = score_rows(scores), bounds_by_path(read_bound(prediction, scores))
+    rows, bounds = score_rows(scores), bounds_by_path(read_oracle_baseline(prediction, scores))
     title = f"{info.method} on {scores.dataset}"
     sections = [
         _header(info, scores, title),
