@@ -175,8 +175,8 @@ def paired_difference(differences: Float[np.ndarray, "P"], seed: int = 0) -> Pai
     """Mean, Student's interval and sign-flip test of paired differences."""
     mean = float(differences.mean()) if len(differences) else None
     interval = mean_interval(differences, CONFIDENCE)
-    ends = (None, None) if interval is None else (interval.low, interval.high)
-    return PairedDifference(len(differences), mean, *ends, sign_flip_test(differences, seed))
+    low, high = (interval.low, interval.high) if interval else (None, None)
+    return PairedDifference(len(differences), mean, low, high, sign_flip_test(differences, seed))
 
 
 def _verdict(difference: PairedDifference, definition: Metric) -> str:
@@ -219,7 +219,7 @@ def _text_row(compared: ComparedMetric) -> tuple[str, ...]:
 
     def text(values: Spread | None) -> str:
         if values is None or values.standard_deviation is None:
-            return definition.text(values and values.mean)
+            return definition.text(values.mean if values else None)
         return f"{definition.text(values.mean)} ± {values.standard_deviation:{definition.format_spec.lstrip('+')}}"
 
     interval = "" if difference.low is None else f" [{signed(difference.low)}, {signed(difference.high)}]"
