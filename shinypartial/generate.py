@@ -102,15 +102,15 @@ def _is_complete(root: Path, frames: Sequence[Frame]) -> bool:
 def _render_frames(spec: SceneSpec, frames: Sequence[Frame], total: int) -> None:
     """Render and write; while a thread writes its frame, another's is being rendered."""
     progress = Progress("Rendering", total, total - len(frames))
-    with open_pool(spec) as pool, ThreadPoolExecutor(pool.plan.workers + 1) as pool:
-        results = [pool.submit(_make_frame, pool, frame) for frame in frames]
+    with open_pool(spec) as pool, ThreadPoolExecutor(pool.plan.workers + 1) as writers:
+        results = [writers.submit(_make_frame, pool, frame) for frame in frames]
         try:
             for done in as_completed(results):
                 done.result()
                 progress.advance()
         except BaseException as error:
             pool.close()
-            pool.shutdown(cancel_futures=True)
+            writers.shutdown(cancel_futures=True)
             if not isinstance(error, PoolClosed):
                 raise
             failures = [each.exception() for each in results if not each.cancelled()]
