@@ -56,16 +56,16 @@ class Fit:
         prediction = self.output or Path("predictions") / name
         run_folder = RUNS / prediction.resolve().name
         device = find_device(self.device)
-        marks = snapshot_schedule(self.snapshots, self.snapshot_seconds, self.config.iterations)
+        schedule = snapshot_schedule(self.snapshots, self.snapshot_seconds, self.config.iterations)
         _refuse_run_folder(prediction, run_folder)
         with folder_lock(prediction):
             acquire_prediction(prediction)
-            state = fit(dataset, self.config, run_folder, marks, device)
+            state = fit(dataset, self.config, run_folder, schedule, device)
             export_prediction(dataset, state, self.config, prediction)
         print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
-        if marks and state.stepless:
-            print(f"No snapshots: this run took {_shape_name(state)}, whose map is solved without steps.")
-        elif marks:
+        if schedule and state.training is None:
+            print(f"No snapshots: this run took {_label(state)}, whose map is solved without steps.")
+        elif schedule:
             print(f"Snapshots: panoless export {run_folder} --output {prediction} --snapshots")
 
 
@@ -93,7 +93,7 @@ class Export:
         folder = self.run_folder or newest_folder(RUNS, DESCRIPTION, "a run", "Make one: `panoless fit`.")
         description = read_description(folder)
         state = load_state(folder)
-        if state is None or state.final_environment is None:
+        if state is None or state.environment is None:
             raise InputError(
                 expected=f"a finished run in {folder}",
                 found=f"no {CHECKPOINT}"
@@ -101,10 +101,10 @@ class Export:
                 else f"{state.iteration} of {description.config.iterations} iterations",
                 remedy="Run the same `panoless fit` command again: it continues where it stopped.",
             )
-        if self.snapshots and state.stepless:
+        if self.snapshots and state.training is None:
             raise InputError(
                 expected=f"a run of surfels in {folder}, for --snapshots",
-                found=f"a run that took {_shape_name(state)}, which is fitted without steps: "
+                found=f"a run that took {_label(state)}, which is fitted without steps: "
                 "there are no moments in between",
                 remedy="Leave --snapshots out; or fit surfels: "
                 "`panoless fit --model surfels --snapshots 6 --output NEW`.",
@@ -123,8 +123,10 @@ class Export:
             print(f"Then: shinypartial evaluate {prediction} --snapshots")
 
 
-def _shape_name(state: "FitState") -> str:
-    return "a plane" if state.flat else "a bent plane" if state.bent else "a surface of revolution"
+def _label(state: "FitState") -> str:
+    from panoless.geometry.registry import FAMILIES
+
+    return FAMILIES[state.geometry.kind].label
 
 
 def _refuse_run_folder(prediction: Path, run_folder: Path) -> None:

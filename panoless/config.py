@@ -10,7 +10,10 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from panoless.selection.options import SelectionOptions
 from shinypartial.core.errors import InputError
+
+Model = Literal["auto", "plane", "height_field", "revolution", "surfels"]
 
 
 @dataclass(frozen=True)
@@ -144,11 +147,11 @@ class FitConfig:
     """Number of optimization steps (one view each)."""
     seed: int = 0
     """Seed of the initial surfels and of the order of views."""
-    model: Annotated[Literal["auto", "plane", "bent", "revolution", "surfels"], tyro.conf.arg(prefix_name=False)] = (
-        "auto"
-    )
-    """`auto`: the simplest that explains held-out views; `plane`: three numbers and an outline; `bent`: a smooth height
-    over that plane; `revolution`: an axis and a profile; `surfels`: curved."""
+    model: Annotated[
+        Literal["auto", "plane", "height_field", "revolution", "surfels"], tyro.conf.arg(prefix_name=False)
+    ] = "auto"
+    """`auto`: the simplest that explains held-out views; `plane`: three numbers and a boundary; `height_field`: a smooth
+    height over that plane; `revolution`: an axis and a profile; `surfels`: curved."""
     albedo: bool = False
     """Learn a diffuse term A (Eq. 8); a perfect mirror has none."""
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -171,6 +174,7 @@ class FitConfig:
     loss: LossConfig = field(default_factory=LossConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     rates: RateConfig = field(default_factory=RateConfig)
+    selection: SelectionOptions = field(default_factory=SelectionOptions)
 
 
 def config_from_dict(content: dict[str, Any]) -> FitConfig:
@@ -225,7 +229,7 @@ def check_config(config: FitConfig) -> None:
             low = -math.inf
         else:
             low = 0
-            open_ended = name.startswith(("rates.", "loss.lambda_")) and name not in (
+            open_ended = name.startswith(("rates.", "loss.lambda_", "selection.")) and name not in (
                 "rates.drop_at",
                 "rates.means_fall_until",
                 "rates.square_memory",

@@ -17,6 +17,10 @@ class ObjectFrame:
     center: Float[np.ndarray, "3"]
     radius: float
 
+    def to_world(self, points: Float[np.ndarray, "*P 3"]) -> Float[np.ndarray, "*P 3"]:
+        """Points of the object frame in the world."""
+        return points * self.radius + self.center
+
 
 def estimate_object_frame(masks: list[tuple[Camera, Float[np.ndarray, "_ _"]]]) -> ObjectFrame:
     """Center and radius of the object from where the masks lie in the views.

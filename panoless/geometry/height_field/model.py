@@ -13,8 +13,8 @@ from torch import Tensor
 from panoless.capture.rays import pixel_rays, pose_of, reflect
 from panoless.capture.views import TrainView
 from panoless.environment.rays import Rays
+from panoless.geometry.base import SurfaceBuffers
 from panoless.geometry.plane.model import Plane
-from panoless.geometry.surfels.rendering import SurfaceBuffers
 from panoless.kernels.cpu.height_field import first_hits
 from panoless.kernels.rasterize import RasterCamera
 from panoless.numeric.bspline import cubic_bspline_basis
@@ -176,7 +176,7 @@ def height_field_rays(height_field: HeightField, view: TrainView, pixels: Int[Te
 
 def height_field_buffers(height_field: HeightField, camera: RasterCamera) -> SurfaceBuffers:
     """The height field as surfels would be seen: alpha is the area of each pixel within the mirror's edge and the
-    frame, depth and normal those of the ray through its center. The three depths agree.
+    frame, depth and normal those of the ray through its center.
     """
     shape, (rotation, center) = (camera.height, camera.width), pose_of(camera)
     alpha = np.zeros(shape)
@@ -197,16 +197,8 @@ def height_field_buffers(height_field: HeightField, camera: RasterCamera) -> Sur
     normals[pixels] = hits.normals @ height_field.frame @ rotation.T
     device = camera.world_to_camera.device
     covered, distance = (torch.from_numpy(image.reshape(shape)).float().to(device) for image in (alpha, depth))
-    return SurfaceBuffers(
-        albedo=covered.new_zeros(3, *shape),
-        alpha=covered,
-        raster_normals_camera=torch.from_numpy(normals.T.reshape(3, *shape)).float().to(device) * covered,
-        expected_depth=distance,
-        median_depth=distance,
-        surface_depth=distance,
-        distortion=torch.zeros_like(covered),
-        in_frustum=(covered > 0).any()[None],
-    )
+    normals_camera = torch.from_numpy(normals.T.reshape(3, *shape)).float().to(device) * covered
+    return SurfaceBuffers(covered, normals_camera, distance, covered.new_zeros(3, *covered.shape))
 
 
 def edge_points(height_field: HeightField) -> Float[np.ndarray, "E 3"]:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from panoless.capture.rays import pose_of
-from panoless.geometry.surfels.rendering import SurfaceBuffers
+from panoless.geometry.base import SurfaceBuffers
 from panoless.kernels.rasterize import RasterCamera
 from panoless.numeric.polygon import projected_coverage
 from shinypartial.core.conventions import PIXEL_CENTER
@@ -48,9 +48,9 @@ class Plane:
 def plane_buffers(plane: Plane, camera: RasterCamera) -> SurfaceBuffers:
     """The plane as surfels would be seen: alpha is the covered area of each pixel, depths are those of its center.
 
-    Normals are alpha times the plane's normal in camera axes; the three depths agree, and where a pixel's center lies
+    Normals are alpha times the plane's normal in camera axes; and where a pixel's center lies
     beside the plane they stay within the depths of the boundary. All is zero where alpha is, and everywhere for a
-    camera behind the mirror. `in_frustum` has one element. With a frame, alpha is the smaller of the coverages of the
+    camera behind the mirror.  With a frame, alpha is the smaller of the coverages of the
     boundary and of the frame, which is exact but for pixels that both outlines cut.
     """
     rotation, center = pose_of(camera)
@@ -92,16 +92,8 @@ def _buffers(
     camera: RasterCamera,
 ) -> SurfaceBuffers:
     covered, distance = _tensor(alpha, camera), _tensor(depth, camera)
-    return SurfaceBuffers(
-        albedo=covered.new_zeros(3, *covered.shape),
-        alpha=covered,
-        raster_normals_camera=_tensor(normal_camera, camera)[:, None, None] * covered,
-        expected_depth=distance,
-        median_depth=distance,
-        surface_depth=distance,
-        distortion=torch.zeros_like(covered),
-        in_frustum=(covered > 0).any()[None],
-    )
+    normals_camera = _tensor(normal_camera, camera)[:, None, None] * covered
+    return SurfaceBuffers(covered, normals_camera, distance, covered.new_zeros(3, *covered.shape))
 
 
 def _tensor(values: Float[np.ndarray, "*S"], camera: RasterCamera) -> Float[Tensor, "*S"]:
