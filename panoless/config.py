@@ -150,8 +150,8 @@ class FitConfig:
     model: Annotated[
         Literal["auto", "plane", "height_field", "revolution", "surfels"], tyro.conf.arg(prefix_name=False)
     ] = "auto"
-    """`auto`: the simplest that explains held-out views; `plane`: three numbers and a boundary; `height_field`: a smooth
-    height over that plane; `revolution`: an axis and a profile; `surfels`: curved."""
+    """`auto`: the simplest that explains held-out views; `plane`: three numbers and a boundary; `height_field`: a
+    smooth height over that plane; `revolution`: an axis and a profile; `surfels`: curved."""
     albedo: bool = False
     """Learn a diffuse term A (Eq. 8); a perfect mirror has none."""
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)

@@ -9,11 +9,12 @@ from shinypartial.io.files import atomic_write
 
 
 def write_ply(path: Path, mesh: Mesh) -> None:
-    """Write a mesh, or a cloud of points, as binary PLY."""
+    """Write a mesh in double, or a cloud of points in single precision, as binary PLY."""
     from plyfile import PlyData, PlyElement
 
     columns = {**dict(zip("xyz", mesh.vertices.T, strict=True)), **mesh.columns}
-    vertices = np.zeros(len(mesh.vertices), dtype=[(name, "<f4") for name in columns])
+    number = "<f4" if mesh.faces is None else "<f8"
+    vertices = np.zeros(len(mesh.vertices), dtype=[(name, number) for name in columns])
     for name, column in columns.items():
         vertices[name] = column
     elements = [PlyElement.describe(vertices, "vertex")]

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -62,6 +62,7 @@ class Training:
         return Training(self.environment.to(device), self.evidence.to(device), self.iteration, self.optimizer)
 
 
+@runtime_checkable
 class Geometry(Protocol):
     """A mirror of one kind in the object frame, and how rays meet it. It is immutable."""
 
@@ -141,6 +142,7 @@ class Proposal:
     """Intersection of shape and mask over their union, in [0, 1]."""
 
 
+@runtime_checkable
 class Family(Protocol):
     """A kind of geometry as a candidate in model selection."""
 
@@ -178,6 +180,7 @@ class Family(Protocol):
         ...
 
 
+@runtime_checkable
 class TrainingObserver(Protocol):
     """Who is told of the steps of an iterative fit."""
 
@@ -202,9 +205,13 @@ def to_plain(value: Any) -> Any:
 
 def from_plain(cls: type[Numbers], content: dict[str, Any]) -> Numbers:
     """The dataclass of that class from `to_plain`; lists become arrays."""
-    values = {name: np.array(value) if isinstance(value, list) else value for name, value in content.items()}
-    nested = {item.name: item.type for item in fields(cls) if is_dataclass(item.type)}  # type: ignore[arg-type]
-    return cls(**{name: from_plain(nested[name], value) if name in nested else value for name, value in values.items()})
+    values: dict[str, Any] = {}
+    for item in fields(cls):  # type: ignore[arg-type]
+        value = content[item.name]
+        if is_dataclass(item.type):
+            value = from_plain(item.type, value)  # type: ignore[arg-type]
+        values[item.name] = np.array(value) if isinstance(value, list) else value
+    return cls(**values)
 
 
 def usable_views(views: Views, geometry: Geometry) -> Views:

@@ -58,7 +58,7 @@ class ExactGeometry:
         """The map where the normals mirror the pixels' centers to."""
         return shade_centers(environment, camera, pixels, normals_camera)
 
-    def to(self, device: torch.device) -> "ExactGeometry":
+    def to(self, device: torch.device) -> Any:
         """Itself: its numbers are arrays in main memory."""
         return self
 
@@ -68,7 +68,7 @@ class ExactGeometry:
         return plain
 
     @classmethod
-    def from_state_dict(cls, content: dict[str, Any]) -> "ExactGeometry":
+    def from_state_dict(cls, content: dict[str, Any]) -> Any:
         """The geometry that `state_dict` was taken from."""
         return from_plain(cls, content)
 

@@ -75,7 +75,9 @@ class HeightFieldMirror(ExactGeometry):
 class HeightFieldFamily(ExactFamily):
     """Heights over a plane that explains the silhouettes, but not what it mirrors."""
 
-    kind, geometry, label = "height_field", HeightFieldMirror, "a height field over it"
+    kind: ClassVar[str] = "height_field"
+    geometry: ClassVar[type[Geometry]] = HeightFieldMirror
+    label: ClassVar[str] = "a height field over it"
     refines: ClassVar[str | None] = "plane"
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:

@@ -72,7 +72,9 @@ class PlaneMirror(ExactGeometry):
 class PlaneFamily(ExactFamily):
     """Planes that explain silhouettes."""
 
-    kind, geometry, label = "plane", PlaneMirror, "a plane"
+    kind: ClassVar[str] = "plane"
+    geometry: ClassVar[type[Geometry]] = PlaneMirror
+    label: ClassVar[str] = "a plane"
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """Plane, boundary and frame by silhouettes."""

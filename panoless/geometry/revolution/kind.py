@@ -89,7 +89,9 @@ class RevolutionMirror(ExactGeometry):
 class RevolutionFamily(ExactFamily):
     """Surfaces of revolution that explain silhouettes."""
 
-    kind, geometry, label = "revolution", RevolutionMirror, "a surface of revolution"
+    kind: ClassVar[str] = "revolution"
+    geometry: ClassVar[type[Geometry]] = RevolutionMirror
+    label: ClassVar[str] = "a surface of revolution"
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """Axis and outer profile by silhouettes."""

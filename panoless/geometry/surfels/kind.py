@@ -19,7 +19,9 @@ INITIAL_RAYS = 1_000_000
 class SurfelFamily:
     """Free surfels."""
 
-    kind, geometry, label = "surfels", SurfelMirror, "surfels"
+    kind: ClassVar[str] = "surfels"
+    geometry: ClassVar[type[Geometry]] = SurfelMirror
+    label: ClassVar[str] = "surfels"
     refines: ClassVar[str | None] = None
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:

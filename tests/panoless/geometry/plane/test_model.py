@@ -96,30 +96,25 @@ def test_buffers_are_those_of_the_plane(frame_height: float) -> None:
     assert difference.max() < (0.05 if frame_height == 0 else 0.3)
     rotation, center = pose_of(camera)
     row, column = np.nonzero(buffers.alpha.numpy() == 1)
-    z = buffers.expected_depth.numpy()[row, column].astype(np.float64)
+    z = buffers.depth.numpy()[row, column].astype(np.float64)
     rays = np.stack([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, np.ones(len(row))], 1)
     np.testing.assert_allclose((center + z[:, None] * rays @ rotation) @ plane.normal, plane.offset, atol=1e-5)
-    normals = buffers.raster_normals_camera.numpy()[:, row, column].T
+    normals = buffers.normals_camera.numpy()[:, row, column].T
     np.testing.assert_allclose(normals @ rotation, np.tile(plane.normal, (len(row), 1)), atol=1e-5)
     assert ((normals * rays).sum(1) < 0).all()
     nothing = buffers.alpha == 0
     for image in (
-        buffers.expected_depth,
-        buffers.median_depth,
-        buffers.surface_depth,
-        buffers.raster_normals_camera[0],
+        buffers.depth,
+        buffers.normals_camera[0],
     ):
         assert (image[nothing] == 0).all()
-    assert torch.equal(buffers.median_depth, buffers.surface_depth)
-    assert bool(buffers.in_frustum.all())
 
 
 def test_a_mirror_has_no_back() -> None:
     behind = camera_at(-3.0 * NORMAL)
     buffers = plane_buffers(plane_of(RECTANGLE), behind)
     assert not buffers.alpha.any()
-    assert not buffers.expected_depth.any()
-    assert not buffers.in_frustum.any()
+    assert not buffers.depth.any()
 
 
 def test_a_plane_that_reaches_behind_the_camera_ends_at_the_horizon() -> None:

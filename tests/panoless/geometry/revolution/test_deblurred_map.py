@@ -7,8 +7,8 @@ import torch
 from torch.nn.functional import max_pool2d, normalize
 
 from panoless.capture.views import Views
-from panoless.environment.solve import solve_environment
 from panoless.environment.footprints import PixelFootprints, deblur_map
+from panoless.environment.solve import solve_environment
 from panoless.geometry.revolution.deblurred_map import pixel_footprints
 from panoless.geometry.revolution.model import revolution_buffers, revolution_rays
 from panoless.geometry.revolution.render import mean_light
@@ -130,7 +130,9 @@ def test_light_above_one_costs_nothing_below(under_a_lamp) -> None:
 def test_without_saturated_pixels_saturation_is_nothing(photographs) -> None:
     """Views that end at 1 and views without an end give the same map, where nothing is brighter than 0.9."""
     start = solve_environment([revolution_rays(bowl(), view, view.solid)[0] for view in photographs.train], 64)
-    ended, endless = (deblur_map(pixel_footprints(photographs, bowl()), start, each * ONE) for each in (1.0, float("inf")))
+    ended, endless = (
+        deblur_map(pixel_footprints(photographs, bowl()), start, each * ONE) for each in (1.0, float("inf"))
+    )
     torch.testing.assert_close(ended, endless.clamp(max=1))
 
 

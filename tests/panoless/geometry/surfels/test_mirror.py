@@ -10,19 +10,14 @@ from torch import Tensor
 
 from panoless.capture.rays import pixel_rays, reflect
 from panoless.capture.views import Views
-from panoless.environment.observation import (
-    GRAY,
-    PRIOR_TRUST,
-    normalize_confidence,
-    observed_rays,
-    solve_final_map,
-    surfel_trust,
-    without_fill,
-)
-from panoless.environment.rays import Rays
+from panoless.environment.rays import Rays, normalize_confidence
 from panoless.environment.resolution import finest_resolution, prediction_error
 from panoless.environment.solve import solve_environment
+from panoless.geometry.base import observe_views
+from panoless.geometry.plane.kind import PlaneMirror
+from panoless.geometry.revolution.kind import RevolutionMirror
 from panoless.geometry.revolution.model import trace_reflections
+from panoless.geometry.surfels.mirror import PRIOR_TRUST, SurfelMirror, surfel_trust
 from panoless.geometry.surfels.model import Surfels
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap
 from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
@@ -31,6 +26,10 @@ from tests.support.mirror_sphere import clipped_environment, sphere_surfels, tin
 
 CONFIG = tiny_config()
 TURN_RAD = np.radians(20)
+
+
+def mirror(surfels: Surfels) -> SurfelMirror:
+    return SurfelMirror.of(surfels, CONFIG)
 
 
 def directions_of(surfels: Surfels, views: Views) -> Float[Tensor, "K 3"]:
@@ -75,12 +74,12 @@ def test_surfels_with_wrong_normals_are_not_trusted(
 ) -> None:
     """By a map that is right, and by one that all surfels together made."""
     with torch.no_grad():
-        own = solve_environment(list(observed_rays(views, partly_wrong, CONFIG, 10**6)), 24)
-        seen = surfel_trust(views, right, CONFIG, truth) > 0.8
+        own = solve_environment(list(observe_views(views, mirror(partly_wrong), 10**6)), 24)
+        seen = surfel_trust(views, mirror(right), truth) > 0.8
         assert (seen & patch).sum() > 20
         assert (seen & ~patch).sum() > 200
         for environment, least_gap in ((truth, 0.5), (own, 0.2)):
-            trust = surfel_trust(views, partly_wrong, CONFIG, environment)
+            trust = surfel_trust(views, mirror(partly_wrong), environment)
             assert float(trust[seen & patch].median()) < float(trust[seen & ~patch].median()) - least_gap
 
 
@@ -89,7 +88,7 @@ def test_trust_is_a_share_and_what_is_not_seen_has_that_of_the_start(
 ) -> None:
     """The first ten surfels stand behind every camera."""
     hidden = replace(right, means=torch.cat([right.means[:10] + torch.tensor([50.0, 0, 0]), right.means[10:]]))
-    trust = surfel_trust(views, hidden, CONFIG, truth)
+    trust = surfel_trust(views, mirror(hidden), truth)
     assert 0 <= float(trust.min()) <= float(trust.max()) <= 1
     torch.testing.assert_close(trust[:10], torch.full((10,), PRIOR_TRUST))
 
@@ -99,9 +98,9 @@ def test_a_map_solved_with_trust_is_nearer_to_the_truth(
 ) -> None:
     """Where the exact sphere reflects to, against the environment itself."""
     with torch.no_grad():
-        plain = solve_environment(list(observed_rays(views, partly_wrong, CONFIG, 10**6)), 24)
-        trusted, rays = solve_final_map(views, partly_wrong, CONFIG)
-        where = torch.cat([batch.directions for batch in observed_rays(views, right, CONFIG, 10**6)])
+        plain = solve_environment(list(observe_views(views, mirror(partly_wrong), 10**6)), 24)
+        trusted, rays = mirror(partly_wrong).solve_map(views, CONFIG)
+        where = torch.cat([batch.directions for batch in observe_views(views, mirror(right), 10**6)])
         expected = clipped_environment(where)
         errors = [float((sample_cubemap(m, where) - expected).square().mean()) for m in (plain, trusted)]
     assert all(batch.trust is not None and batch.trust.min() >= 0 and batch.trust.max() <= 1 for batch in rays)
@@ -111,7 +110,7 @@ def test_a_map_solved_with_trust_is_nearer_to_the_truth(
 def test_rays_of_a_plane_point_where_it_mirrors() -> None:
     """Radiance is that of the environment in the ray's own direction, and no ray needs a trust."""
     plane = plane_of(RECTANGLE)
-    rays = list(observed_rays(reflecting_views(plane, arc(4, size=48)), plane, CONFIG, 10**6))
+    rays = list(observe_views(reflecting_views(plane, arc(4, size=48)), PlaneMirror(plane), 10**6))
     for batch in rays:
         assert len(batch.directions) > 100
         assert batch.trust is None
@@ -120,12 +119,12 @@ def test_rays_of_a_plane_point_where_it_mirrors() -> None:
 
 def test_a_limit_thins_the_rays_and_none_are_no_error(views: Views, right: Surfels) -> None:
     everything, fewer = (
-        sum(len(batch.directions) for batch in observed_rays(views, right, CONFIG, most)) for most in (10**6, 300)
+        sum(len(batch.directions) for batch in observe_views(views, mirror(right), most)) for most in (10**6, 300)
     )
     assert everything > 1000
     assert 0.5 * 300 < fewer <= 300 + len(views.train)
     nothing = replace(views, train=tuple(replace(view, solid=view.solid[:0]) for view in views.train))
-    assert all(len(batch.directions) == 0 for batch in observed_rays(nothing, right, CONFIG, 300))
+    assert all(len(batch.directions) == 0 for batch in observe_views(nothing, mirror(right), 300))
 
 
 def rays_of(count: int, batches: int = 10) -> list[Rays]:
@@ -182,20 +181,10 @@ def test_a_map_does_not_depend_on_how_far_all_rays_are_trusted_alike() -> None:
     assert float(normalize_confidence([faint])[0].initial_weight().mean()) == pytest.approx(1.0, rel=1e-5)
 
 
-def test_without_the_fill_only_what_no_ray_met_is_gray() -> None:
-    """The rest is as it was, bit by bit."""
-    filled = torch.rand(6, 3, 16, 16, generator=torch.Generator().manual_seed(3))
-    directions = cubemap_directions(16)[4].reshape(-1, 3).contiguous()
-    bare = without_fill([Rays(directions, directions)], filled)
-    assert torch.equal(bare[4], filled[4])
-    assert (bare[[0, 1, 2, 3, 5], :, 2:-2, 2:-2] == GRAY).all()
-
-
 def test_what_mirrors_itself_votes_only_if_nothing_is_traced() -> None:
     """In a funnel: traced, the pixels whose mirrored ray leaves; else all that meet it, in its mirrored direction."""
     views = revolution_views(funnel(), around(4)[2:])
-    whether = [replace(CONFIG, environment=replace(CONFIG.environment, trace=trace)) for trace in (True, False)]
-    traced, blind = ([*observed_rays(views, funnel(), each, 10**6)] for each in whether)
+    traced, blind = ([*observe_views(views, RevolutionMirror(funnel(), test), 10**6)] for test in (True, False))
     for view, some, every in zip(views.train, traced, blind, strict=True):
         origins, directions_local = pixel_rays(view.camera, view.solid.numpy())
         normals = funnel().hits(origins, directions_local).normals
