@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from panoless.capture.rays import pose_of
+from panoless.capture.rays import camera_rays, pose_of, project
 from panoless.capture.views import TrainView, Views, concatenated
 from panoless.kernels.rasterize import RasterCamera
 from shinypartial.core.conventions import PIXEL_CENTER
@@ -41,8 +41,7 @@ class MaskDistance:
         camera = self.camera
         seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
         depth = seen[:, 2].clamp(min=camera.near)
-        column = seen[:, 0] / depth * camera.fx + (camera.cx - PIXEL_CENTER)
-        row = seen[:, 1] / depth * camera.fy + (camera.cy - PIXEL_CENTER)
+        column, row = project(camera, seen, first_center=0)
         inner_column, inner_row = column.clamp(0, camera.width - 1), row.clamp(0, camera.height - 1)
         beyond = torch.hypot(column - inner_column, row - inner_row)
         left, top = inner_column.floor().clamp(max=camera.width - 2), inner_row.floor().clamp(max=camera.height - 2)
@@ -120,11 +119,11 @@ def mask_contours(views: Views) -> MaskContours:
             continue
         pixels, camera = max(found, key=len)[:-1, ::-1] + PIXEL_CENTER, view.camera
         rotation, center = pose_of(camera)
-        x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
-        rays = np.stack([x, y, np.ones_like(x)], 1) @ rotation
-        columns = camera.fx * (rotation[0] - x[:, None] * rotation[2])
-        rows = camera.fy * (rotation[1] - y[:, None] * rotation[2])
-        parts.append(MaskContours(np.full(len(x), index), np.tile(center, (len(x), 1)), rays, columns, rows))
+        rays = camera_rays(camera, *pixels.T)
+        columns = camera.fx * (rotation[0] - rays[:, :1] * rotation[2])
+        rows = camera.fy * (rotation[1] - rays[:, 1:2] * rotation[2])
+        centers = np.tile(center, (len(rays), 1))
+        parts.append(MaskContours(np.full(len(rays), index), centers, rays @ rotation, columns, rows))
     if not parts:
         return MaskContours(np.zeros(0, dtype=np.int64), *(np.zeros((0, 3)) for _ in range(4)))
     return concatenated(parts)

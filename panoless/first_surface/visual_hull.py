@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from panoless.capture.rays import pose_of
+from panoless.capture.rays import camera_rays, pose_of
 from panoless.capture.silhouettes import MaskDistance, mask_distance
 from panoless.capture.views import Views
 from shinypartial.core.conventions import PIXEL_CENTER
@@ -161,9 +161,7 @@ def _points_on_rays(outlines: Sequence[MaskDistance]) -> Float[np.ndarray, "R S 
         distance = outline.distance_px.cpu().numpy()
         rows, columns = np.nonzero((distance < 0) & (distance > -1))
         chosen = np.linspace(0, len(rows) - 1, min(each, len(rows))).round().astype(int)
-        x = (columns[chosen] + PIXEL_CENTER - camera.cx) / camera.fx
-        y = (rows[chosen] + PIXEL_CENTER - camera.cy) / camera.fy
-        rays = np.stack([x, y, np.ones_like(x)], 1) @ rotation
+        rays = camera_rays(camera, columns[chosen] + PIXEL_CENTER, rows[chosen] + PIXEL_CENTER) @ rotation
         reach = np.linalg.norm(center) + HULL_HALF_SIDE * np.array([-1.0, 1.0]) * math.sqrt(3)
         depths = np.linspace(max(reach[0], camera.near), reach[1], STEPS_ALONG_RAY)
         points.append(center + depths[:, None] * (rays / np.linalg.norm(rays, axis=1, keepdims=True))[:, None])
