@@ -61,8 +61,8 @@ def estimate_object_frame(masks: list[tuple[Camera, Float[np.ndarray, "_ _"]]]) 
     The center is the point nearest, in least squares, to the rays through the middles of the masks' boxes. Of a box
     that the picture cuts at one side or two opposite ones, the plane through the other two sides' middle counts instead
     of the ray, and of one that is cut both ways nothing, unless too little is left.
-    The radius is the median over uncut views of (largest distance of a mask pixel from the projected center) · depth /
-    focal length, or that over cut ones where it is larger, with a tenth to spare; the reach is a quantile of the same.
+    The radius is the median of (largest distance of a mask pixel from the projected center) · depth / focal length over
+    the uncut views, or all if there are none, with a tenth to spare; the reach is a high quantile over all views.
     Raises InputError when all cameras look along one line, which leaves the depth open.
     """
     pieces = [(camera, largest_pieces(alpha >= MASK_LEVEL, MAIN_SHARE)) for camera, alpha in masks]
@@ -78,8 +78,7 @@ def estimate_object_frame(masks: list[tuple[Camera, Float[np.ndarray, "_ _"]]]) 
             remedy="Add views from the sides; an arc of at least 30° is best.",
         )
     radii = np.array([_mask_radius(camera, inside, center) for camera, inside in pieces])
-    groups = [radii[group] for group in (uncut, ~uncut) if group.any()]
-    radius = SPARE * max(float(np.median(group)) for group in groups)
+    radius = SPARE * float(np.median(radii[uncut] if uncut.any() else radii))
     return ObjectFrame(center, radius, float(np.quantile(radii, REACH_QUANTILE)) / radius)
 
 

@@ -44,7 +44,7 @@ class MaskDistance:
     def distances(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
         """Signed distance of points from the silhouette's cone, to first order: pixels · depth / focal length.
 
-        −∞ where the view doesn't tell: beyond a side of the picture that cuts the mask.
+        −∞ where the view doesn't tell: beyond the last pixel centers at a side of the picture that cuts the mask.
         """
         camera = self.camera
         points_camera = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
@@ -61,7 +61,7 @@ class MaskDistance:
         before = points_camera[:, 2] > camera.near
         outside = torch.where(before, torch.lerp(upper, lower, down) + beyond, beyond + camera.width)
         if any(self.cut):
-            past = column + 0.5, row + 0.5, camera.width - 0.5 - column, camera.height - 0.5 - row
+            past = column, row, camera.width - 1 - column, camera.height - 1 - row
             unknown = ~before
             for side, cut in zip(past, self.cut, strict=True):
                 unknown = unknown | (side < 0) if cut else unknown
