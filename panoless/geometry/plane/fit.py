@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float
 
-from panoless.capture.rays import pose_of
+from panoless.capture.rays import pose_of, project
 from panoless.capture.silhouettes import MaskContours, mask_contours
 from panoless.capture.views import TrainView, Views
 from panoless.geometry.plane.model import Plane, plane_buffers
@@ -28,7 +28,6 @@ from panoless.geometry.plane.silhouette import (
     vertex_pull,
 )
 from panoless.numeric.gauss_newton import accept_step, damped_step, normal_equations
-from shinypartial.core.conventions import PIXEL_CENTER
 from shinypartial.core.errors import InputError
 
 
@@ -148,9 +147,7 @@ def _votes(
         camera = view.camera
         rotation, center = pose_of(camera)
         seen = (points - center) @ rotation.T
-        depth = np.maximum(seen[:, 2], camera.near)
-        x = seen[:, 0] / depth * camera.fx + camera.cx - PIXEL_CENTER
-        y = seen[:, 1] / depth * camera.fy + camera.cy - PIXEL_CENTER
+        x, y = project(camera, seen, first_center=0)
         inside = map_coordinates(view.mask.cpu().numpy(), [y, x], order=1, cval=0.0) * (seen[:, 2] > camera.near)
         result[index] = inside.reshape(len(u), len(v))
     return result

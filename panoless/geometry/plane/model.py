@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from panoless.capture.rays import pose_of
+from panoless.capture.rays import camera_rays, pose_of
 from panoless.geometry.base import SurfaceBuffers, buffers_from_arrays
 from panoless.kernels.rasterize import RasterCamera
 from panoless.numeric.polygon import projected_coverage
@@ -62,9 +62,8 @@ def plane_buffers(plane: Plane, camera: RasterCamera) -> SurfaceBuffers:
     alpha = projected_coverage(corners, camera)
     if 0 < plane.frame_height < height_above:
         alpha = np.minimum(alpha, projected_coverage(corners + plane.frame_height * normal, camera))
-    x = (np.arange(camera.width) + PIXEL_CENTER - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + PIXEL_CENTER - camera.cy) / camera.fy
-    slope = -(normal[0] * x + (normal[1] * y + normal[2])[:, None])
+    centers = (np.arange(size) + PIXEL_CENTER for size in (camera.width, camera.height))
+    slope = -(camera_rays(camera, *np.meshgrid(*centers)) @ normal)
     nearest, farthest = max(corners[:, 2].min(), camera.near), max(corners[:, 2].max(), camera.near)
     depth = np.where(slope > 0, height_above / np.maximum(slope, 1e-12), farthest).clip(nearest, farthest)
     return buffers_from_arrays(alpha, depth * (alpha > 0), normal[:, None, None], camera)
