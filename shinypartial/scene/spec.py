@@ -68,8 +68,8 @@ class Render:
     """Seed of the sampling pattern."""
     exposure: float = field(default=0.0, metadata=limits(-20.0, 20.0))
     """Photographic stops: the light of the world is multiplied by 2^exposure, in pictures and in the stored map."""
-    max_bounces: int = field(default=16, metadata=limits(1, 1024))
-    """Reflections that a path is followed through; light that would need more is lost."""
+    max_bounces: int = field(default=16, metadata=limits(0, 1024))
+    """As Cycles counts: a path is reflected at most once more than this, and light that would need more is lost."""
 
 
 @dataclass(frozen=True)

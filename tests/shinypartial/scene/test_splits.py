@@ -94,7 +94,7 @@ def test_a_recipe_without_split_learns_what_to_write() -> None:
     with pytest.raises(InputError, match=r"`split` of scene\.toml") as raised:
         parse_scene(table, "scene.toml")
     assert 'split = "development"' in raised.value.remedy
-    with pytest.raises(InputError, match="split.*one of development, held-out"):
+    with pytest.raises(InputError, match=r"split.*one of development, held-out"):
         parse_scene(table | {"split": "test"}, "scene.toml")
 
 
