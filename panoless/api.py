@@ -49,7 +49,7 @@ class Reconstruction:
     @property
     def model(self) -> str:
         """The kind of geometry that was taken: `plane`, `height_field`, `revolution` or `surfels`."""
-        return (self.info.model or "").split(" ")[0]
+        return self.info.model_selection.chosen if self.info.model_selection else ""
 
     @property
     def environment(self) -> Float[np.ndarray, "H W 3"]:
