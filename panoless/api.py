@@ -49,7 +49,8 @@ class Reconstruction:
     @property
     def model(self) -> str:
         """The kind of geometry that was taken: `plane`, `height_field`, `revolution` or `surfels`."""
-        return (self.info.model or "").split(" ")[0]
+        selection = self.info.model_selection
+        return selection.chosen if selection else (self.info.model or "").split(" ")[0]
 
     @property
     def environment(self) -> Float[np.ndarray, "H W 3"]:
