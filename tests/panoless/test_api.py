@@ -8,6 +8,7 @@ import subprocess
 import sys
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -87,16 +88,18 @@ def test_a_saved_prediction_is_scored_where_it_lies(result: panoless.Reconstruct
     ("arguments", "message"),
     [
         ({"preset": "quick"}, "a preset: fast"),
+        ({"model": "cube"}, "model"),
+        ({"set": ("plane.corners=3",)}, "plane.corners=3"),
         ({"dataset": "nowhere"}, "a dataset folder at nowhere"),
         ({}, "`panoless fit tiny-vase`"),
     ],
 )
 def test_wrong_arguments_are_refused(
-    arguments: dict[str, str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arguments: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match=message):
-        panoless.fit(**arguments)  # type: ignore[arg-type]
+        panoless.fit(**arguments)
 
 
 def test_a_view_that_is_not_there_is_refused(result: panoless.Reconstruction) -> None:
