@@ -1,21 +1,15 @@
 """The `panoless` command: fit a dataset, export a finished fit."""
 
-import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
-from panoless.config import FitConfig
+from panoless.config import FitConfig, renamed_arguments, with_overrides
 from panoless.presets import PRESETS
-from shinypartial.core.errors import EXIT_BAD_INPUT, InputError, run_command
-
-if TYPE_CHECKING:
-    from panoless.reconstruct.state import FitState
-
-RUNS = Path("runs")
+from shinypartial.core.errors import InputError, parse_and_run
 
 
 @dataclass(frozen=True)
@@ -23,50 +17,49 @@ class Fit:
     """Fit a dataset: its surface, an environment map and a visibility map; then export the prediction."""
 
     dataset: Annotated[Path | None, tyro.conf.Positional] = None
-    """Dataset folder, also a plain NeRF-synthetic one; without it the newest below ./datasets."""
+    """Dataset folder, also a plain NeRF-synthetic one, or the name of a bundled one, such as tiny-vase; without it the
+    newest below ./datasets."""
     preset: Literal[tuple(PRESETS)] = "default"  # type: ignore[valid-type]
     """Starting values of the configuration."""
     output: Path | None = None
     """Prediction folder; default predictions/DATASET-PRESET. The run folder has the same name below ./runs."""
     snapshots: int = 0
-    """Keep this many moments of the fit: its end, half of the iterations, a quarter, and so on; see docs/chart.md."""
+    """Keep this many moments of the fit: its end, half of the iterations, a quarter, and so on; see
+    docs/how-to/compare-methods.md."""
     snapshot_seconds: tuple[float, ...] = ()
     """Keep the moments after these seconds of fitting."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where the fit computes; `cuda` (NVIDIA or AMD) needs a GPU, torch for it and Triton; see docs/gpu.md."""
+    """Where the fit computes; `cuda` (NVIDIA or AMD) needs a GPU, torch for it and Triton; see
+    docs/how-to/use-a-gpu.md."""
+    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="OPTION=VALUE")] = ()
+    """Change tuned numbers, such as plane.max_vertices=64; docs/reference/fit-options.md lists them."""
     config: FitConfig = field(default_factory=FitConfig)
 
     def run(self) -> None:
-        """Load, fit, export and say what to do next."""
-        _prepare_threads()
-        from panoless.export.prediction import export_prediction
-        from panoless.reconstruct.fit import find_device, fit
-        from panoless.reconstruct.snapshots import snapshot_schedule
-        from shinypartial.dataset.read import newest_dataset, open_dataset
-        from shinypartial.io.files import folder_lock
-        from shinypartial.prediction.format import acquire_prediction
+        """Fit, export and say what to do next."""
+        from panoless.api import RUNS, fit
 
-        _announce_compilation()
-        root = self.dataset
-        if root is None:
-            root = newest_dataset()
-            print(f"No dataset named; taking the newest one: {root}")
-        dataset = open_dataset(root)
-        name = f"{dataset.name}-{self.config.preset}"
-        prediction = self.output or Path("predictions") / name
-        run_folder = RUNS / prediction.resolve().name
-        device = find_device(self.device)
-        marks = snapshot_schedule(self.snapshots, self.snapshot_seconds, self.config.iterations)
-        _refuse_run_folder(prediction, run_folder)
-        with folder_lock(prediction):
-            acquire_prediction(prediction)
-            state = fit(dataset, self.config, run_folder, marks, device)
-            export_prediction(dataset, state, self.config, prediction)
-        print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
-        if marks and state.stepless:
-            print(f"No snapshots: this run took {_shape_name(state)}, whose map is solved without steps.")
-        elif marks:
-            print(f"Snapshots: panoless export {run_folder} --output {prediction} --snapshots")
+        config = with_overrides(self.config, self.set)
+        result = fit(
+            self.dataset,
+            output=self.output,
+            snapshots=self.snapshots,
+            snapshot_seconds=self.snapshot_seconds,
+            device=self.device,
+            config=config,
+        )
+        print(f"Prediction written to {result.folder}\nNext: shinypartial evaluate {result.folder}")
+        if not (self.snapshots or self.snapshot_seconds):
+            return
+        from panoless.geometry.registry import FAMILIES
+        from panoless.reconstruct.snapshots import snapshot_folders
+
+        run_folder = RUNS / result.folder.resolve().name
+        if snapshot_folders(run_folder):
+            print(f"Snapshots: panoless export {run_folder} --output {result.folder} --snapshots")
+        else:
+            label = FAMILIES[result.model].label
+            print(f"No snapshots: this run took {label}, whose map is solved without steps.")
 
 
 @dataclass(frozen=True)
@@ -82,18 +75,21 @@ class Export:
 
     def run(self) -> None:
         """Read the checkpoint and export it."""
-        _prepare_threads()
+        from panoless.api import RUNS, announce_compilation, prepare_threads, refuse_run_folder
+
+        prepare_threads()
         from panoless.export.prediction import export_prediction, export_snapshots
+        from panoless.geometry.registry import FAMILIES
         from panoless.reconstruct.state import CHECKPOINT, DESCRIPTION, load_state, read_description
         from shinypartial.dataset.read import open_dataset
         from shinypartial.io.files import folder_lock, newest_folder
         from shinypartial.prediction.format import acquire_prediction
 
-        _announce_compilation()
+        announce_compilation()
         folder = self.run_folder or newest_folder(RUNS, DESCRIPTION, "a run", "Make one: `panoless fit`.")
         description = read_description(folder)
         state = load_state(folder)
-        if state is None or state.final_environment is None:
+        if state is None or state.environment is None:
             raise InputError(
                 expected=f"a finished run in {folder}",
                 found=f"no {CHECKPOINT}"
@@ -101,16 +97,16 @@ class Export:
                 else f"{state.iteration} of {description.config.iterations} iterations",
                 remedy="Run the same `panoless fit` command again: it continues where it stopped.",
             )
-        if self.snapshots and state.stepless:
+        if self.snapshots and state.training is None:
             raise InputError(
                 expected=f"a run of surfels in {folder}, for --snapshots",
-                found=f"a run that took {_shape_name(state)}, which is fitted without steps: "
+                found=f"a run that took {FAMILIES[state.geometry.kind].label}, which is fitted without steps: "
                 "there are no moments in between",
                 remedy="Leave --snapshots out; or fit surfels: "
                 "`panoless fit --model surfels --snapshots 6 --output NEW`.",
             )
         prediction = self.output or Path("predictions") / folder.resolve().name
-        _refuse_run_folder(prediction, folder)
+        refuse_run_folder(prediction, folder)
         with folder_lock(prediction):
             acquire_prediction(prediction)
             dataset = open_dataset(description.dataset)
@@ -121,44 +117,6 @@ class Export:
         print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
         if self.snapshots:
             print(f"Then: shinypartial evaluate {prediction} --snapshots")
-
-
-def _shape_name(state: "FitState") -> str:
-    return "a plane" if state.flat else "a bent plane" if state.bent else "a surface of revolution"
-
-
-def _refuse_run_folder(prediction: Path, run_folder: Path) -> None:
-    if prediction.resolve() == run_folder.resolve():
-        raise InputError(
-            expected="a prediction folder apart from the run folder",
-            found=f"{prediction} for both",
-            remedy="Choose an --output that is not below ./runs.",
-        )
-
-
-def _prepare_threads() -> None:
-    """Before torch loads: let idle OpenMP threads sleep, because spinning ones slow a busy machine tenfold."""
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
-
-def _announce_compilation() -> None:
-    """Say once that kernels are compiled, when that begins; those that lie on disk load in a second."""
-    from numba.core import event
-
-    class Announcement(event.Listener):
-        made = False
-
-        def on_start(self, event: object) -> None:
-            if not self.made:
-                self.made = True
-                clear = "\r\x1b[2K" if sys.stderr.isatty() else ""
-                note = "some 20 seconds in all if none is there yet; later runs find them on disk"
-                print(f"{clear}Compiling kernels for this machine: {note} …", file=sys.stderr)
-
-        def on_end(self, event: object) -> None:
-            pass
-
-    event.register("numba:compile", Announcement())
 
 
 def _preset_of(arguments: list[str]) -> str:
@@ -173,23 +131,23 @@ def _preset_of(arguments: list[str]) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns 0, 2 for bad input or usage, 130 when interrupted."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    arguments = renamed_arguments(sys.argv[1:] if arguments is None else arguments)
     preset = _preset_of(arguments)
     fit_default = Fit(preset=preset, config=PRESETS[preset])
     kinds = (
         Annotated[Fit, tyro.conf.subcommand("fit", default=fit_default)]
         | Annotated[Export, tyro.conf.subcommand("export")]
     )
-    try:
-        command: Fit | Export = tyro.cli(
+
+    def parse() -> Fit | Export:
+        return tyro.cli(
             kinds,  # type: ignore[arg-type]
             args=arguments,
             prog="panoless",
             description="The environment that a shiny object reflects, from photographs of one side of it.",
         )
-    except SystemExit as stop:
-        return EXIT_BAD_INPUT if stop.code else 0
-    return run_command(command.run)
+
+    return parse_and_run(parse)
 
 
 if __name__ == "__main__":

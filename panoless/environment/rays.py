@@ -1,6 +1,7 @@
 """Rays: what was seen of the environment, in which direction, and how far it is to be trusted."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -26,3 +27,16 @@ class Rays:
         """Every stride-th ray from the first."""
         part = slice(first, None, stride)
         return Rays(self.directions[part], self.radiance[part], None if self.trust is None else self.trust[part])
+
+
+def normalize_confidence(rays: Sequence[Rays]) -> list[Rays]:
+    """The same rays with their trust in units of its mean.
+
+    The map's fill of gaps and its pull toward a start count in rays: if all are hardly trusted, these would outvote
+    them where only the least trusted see.
+    """
+    total = sum(float(batch.initial_weight().sum()) for batch in rays)
+    mean = total / max(sum(len(batch.directions) for batch in rays), 1)
+    if mean <= 0:
+        return list(rays)
+    return [replace(batch, trust=batch.initial_weight() / mean) for batch in rays]

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from panoless.export.render import Decomposition
-from panoless.geometry.surfels.rendering import ALPHA_FLOOR
+from panoless.kernels.constants import ALPHA_FLOOR
 from shinypartial.core.color import to_display
 
 

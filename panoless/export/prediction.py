@@ -1,8 +1,10 @@
 """A finished fit → the prediction folder that the evaluator reads, pictures of the decomposition, and a PLY."""
 
 import json
+import math
 import os
 import platform
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
@@ -16,29 +18,20 @@ from panoless.capture.encoding import encoding_of
 from panoless.capture.rays import raster_camera
 from panoless.capture.views import load_views
 from panoless.config import FitConfig
-from panoless.export.mesh_files import (
-    HEIGHT_FIELD_PLY_NAME,
-    PLANE_PLY_NAME,
-    PLY_NAME,
-    REVOLUTION_PLY_NAME,
-    write_height_field_ply,
-    write_plane_ply,
-    write_ply,
-    write_revolution_ply,
-)
+from panoless.export.mesh_files import write_ply
 from panoless.export.pictures import crop_to_object, decomposition_pictures
-from panoless.export.render import render
-from panoless.geometry.height_field.model import HeightField
-from panoless.geometry.plane.model import Plane
-from panoless.geometry.revolution.model import SurfaceOfRevolution
-from panoless.geometry.surfels.model import Surfels
+from panoless.export.render import Decomposition, render
+from panoless.geometry.base import usable_views
+from panoless.geometry.registry import FAMILIES
 from panoless.kernels.cubemap import sample_cubemap
-from panoless.reconstruct.fit import clear_views, complete, object_frame_of
+from panoless.reconstruct.final_map import complete
+from panoless.reconstruct.recorder import timed
 from panoless.reconstruct.snapshots import read_snapshot, snapshot_folders
 from panoless.reconstruct.state import FitState
+from panoless.selection.candidates import Selection
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import latlong_directions
-from shinypartial.dataset.schema import Dataset, View
+from shinypartial.dataset.schema import Dataset, Frame, View
 from shinypartial.io.files import remove_partial_files
 from shinypartial.io.images import write_png
 from shinypartial.io.picture_sheet import write_picture_sheet
@@ -48,6 +41,8 @@ from shinypartial.prediction.format import (
     DESCRIPTION,
     ENVIRONMENT,
     SNAPSHOTS,
+    Candidate,
+    ModelSelection,
     PredictionInfo,
     acquire_prediction,
     dataset_hash,
@@ -60,6 +55,7 @@ from shinypartial.prediction.format import (
 
 PICTURES = "pictures"
 SUPERSAMPLING = 2
+EXPORT_THREADS = 2
 
 
 def export_prediction(
@@ -70,26 +66,18 @@ def export_prediction(
     `snapshot` says that the state is not the end of its fit, and states its iteration. An earlier prediction.json is
     removed first, so that it never describes a mixture; `test` marks the folder as begun.
     """
-    if state.final_environment is None or state.visibility is None:
+    if state.environment is None or state.visibility is None:
         raise ValueError("only a finished fit can be exported")
     (folder / "test").mkdir(parents=True, exist_ok=True)
     (folder / DESCRIPTION).unlink(missing_ok=True)
     remove_partial_files(folder)
-    environment = state.final_environment
-    height = 2 * environment.shape[-1]
-    write_environment_map(folder, cube_to_latlong(environment, height))
+    height = 2 * state.environment.shape[-1]
+    write_environment_map(folder, cube_to_latlong(state.environment, height))
     write_visibility(folder, cube_to_latlong(state.visibility[:, None], height)[..., 0].clip(0, 1))
-    geometry = state.geometry
-    for name in (PLY_NAME, PLANE_PLY_NAME, HEIGHT_FIELD_PLY_NAME, REVOLUTION_PLY_NAME):
-        (folder / name).unlink(missing_ok=True)
-    if isinstance(geometry, Surfels):
-        write_ply(folder / PLY_NAME, geometry, object_frame_of(state))
-    elif isinstance(geometry, SurfaceOfRevolution):
-        write_revolution_ply(folder / REVOLUTION_PLY_NAME, geometry, object_frame_of(state))
-    elif isinstance(geometry, HeightField):
-        write_height_field_ply(folder / HEIGHT_FIELD_PLY_NAME, geometry, object_frame_of(state))
-    else:
-        write_plane_ply(folder / PLANE_PLY_NAME, geometry, object_frame_of(state))
+    for kind in FAMILIES:
+        (folder / f"{kind}.ply").unlink(missing_ok=True)
+    mesh_file = f"{state.geometry.kind}.ply"
+    write_ply(folder / mesh_file, state.geometry.mesh(state.frame))
     _write_test_views(dataset, state, config, folder)
     info = PredictionInfo(
         method=f"panoless {__version__} ({config.preset})",
@@ -99,17 +87,22 @@ def export_prediction(
         seconds={name: round(value, 3) for name, value in state.seconds.items()},
         hardware={
             "processor": _processor_name(),
+            "device": state.device,
             "cores": os.cpu_count(),
             "threads": torch.get_num_threads(),
             "python": platform.python_version(),
             "torch": torch.__version__,
         },
-        parameter_counts=_parameter_counts(state, config),
+        parameter_counts={
+            f"{state.geometry.kind} parameters": state.geometry.num_parameters,
+            "environment parameters": state.environment.numel(),
+        },
         peak_memory_bytes=state.peak_memory_bytes,
         curves=state.curves,
-        primitives=state.surfels.count if isinstance(geometry, Surfels) else 1,
-        model_bytes=sum((folder / name).stat().st_size for name in (_ply_name(state), ENVIRONMENT)),
-        model=state.rung or None,
+        primitives=state.geometry.num_primitives,
+        model_bytes=sum((folder / name).stat().st_size for name in (mesh_file, ENVIRONMENT)),
+        model=state.selection.sentence,
+        model_selection=_model_selection(state.selection),
         iteration=state.iteration if snapshot else None,
     )
     write_info(folder, info)
@@ -135,8 +128,9 @@ def export_snapshots(dataset: Dataset, run: Path, config: FitConfig, prediction:
             continue
         if views is None:
             loaded = load_views(dataset, config.crop_margin_px, config.downscale, encoding_of(config))
-            views = clear_views(loaded, state, config)
-        complete(state, views, config)
+            views = usable_views(loaded, state.geometry)
+        with timed(state.seconds, "solve environment"):
+            complete(state, views, config)
         acquire_prediction(target)
         export_prediction(dataset, state, config, target, snapshot=True)
     return [prediction / SNAPSHOTS / source.name for source in found]
@@ -153,14 +147,12 @@ def _is_exported(folder: Path, state: FitState, config: FitConfig, dataset: Data
 
 
 def _write_test_views(dataset: Dataset, state: FitState, config: FitConfig, folder: Path) -> None:
-    object_frame = object_frame_of(state)
-    environment = state.final_environment
-    assert environment is not None
+    """Render and write the test views on two threads; the middle one is drawn in its parts."""
     progress = Progress("exporting test views", len(dataset.test))
-    for index, frame in enumerate(dataset.test):
-        distance = np.linalg.norm(frame.camera.position_world - object_frame.center) / object_frame.radius
-        camera = raster_camera(frame.camera, object_frame, 0.1 * float(distance))
-        parts = render(state.geometry, environment, camera, object_frame, config)
+
+    def export(index: int) -> None:
+        frame = dataset.test[index]
+        parts = _render_frame(frame, state, config)
         view = View(
             radiance=parts.radiance.permute(1, 2, 0).numpy(),
             alpha=parts.alpha.numpy(),
@@ -174,7 +166,17 @@ def _write_test_views(dataset: Dataset, state: FitState, config: FitConfig, fold
             for name, picture in pictures.items():
                 write_png(folder / PICTURES / f"{name}.png", picture)
             write_picture_sheet(folder / DECOMPOSITION, crop_to_object(pictures, parts.alpha))
-        progress.advance()
+
+    with ThreadPoolExecutor(EXPORT_THREADS) as pool:
+        for _ in pool.map(export, range(len(dataset.test))):
+            progress.advance()
+
+
+def _render_frame(frame: Frame, state: FitState, config: FitConfig) -> Decomposition:
+    assert state.environment is not None
+    distance = np.linalg.norm(frame.camera.position_world - state.frame.center) / state.frame.radius
+    camera = raster_camera(frame.camera, state.frame, 0.1 * float(distance))
+    return render(state.geometry, state.environment, camera, state.frame, config)
 
 
 def cube_to_latlong(cube: Float[Tensor, "6 C L L"], height: int) -> Float[np.ndarray, "H 2*H C"]:
@@ -185,26 +187,20 @@ def cube_to_latlong(cube: Float[Tensor, "6 C L L"], height: int) -> Float[np.nda
     return blocks.mean((1, 3))
 
 
-def _ply_name(state: FitState) -> str:
-    names = {
-        SurfaceOfRevolution: REVOLUTION_PLY_NAME,
-        HeightField: HEIGHT_FIELD_PLY_NAME,
-        Plane: PLANE_PLY_NAME,
-        Surfels: PLY_NAME,
-    }
-    return names[type(state.geometry)]
-
-
-def _parameter_counts(state: FitState, config: FitConfig) -> dict[str, int]:
-    """Numbers that the fit may choose, by what they belong to."""
-    assert state.final_environment is not None
-    geometry, environment = state.geometry, {"environment parameters": state.final_environment.numel()}
-    if not isinstance(geometry, Surfels):
-        kinds = {Plane: "plane", HeightField: "bent plane", SurfaceOfRevolution: "revolution"}
-        return {f"{kinds[type(geometry)]} parameters": geometry.num_parameters, **environment}
-    per_surfel = 3 + 4 + 2 + 1
-    per_surfel += 3 * config.albedo + 3 * config.surfels.curved + config.loss.roughness_weighted
-    return {"surfel parameters": per_surfel * geometry.count, **environment}
+def _model_selection(selection: Selection) -> ModelSelection:
+    """The table of candidates as the prediction's format has it; what is infinitely far has no number."""
+    rows = (
+        Candidate(
+            kind=each.kind,
+            silhouette_px=each.silhouette_px if each.silhouette_px not in (None, math.inf) else None,
+            overlap=each.overlap,
+            held_out_error=each.held_out_error,
+            verdict=str(each.verdict),
+            reason=each.reason,
+        )
+        for each in selection.candidates
+    )
+    return ModelSelection(selection.chosen, tuple(rows))
 
 
 def _processor_name() -> str:

@@ -2,92 +2,72 @@
 
 import io
 import json
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
+from panoless.capture.object_frame import ObjectFrame
 from panoless.config import FitConfig, config_from_dict
-from panoless.geometry.height_field.model import HeightField
-from panoless.geometry.plane.model import Plane
-from panoless.geometry.revolution.model import SurfaceOfRevolution
-from panoless.geometry.surfels.model import Surfels
+from panoless.geometry.base import Geometry, Training, from_plain, to_plain
+from panoless.geometry.registry import FAMILIES
+from panoless.selection.candidates import Selection, selection_from_plain
 from shinypartial.core.errors import InputError
 from shinypartial.io.files import PARTIAL_PREFIX, atomic_write, read_json, remove_partial_files, write_json
 
 CHECKPOINT = "checkpoint.pt"
 DESCRIPTION = "fit.json"
-SHAPES: dict[str, Any] = {"plane": Plane, "height_field": HeightField, "surface": SurfaceOfRevolution}
-"""What a state may be made of beside surfels, by the name of its field."""
 
 
 @dataclass
 class FitState:
-    """What changes during a fit. `iteration` counts finished steps; `environment` is as the optimizer holds it.
+    """What changes during a fit. `environment` (linear radiance) and `visibility` in [0, 1] are set when it is done."""
 
-    `evidence` is what online visibility has accumulated. `final_environment` (radiance) and `visibility` in [0, 1] are
-    set when the fit is complete.
-    """
-
-    surfels: Surfels
-    environment: Tensor
-    iteration: int
-    optimizer: dict[str, Any]
-    gradient_sum: Tensor
-    gradient_count: Tensor
-    evidence: Tensor
-    center: list[float]
-    radius: float
-    final_environment: Tensor | None = None
-    visibility: Tensor | None = None
+    geometry: Geometry
+    frame: ObjectFrame
+    selection: Selection
+    training: Training | None = None
+    """What the steps of an iterative kind need to continue; None for a kind in closed form."""
+    environment: Float[Tensor, "6 3 L L"] | None = None
+    visibility: Float[Tensor, "6 L L"] | None = None
     seconds: dict[str, float] = field(default_factory=dict)
+    """Of each stage."""
     curves: dict[str, list[float]] = field(default_factory=dict)
     peak_memory_bytes: int = 0
-    plane: Plane | None = None
-    """The plane of the outline, where there is one."""
-    flat: bool = False
-    """Whether that plane is the geometry; there are no surfels then."""
-    surface: SurfaceOfRevolution | None = None
-    """The surface of revolution of the outlines, where there is one."""
-    turned: bool = False
-    """Whether that surface is the geometry; no steps are taken with it then."""
-    height_field: HeightField | None = None
-    """The heights over the plane, where it bends."""
-    bent: bool = False
-    """Whether that bent plane is the geometry; no steps are taken with it then."""
-    rung: str = ""
-    """Which rung of the ladder was taken, and why."""
+    device: str = "cpu"
+    """The name of what computed it."""
 
     @property
-    def stepless(self) -> bool:
-        """Whether the geometry is not made of free surfels, so that no steps of the optimization are taken."""
-        return self.flat or self.bent or self.turned
-
-    @property
-    def geometry(self) -> Surfels | Plane | HeightField | SurfaceOfRevolution:
-        """What mirrors the environment."""
-        if self.bent and self.height_field is not None:
-            return self.height_field
-        if self.turned and self.surface is not None:
-            return self.surface
-        return self.plane if self.flat and self.plane is not None else self.surfels
+    def iteration(self) -> int:
+        """Number of finished steps."""
+        return 0 if self.training is None else self.training.iteration
 
     def to(self, device: torch.device) -> "FitState":
-        """The same state on a device; the optimizer's part follows its parameters when it is loaded."""
-        moved: dict[str, Any] = {"surfels": self.surfels.to(device)}
-        moved |= {name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)}
-        return replace(self, **moved)
+        """The same state on a device."""
+        return replace(
+            self,
+            geometry=self.geometry.to(device),
+            training=None if self.training is None else self.training.to(device),
+            environment=None if self.environment is None else self.environment.to(device),
+            visibility=None if self.visibility is None else self.visibility.to(device),
+        )
 
 
 def save_state(folder: Path, state: FitState) -> None:
     """Write the checkpoint whole or not at all."""
-    content = {**vars(state), "surfels": {name: value.detach() for name, value in state.surfels.named().items()}}
-    content["environment"] = state.environment.detach()
-    for name in SHAPES:
-        content[name] = _listed(getattr(state, name))
+    content = {
+        **vars(state),
+        "kind": state.geometry.kind,
+        "geometry": state.geometry.state_dict(),
+        "frame": to_plain(state.frame),
+        "selection": asdict(state.selection),
+        "training": None if state.training is None else vars(state.training),
+    }
+    content["selection"]["candidates"] = [
+        {**each, "verdict": str(each["verdict"])} for each in content["selection"]["candidates"]
+    ]
     # Through memory, because torch reports a full disk as an internal error of its own.
     buffer = io.BytesIO()
     torch.save(content, buffer)
@@ -102,32 +82,17 @@ def load_state(folder: Path) -> FitState | None:
         return None
     try:
         content = torch.load(path, weights_only=True, map_location="cpu")
-        for name in SHAPES:
-            content[name] = _shape(name, content[name])
-        return FitState(**{**content, "surfels": Surfels(**content["surfels"])})
+        content["geometry"] = FAMILIES[content.pop("kind")].geometry.from_state_dict(content["geometry"])
+        content["frame"] = from_plain(ObjectFrame, content["frame"])
+        content["selection"] = selection_from_plain(**content["selection"])
+        content["training"] = None if content["training"] is None else Training(**content["training"])
+        return FitState(**content)
     except Exception as error:
         raise InputError(
             expected=f"a checkpoint of this version at {path}",
             found=f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}",
             remedy="Delete that run folder and fit again.",
         ) from None
-
-
-def _listed(shape: Any) -> Any:
-    """A shape as lists and numbers, which torch reads without running code."""
-    if not is_dataclass(shape):
-        return None if shape is None else np.asarray(shape).tolist()
-    return {item.name: _listed(getattr(shape, item.name)) for item in fields(shape)}
-
-
-def _shape(name: str, listed: Any) -> Any:
-    """The shape of that name from its lists."""
-    if listed is None:
-        return None
-    values = {key: np.array(value) if isinstance(value, list) else value for key, value in listed.items()}
-    return SHAPES[name](
-        **{key: _shape(key, value) if isinstance(value, dict) else value for key, value in values.items()}
-    )
 
 
 def acquire_run(folder: Path, dataset: Path, dataset_hash: str, config: FitConfig) -> None:

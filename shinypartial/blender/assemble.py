@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from shinypartial.blender.geometry import make_mesh
-from shinypartial.blender.materials import environment_texture, make_room_material
+from shinypartial.blender.materials import environment_color, make_room_material
 from shinypartial.blender.objects import mesh_of, place_objects
 from shinypartial.blender.output import add_passes, set_file
 from shinypartial.blender.runtime import choose_device, studio_light
@@ -17,7 +17,6 @@ from shinypartial.core.trajectory import CameraPath
 from shinypartial.io.images import read_exr_rgb
 from shinypartial.scene import FileWorld, Render, SceneSpec, Sphere, StudioWorld
 
-BOUNCES = 16
 #: Measured in Blender's own maps: −0.0022 (forest), beside radiance up to 1400.
 LOWEST_RADIANCE = -1e-2
 
@@ -69,7 +68,7 @@ def _set_sampling(scene: Any, render: Render) -> None:
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0
     cycles.light_sampling_threshold = cycles.blur_glossy = 0
     cycles.caustics_reflective = True
-    cycles.max_bounces = cycles.glossy_bounces = cycles.diffuse_bounces = BOUNCES
+    cycles.max_bounces = cycles.glossy_bounces = cycles.diffuse_bounces = render.max_bounces
     cycles.pixel_filter_type = "BOX"
     cycles.filter_width = 1.0
     cycles.film_exposure = 1.0
@@ -100,7 +99,7 @@ def _surround(bpy: Any, scene: Any, spec: SceneSpec) -> None:
     background.inputs["Strength"].default_value = spec.light_factor
     links.new(background.outputs["Background"], output.inputs["Surface"])
     if spec.world.distance is None:
-        links.new(environment_texture(nodes, image).outputs["Color"], background.inputs["Color"])
+        links.new(environment_color(nodes, links, image), background.inputs["Color"])
         # Light is sampled by a map as fine as the image; the automatic choice costs a second and gains nothing.
         scene.world.cycles.sampling_method = "MANUAL"
         scene.world.cycles.sample_map_resolution = min(image.size[0], 8192)

@@ -37,6 +37,7 @@ LEAST_MIRROR_SHARE = 0.5
 BOUNCE_STEP = 4
 #: Radiance of what is no perfect mirror, above every color of the world.
 MARK = 100.0
+LEAST_MARKED = 0.9 * MARK
 MISSED, LOST, MARKED = 0, -1, -2
 
 
@@ -60,6 +61,8 @@ def mirrors_enough(bpy: Any, spec: SceneSpec) -> bool:
     """Whether the object is mostly a perfect mirror in light from infinitely far, so that paths are worth tracing."""
     if isinstance(spec.object, BlendFile) or spec.world.distance is not None:
         return False
+    if BOUNCE_STEP * (spec.render.max_bounces + 1) > LEAST_MARKED:  # Their numbers would be taken for marks.
+        return False
     mesh = bpy.context.scene.objects[BODY].data
     area, number = np.empty(len(mesh.polygons), np.float32), np.empty(len(mesh.polygons), np.int32)
     mesh.polygons.foreach_get("area", area)
@@ -68,11 +71,11 @@ def mirrors_enough(bpy: Any, spec: SceneSpec) -> bool:
     return bool(area[perfect[number]].sum() >= LEAST_MIRROR_SHARE * area.sum())
 
 
-def assemble_directions(bpy: Any, spec: SceneSpec, bounces: int) -> None:
+def assemble_directions(bpy: Any, spec: SceneSpec) -> None:
     """Add the scene to the open one; at most as many reflections are followed as there."""
     main = bpy.context.scene
     scene = bpy.data.scenes.new(DIRECTIONS)
-    set_single_sample(scene, main, bounces)
+    set_single_sample(scene, main, spec.render.max_bounces)
     scene.render.resolution_x = scene.render.resolution_y = GRID * main.render.resolution_x
     set_file(scene)
     add_passes(scene)
@@ -119,7 +122,7 @@ def render_directions(bpy: Any, path: Path, region: Region, camera: Camera) -> M
 def _bounces(color: Float[np.ndarray, "h w"]) -> tuple[Int[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Their number, or LOST, by one channel of the world's color; and where that is a mark's."""
     number = np.floor_divide(color + np.float32(1e-3), BOUNCE_STEP).astype(np.int32)
-    return np.where(number == 0, LOST, number), color > 0.9 * MARK
+    return np.where(number == 0, LOST, number), color > LEAST_MARKED
 
 
 def _direction_world(bpy: Any) -> Any:

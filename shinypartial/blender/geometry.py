@@ -5,12 +5,31 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float
 
-from shinypartial.blender.mesh import Mesh, Outline, grid_faces, joined
-from shinypartial.blender.organic import blob_mesh
-from shinypartial.scene import Blob, Frame, Plane, Shape, Sphere, SurfaceOfRevolution, Tube
+from shinypartial.blender.closed_forms import harmonic_mesh, ring_mesh, superquadric_mesh
+from shinypartial.blender.mesh import Mesh, Outline, grid_faces, joined, placed
+from shinypartial.blender.organic import blob_mesh, soft_balls_mesh
+from shinypartial.scene import (
+    Blob,
+    Frame,
+    Part,
+    Plane,
+    RadialHarmonics,
+    Ring,
+    Shape,
+    SoftBalls,
+    Sphere,
+    Superquadric,
+    SurfaceOfRevolution,
+    Tube,
+)
 
 #: Squares per side of a plane that is to be deformed: bumps of a tenth of its width take 25 of them.
 DEFORMED_PLANE_DIVISIONS = 256
+
+
+def make_part(part: Part, *, fine: bool = False) -> Mesh:
+    """Mesh of a part's shape, stretched, turned and moved."""
+    return placed(make_mesh(part.shape, fine=fine), part.stretch, part.turn_deg, part.offset)
 
 
 def make_mesh(shape: Shape, *, fine: bool = False) -> Mesh:
@@ -23,8 +42,17 @@ def make_mesh(shape: Shape, *, fine: bool = False) -> Mesh:
         return _tube(shape)
     if isinstance(shape, Blob):
         return blob_mesh(shape)
-    pieces = [sphere_outline(shape)] if isinstance(shape, Sphere) else profile_outlines(shape)
-    return joined([_revolve(piece, shape.segments) for piece in pieces])
+    if isinstance(shape, SoftBalls):
+        return soft_balls_mesh(shape)
+    if isinstance(shape, Ring):
+        return ring_mesh(shape)
+    if isinstance(shape, RadialHarmonics):
+        return harmonic_mesh(shape, _sphere(1.0, shape.segments, shape.rings))
+    if isinstance(shape, Superquadric):
+        return superquadric_mesh(shape, _sphere(1.0, shape.segments, shape.rings))
+    if isinstance(shape, Sphere):
+        return _sphere(shape.radius, shape.segments, shape.rings)
+    return joined([_revolve(piece, shape.segments) for piece in profile_outlines(shape)])
 
 
 def profile_outlines(surface: SurfaceOfRevolution) -> list[Outline]:
@@ -36,11 +64,6 @@ def profile_outlines(surface: SurfaceOfRevolution) -> list[Outline]:
         _spline_piece(surface.profile[first : last + 1], surface.offset_z, count + 1)
         for (first, last), count in zip(pairwise(ends), counts, strict=True)
     ]
-
-
-def spline_outline(surface: SurfaceOfRevolution, count: int) -> Outline:
-    """Evaluate a profile without creases at `count` equal steps of accumulated chord length."""
-    return _spline_piece(surface.profile, surface.offset_z, count)
 
 
 def _chord(points: tuple[tuple[float, float], ...]) -> Float[np.ndarray, "P"]:
@@ -65,15 +88,16 @@ def _spline_piece(points: tuple[tuple[float, float], ...], offset_z: float, coun
     height = CubicSpline(chord, knots[:, 1] + offset_z, bc_type=height_ends)
     normals = np.stack([height(at, 1), -radius(at, 1)], -1)
     samples = np.stack([np.maximum(radius(at), 0), height(at)], -1)
+    samples[[0, -1], 0] = knots[[0, -1], 0]  # An end on the axis is there exactly, so that it becomes one vertex.
     return Outline(samples, normals / np.linalg.norm(normals, axis=-1, keepdims=True))
 
 
-def sphere_outline(sphere: Sphere) -> Outline:
-    """A half circle from the south pole to the north pole."""
-    latitude = np.linspace(-np.pi / 2, np.pi / 2, sphere.rings + 1)
+def _sphere(radius: float, segments: int, rings: int) -> Mesh:
+    """A half circle from the south pole to the north pole, turned about Z."""
+    latitude = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)
     normals = np.stack([np.cos(latitude), np.sin(latitude)], -1)
     normals[[0, -1], 0] = 0
-    return Outline(sphere.radius * normals, normals)
+    return _revolve(Outline(radius * normals, normals), segments)
 
 
 def _revolve(outline: Outline, segments: int) -> Mesh:

@@ -65,20 +65,24 @@ def make_mark_material(bpy: Any, radiance: float) -> Any:
 def make_room_material(bpy: Any, image: Any, strength: float) -> Any:
     """Light that depends on where the room's wall is, as seen from the origin: the map in that direction."""
     material, nodes, links = _empty(bpy, "room")
-    texture, light = environment_texture(nodes, image), nodes.new("ShaderNodeEmission")
+    light = nodes.new("ShaderNodeEmission")
     light.inputs["Strength"].default_value = strength
-    links.new(nodes.new("ShaderNodeNewGeometry").outputs["Position"], texture.inputs["Vector"])
-    links.new(texture.outputs["Color"], light.inputs["Color"])
+    position = nodes.new("ShaderNodeNewGeometry").outputs["Position"]
+    links.new(environment_color(nodes, links, image, position), light.inputs["Color"])
     links.new(light.outputs["Emission"], nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
     return material
 
 
-def environment_texture(nodes: Any, image: Any) -> Any:
-    """A node that looks a direction up in a lat-long image."""
-    texture = nodes.new("ShaderNodeTexEnvironment")
+def environment_color(nodes: Any, links: Any, image: Any, direction: Any = None) -> Any:
+    """The color of a lat-long image in a direction, that of the ray unless another is given; nowhere below zero."""
+    texture, positive = nodes.new("ShaderNodeTexEnvironment"), nodes.new("ShaderNodeVectorMath")
     texture.image = image
     texture.projection, texture.interpolation = "EQUIRECTANGULAR", "Linear"
-    return texture
+    if direction is not None:
+        links.new(direction, texture.inputs["Vector"])
+    positive.operation = "MAXIMUM"
+    links.new(texture.outputs["Color"], positive.inputs[0])
+    return positive.outputs["Vector"]
 
 
 def _mirror_and_light(nodes: Any, radiance: float) -> tuple[Any, Any]:

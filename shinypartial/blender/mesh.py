@@ -58,6 +58,25 @@ def scaled(mesh: Mesh, factor: float) -> Mesh:
     return Mesh(factor * mesh.vertices, mesh.normals, mesh.faces)
 
 
+def placed(
+    mesh: Mesh,
+    stretch: tuple[float, float, float],
+    turn_deg: tuple[float, float, float],
+    offset: tuple[float, float, float],
+) -> Mesh:
+    """Stretch along the axes, turn about X, then Y, then Z, and move; normals by the inverse transpose."""
+    matrix = np.eye(3)
+    for axis, angle in enumerate(np.radians(turn_deg)):
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        turn = np.eye(3)
+        turn[first, first] = turn[second, second] = np.cos(angle)
+        turn[first, second], turn[second, first] = -np.sin(angle), np.sin(angle)
+        matrix = turn @ matrix
+    normals = mesh.normals / np.array(stretch) @ matrix.T
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return Mesh(mesh.vertices * np.array(stretch) @ matrix.T + np.array(offset), normals, mesh.faces)
+
+
 def deformed(mesh: Mesh, deformation: Deformation) -> Mesh:
     """Displace along the normals: x + a·h(x)·n(x), with a smooth random field h of unit variance over all space.
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from shinypartial.blender.blend_file import load_blend_object
-from shinypartial.blender.geometry import make_mesh
+from shinypartial.blender.geometry import make_part
 from shinypartial.blender.materials import add_depth_pass, make_material
 from shinypartial.blender.mesh import Mesh, deformed, joined, scaled
 from shinypartial.scene import Assembly, BlendFile, Material, Part, SceneSpec
@@ -64,7 +64,7 @@ def _link(bpy: Any, scene: Any, name: str, parts: Iterable[Part], spec: SceneSpe
     parts = tuple(parts)
     is_body = name == BODY
     fine = is_body and spec.deformation.amplitude > 0
-    pieces = [make_mesh(part.shape, fine=fine) for part in parts]
+    pieces = [make_part(part, fine=fine) for part in parts]
     whole = joined(pieces)
     mesh = mesh_of(bpy, name, scaled(deformed(whole, spec.deformation) if is_body else whole, spec.scale))
     for part in parts:

@@ -19,7 +19,7 @@ from shinypartial.dataset.read import image_size, image_stem, read_entry, read_v
 from shinypartial.dataset.schema import CHECKSUMS, ENVIRONMENT_LATLONG, LICENSES, MANIFEST, Frame, View
 from shinypartial.dataset.violations import Violation, violation_of
 from shinypartial.io.files import read_json
-from shinypartial.io.images import read_png
+from shinypartial.io.images import read_picture, read_png
 
 RESTORE = "Restore the file from the original dataset."
 DISPARITY_SUFFIX = "_disp.tiff"
@@ -148,10 +148,7 @@ def _check_normals(root: Path, frame: Frame, solid: Bool[np.ndarray, "H W"]) -> 
 def _check_disparity(name: str, path: Path, solid: Bool[np.ndarray, "H W"]) -> Iterator[Violation]:
     """Finite on the object, with one channel or several. Nothing here reads it otherwise."""
     try:
-        values = _read_tiff(path)
-    except ImportError as error:
-        yield Violation(name, f"can't be checked: {error}", "Nothing needs it; other readers may.", warning=True)
-        return
+        values = read_picture(path)
     except InputError as error:
         yield violation_of(name, error, RESTORE)
         return
@@ -161,25 +158,6 @@ def _check_disparity(name: str, path: Path, solid: Bool[np.ndarray, "H W"]) -> I
     infinite = int((~np.isfinite(values[solid])).sum())
     if infinite:
         yield Violation(name, f"{infinite} values on the object are NaN or infinite", RESTORE)
-
-
-def _read_tiff(path: Path) -> Float[np.ndarray, "H W *C"]:
-    """Pillow knows compressions, scikit-image floats of several channels; ImportError when a decoder is lacking."""
-    from PIL import Image
-
-    try:
-        with Image.open(path) as stored:
-            return np.asarray(stored, dtype=np.float64)
-    except Exception:
-        pass
-    import skimage.io
-
-    try:
-        return np.asarray(skimage.io.imread(path), dtype=np.float64)
-    except Exception as error:
-        if "imagecodecs" in str(error):
-            raise ImportError(str(error)) from None
-        raise InputError(expected=f"a complete TIFF at {path}", found=f"{error}", remedy=RESTORE) from None
 
 
 def check_normals_of_split(split: str, frames: Sequence[Frame]) -> Iterator[Violation]:

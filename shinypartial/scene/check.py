@@ -3,7 +3,7 @@
 import math
 from itertools import pairwise
 
-from shinypartial.scene.shapes import Assembly, BlendFile, Frame, Part, Plane, SurfaceOfRevolution, Tube
+from shinypartial.scene.shapes import Assembly, BlendFile, Frame, Part, Plane, SoftBalls, SurfaceOfRevolution, Tube
 from shinypartial.scene.spec import SceneSpec
 from shinypartial.scene.tables import Place
 
@@ -23,7 +23,7 @@ def check_scene(spec: SceneSpec, place: Place) -> None:
             .below("radius")
             .error("cameras outside the object", f"{spec.camera.radius}, but {reach}")
         )
-    around = max([spec.extent, *(spec.scale * part.shape.extent for part in spec.props)])
+    around = max([spec.extent, *(spec.scale * part.extent for part in spec.props)])
     if spec.world.distance is not None and spec.world.distance <= around:
         found = f"{spec.world.distance}, but {reach}, and what stands around it {around:.3g}"
         raise place.below("world").below("distance").error("surroundings that enclose the object", found)
@@ -50,6 +50,8 @@ def _check_parts(parts: tuple[Part, ...], place: Place, numbered: bool = True) -
             raise at.below("normal").error("a direction", "a vector of length zero")
         if isinstance(part.shape, Frame):
             _check_distinct(part.shape.profile, 2, at.below("profile"))
+        if isinstance(part.shape, SoftBalls):
+            _check_balls(part.shape, at.below("balls"))
         if isinstance(part.shape, Tube):
             _check_distinct(part.shape.path, 3, at.below("path"))
             if len(part.shape.radii) != len(part.shape.path):
@@ -63,6 +65,15 @@ def _check_distinct(points: tuple[tuple[float, ...], ...], fewest: int, place: P
     for i, (before, point) in enumerate(pairwise(points), 1):
         if math.dist(before, point) < 1e-9:
             raise place.error("points that differ from the one before", f"point {i} twice")
+
+
+def _check_balls(shape: SoftBalls, place: Place) -> None:
+    """Radii must be above 0, and some ball must be solid."""
+    for i, (*_, radius, _strength) in enumerate(shape.balls):
+        if radius <= 0:
+            raise place.below(str(i)).error("a radius above 0", f"{radius}")
+    if not any(strength >= 1 for *_, strength in shape.balls):
+        raise place.error("a ball of strength 1 or more", "none")
 
 
 def _check_profile(surface: SurfaceOfRevolution, place: Place) -> None:

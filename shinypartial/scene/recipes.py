@@ -9,17 +9,25 @@ from shinypartial.core.errors import InputError
 from shinypartial.core.trajectory import SWEPT_PATHS
 from shinypartial.scene.check import check_scene
 from shinypartial.scene.shapes import BlendFile, Material
-from shinypartial.scene.spec import STUDIO_LIGHTS, FileWorld, SceneSpec
+from shinypartial.scene.spec import DEVELOPMENT, HELD_OUT, STUDIO_LIGHTS, FileWorld, SceneSpec
 from shinypartial.scene.tables import Place, parse_table
 
 SCENES = Path(__file__).resolve().parents[2] / "blender_scenes"
 RECIPE = "scene.toml"
 BLEND = ".blend"
+#: Keys of a recipe that the first datasets don't have, and what they mean there.
+ADDED_KEYS = {
+    "max_bounces": 16,
+    "stretch": [1.0, 1.0, 1.0],
+    "turn_deg": [0.0, 0.0, 0.0],
+    "offset": [0.0, 0.0, 0.0],
+}
 
 
-def scene_names() -> list[str]:
-    """Names of the scenes that come with the repository."""
-    return sorted(path.parent.name for path in SCENES.glob(f"*/{RECIPE}"))
+def scene_names(split: str | None = None) -> list[str]:
+    """Names of the scenes that come with the repository; only those of a split (`SPLITS`) where one is named."""
+    names = sorted(path.parent.name for path in SCENES.glob(f"*/{RECIPE}"))
+    return [name for name in names if split is None or load_scene(name).split == split]
 
 
 def find_scene(scene: str, object_name: str | None = None) -> SceneSpec:
@@ -86,6 +94,7 @@ def from_blend_file(path: Path, object_name: str | None) -> SceneSpec:
         "title": f"{object_name} of {path.name}",
         "provenance": f"Object {object_name} of the file {path.name}.",
         "license": "that of the file",
+        "split": DEVELOPMENT,
         "object": {"kind": "blend", "path": str(file), "object": object_name},
         "world": {"kind": "studiolight", "name": "interior"},
         "material": None,
@@ -166,9 +175,26 @@ def variant_name(original: SceneSpec, varied: SceneSpec) -> str:
     return "-".join(words)
 
 
+def older_recipe(recipe: Any) -> Any:
+    """A recipe without the keys that later versions added and that have the values which were fixed before.
+
+    A dataset that was begun with such a recipe is one of the same scene. `split` says nothing about its pictures.
+    """
+    if isinstance(recipe, dict):
+        added = {"split", *(key for key, value in ADDED_KEYS.items() if recipe.get(key) == value)}
+        return {key: older_recipe(value) for key, value in recipe.items() if key not in added}
+    return [older_recipe(each) for each in recipe] if isinstance(recipe, list) else recipe
+
+
 def parse_scene(table: dict[str, Any], source: str) -> SceneSpec:
     """Build a SceneSpec from nested tables; `source` names their origin in messages."""
     place = Place(source)
+    if "split" not in table:
+        raise InputError(
+            expected=f"`split` of {source}: whether anything may be chosen by the scores of this scene",
+            found="no such key",
+            remedy=f'Add the line split = "{DEVELOPMENT}", or split = "{HELD_OUT}" where nothing ever is.',
+        )
     spec = parse_table(SceneSpec, table, place)
     check_scene(spec, place)
     return spec

@@ -137,11 +137,127 @@ class Blob:
 
 
 @dataclass(frozen=True)
-class Part:
-    """A shape with a material of its own, or with the scene's."""
+class RadialHarmonics:
+    """A closed smooth form whose radius is 1 + h(d) in direction d, h a seeded sum of harmonics of low degree.
 
-    shape: SurfaceOfRevolution | Sphere | Plane | Frame | Tube | Blob
+    h(d) = Σ c P(d·u): Legendre polynomials P of degree 2 to `degree` about seeded axes u, scaled to the root mean
+    square `variation`. The whole is then enlarged so that its farthest point lies at `radius`.
+    """
+
+    kind: str = "radial_harmonics"
+    seed: int = field(default=0, metadata=limits(0, 2**31 - 1))
+    """Determines axes and coefficients, which fall with the square of the degree."""
+    degree: int = field(default=4, metadata=limits(2, 16))
+    """Highest degree: about the number of bumps around the form."""
+    variation: float = field(default=0.08, metadata=limits(0.0, 0.2))
+    """Root mean square of the radius about its mean, as a share of it."""
+    radius: float = field(default=1.0, metadata=limits(1e-3, 1e3))
+    """Distance of its farthest point from the origin."""
+    segments: int = field(default=512, metadata=limits(3, 4096))
+    """Faces around the Z axis."""
+    rings: int = field(default=256, metadata=limits(2, 4096))
+    """Faces from pole to pole."""
+
+    @property
+    def extent(self) -> float:
+        """The radius."""
+        return self.radius
+
+
+@dataclass(frozen=True)
+class Superquadric:
+    """A rounded box (|x/a|^p + |y/b|^p)^(q/p) + |z/c|^q = 1 with half sizes a, b, c, twisted about the Z axis."""
+
+    kind: str = "superquadric"
+    size: tuple[float, float, float] = field(default=(1.2, 1.2, 1.2), metadata=limits(1e-3, 1e3))
+    """Full sizes along X, Y and Z: 2a, 2b, 2c."""
+    exponents: tuple[float, float] = field(default=(4.0, 4.0), metadata=limits(2.0, 12.0))
+    """p of horizontal and q of vertical sections: 2 is an ellipse, more is nearer to a box with rounded edges."""
+    twist_deg: float = field(default=0.0, metadata=limits(-720.0, 720.0))
+    """By how much the top is turned against the bottom; sections between in proportion to their height."""
+    segments: int = field(default=768, metadata=limits(3, 4096))
+    """Faces around the Z axis."""
+    rings: int = field(default=384, metadata=limits(2, 4096))
+    """Faces from pole to pole."""
+
+    @property
+    def extent(self) -> float:
+        """Half the diagonal of the box that holds it."""
+        return math.hypot(*self.size) / 2
+
+
+@dataclass(frozen=True)
+class Ring:
+    """A torus about the Z axis whose tube may rise, fall and swell along its way around.
+
+    At azimuth u the tube has its center at (R cos u, R sin u, b sin wu) and the radius r (1 + s cos(wu + φ)).
+    """
+
+    kind: str = "ring"
+    radius: float = field(default=0.75, metadata=limits(1e-3, 1e3))
+    """R, from the axis to the tube's center."""
+    thickness: float = field(default=0.25, metadata=limits(1e-3, 1e3))
+    """r, mean radius of the tube."""
+    waves: int = field(default=0, metadata=limits(0, 64))
+    """w, waves on the way around; without any the ring is a plain torus."""
+    bend: float = field(default=0.0, metadata=limits(0.0, 1e3))
+    """b, height of a wave."""
+    swell: float = field(default=0.0, metadata=limits(0.0, 0.9))
+    """s, share by which the thickness varies."""
+    phase_deg: float = field(default=0.0, metadata=limits(-360.0, 360.0))
+    """φ, between bend and swell."""
+    segments: int = field(default=256, metadata=limits(3, 4096))
+    """Faces around the tube."""
+    rings: int = field(default=768, metadata=limits(3, 4096))
+    """Faces along the ring."""
+
+    @property
+    def extent(self) -> float:
+        """Largest possible distance from the origin."""
+        return math.hypot(self.radius, self.bend) + self.thickness * (1 + self.swell)
+
+
+@dataclass(frozen=True)
+class SoftBalls:
+    """A smooth form that is drawn with balls: the level set Σ s exp(1 − |x − c|²/r²) = 1, moved and scaled to fit."""
+
+    balls: tuple[tuple[float, float, float, float, float], ...] = field(metadata=limits(-1e3, 1e3))
+    """Center (x, y, z), radius r > 0 and strength s. Alone, a ball of strength 1 is a sphere of its radius; balls near
+    one another melt together, and those of negative strength carve hollows."""
+    kind: str = "soft_balls"
+    radius: float = field(default=1.0, metadata=limits(1e-3, 1e3))
+    """Distance of the farthest point from the origin, which is the middle of the form's bounding box."""
+    resolution: int = field(default=128, metadata=limits(8, 512))
+    """Cells per side of the grid in which the surface is found."""
+    refinements: int = field(default=1, metadata=limits(0, 3))
+    """How often each triangle is divided into four on the level set."""
+
+    @property
+    def extent(self) -> float:
+        """The radius."""
+        return self.radius
+
+
+Shape = SurfaceOfRevolution | Sphere | Plane | Frame | Tube | Blob | RadialHarmonics | Superquadric | Ring | SoftBalls
+
+
+@dataclass(frozen=True)
+class Part:
+    """A shape that is stretched, turned and moved, with a material of its own or with the scene's."""
+
+    shape: Shape
     material: Material | None = None
+    stretch: tuple[float, float, float] = field(default=(1.0, 1.0, 1.0), metadata=limits(1e-3, 1e3))
+    """Factors along X, Y and Z, first of all."""
+    turn_deg: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), metadata=limits(-360.0, 360.0))
+    """Rotations about X, then Y, then Z, counterclockwise."""
+    offset: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), metadata=limits(-1e3, 1e3))
+    """Where the shape's origin lies, last of all."""
+
+    @property
+    def extent(self) -> float:
+        """Distance from the origin that the part does not exceed."""
+        return max(self.stretch) * self.shape.extent + math.hypot(*self.offset)
 
 
 @dataclass(frozen=True)
@@ -154,7 +270,7 @@ class Assembly:
     @property
     def extent(self) -> float:
         """That of the part which reaches farthest."""
-        return max(part.shape.extent for part in self.parts)
+        return max(part.extent for part in self.parts)
 
 
 @dataclass(frozen=True)
@@ -171,6 +287,3 @@ class BlendFile:
     def extent(self) -> float:
         """One, by definition."""
         return 1.0
-
-
-Shape = SurfaceOfRevolution | Sphere | Plane | Frame | Tube | Blob

@@ -8,19 +8,12 @@ from typing import Any
 
 from shinypartial.core.trajectory import CameraPath, limits
 from shinypartial.io.files import sha256_of
-from shinypartial.scene.shapes import (
-    Assembly,
-    BlendFile,
-    Blob,
-    Material,
-    Part,
-    Plane,
-    Sphere,
-    SurfaceOfRevolution,
-    Tube,
-)
+from shinypartial.scene.shapes import Assembly, BlendFile, Material, Part, Shape
 
 FORMAT_VERSION = 1
+#: What a scene may be used for: anything is chosen by its scores, or nothing ever is.
+DEVELOPMENT, HELD_OUT = "development", "held-out"
+SPLITS = (DEVELOPMENT, HELD_OUT)
 STUDIO_LIGHTS = ("city", "courtyard", "forest", "interior", "night", "studio", "sunrise", "sunset")
 
 
@@ -75,6 +68,8 @@ class Render:
     """Seed of the sampling pattern."""
     exposure: float = field(default=0.0, metadata=limits(-20.0, 20.0))
     """Photographic stops: the light of the world is multiplied by 2^exposure, in pictures and in the stored map."""
+    max_bounces: int = field(default=16, metadata=limits(0, 1024))
+    """As Cycles counts: a path is reflected at most once more than this, and light that would need more is lost."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +80,9 @@ class SceneSpec:
     title: str
     provenance: str
     license: str
-    object: SurfaceOfRevolution | Sphere | Plane | Tube | Blob | Assembly | BlendFile
+    split: str = field(metadata={"choices": SPLITS})
+    """Whether constants and presets may be chosen by this scene (`development`) or never (`held-out`)."""
+    object: Shape | Assembly | BlendFile
     world: StudioWorld | FileWorld
     material: Material | None = Material()
     """Of the object, but for parts that have their own. None: a Blender file's own materials."""

@@ -114,27 +114,27 @@ def measure(dataset: Path, case: Case, steps: int, threads: int) -> Cost:
     """Cost of a fit's steps right after its warm-up, when all terms act. To be called in a fresh process."""
     from tests.benchmarks.bench_step import WARM_UP_STEPS
 
-    fitter = _make_fitter(dataset, case, threads)
+    trainer = _make_trainer(dataset, case, threads)
     prepared_peak = _peak_mib()
-    start = round(1.5 * fitter.config.environment.warmup * fitter.config.iterations)
+    start = round(1.5 * trainer.config.environment.warmup * trainer.config.iterations)
     for iteration in range(start, start + WARM_UP_STEPS):
-        fitter._step(iteration)
+        trainer._step(iteration)
     iterations = range(start + WARM_UP_STEPS, start + WARM_UP_STEPS + steps)
     wall, cpu = [], []
     for iteration in iterations:
         before, busy = time.perf_counter(), time.process_time()
-        fitter._step(iteration)
+        trainer._step(iteration)
         wall.append(1e3 * (time.perf_counter() - before))
         cpu.append(1e3 * (time.process_time() - busy))
     peak = _peak_mib()
-    viewed = [fitter._view_index(iteration) for iteration in iterations]
-    counts = _count_views(fitter, set(viewed))
-    cameras = [fitter.views.train[index].camera for index in viewed]
+    viewed = [trainer._view_index(iteration) for iteration in iterations]
+    counts = _count_views(trainer, set(viewed))
+    cameras = [trainer.views.train[index].camera for index in viewed]
     return Cost(
         case=case,
         threads=threads,
         steps=steps,
-        views=len(fitter.views.train),
+        views=len(trainer.views.train),
         wall_ms=statistics.median(wall),
         cpu_ms=statistics.median(cpu),
         evaluated_pairs=statistics.median(counts[index].evaluated for index in viewed),
@@ -145,10 +145,10 @@ def measure(dataset: Path, case: Case, steps: int, threads: int) -> Cost:
     )
 
 
-def _make_fitter(dataset: Path, case: Case, threads: int) -> Any:
+def _make_trainer(dataset: Path, case: Case, threads: int) -> Any:
     from dataclasses import replace
 
-    from tests.benchmarks.bench_step import PRESETS, Fitter, new_state, resampled_views, torch
+    from tests.benchmarks.bench_step import PRESETS, new_trainer, resampled_views, torch
 
     torch.set_num_threads(threads)
     config = PRESETS["default"]
@@ -158,14 +158,14 @@ def _make_fitter(dataset: Path, case: Case, threads: int) -> Any:
         environment=replace(config.environment, resolution=case.texels),
     )
     views = resampled_views(dataset, case.pixels, config.crop_margin_px, case.views)
-    return Fitter(views, config, Path(tempfile.gettempdir()) / "bench-cost", new_state(views, config))
+    return new_trainer(views, config)
 
 
-def _count_views(fitter: Any, indices: set[int]) -> dict[int, Any]:
+def _count_views(trainer: Any, indices: set[int]) -> dict[int, Any]:
     """Pairs of the given views, of all their tiles: with a silhouette term none is left out."""
     from tests.benchmarks.lane_counts import count_lanes
 
-    surfels = fitter.optimizer.surfels.detached()
+    surfels = trainer.optimizer.surfels.detached()
     parameters = (
         surfels.means,
         surfels.quats,
@@ -174,7 +174,7 @@ def _count_views(fitter: Any, indices: set[int]) -> dict[int, Any]:
         surfels.albedo,
         surfels.curvatures,
     )
-    return {index: count_lanes(parameters, fitter.views.train[index].camera) for index in indices}
+    return {index: count_lanes(parameters, trainer.views.train[index].camera) for index in indices}
 
 
 def _peak_mib() -> float:

@@ -9,7 +9,6 @@ import argparse
 import json
 import statistics
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
@@ -169,9 +168,11 @@ def time_fit(surfels: Vase, camera: RasterCamera, device: torch.device) -> Row:
     from panoless.capture.object_frame import ObjectFrame
     from panoless.capture.views import TrainView, Views
     from panoless.config import FitConfig
+    from panoless.geometry.base import Training
+    from panoless.geometry.surfels.mirror import SurfelMirror
     from panoless.geometry.surfels.model import Surfels
-    from panoless.geometry.surfels.train import Fitter
-    from panoless.reconstruct.state import FitState
+    from panoless.geometry.surfels.train import SurfelTrainer
+    from panoless.selection.held_out import Unobserved
 
     with torch.no_grad():
         picture = drawn(placed(surfels, device), camera, True)
@@ -194,26 +195,16 @@ def time_fit(surfels: Vase, camera: RasterCamera, device: torch.device) -> Row:
         roughness_logits=torch.zeros_like(here.opacities),
     ).detached()
     length = config.environment.resolution
-    state = FitState(
-        surfels=parameters,
-        environment=torch.full((6, 3, length, length), 0.5, device=device),
-        iteration=0,
-        optimizer={},
-        gradient_sum=torch.zeros(count, device=device),
-        gradient_count=torch.zeros(count, device=device),
-        evidence=torch.zeros(6, length, length, device=device),
-        center=[0.0, 0.0, 0.0],
-        radius=1.0,
-    )
+    environment = torch.full((6, 3, length, length), 0.5, device=device)
+    training = Training(environment, torch.zeros(6, length, length, device=device))
     views = Views((view,), ObjectFrame(torch.zeros(3).numpy(), 1.0), camera.near)
-    with tempfile.TemporaryDirectory() as folder:
-        fitter = Fitter(views, config, Path(folder), state)
-        warm = round(config.environment.warmup * config.iterations) + 1
+    trainer = SurfelTrainer(views, SurfelMirror(parameters), training, config, Unobserved())
+    warm = round(config.environment.warmup * config.iterations) + 1
 
-        def step() -> None:
-            fitter._step(warm)
+    def step() -> None:
+        trainer._step(warm)
 
-        return Row("step of a fit", camera.width, count, None, milliseconds(device, step))
+    return Row("step of a fit", camera.width, count, None, milliseconds(device, step))
 
 
 def sweep(surfels: Vase, camera: RasterCamera, device: torch.device) -> list[Row]:

@@ -1,8 +1,8 @@
 """Whole training steps by stage: `python -m tests.benchmarks.bench_step --json out.json`.
 
-Each case runs the steps of a real `Fitter` (rasterize, objective, backward, Adam) on views of a dataset, resampled to
-the case's size. Without a dataset, the views are of a synthetic mirror sphere. The cold start is a process of its own,
-from its first import to the end of its first step, with kernels from the disk cache.
+Each case runs the steps of a real `SurfelTrainer` (rasterize, objective, backward, Adam) on views of a dataset,
+resampled to the case's size. Without a dataset, the views are of a synthetic mirror sphere. The cold start is a
+process of its own, from its first import to the end of its first step, with kernels from the disk cache.
 """
 
 import argparse
@@ -25,11 +25,15 @@ import numpy as np
 import torch
 
 from panoless.capture.views import Views, cropped, views_of
+from panoless.config import FitConfig
+from panoless.geometry.surfels import train as train_module
+from panoless.geometry.surfels.kind import SurfelFamily
+from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.geometry.surfels.optimizer import SurfelOptimizer
-from panoless.geometry.surfels.train import Fitter
+from panoless.geometry.surfels.placement import initial_surfels
+from panoless.geometry.surfels.train import SurfelTrainer
 from panoless.presets import PRESETS
-from panoless.reconstruct import fit as fit_module
-from panoless.reconstruct.fit import new_state
+from panoless.selection.held_out import Unobserved
 from shinypartial.core.camera import Camera
 from shinypartial.dataset.read import open_dataset, read_view
 
@@ -54,7 +58,7 @@ class StepTiming:
     """Wall time by stage; the rest is the step's own bookkeeping."""
 
 
-def resample_profile(image: np.ndarray, size: int) -> np.ndarray:
+def resampled(image: np.ndarray, size: int) -> np.ndarray:
     """A square image at another size: means of blocks, or bilinear."""
     stack = torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1)[None]
     if size < image.shape[0]:
@@ -73,17 +77,23 @@ def resampled_views(dataset: Path, size: int, crop_margin_px: int, count: int = 
         old, scale = frame.camera, size / frame.camera.width
         intrinsics = (scale * old.fx, scale * old.fy, scale * old.cx, scale * old.cy)
         camera = Camera(old.camera_to_world, *intrinsics, size, size)
-        images = (resample_profile(image.clip(0, 1), size) for image in (view.radiance, view.alpha))
+        images = (resampled(image.clip(0, 1), size) for image in (view.radiance, view.alpha))
         photographs.append(cropped(camera, *images, crop_margin_px))
     return views_of(photographs)
 
 
-def make_fitter(dataset: Path, size: int, count: int, preset: str) -> Fitter:
+def make_trainer(dataset: Path, size: int, count: int, preset: str) -> SurfelTrainer:
     """A fit right after its warm-up, when all terms act."""
     config = PRESETS[preset]
     config = replace(config, surfels=replace(config.surfels, count=count))
     views = resampled_views(dataset, size, config.crop_margin_px)
-    return Fitter(views, config, Path(tempfile.gettempdir()) / "bench-step", new_state(views, config))
+    return new_trainer(views, config)
+
+
+def new_trainer(views: Views, config: FitConfig) -> SurfelTrainer:
+    """A trainer before its first step."""
+    mirror = SurfelMirror.of(initial_surfels(views, config.surfels, config.seed), config)
+    return SurfelTrainer(views, mirror, SurfelFamily().begin(views, mirror, config), config, Unobserved())
 
 
 @contextmanager
@@ -101,8 +111,8 @@ def stage_clock() -> Iterator[dict[str, list[float]]]:
         return run
 
     places = (
-        (fit_module, "rasterize_surfels"),
-        (fit_module, "mirror_objective"),
+        (train_module, "rasterize_surfels"),
+        (train_module, "mirror_objective"),
         (torch.Tensor, "backward"),
         (SurfelOptimizer, "step"),
     )
@@ -118,15 +128,15 @@ def stage_clock() -> Iterator[dict[str, list[float]]]:
 
 def measure(dataset: Path, size: int, count: int, steps: int, preset: str) -> StepTiming:
     """Time the steps of one case."""
-    fitter = make_fitter(dataset, size, count, preset)
-    first = round(1.5 * fitter.config.environment.warmup * fitter.config.iterations)
+    trainer = make_trainer(dataset, size, count, preset)
+    first = round(1.5 * trainer.config.environment.warmup * trainer.config.iterations)
     for iteration in range(first, first + WARM_UP_STEPS):
-        fitter._step(iteration)
+        trainer._step(iteration)
     wall, cpu = [], []
     with stage_clock() as seconds:
         for iteration in range(first + WARM_UP_STEPS, first + WARM_UP_STEPS + steps):
             start, busy = time.perf_counter(), time.process_time()
-            fitter._step(iteration)
+            trainer._step(iteration)
             wall.append(1e3 * (time.perf_counter() - start))
             cpu.append(1e3 * (time.process_time() - busy))
     return StepTiming(
@@ -152,16 +162,16 @@ mark("import torch")
 import numba
 mark("import numba")
 from pathlib import Path
-from tests.benchmarks.bench_step import make_fitter
+from tests.benchmarks.bench_step import make_trainer
 mark("import panoless")
 prepared = time.perf_counter()
-fitter = make_fitter(Path(sys.argv[1]), 200, 5000, "default")
+trainer = make_trainer(Path(sys.argv[1]), 200, 5000, "default")
 prepared = time.perf_counter() - prepared
 step = time.perf_counter()
-fitter._step(100)
+trainer._step(100)
 marks["first step"] = time.perf_counter() - step
 step = time.perf_counter()
-fitter._step(101)
+trainer._step(101)
 marks["second step"] = time.perf_counter() - step
 marks["views and surfels"] = prepared
 print(json.dumps(marks))

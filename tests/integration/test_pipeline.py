@@ -12,11 +12,11 @@ from shinypartial.cli import main as shinypartial
 pytest.importorskip("bpy", reason="the pipeline begins with Blender: pip install 'panoless[blender]'")
 
 
-def num_parameters(content: object) -> list[float]:
+def numbers_in(content: object) -> list[float]:
     if isinstance(content, dict):
-        return [number for value in content.values() for number in num_parameters(value)]
+        return [number for value in content.values() for number in numbers_in(value)]
     if isinstance(content, list):
-        return [number for value in content for number in num_parameters(value)]
+        return [number for value in content for number in numbers_in(value)]
     return [content] if isinstance(content, float) else []
 
 
@@ -27,7 +27,7 @@ def assert_complete(prediction: Path, model: str, largest_error_deg: float, leas
         assert (prediction / name).stat().st_size > 0, name
     assert len(list((prediction / "test").glob("*.exr"))) == 4
     scores = json.loads((prediction / "scores.json").read_text())
-    assert all(map(math.isfinite, num_parameters(scores)))
+    assert all(map(math.isfinite, numbers_in(scores)))
     assert scores["normals"]["median_angular_error_deg"] < largest_error_deg
     assert scores["render"]["alpha_iou"] > least_overlap
 
@@ -51,4 +51,4 @@ def test_generate_fit_evaluate_report(
     # A second of fitting at 48 px: 9° and a silhouette of 0.95 were measured; a wrong axis gives 60° and 0.5.
     assert_complete(free, "surfels.ply", largest_error_deg=20, least_overlap=0.8)
     # 0.9° and 0.97.
-    assert_complete(turned, "surface.ply", largest_error_deg=3, least_overlap=0.9)
+    assert_complete(turned, "revolution.ply", largest_error_deg=3, least_overlap=0.9)

@@ -4,14 +4,17 @@ import ast
 import json
 from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import panoless
-from panoless.config import FitConfig, RateConfig, check_config, config_from_dict
+from panoless.cli import main
+from panoless.config import FitConfig, RateConfig, check_config, config_from_dict, renamed_arguments
 from panoless.geometry.surfels.model import Surfels
 from panoless.presets import PRESETS
 from shinypartial.core.errors import InputError
+from shinypartial.io.records import write_record
 
 ROOT = Path(panoless.__file__).parent
 SECTIONS = {item.name: item.default_factory for item in fields(FitConfig) if is_dataclass(item.default_factory)}  # type: ignore[arg-type]
@@ -70,7 +73,7 @@ def test_every_parameter_has_a_rate() -> None:
     assert rates - others == {item.name for item in fields(Surfels)} | {"environment"}
 
 
-def with_value(config: FitConfig, name: str, value: float) -> FitConfig:
+def with_value(config: FitConfig, name: str, value: Any) -> FitConfig:
     section, _, leaf = name.rpartition(".")
     if not section:
         return replace(config, **{leaf: value})
@@ -97,6 +100,9 @@ def test_presets_are_in_range(preset: str) -> None:
         ("rates.environment", float("inf")),
         ("crop_margin_px", -2),
         ("visibility_alpha", 1.5),
+        ("loss.robust_scale", -0.1),
+        ("rates.square_memory", 1.0),
+        ("environment.rays", 7),
     ],
 )
 def test_a_value_out_of_range_is_named_as_the_command_line_names_it(name: str, value: float) -> None:
@@ -107,3 +113,60 @@ def test_a_value_out_of_range_is_named_as_the_command_line_names_it(name: str, v
 @pytest.mark.parametrize(("name", "value"), [("loss.lambda_distortion", 1000.0), ("crop_margin_px", -1), ("seed", -5)])
 def test_unusual_values_are_allowed(name: str, value: float) -> None:
     check_config(with_value(PRESETS["default"], name, value))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("surfels.hull_resolution", 7, "--config.surfels.hull-resolution: a whole number of at least 8"),
+        ("tint", (1.0, 0.0, 1.0), "--config.tint: a number above 0"),
+    ],
+)
+def test_a_refusal_says_what_is_allowed(name: str, value: Any, expected: str) -> None:
+    with pytest.raises(InputError) as raised:
+        check_config(with_value(PRESETS["default"], name, value))
+    assert raised.value.expected == expected
+
+
+def test_a_stored_value_out_of_range_is_refused() -> None:
+    content = write_record(PRESETS["default"])
+    content["surfels"]["count"] = 0
+    with pytest.raises(InputError, match=r"`surfels\.count`.*at least 1"):
+        config_from_dict(content)
+    with pytest.raises(
+        InputError, match=r"`model`.*one of auto, plane, height_field, revolution, surfels; found 'ball'"
+    ):
+        config_from_dict(write_record(PRESETS["default"]) | {"model": "ball"})
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--model", "bent"], ["--model=bent"], ["--config.model", "bent"], ["--config.model=bent"]]
+)
+def test_the_former_name_of_a_model_works_with_a_warning(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    renamed = renamed_arguments(["fit", "bent", *arguments, "--output", "bent"])
+    assert " ".join(renamed).replace("=", " ") == "fit bent --model height_field --output bent"
+    assert "--model bent is now --model height_field" in capsys.readouterr().err
+
+
+def test_other_arguments_pass_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["fit", "--output=a=b", "--model", "plane", "--preset=", "--config.tint", "1", "0.5", "1"]
+    assert renamed_arguments(arguments) == arguments
+    assert capsys.readouterr().err == ""
+
+
+def test_a_run_of_the_former_name_can_be_read() -> None:
+    content = write_record(replace(PRESETS["default"], model="height_field")) | {"model": "bent"}
+    assert config_from_dict(content).model == "height_field"
+
+
+def test_the_command_line_is_derived_from_the_same_fields(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fit", "--help"]) == 0
+    text = capsys.readouterr().out
+    for name in (
+        "--model {auto,plane,height_field,revolution,surfels}",
+        "--config.surfels.hull-votes",
+        "--config.tint",
+    ):
+        assert name in text

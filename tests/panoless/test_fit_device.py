@@ -25,7 +25,6 @@ def definition_only(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(backend, "_fastest", lambda dtype, device: "reference")
     monkeypatch.setattr(cubemap, "ROBUST_SCALES", (None,))
     monkeypatch.setattr(cubemap, "REFINING_SCALES", (0.05,))
-    monkeypatch.setattr(cubemap, "CONJUGATE_GRADIENT_STEPS", 1)
 
 
 def shortest_config(preset: str) -> FitConfig:
@@ -50,24 +49,27 @@ def test_a_fit_on_another_device_mixes_nothing_and_ends_the_same(
     here = fit(dataset, config, tmp_path / "here")
     with second_device() as device:
         there = fit(dataset, config, tmp_path / "there", device=device)
-    assert there.surfels.means.device.type == "cpu"
-    for name, value in here.surfels.named().items():
-        torch.testing.assert_close(there.surfels.named()[name], value)
-    torch.testing.assert_close(there.final_environment, here.final_environment)
+    surfels, expected = there.geometry.state_dict()["surfels"], here.geometry.state_dict()["surfels"]
+    assert surfels["means"].device.type == "cpu"
+    for name, value in expected.items():
+        torch.testing.assert_close(surfels[name], value)
+    torch.testing.assert_close(there.environment, here.environment)
     torch.testing.assert_close(there.visibility, here.visibility)
     for name, series in here.curves.items():
         assert there.curves[name] == pytest.approx(series), name
 
 
-def test_the_ladder_on_another_device_takes_the_same_rung(tmp_path: Path, definition_only: None) -> None:
+def test_the_same_kind_is_chosen_on_another_device(tmp_path: Path, definition_only: None) -> None:
     dataset = make_plane_dataset(tmp_path / "plane", plane_of(RECTANGLE), size=48, train=4, test=1)
     config = replace(shortest_config("default"), model="auto")
     here = fit(dataset, config, tmp_path / "here")
     with second_device() as device:
         there = fit(dataset, config, tmp_path / "there", device=device)
-    assert here.plane is not None
-    assert there.rung == here.rung
-    torch.testing.assert_close(there.final_environment, here.final_environment)
+    kinds = [each.kind for each in here.selection.candidates]
+    assert kinds[0] == "plane"
+    assert [each.kind for each in there.selection.candidates] == kinds
+    assert [each.verdict for each in there.selection.candidates] == [e.verdict for e in here.selection.candidates]
+    torch.testing.assert_close(there.environment, here.environment)
     torch.testing.assert_close(there.visibility, here.visibility)
 
 

@@ -16,6 +16,7 @@ name = "tiny"
 title = "A small mirror"
 provenance = "Made for tests."
 license = "CC0-1.0"
+split = "development"
 object = {object}
 world = {{ kind = "file", path = "world.exr", license = "CC0-1.0", source = "computed" }}
 camera = {{ radius = 4.0, facing_azimuth_deg = {facing}, azimuth_deg = {azimuth}, elevation_deg = {elevation}, \

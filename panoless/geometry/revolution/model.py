@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from panoless.capture.rays import pixel_rays, pose_of, reflect
+from panoless.capture.rays import pixel_rays, pose_of, project, reflect
 from panoless.capture.views import TrainView
 from panoless.environment.rays import Rays
-from panoless.geometry.surfels.rendering import SurfaceBuffers
+from panoless.geometry.base import SurfaceBuffers
 from panoless.kernels.cpu.revolution import first_hits, follow
 from panoless.kernels.rasterize import RasterCamera
 from shinypartial.core.sphere import pixel_footprint_sr
@@ -138,7 +138,7 @@ class SurfaceOfRevolution:
 
 def revolution_buffers(surface: SurfaceOfRevolution, camera: RasterCamera) -> SurfaceBuffers:
     """The surface as surfels would be seen: depth and normal of the rays through pixel centers, alpha by 4×4 rays where
-    neighbors disagree. Where only the center misses, depth and normal are those of a neighbor. The three depths agree.
+    neighbors disagree. Where only the center misses, depth and normal are those of a neighbor.
     """
     shape, everything = (camera.height, camera.width), np.arange(camera.height * camera.width)
     hits = _hits_within(surface, camera, everything)
@@ -166,17 +166,8 @@ def revolution_buffers(surface: SurfaceOfRevolution, camera: RasterCamera) -> Su
     covered, distance = (
         torch.from_numpy(image.reshape(shape)).float().to(device) for image in (alpha, z * (alpha.ravel() > 0))
     )
-    return SurfaceBuffers(
-        albedo=covered.new_zeros(3, *shape),
-        alpha=covered,
-        raster_normals_camera=torch.from_numpy((normals @ rotation.T).T.reshape(3, *shape)).float().to(device)
-        * covered,
-        expected_depth=distance,
-        median_depth=distance,
-        surface_depth=distance,
-        distortion=torch.zeros_like(covered),
-        in_frustum=(covered > 0).any()[None],
-    )
+    normals_camera = torch.from_numpy((normals @ rotation.T).T.reshape(3, *shape)).float().to(device) * covered
+    return SurfaceBuffers(covered, normals_camera, distance, covered.new_zeros(3, *covered.shape))
 
 
 def _hits_within(surface: SurfaceOfRevolution, camera: RasterCamera, pixels: Int[np.ndarray, "P"]) -> Hits:
@@ -185,10 +176,9 @@ def _hits_within(surface: SurfaceOfRevolution, camera: RasterCamera, pixels: Int
     corners = (surface.rings(BOX_AROUND).reshape(-1, 3) - center) @ rotation.T
     row, column = np.divmod(pixels, camera.width)
     traced = np.ones(len(pixels), dtype=bool)
-    if corners[:, 2].min() > 0:
+    if corners[:, 2].min() > camera.near:
         margin = 2 + (1 / np.cos(np.pi / BOX_AROUND) - 1) * max(camera.width, camera.height)
-        for place, axis, focal, middle in ((column, 0, camera.fx, camera.cx), (row, 1, camera.fy, camera.cy)):
-            seen = corners[:, axis] / corners[:, 2] * focal + middle
+        for place, seen in zip((column, row), project(camera, corners), strict=True):
             traced &= (place > seen.min() - margin) & (place < seen.max() + margin)
     found = surface.hits(*pixel_rays(camera, pixels[traced]))
     count = len(pixels)

@@ -9,12 +9,10 @@ from torch import Tensor
 
 from panoless.capture.views import Views
 from panoless.config import SurfelConfig
-from panoless.first_surface.completion import completed_surface, hull_surface
+from panoless.first_surface.completion import complete_surface, hull_surface
 from panoless.first_surface.mesh import unit
+from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.first_surface.visual_hull import Hull, carve_hull
-from panoless.geometry.height_field.model import HeightField
-from panoless.geometry.plane.model import Plane
-from panoless.geometry.revolution.model import SurfaceOfRevolution
 from panoless.geometry.surfels.model import Surfels
 
 OVERLAP = 0.8
@@ -30,14 +28,14 @@ INITIAL_ROUGHNESS_LOGIT = -2.2
 RANDOM_OPACITY = 0.1
 
 
-def hull_surfels(views: Views, config: SurfelConfig, seed: int) -> Surfels:
+def hull_surfels(views: Views, config: SurfelConfig, seed: int, options: FirstSurfaceOptions) -> Surfels:
     """Surfels over the part of the first surface that faces some camera, curved as it is, within the outlines.
 
     `thin-plate` takes the completed hull, `hull` the hull itself. Axes follow the principal directions; a radius is
     at most that of `_reach`, so that strong curvature gets smaller surfels, and more of them.
     """
-    hull = carve_hull(views, config.hull_resolution, config.hull_votes)
-    surface = completed_surface(hull, views) if config.initial == "thin-plate" else hull_surface(hull)
+    hull = carve_hull(views, config.hull_resolution, config.hull_votes, options)
+    surface = complete_surface(hull, views, options) if config.initial == "thin-plate" else hull_surface(hull)
     vertex_normals, tensors = surface.vertex_normals(), surface.shape_tensors()
     corners = surface.vertices[surface.triangles]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -59,7 +57,7 @@ def hull_surfels(views: Views, config: SurfelConfig, seed: int) -> Surfels:
     normals, tensors = (np.einsum("kv,kv...->k...", shares, values[faces]) for values in (vertex_normals, tensors))
     bends, frames = _principal(tensors, _tangent_frames(unit(normals)))
     scales = _within_hull(hull, points, frames, np.minimum(_reach(bends, hull.pixel), largest))
-    return _surfels(points, frames, scales, _shape_operators(tensors, frames), INITIAL_OPACITY_LOGIT)
+    return surfels_at(points, frames, scales, _shape_operators(tensors, frames))
 
 
 def _radii(
@@ -131,31 +129,7 @@ def _principal(
     return bends, np.stack([tangent_u, np.cross(frames[:, :, 2], tangent_u), frames[:, :, 2]], 2)
 
 
-def surfels_on_plane(plane: Plane, count: int, seed: int) -> Surfels:
-    """Flat surfels evenly within the boundary of a plane: about `count`, on a hexagonal grid shifted by the seed."""
-    places, radius = _places_within(plane.boundary, count, seed)
-    frames = np.broadcast_to(np.stack([plane.tangent_u, plane.tangent_v, plane.normal], 1), (len(places), 3, 3))
-    scales, curvatures = np.full((len(places), 2), radius), np.zeros((len(places), 3))
-    return _surfels(plane.points(places), frames, scales, curvatures, INITIAL_OPACITY_LOGIT)
-
-
-def surfels_on_height_field(height_field: HeightField, count: int, seed: int) -> Surfels:
-    """Surfels over the same places of a bent plane, tilted and curved as it is.
-
-    Curvatures are D²h/√(1 + |∇h|²), which is the shape operator but for terms of second order in the slope.
-    """
-    places, radius = _places_within(height_field.plane.boundary, count, seed)
-    h, h_u, h_v, *bends = height_field.heights(places)
-    points = height_field.plane.points(places) + h[:, None] * height_field.plane.normal
-    norm, zero = np.sqrt(1 + h_u**2 + h_v**2), np.zeros_like(h)
-    normals = np.stack([-h_u, -h_v, zero + 1], 1) / norm[:, None]
-    tangents = np.stack([zero + 1, zero, h_u], 1) / np.sqrt(1 + h_u**2)[:, None]
-    frames = np.einsum("iw,pij->pwj", height_field.frame, np.stack([tangents, np.cross(normals, tangents), normals], 2))
-    scales = np.full((len(places), 2), radius)
-    return _surfels(points, frames, scales, np.stack(bends, 1) / norm[:, None], INITIAL_OPACITY_LOGIT)
-
-
-def _places_within(boundary: Float[np.ndarray, "N 2"], count: int, seed: int) -> tuple[Float[np.ndarray, "K 2"], float]:
+def places_within(boundary: Float[np.ndarray, "N 2"], count: int, seed: int) -> tuple[Float[np.ndarray, "K 2"], float]:
     """Points of a hexagonal grid within an boundary, and the radius of surfels there."""
     from skimage.measure import points_in_poly
 
@@ -170,40 +144,6 @@ def _places_within(boundary: Float[np.ndarray, "N 2"], count: int, seed: int) ->
     return grid[points_in_poly(grid, boundary)], OVERLAP * math.sqrt(area / count)
 
 
-def surfels_on_revolution(surface: SurfaceOfRevolution, count: int) -> Surfels:
-    """About `count` surfels in rings around a surface of revolution, curved as it is: half as long along the profile
-    as around.
-    """
-    profile, ends = surface.profile, surface.angles
-    steps = np.diff(surface.arc_lengths)
-    areas = math.pi * steps * (profile[:-1, 0] + profile[1:, 0])
-    # A ring of radius ρ and width w holds 2πρ/2w surfels.
-    width = math.sqrt(areas.sum() / count / 2)
-    rings = max(round(surface.arc_lengths[-1] / width), 1)
-    place = (np.arange(rings) + 0.5) * surface.arc_lengths[-1] / rings
-    side = np.clip(np.searchsorted(surface.arc_lengths, place) - 1, 0, len(steps) - 1)
-    along = (place - surface.arc_lengths[side]) / np.maximum(steps[side], 1e-12)
-    radius, height = (profile[side] + along[:, None] * (profile[side + 1] - profile[side])).T
-    angle = ends[side, 0] + along * (ends[side, 1] - ends[side, 0])
-    bend = (ends[side, 1] - ends[side, 0]) / np.maximum(steps[side], 1e-12)
-    around = np.maximum(np.round(math.pi * radius / width), 3).astype(np.int64)
-    ring = np.repeat(np.arange(rings), around)
-    first = np.cumsum(around) - around
-    turn = 2 * math.pi * (np.arange(len(ring)) - first[ring] + ring % 2 / 2) / around[ring]
-    cos, sin, zero = np.cos(turn), np.sin(turn), np.zeros(len(ring))
-    along_radius, along_axis = np.cos(angle[ring]), np.sin(angle[ring])
-    local = np.stack([radius[ring] * cos, radius[ring] * sin, height[ring]], 1)
-    meridian = np.stack([along_radius * cos, along_radius * sin, along_axis], 1)
-    azimuth = np.stack([-sin, cos, zero], 1)
-    frames = np.stack([azimuth, meridian, np.cross(azimuth, meridian)], 2)
-    frames = np.einsum("ji,kjl->kil", surface.frame, frames)
-    # n = n₀ − S·(x − x₀): the normal turns with the profile, and by n_ρ/ρ around the axis.
-    curvatures = np.stack([-along_axis / np.maximum(radius[ring], width / 2), zero, -bend[ring]], 1)
-    spacing = np.stack([2 * math.pi * radius[ring] / around[ring], np.full(len(ring), width)], 1)
-    scales = OVERLAP * np.maximum(spacing, 1e-6)
-    return _surfels(surface.origin + local @ surface.frame, frames, scales, curvatures, INITIAL_OPACITY_LOGIT)
-
-
 def random_surfels(config: SurfelConfig, seed: int) -> Surfels:
     """Surfels uniformly in the normalized cube with random orientation, sized by their mean distance."""
     from scipy.spatial.transform import Rotation
@@ -213,22 +153,25 @@ def random_surfels(config: SurfelConfig, seed: int) -> Surfels:
     frames = Rotation.random(config.count, random_state=rng).as_matrix()
     scale = 0.55 * 2 / config.count ** (1 / 3)
     logit = math.log(RANDOM_OPACITY / (1 - RANDOM_OPACITY))
-    return _surfels(points, frames, np.full((config.count, 2), scale), np.zeros((config.count, 3)), logit)
+    return surfels_at(points, frames, np.full((config.count, 2), scale), np.zeros((config.count, 3)), logit)
 
 
-def initial_surfels(views: Views, config: SurfelConfig, seed: int) -> Surfels:
+def initial_surfels(
+    views: Views, config: SurfelConfig, seed: int, options: FirstSurfaceOptions = FirstSurfaceOptions()
+) -> Surfels:
     """The surfels that a fit starts from, on the device of the views."""
-    surfels = random_surfels(config, seed) if config.initial == "random" else hull_surfels(views, config, seed)
+    surfels = random_surfels(config, seed) if config.initial == "random" else hull_surfels(views, config, seed, options)
     return surfels.to(views.train[0].mask.device)
 
 
-def _surfels(
+def surfels_at(
     points: Float[np.ndarray, "K 3"],
     frames: Float[np.ndarray, "K 3 3"],
     scales: Float[np.ndarray, "K 2"],
     curvatures: Float[np.ndarray, "K 3"],
-    opacity_logit: float,
+    opacity_logit: float = INITIAL_OPACITY_LOGIT,
 ) -> Surfels:
+    """Surfels with centers, tangent frames (columns), radii and shape operators."""
     from scipy.spatial.transform import Rotation
 
     quats = Rotation.from_matrix(frames).as_quat()[:, [3, 0, 1, 2]]

@@ -3,7 +3,6 @@
 import math
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -12,10 +11,12 @@ from torch import Tensor
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.cubemap import look_up
-from panoless.environment.observation import reflections
 from panoless.environment.visibility import accumulate
+from panoless.geometry.base import Training, TrainingObserver
+from panoless.geometry.exact import reflections
 from panoless.geometry.surfels.density import DensityStatistics, grow_and_prune, propagate_normals, reset_opacities
 from panoless.geometry.surfels.losses import photometric_paper
+from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.geometry.surfels.model import Surfels
 from panoless.geometry.surfels.optimizer import SurfelOptimizer
 from panoless.geometry.surfels.rendering import ALPHA_FLOOR, compose, rasterize_surfels
@@ -23,12 +24,9 @@ from panoless.geometry.surfels.schedule import Phase, Schedule, phase_of
 from panoless.kernels.adam import UNBOUNDED
 from panoless.kernels.objective import mirror_objective
 from panoless.kernels.rasterize import Channels, RasterBuffers
-from panoless.reconstruct.snapshots import NO_SNAPSHOTS, SnapshotKeeper, SnapshotSchedule
-from panoless.reconstruct.state import FitState, save_state
 from shinypartial.core.errors import InputError
 from shinypartial.io.progress import Progress
 
-CHECKPOINT_INTERVAL_S = 20.0
 CURVE_EVERY = 10
 
 
@@ -50,14 +48,29 @@ class Observed:
     alpha: Float[Tensor, "P"]
 
 
-class Fitter:
-    """Runs the steps of a fit from a state to completion, saving as it goes."""
+def train_surfels(
+    views: Views, mirror: SurfelMirror, training: Training, config: FitConfig, observer: TrainingObserver
+) -> tuple[SurfelMirror, Training]:
+    """Take the steps that remain."""
+    trainer = SurfelTrainer(views, mirror, training, config, observer)
+    progress = Progress(observer.title, config.iterations, training.iteration)
+    while trainer.iteration < config.iterations:
+        start = time.monotonic()
+        terms = trainer.step()
+        observer.after_step(trainer.iteration, time.monotonic() - start, trainer.current)
+        progress.advance(f"loss {terms.photometric:.4f}  {trainer.optimizer.surfels.count} surfels")
+    return trainer.current()
+
+
+class SurfelTrainer:
+    """The optimization of surfels and map from a state on."""
 
     def __init__(
-        self, views: Views, config: FitConfig, folder: Path, state: FitState, marks: SnapshotSchedule = NO_SNAPSHOTS
+        self, views: Views, mirror: SurfelMirror, training: Training, config: FitConfig, observer: TrainingObserver
     ) -> None:
-        """Continue from `state`, which may be new."""
-        self.views, self.config, self.folder, self.state, self.marks = views, config, folder, state, marks
+        """Continue from `mirror` and `training`, which may be new."""
+        self.views, self.config, self.observer, self._mirror = views, config, observer, mirror
+        self.iteration, self.evidence = training.iteration, training.evidence
         self.schedule = Schedule(config)
         self._epoch, self._order = -1, list[int]()
         self._phases = dict[tuple[bool, float], Phase]()
@@ -66,10 +79,12 @@ class Fitter:
         rates = replace(config.rates, means=config.rates.means * unit)
         shares = config.density.dense_share * unit, config.density.prune_share * unit
         self._density = replace(config.density, dense_share=shares[0], prune_share=shares[1])
-        self.optimizer = SurfelOptimizer(state.surfels, state.environment, rates)
-        if state.optimizer:
-            self.optimizer.load_state_dict(state.optimizer)
-        self.statistics = DensityStatistics(state.gradient_sum, state.gradient_count)
+        self.optimizer = SurfelOptimizer(mirror.surfels, training.environment, rates)
+        self.statistics = DensityStatistics.empty(mirror.surfels.count, mirror.surfels.means.device)
+        if training.optimizer:
+            self.optimizer.load_state_dict(training.optimizer["adam"])
+            device = mirror.surfels.means.device
+            self.statistics = DensityStatistics(*(part.to(device) for part in training.optimizer["gradients"]))
         frozen = {
             "albedo": config.albedo,
             "curvatures": config.surfels.curved,
@@ -79,24 +94,19 @@ class Fitter:
         for name in self._frozen:
             getattr(self.optimizer.surfels, name).requires_grad_(False)
 
-    def run(self) -> None:
-        """Optimize to the last iteration and complete the state."""
-        from panoless.reconstruct.fit import _timed
+    def current(self) -> tuple[SurfelMirror, Training]:
+        """Surfels and training after the last step."""
+        gradients = [self.statistics.gradient_sum, self.statistics.count]
+        optimizer = {"adam": self.optimizer.state_dict(), "gradients": gradients}
+        environment = self.optimizer.environment.detach()
+        training = Training(environment, self.evidence, self.iteration, optimizer)
+        return replace(self._mirror, surfels=self.optimizer.surfels.detached()), training
 
-        snapshots = SnapshotKeeper(self.folder, self.marks, self.state)
-        progress = Progress("fitting", self.config.iterations, self.state.iteration)
-        saved = time.monotonic()
-        while self.state.iteration < self.config.iterations:
-            with _timed(self.state, "optimize"):
-                terms = self._step(self.state.iteration)
-            self.state.iteration += 1
-            snapshots.observe(self.state, self.optimizer.surfels, self.optimizer.environment)
-            progress.advance(f"loss {terms.photometric:.4f}  {self.optimizer.surfels.count} surfels")
-            if time.monotonic() - saved > CHECKPOINT_INTERVAL_S:
-                self._save()
-                saved = time.monotonic()
-        self._complete()
-        self._save()
+    def step(self) -> LossTerms:
+        """One step on one view."""
+        terms = self._step(self.iteration)
+        self.iteration += 1
+        return terms
 
     def _step(self, iteration: int) -> LossTerms:
         view = self.views.train[self._view_index(iteration)]
@@ -134,7 +144,7 @@ class Fitter:
             environment_bounds=(0, self._brightest) if self.config.environment.activation == "clamp" else UNBOUNDED,
         )
         if observed is not None:
-            accumulate(self.state.evidence, observed.directions, observed.alpha, self.config.visibility_alpha)
+            accumulate(self.evidence, observed.directions, observed.alpha, self.config.visibility_alpha)
         self._control_density(iteration)
         if iteration % CURVE_EVERY == 0:
             self._record(iteration, terms)
@@ -241,23 +251,4 @@ class Fitter:
             "silhouette loss": terms.silhouette,
             "surfels": float(self.optimizer.surfels.count),
         }
-        for name, value in point.items():
-            self.state.curves.setdefault(name, []).append(value)
-
-    def _complete(self) -> None:
-        from panoless.reconstruct.fit import complete
-
-        self.state.surfels = self.optimizer.surfels.detached()
-        self.state.environment = self.optimizer.environment.detach()
-        complete(self.state, self.views, self.config)
-
-    def _save(self) -> None:
-        from panoless.reconstruct.fit import _note_peak_memory
-
-        state = self.state
-        state.surfels = self.optimizer.surfels.detached()
-        state.environment = self.optimizer.environment.detach()
-        state.optimizer = self.optimizer.state_dict()
-        state.gradient_sum, state.gradient_count = self.statistics.gradient_sum, self.statistics.count
-        _note_peak_memory(state)
-        save_state(self.folder, state)
+        self.observer.record(point)

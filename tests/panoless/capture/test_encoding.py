@@ -16,9 +16,10 @@ from panoless.capture.views import load_views
 from panoless.config import FitConfig, check_config
 from panoless.environment.cubemap import look_up
 from panoless.export.render import render
+from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.presets import PRESETS
-from panoless.reconstruct.fit import fit, object_frame_of
+from panoless.reconstruct.fit import fit
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import read_view
 from shinypartial.dataset.schema import Dataset
@@ -85,19 +86,19 @@ def test_a_high_dynamic_range_is_found_where_a_low_one_saturates(
     sun = torch.from_numpy(SUN_DIRECTION)[None].float()
     truth = torch.from_numpy(environment_radiance(SUN_DIRECTION[None])).float()
     assert float(truth.min()) > 3
-    assert state.final_environment is not None
-    assert finished.state.final_environment is not None
+    assert state.environment is not None
+    assert finished.state.environment is not None
     # 24 texels a side blur the sun a little.
-    torch.testing.assert_close(look_up(state.final_environment, sun, "clamp"), truth, rtol=0.15, atol=0)
-    assert float(look_up(finished.state.final_environment, sun, "clamp").max()) <= 1
-    frame = object_frame_of(state)
+    torch.testing.assert_close(look_up(state.environment, sun, "clamp"), truth, rtol=0.15, atol=0)
+    assert float(look_up(finished.state.environment, sun, "clamp").max()) <= 1
+    frame = state.frame
     camera = raster_camera(many_views_dataset.test[1].camera, frame, 0.1)
-    assert float(render(state.surfels, state.final_environment, camera, frame, config).radiance.max()) > 2
+    assert float(render(state.geometry, state.environment, camera, frame, config).radiance.max()) > 2
 
 
 def test_views_without_light_above_one_are_the_same_in_both_ranges(sphere_dataset: Dataset) -> None:
     for usual, high in zip(
-        load_views(sphere_dataset, 2).train, load_views(sphere_dataset, 2, light=HDR).train, strict=True
+        load_views(sphere_dataset, 2).train, load_views(sphere_dataset, 2, encoding=HDR).train, strict=True
     ):
         dim = high.radiance <= 1
         assert torch.equal(usual.radiance[dim], high.radiance[dim])
@@ -120,11 +121,11 @@ def test_a_tinted_mirror_with_its_tint_gives_the_map_of_an_untinted_one(finished
     config = finished.config
     given_tint = replace(config, tint=tint)
     states = [fit(plain, config, tmp_path / "a"), fit(tinted, given_tint, tmp_path / "b")]
-    maps = [state.final_environment for state in states]
+    maps = [state.environment for state in states]
     assert maps[0] is not None
     assert maps[1] is not None
     torch.testing.assert_close(maps[1], maps[0], rtol=0, atol=1e-6)
-    blind = fit(tinted, config, tmp_path / "c").final_environment
+    blind = fit(tinted, config, tmp_path / "c").environment
     assert blind is not None
     assert float((maps[0] - blind)[:, 2].abs().mean()) > 0.1
 
@@ -133,9 +134,9 @@ def test_a_render_is_multiplied_by_the_tint() -> None:
     frame = ObjectFrame(np.zeros(3), 1.0)
     camera = raster_camera(sphere_cameras("test", 1, 24)[0], frame, 0.1)
     environment = clipped_environment(cubemap_directions(8)).permute(0, 3, 1, 2).contiguous()
-    surfels, config = sphere_surfels(300), FitConfig()
-    plain = render(surfels, environment, camera, frame, config)
-    tinted = render(surfels, environment, camera, frame, replace(config, tint=TINT))
+    mirror, config = SurfelMirror(sphere_surfels(300)), FitConfig()
+    plain = render(mirror, environment, camera, frame, config)
+    tinted = render(mirror, environment, camera, frame, replace(config, tint=TINT))
     assert float(plain.radiance.max()) > 0.1
     factor = torch.tensor(TINT)[:, None, None]
     torch.testing.assert_close(tinted.radiance, factor * plain.radiance)
@@ -144,7 +145,7 @@ def test_a_render_is_multiplied_by_the_tint() -> None:
 
 def test_pictures_of_8_bits_have_no_high_dynamic_range(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="8-bit"):
-        load_views(make_plain_sphere_dataset(tmp_path / "plain"), 2, light=HDR)
+        load_views(make_plain_sphere_dataset(tmp_path / "plain"), 2, encoding=HDR)
 
 
 @pytest.mark.parametrize(

@@ -1,31 +1,29 @@
 """What a fit leaves behind: a prediction that the evaluator reads, a PLY in world units, and renders that are right."""
 
 import json
-import struct
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from plyfile import PlyData
 
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import raster_camera
-from panoless.export.mesh_files import (
-    PLANE_PLY_NAME,
-    PLY_NAME,
-    REVOLUTION_PLY_NAME,
-    write_height_field_ply,
-    write_plane_ply,
-    write_ply,
-)
+from panoless.export.mesh_files import write_ply
 from panoless.export.pictures import crop_to_object
 from panoless.export.prediction import PICTURES, cube_to_latlong, export_prediction
 from panoless.export.render import render
+from panoless.geometry.base import Geometry
+from panoless.geometry.height_field.kind import HeightFieldMirror
+from panoless.geometry.plane.kind import PlaneMirror
+from panoless.geometry.revolution.kind import RevolutionMirror
 from panoless.geometry.revolution.model import SurfaceOfRevolution
-from panoless.geometry.surfels.placement import surfels_on_plane, surfels_on_revolution
+from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.reconstruct.state import FitState
+from panoless.selection.candidates import Candidate, Selection, Verdict
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import cube_to_latlong as clamped_cube_to_latlong
 from shinypartial.core.sphere import directions_to_cube, latlong_directions
@@ -63,8 +61,8 @@ def test_the_readers_accept_the_prediction(prediction: Path, finished: FinishedF
     info = read_info(prediction)
     assert info.dataset_hash == dataset_hash(finished.dataset)
     assert info.config["surfels"]["count"] == finished.config.surfels.count
-    assert info.primitives == finished.state.surfels.count
-    files = (prediction / PLY_NAME, prediction / "environment.exr")
+    assert info.primitives == finished.state.geometry.num_primitives
+    files = (prediction / "surfels.ply", prediction / "environment.exr")
     assert info.model_bytes == sum(path.stat().st_size for path in files)
     assert info.iteration is None
     assert sum(info.parameter_counts.values()) == 13 * finished.config.surfels.count + 6 * 3 * 24 * 24
@@ -157,20 +155,22 @@ def test_an_export_killed_at_its_first_file_may_be_repeated(tmp_path: Path, fini
 
 
 def read_ply(path: Path) -> dict[str, np.ndarray]:
-    """The columns of a binary PLY of single-precision vertices."""
-    header, _, body = path.read_bytes().partition(b"end_header\n")
-    lines = header.decode("ascii").splitlines()
-    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
-    count = int(next(line for line in lines if line.startswith("element vertex")).split()[-1])
-    names = [line.split()[-1] for line in lines if line.startswith("property float")]
-    rows = [struct.unpack_from(f"<{len(names)}f", body, 4 * len(names) * row) for row in range(count)]
-    assert len(body) == 4 * len(names) * count
-    return dict(zip(names, np.array(rows).T, strict=True))
+    """The vertices' columns, and the faces' indices where there are faces."""
+    content = PlyData.read(str(path))
+    vertices = content["vertex"].data
+    table = {name: np.asarray(vertices[name]) for name in vertices.dtype.names}
+    if "face" in content:
+        table["faces"] = np.stack(list(content["face"]["vertex_indices"]))
+    return table
+
+
+def vertices_of(table: dict[str, np.ndarray]) -> np.ndarray:
+    return np.stack([table[name] for name in "xyz"], 1)
 
 
 def test_the_ply_holds_the_surfels_in_world_units(tmp_path: Path) -> None:
     radius, center = 2.0, np.array([10.0, -20.0, 30.0])
-    write_ply(tmp_path / "s.ply", sphere_surfels(50), ObjectFrame(center, radius))
+    write_ply(tmp_path / "s.ply", SurfelMirror(sphere_surfels(50)).mesh(ObjectFrame(center, radius)))
     table = read_ply(tmp_path / "s.ply")
     points = np.stack([table[name] for name in "xyz"], 1)
     normals = np.stack([table[name] for name in ("nx", "ny", "nz")], 1)
@@ -186,8 +186,8 @@ def test_the_ply_holds_the_surfels_in_world_units(tmp_path: Path) -> None:
 
 
 def test_the_exported_ply_lies_on_the_sphere(prediction: Path, finished: FinishedFit) -> None:
-    table = read_ply(prediction / PLY_NAME)
-    assert len(table["x"]) == finished.state.surfels.count
+    table = read_ply(prediction / "surfels.ply")
+    assert len(table["x"]) == finished.state.geometry.num_primitives
     points = np.stack([table[name] for name in "xyz"], 1)
     front = points[:, 0] > 0.5
     assert abs(np.median(np.linalg.norm(points[front], axis=1)) - 1) < 0.05
@@ -236,7 +236,7 @@ def test_a_rendered_mirror_sphere_is_the_traced_one(scale: float) -> None:
     pose[:3, 3] *= scale
     frame = ObjectFrame(np.zeros(3), scale)
     raster = raster_camera(replace(camera, camera_to_world=pose), frame, 0.3)
-    parts = render(sphere_surfels(1500), environment, raster, frame, tiny_config())
+    parts = render(SurfelMirror(sphere_surfels(1500)), environment, raster, frame, tiny_config())
     # Blended Gaussians reach beyond a silhouette by their radius and bend its normals, so the rim is left out.
     cosine = np.abs((truth.normals_world * (camera.position_world / 4.0)).sum(-1))
     inner = (truth.alpha > 0.99) & (cosine > 0.6)
@@ -253,7 +253,7 @@ def test_a_rendered_mirror_sphere_is_the_traced_one(scale: float) -> None:
 
 
 def test_only_a_finished_fit_is_exported(tmp_path: Path, finished: FinishedFit) -> None:
-    unfinished = replace(finished.state, final_environment=None)
+    unfinished = replace(finished.state, environment=None)
     with pytest.raises(ValueError, match="finished"):
         export_prediction(finished.dataset, unfinished, finished.config, tmp_path)
     assert list(tmp_path.iterdir()) == []
@@ -263,7 +263,11 @@ def test_the_info_is_strict_json(prediction: Path) -> None:
     json.loads((prediction / "prediction.json").read_text(), parse_constant=lambda name: pytest.fail(name))
 
 
-RUNG = "plane (a plane explains the outlines to 0.05 px)"
+def finished_state(geometry: Geometry, frame: ObjectFrame, candidate: Candidate) -> FitState:
+    """A state of an exact geometry in the known environment."""
+    environment = clipped_environment(cubemap_directions(64)).permute(0, 3, 1, 2).contiguous()
+    selection = Selection(geometry.kind, (candidate,))
+    return FitState(geometry, frame, selection, environment=environment, visibility=torch.ones(6, 64, 64))
 
 
 @pytest.fixture(scope="module")
@@ -274,27 +278,12 @@ def plane_prediction(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Pa
     offset = (plane.offset - float(plane.normal @ center)) / radius
     shift = np.array([plane.tangent_u @ center, plane.tangent_v @ center])
     placed = replace(plane, offset=offset, boundary=(plane.boundary - shift) / radius)
-    environment = clipped_environment(cubemap_directions(64)).permute(0, 3, 1, 2).contiguous()
-    state = FitState(
-        surfels=surfels_on_plane(placed, 1, seed=0),
-        environment=environment,
-        iteration=0,
-        optimizer={},
-        gradient_sum=torch.zeros(1),
-        gradient_count=torch.zeros(1),
-        evidence=torch.zeros(6, 64, 64),
-        center=center.tolist(),
-        radius=radius,
-        final_environment=environment,
-        visibility=torch.ones(6, 64, 64),
-        plane=placed,
-        flat=True,
-        rung=RUNG,
-    )
+    chosen = Candidate("plane", Verdict.CHOSEN, "surfels are no better", 0.05, 1.0, 0.01, 0.02)
+    state = finished_state(PlaneMirror(placed), ObjectFrame(center, radius), chosen)
     folder = tmp_path_factory.mktemp("predictions") / "plane"
     acquire_prediction(folder)
     (folder / "test").mkdir()
-    (folder / PLY_NAME).write_text("of an earlier fit with surfels")
+    (folder / "surfels.ply").write_text("of an earlier fit with surfels")
     export_prediction(dataset, state, tiny_config(), folder)
     return folder, dataset.root
 
@@ -325,25 +314,29 @@ def test_a_plane_is_described_as_what_it_is(plane_prediction: tuple[Path, Path])
     """Three numbers and four corners; one primitive; the reason in words; no surfels of an earlier fit beside it."""
     folder, _ = plane_prediction
     info = read_info(folder)
-    assert info.model == RUNG
+    expected = "plane (surfels are no better; silhouettes 0.05 px away, overlap 100%; "
+    assert info.model == expected + "held-out error 0.0100, 0.0200 with surfels)"
     assert info.primitives == 1
     assert info.parameter_counts == {"plane parameters": 3 + 8, "environment parameters": 6 * 3 * 64 * 64}
-    assert info.model_bytes == sum((folder / name).stat().st_size for name in (PLANE_PLY_NAME, "environment.exr"))
-    assert not (folder / PLY_NAME).exists()
+    assert info.model_bytes == sum((folder / name).stat().st_size for name in ("plane.ply", "environment.exr"))
+    assert not (folder / "surfels.ply").exists()
 
 
 def test_surfels_say_why_they_were_taken(prediction: Path, finished: FinishedFit, tmp_path: Path) -> None:
-    """In the words of the ladder; no other model lies beside them."""
-    assert read_info(prediction).model == finished.state.rung == "surfels (asked for)"
-    reason = "surfels (no plane explains the outlines: 7 px away, overlap 80%; no axis of revolution)"
-    for name in (PLANE_PLY_NAME, REVOLUTION_PLY_NAME):
+    """In the words of model selection; no other model lies beside them."""
+    assert read_info(prediction).model == finished.state.selection.sentence == "surfels (asked for)"
+    refused = Candidate("plane", Verdict.REFUSED_BY_SILHOUETTES, "misses the silhouettes", 7.0, 0.8)
+    chosen = Candidate("surfels", Verdict.CHOSEN, "no simpler kind explains the views")
+    for name in ("plane.ply", "revolution.ply"):
         (tmp_path / name).write_text("of an earlier fit")
-    export_prediction(finished.dataset, replace(finished.state, rung=reason), finished.config, tmp_path)
-    assert read_info(tmp_path).model == reason
+    selection = Selection("surfels", (refused, chosen))
+    export_prediction(finished.dataset, replace(finished.state, selection=selection), finished.config, tmp_path)
+    reason = "before it plane: misses the silhouettes; silhouettes 7 px away, overlap 80%"
+    assert read_info(tmp_path).model == f"surfels (no simpler kind explains the views); {reason}"
     for folder in (prediction, tmp_path):
-        assert (folder / PLY_NAME).exists()
-        assert not (folder / PLANE_PLY_NAME).exists()
-        assert not (folder / REVOLUTION_PLY_NAME).exists()
+        assert (folder / "surfels.ply").exists()
+        assert not (folder / "plane.ply").exists()
+        assert not (folder / "revolution.ply").exists()
 
 
 @pytest.fixture(scope="module")
@@ -356,23 +349,8 @@ def ball_prediction(tmp_path_factory: pytest.TempPathFactory, sphere_dataset: Da
     middle = -center / radius
     height = float(middle @ axis)
     surface = SurfaceOfRevolution(middle - height * axis, axis, profile + np.array([0.0, height]), sides)
-    environment = clipped_environment(cubemap_directions(64)).permute(0, 3, 1, 2).contiguous()
-    state = FitState(
-        surfels=surfels_on_revolution(surface, 40),
-        environment=environment,
-        iteration=0,
-        optimizer={},
-        gradient_sum=torch.zeros(1),
-        gradient_count=torch.zeros(1),
-        evidence=torch.zeros(6, 64, 64),
-        center=center.tolist(),
-        radius=radius,
-        final_environment=environment,
-        visibility=torch.ones(6, 64, 64),
-        surface=surface,
-        turned=True,
-        rung="revolution (asked for)",
-    )
+    asked = Candidate("revolution", Verdict.CHOSEN, "asked for")
+    state = finished_state(RevolutionMirror(surface), ObjectFrame(center, radius), asked)
     folder = tmp_path_factory.mktemp("predictions") / "ball"
     acquire_prediction(folder)
     export_prediction(sphere_dataset, state, tiny_config(), folder)
@@ -406,42 +384,30 @@ def test_a_surface_of_revolution_is_described_as_what_it_is(ball_prediction: Pat
     assert info.model == "revolution (asked for)"
     assert info.primitives == 1
     assert info.parameter_counts == {"revolution parameters": 5 + 2 * 721, "environment parameters": 6 * 3 * 64 * 64}
-    assert not (ball_prediction / PLY_NAME).exists()
-    lines = (ball_prediction / REVOLUTION_PLY_NAME).read_text(encoding="ascii").splitlines()
-    count = next(int(line.split()[-1]) for line in lines if line.startswith("element vertex"))
-    begin = lines.index("end_header") + 1
-    vertices = np.array([[float(value) for value in line.split()] for line in lines[begin : begin + count]])
-    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1, atol=1e-6)
-    faces = np.array([[int(value) for value in line.split()] for line in lines[begin + count :]])
-    assert (faces[:, 0] == 4).all()
-    assert faces[:, 1:].min() == 0
-    assert faces[:, 1:].max() == count - 1
+    assert not (ball_prediction / "surfels.ply").exists()
+    table = read_ply(ball_prediction / "revolution.ply")
+    np.testing.assert_allclose(np.linalg.norm(vertices_of(table), axis=1), 1, atol=1e-6)
+    assert table["faces"].shape[1] == 4
+    assert table["faces"].min() == 0
+    assert table["faces"].max() == len(table["x"]) - 1
 
 
-def test_the_ply_of_a_plane_is_its_outline_in_world_units(tmp_path: Path) -> None:
+def test_the_ply_of_a_plane_is_its_boundary_in_world_units(tmp_path: Path) -> None:
     plane, radius, center = plane_of(L_SHAPE), 2.0, np.array([10.0, -20.0, 30.0])
-    write_plane_ply(tmp_path / "p.ply", plane, ObjectFrame(center, radius))
-    lines = (tmp_path / "p.ply").read_text(encoding="ascii").splitlines()
-    body = lines[lines.index("end_header") + 1 :]
-    assert "element vertex 6" in lines
-    assert "element face 1" in lines
-    corners = np.array([[float(value) for value in line.split()] for line in body[:6]])
+    write_ply(tmp_path / "p.ply", PlaneMirror(plane).mesh(ObjectFrame(center, radius)))
+    table = read_ply(tmp_path / "p.ply")
     expected = [
         center + radius * (plane.offset * plane.normal + u * plane.tangent_u + v * plane.tangent_v) for u, v in L_SHAPE
     ]
-    np.testing.assert_allclose(corners, expected, atol=1e-6)
-    assert body[6:] == ["6 0 1 2 3 4 5"]
+    np.testing.assert_allclose(vertices_of(table), expected, atol=1e-6)
+    assert table["faces"].tolist() == [[0, 1, 2, 3, 4, 5]]
 
 
-def test_the_ply_of_a_bent_plane_is_its_mesh_in_world_units(tmp_path: Path) -> None:
+def test_the_ply_of_a_height_field_is_its_mesh_in_world_units(tmp_path: Path) -> None:
     """Every vertex lies at its height over the plane; faces name vertices that exist."""
-    height_field, object_frame = bumpy(plane_of(RECTANGLE), 0.02), ObjectFrame(np.array([1.0, -2.0, 0.5]), 3.0)
-    write_height_field_ply(tmp_path / "height field.ply", height_field, object_frame)
-    header, body = (tmp_path / "height field.ply").read_text().split("end_header\n")
+    height_field, frame = bumpy(plane_of(RECTANGLE), 0.02), ObjectFrame(np.array([1.0, -2.0, 0.5]), 3.0)
+    write_ply(tmp_path / "h.ply", HeightFieldMirror(height_field).mesh(frame))
     points, faces = height_field.quadrilaterals()
-    assert f"element vertex {len(points)}\n" in header
-    assert f"element face {len(faces)}\n" in header
-    rows = body.splitlines()
-    written = np.array([row.split() for row in rows[: len(points)]], dtype=np.float64)
-    np.testing.assert_allclose((written - object_frame.center) / object_frame.radius, points, atol=1e-7)
-    assert [int(number) for number in rows[-1].split()] == [4, *faces[-1]]
+    table = read_ply(tmp_path / "h.ply")
+    np.testing.assert_allclose((vertices_of(table) - frame.center) / frame.radius, points, atol=1e-7)
+    np.testing.assert_array_equal(table["faces"], faces)

@@ -14,14 +14,21 @@ from panoless.capture.views import Views, load_views
 from panoless.config import FitConfig
 from panoless.environment.cubemap import look_up
 from panoless.export.render import render
+from panoless.geometry.base import Geometry, Training
+from panoless.geometry.surfels import train as train_module
+from panoless.geometry.surfels.kind import SurfelFamily
+from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.geometry.surfels.model import Surfels
-from panoless.geometry.surfels.train import Fitter, LossTerms
+from panoless.geometry.surfels.placement import initial_surfels
+from panoless.geometry.surfels.train import LossTerms, SurfelTrainer
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.kernels.objective import Objective
 from panoless.presets import PRESETS
 from panoless.reconstruct import fit as fit_module
-from panoless.reconstruct.fit import fit, new_state, object_frame_of
+from panoless.reconstruct import recorder as recorder_module
+from panoless.reconstruct.fit import fit
 from panoless.reconstruct.state import FitState, load_state
+from panoless.selection.held_out import Unobserved
 from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import read_view
@@ -32,14 +39,29 @@ from tests.support.mirror_sphere import clipped_environment, tiny_config
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def normal_errors_deg(surfels: Surfels, config: FitConfig, dataset: Dataset, state: FitState) -> torch.Tensor:
+def begin(views: Views, config: FitConfig) -> tuple[SurfelMirror, Training]:
+    """Surfels and training before the first step."""
+    mirror = SurfelMirror.of(initial_surfels(views, config.surfels, config.seed), config)
+    return mirror, SurfelFamily().begin(views, mirror, config)
+
+
+def trainer_of(views: Views, config: FitConfig) -> SurfelTrainer:
+    return SurfelTrainer(views, *begin(views, config), config, Unobserved())
+
+
+def surfels_of(state: FitState) -> Surfels:
+    assert isinstance(state.geometry, SurfelMirror)
+    return state.geometry.surfels
+
+
+def normal_errors_deg(mirror: Geometry, config: FitConfig, dataset: Dataset, state: FitState) -> torch.Tensor:
     """Angles between rendered and true normals over the solid pixels of the test views."""
-    frame = object_frame_of(state)
+    frame = state.frame
     errors = []
     for each in dataset.test:
         truth = read_view(each)
         assert truth.normals_world is not None
-        parts = render(surfels, torch.zeros(6, 3, 2, 2), raster_camera(each.camera, frame, 0.1), frame, config)
+        parts = render(mirror, torch.zeros(6, 3, 2, 2), raster_camera(each.camera, frame, 0.1), frame, config)
         cosine = (parts.normals_world.permute(1, 2, 0) * torch.from_numpy(truth.normals_world)).sum(-1)
         errors.append(torch.rad2deg(cosine.clamp(-1, 1).acos())[torch.from_numpy(truth.alpha) > 0.99])
     return torch.cat(errors)
@@ -47,39 +69,37 @@ def normal_errors_deg(surfels: Surfels, config: FitConfig, dataset: Dataset, sta
 
 def environment_psnr(state: FitState) -> float:
     """Over the directions that were well observed, against the environment that the views were traced with."""
-    assert state.final_environment is not None
+    assert state.environment is not None
     assert state.visibility is not None
     directions = cubemap_directions(state.visibility.shape[-1])
     observed = state.visibility > 0.5
     assert observed.float().mean() > 0.1
-    found = look_up(state.final_environment, directions[observed], "clamp")
+    found = look_up(state.environment, directions[observed], "clamp")
     error = (found - clipped_environment(directions[observed])).square().mean()
     return -10 * math.log10(float(error))
 
 
 def test_unseen_views_are_rendered_better_than_by_the_start(finished: FinishedFit, views: Views) -> None:
-    start, end, config = new_state(views, finished.config), finished.state, finished.config
-    assert end.final_environment is not None
-    frame = object_frame_of(end)
+    (start, training), end, config = begin(views, finished.config), finished.state, finished.config
+    assert end.environment is not None
+    frame = end.frame
 
-    def error(surfels: Surfels, environment: torch.Tensor) -> float:
+    def error(mirror: Geometry, environment: torch.Tensor) -> float:
         total = 0.0
         for each in finished.dataset.test:
             truth = torch.from_numpy(read_view(each).radiance).clamp(0, 1).permute(2, 0, 1)
-            parts = render(surfels, environment, raster_camera(each.camera, frame, 0.1), frame, config)
+            parts = render(mirror, environment, raster_camera(each.camera, frame, 0.1), frame, config)
             total += float((parts.radiance - truth).square().mean())
         return total / len(finished.dataset.test)
 
     # Measured: a third on one processor, 0.60 to 0.62 on another.
-    assert error(end.surfels, end.final_environment) < 0.8 * error(start.surfels, start.environment)
+    assert error(end.geometry, end.environment) < 0.8 * error(start, training.environment)
     assert end.curves["iteration"] == list(range(0, config.iterations, 10))
 
 
 def test_normals_become_better_than_the_hull(finished: FinishedFit, views: Views) -> None:
-    before = normal_errors_deg(
-        new_state(views, finished.config).surfels, finished.config, finished.dataset, finished.state
-    )
-    after = normal_errors_deg(finished.state.surfels, finished.config, finished.dataset, finished.state)
+    before = normal_errors_deg(begin(views, finished.config)[0], finished.config, finished.dataset, finished.state)
+    after = normal_errors_deg(finished.state.geometry, finished.config, finished.dataset, finished.state)
     assert float(after.median()) < float(before.median())
     assert float(after.median()) < 3.0
 
@@ -100,10 +120,16 @@ def test_a_finished_fit_is_returned_at_once(finished: FinishedFit, monkeypatch: 
 
 def assert_same(first: FitState, second: FitState) -> None:
     """Equal to the last bit in everything that a prediction is made of."""
-    for name, value in first.surfels.named().items():
-        assert torch.equal(value, second.surfels.named()[name]), name
-    for name in ("environment", "evidence", "final_environment", "visibility", "gradient_sum", "gradient_count"):
+    for name, value in surfels_of(first).named().items():
+        assert torch.equal(value, surfels_of(second).named()[name]), name
+    for name in ("environment", "visibility"):
         assert torch.equal(getattr(first, name), getattr(second, name)), name
+    assert first.training is not None
+    assert second.training is not None
+    for name in ("environment", "evidence"):
+        assert torch.equal(getattr(first.training, name), getattr(second.training, name)), name
+    gradients = zip(first.training.optimizer["gradients"], second.training.optimizer["gradients"], strict=True)
+    assert all(torch.equal(one, other) for one, other in gradients)
     assert first.curves == second.curves
 
 
@@ -113,7 +139,7 @@ class Killed(BaseException):
 
 def fit_in_pieces(dataset: Dataset, config: FitConfig, folder: Path, stops: tuple[int, ...]) -> FitState:
     """Fit with a checkpoint after every third step, interrupted at the given iterations."""
-    step, save = Fitter._step, fit_module.save_state
+    step, save = SurfelTrainer._step, recorder_module.save_state
 
     def save_sometimes(folder: Path, state: FitState) -> None:
         if state.iteration % 3 == 0:
@@ -121,15 +147,15 @@ def fit_in_pieces(dataset: Dataset, config: FitConfig, folder: Path, stops: tupl
 
     for stop in stops:
 
-        def step_until(self: Fitter, iteration: int, stop: int = stop) -> LossTerms:
+        def step_until(self: SurfelTrainer, iteration: int, stop: int = stop) -> LossTerms:
             if iteration == stop:
                 raise Killed
             return step(self, iteration)
 
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(fit_module, "CHECKPOINT_INTERVAL_S", -1.0)
-            patch.setattr(fit_module, "save_state", save_sometimes)
-            patch.setattr(Fitter, "_step", step_until)
+            patch.setattr(recorder_module, "CHECKPOINT_INTERVAL_S", -1.0)
+            patch.setattr(recorder_module, "save_state", save_sometimes)
+            patch.setattr(SurfelTrainer, "_step", step_until)
             with pytest.raises(Killed):
                 fit(dataset, config, folder)
         state = load_state(folder)
@@ -152,12 +178,13 @@ def test_the_paper_presets_run_all_their_paths(preset: str, tmp_path: Path, sphe
     config = tiny_config(preset, iterations=60, count=400)
     config = replace(config, density=replace(config.density, gradient_threshold=1e-6))
     state = fit(sphere_dataset, config, tmp_path / "run")
-    for name, value in state.surfels.named().items():
+    for name, value in surfels_of(state).named().items():
         assert torch.isfinite(value).all(), name
-    assert state.final_environment is not None
-    assert torch.isfinite(state.final_environment).all()
-    assert 0.0 <= float(state.final_environment.min()) <= float(state.final_environment.max()) <= 1.0
-    assert float(state.evidence.sum()) > 0
+    assert state.environment is not None
+    assert torch.isfinite(state.environment).all()
+    assert 0.0 <= float(state.environment.min()) <= float(state.environment.max()) <= 1.0
+    assert state.training is not None
+    assert float(state.training.evidence.sum()) > 0
     counts = state.curves["surfels"]
     assert len(set(counts)) > 2
     assert all(math.isfinite(value) for series in state.curves.values() for value in series)
@@ -181,8 +208,8 @@ def test_the_paper_method_learns(tmp_path: Path, sphere_dataset: Dataset) -> Non
 def test_what_is_not_learned_does_not_change(preset: str, tmp_path: Path, sphere_dataset: Dataset) -> None:
     config = tiny_config(preset, iterations=12, count=60)
     config = replace(config, density=replace(config.density, enabled=False))
-    before = new_state(load_views(sphere_dataset, config.crop_margin_px), config).surfels.named()
-    after = fit(sphere_dataset, config, tmp_path / "run").surfels.named()
+    before = begin(load_views(sphere_dataset, config.crop_margin_px), config)[0].surfels.named()
+    after = surfels_of(fit(sphere_dataset, config, tmp_path / "run")).named()
     learned = {name for name in before if not torch.equal(before[name], after[name])}
     assert ("albedo" in learned) == config.albedo
     assert ("curvatures" in learned) == config.surfels.curved
@@ -193,11 +220,12 @@ def test_what_is_not_learned_does_not_change(preset: str, tmp_path: Path, sphere
 def test_geometry_rests_while_the_environment_warms_up(tmp_path: Path, sphere_dataset: Dataset) -> None:
     config = tiny_config(iterations=10, count=60)
     config = replace(config, environment=replace(config.environment, warmup=1.0))
-    first = new_state(load_views(sphere_dataset, config.crop_margin_px), config)
+    first, training = begin(load_views(sphere_dataset, config.crop_margin_px), config)
     state = fit(sphere_dataset, config, tmp_path / "run")
     for name, value in first.surfels.named().items():
-        assert torch.equal(value, state.surfels.named()[name]), name
-    assert not torch.equal(first.environment, state.environment)
+        assert torch.equal(value, surfels_of(state).named()[name]), name
+    assert state.training is not None
+    assert not torch.equal(training.environment, state.training.environment)
 
 
 @pytest.mark.parametrize("lambda_normal_consistency", [0.0, 0.05])
@@ -210,12 +238,12 @@ def test_pixels_that_no_term_reads_change_nothing(
     config = replace(config, loss=loss)
     view = load_views(sphere_dataset, config.crop_margin_px).train[0]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Fitter, "_active_tiles", lambda *_: None)
+        patch.setattr(SurfelTrainer, "_active_tiles", lambda *_: None)
         everywhere = fit(sphere_dataset, config, tmp_path / "everywhere")
     only_needed = fit(sphere_dataset, config, tmp_path / "needed")
     assert_same(only_needed, everywhere)
-    fitter = Fitter(load_views(sphere_dataset, config.crop_margin_px), config, tmp_path, only_needed)
-    tiles = fitter._active_tiles(view, 10)
+    trainer = trainer_of(load_views(sphere_dataset, config.crop_margin_px), config)
+    tiles = trainer._active_tiles(view, 10)
     assert tiles is not None
     assert tiles.any()
     assert not tiles.all() or tiles.numel() <= 4
@@ -228,24 +256,24 @@ def test_another_seed_is_another_fit(tmp_path: Path, sphere_dataset: Dataset) ->
         for seed, name in ((0, "a"), (0, "b"), (1, "c"))
     )
     assert_same(first, again)
-    assert not torch.equal(first.surfels.means, other.surfels.means)
+    assert not torch.equal(surfels_of(first).means, surfels_of(other).means)
 
 
-def test_every_epoch_sees_every_view_once(tmp_path: Path, views: Views) -> None:
+def test_every_epoch_sees_every_view_once(views: Views) -> None:
     config = tiny_config(count=60)
-    fitter = Fitter(views, config, tmp_path, new_state(views, config))
+    trainer = trainer_of(views, config)
     count = len(views.train)
-    orders = [[fitter._view_index(epoch * count + i) for i in range(count)] for epoch in range(3)]
+    orders = [[trainer._view_index(epoch * count + i) for i in range(count)] for epoch in range(3)]
     assert all(sorted(order) == list(range(count)) for order in orders)
     assert orders[0] != orders[1] != orders[2]
 
 
-def test_rates_and_sizes_are_those_of_the_scene_that_they_are_shares_of(tmp_path: Path, views: Views) -> None:
+def test_rates_and_sizes_are_those_of_the_scene_that_they_are_shares_of(views: Views) -> None:
     """The paper's code counts in the extent of its cameras, of which the object is a part."""
     here = tiny_config("paper", count=60)
     assert here.scene_radius == "cameras"
     there = replace(here, scene_radius="object")
-    first, second = (Fitter(views, config, tmp_path, new_state(views, config)) for config in (here, there))
+    first, second = (trainer_of(views, config) for config in (here, there))
     ratios = [
         first._density.dense_share / second._density.dense_share,
         first._density.prune_share / second._density.prune_share,
@@ -263,13 +291,13 @@ def test_rates_and_sizes_are_those_of_the_scene_that_they_are_shares_of(tmp_path
 
 
 def test_a_loss_that_is_not_finite_stops_the_fit(tmp_path: Path, sphere_dataset: Dataset, monkeypatch) -> None:
-    objective = fit_module.mirror_objective
+    objective = train_module.mirror_objective
 
     def spoiled(*arguments) -> Objective:
         found = objective(*arguments)
         return replace(found, total=found.total * float("nan"))
 
-    monkeypatch.setattr(fit_module, "mirror_objective", spoiled)
+    monkeypatch.setattr(train_module, "mirror_objective", spoiled)
     with pytest.raises(InputError, match="nan at iteration 0"):
         fit(sphere_dataset, tiny_config(iterations=5, count=60), tmp_path / "run")
     assert load_state(tmp_path / "run") is None
@@ -288,16 +316,16 @@ def test_the_world_may_be_anywhere_and_of_any_size(tmp_path: Path, sphere_datase
     config = tiny_config(iterations=20, count=60)
     here = fit(sphere_dataset, config, tmp_path / "here")
     there = fit(replace(sphere_dataset, train=train), config, tmp_path / "there")
-    assert there.radius == pytest.approx(scale * here.radius, rel=1e-5)
+    assert there.frame.radius == pytest.approx(scale * here.frame.radius, rel=1e-5)
     # Rounding of poses differs; twenty steps of Adam enlarge it to 1e-4 at most.
-    torch.testing.assert_close(there.final_environment, here.final_environment, rtol=0, atol=0.02)
+    torch.testing.assert_close(there.environment, here.environment, rtol=0, atol=0.02)
 
 
 def test_a_fit_loads_neither_metrics_nor_blender(tmp_path: Path, sphere_dataset: Dataset) -> None:
     """Method and score are blind to each other: in the process of a fit no module that scores exists."""
     program = (
         "import sys; from panoless.cli import main; code = main(sys.argv[1:]); "
-        "rooms = [f'shinypartial.{room}' for room in ('metrics', 'evaluate', 'scores', 'scene', 'blender')]; "
+        "rooms = [f'shinypartial.{room}' for room in 'metrics evaluation comparison report scene blender'.split()]; "
         "found = [name for name in sys.modules if f'{name}.'.startswith(tuple(f'{b}.' for b in [*rooms, 'bpy']))]; "
         "assert not found, found; sys.exit(code)"
     )

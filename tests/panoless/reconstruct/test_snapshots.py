@@ -4,24 +4,29 @@ from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import load_views
 from panoless.cli import main
-from panoless.environment.observation import solve_final_map
 from panoless.export.prediction import export_prediction, export_snapshots
-from panoless.geometry.surfels.train import Fitter, LossTerms
-from panoless.reconstruct import fit as fit_module
+from panoless.geometry.base import Training
+from panoless.geometry.surfels.mirror import SurfelMirror
+from panoless.geometry.surfels.train import LossTerms, SurfelTrainer
+from panoless.reconstruct import recorder as recorder_module
+from panoless.reconstruct.final_map import complete
 from panoless.reconstruct.fit import fit
+from panoless.reconstruct.recorder import Recorder
 from panoless.reconstruct.snapshots import (
-    SnapshotKeeper,
     SnapshotSchedule,
     read_snapshot,
     snapshot_folders,
     snapshot_schedule,
 )
 from panoless.reconstruct.state import FitState, load_state
+from panoless.selection.candidates import Selection
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
 from shinypartial.prediction.format import prediction_folders, read_info
@@ -79,7 +84,7 @@ def test_each_mark_leaves_one_snapshot(run: Path) -> None:
     for folder in snapshot_folders(run):
         state = read_snapshot(folder)
         assert state.iteration == int(folder.name)
-        assert state.final_environment is None
+        assert state.environment is None
         assert len(state.curves["iteration"]) == (state.iteration + 9) // 10
 
 
@@ -115,8 +120,8 @@ def test_completing_the_last_snapshot_completes_the_fit(preset: str, tmp_path: P
     views = load_views(sphere_dataset, config.crop_margin_px)
     early, late = (read_snapshot(folder) for folder in snapshot_folders(tmp_path))
     for state in (early, late):
-        fit_module.complete(state, views, config)
-    for name in ("final_environment", "visibility"):
+        complete(state, views, config)
+    for name in ("environment", "visibility"):
         assert torch.equal(getattr(late, name), getattr(final, name)), name
         assert not torch.equal(getattr(early, name), getattr(final, name)), name
 
@@ -134,10 +139,10 @@ def test_a_snapshot_is_solved_like_an_end(run: Path, sphere_dataset: Dataset) ->
     """Its environment is the closed-form map of its own geometry, not that of the finished fit."""
     state, views = read_snapshot(snapshot_folders(run)[0]), load_views(sphere_dataset, CONFIG.crop_margin_px)
     with torch.no_grad():
-        expected, _ = solve_final_map(views, state.surfels, CONFIG)
-    fit_module.complete(state, views, CONFIG)
-    assert state.final_environment is not None
-    assert torch.equal(state.final_environment, expected)
+        expected, _ = state.geometry.solve_map(views, CONFIG)
+    complete(state, views, CONFIG)
+    assert state.environment is not None
+    assert torch.equal(state.environment, expected)
 
 
 def test_the_format_tells_results_from_snapshots(prediction: Path) -> None:
@@ -161,7 +166,7 @@ def test_a_killed_fit_has_the_same_snapshots(preset: str, tmp_path: Path, sphere
     config = tiny_config(preset, iterations=24, count=120)
     marks = SnapshotSchedule(frozenset({5, 9, 10, 24}))
     fit(sphere_dataset, config, tmp_path / "whole", marks)
-    step, save = Fitter._step, fit_module.save_state
+    step, save = SurfelTrainer._step, recorder_module.save_state
 
     def save_sometimes(folder: Path, state: FitState) -> None:
         if state.iteration % 4 == 0:
@@ -169,35 +174,38 @@ def test_a_killed_fit_has_the_same_snapshots(preset: str, tmp_path: Path, sphere
 
     for stop in (6, 10, 11):
 
-        def step_until(self: Fitter, iteration: int, stop: int = stop) -> LossTerms:
+        def step_until(self: SurfelTrainer, iteration: int, stop: int = stop) -> LossTerms:
             if iteration == stop:
                 raise Killed
             return step(self, iteration)
 
         with monkeypatch.context() as patch:
-            patch.setattr(fit_module, "CHECKPOINT_INTERVAL_S", -1.0)
-            patch.setattr(fit_module, "save_state", save_sometimes)
-            patch.setattr(Fitter, "_step", step_until)
+            patch.setattr(recorder_module, "CHECKPOINT_INTERVAL_S", -1.0)
+            patch.setattr(recorder_module, "save_state", save_sometimes)
+            patch.setattr(SurfelTrainer, "_step", step_until)
             with pytest.raises(Killed):
                 fit(sphere_dataset, config, tmp_path / "pieces", marks)
     fit(sphere_dataset, config, tmp_path / "pieces", marks)
     assert moments(tmp_path / "pieces") == moments(tmp_path / "whole") == [5, 9, 10, 24]
     for first, second in zip(*(snapshot_folders(tmp_path / name) for name in ("pieces", "whole")), strict=True):
         one, other = read_snapshot(first), read_snapshot(second)
-        for name, value in one.surfels.named().items():
-            assert torch.equal(value, other.surfels.named()[name]), name
-        assert torch.equal(one.environment, other.environment)
-        assert torch.equal(one.evidence, other.evidence)
+        for name, value in one.geometry.state_dict()["surfels"].items():
+            assert torch.equal(value, other.geometry.state_dict()["surfels"][name]), name
+        assert one.training is not None
+        assert other.training is not None
+        assert torch.equal(one.training.environment, other.training.environment)
+        assert torch.equal(one.training.evidence, other.training.evidence)
         assert one.curves == other.curves
 
 
 def state_at(iteration: int, seconds: float) -> FitState:
-    nothing = torch.zeros(0)
-    evidence = torch.zeros(6, 2, 2)
     return FitState(
-        sphere_surfels(3), torch.zeros(6, 3, 2, 2), iteration, {}, nothing, nothing, evidence, [0.0] * 3, 1.0,
+        SurfelMirror(sphere_surfels(3)),
+        ObjectFrame(np.zeros(3), 1.0),
+        Selection("surfels", ()),
+        Training(torch.zeros(6, 3, 2, 2), torch.zeros(6, 2, 2), iteration),
         seconds={"read views": 0.5, "optimize": seconds - 0.5},
-    )  # fmt: skip
+    )
 
 
 def test_marks_in_seconds_come_once_however_often_the_fit_is_killed(tmp_path: Path) -> None:
@@ -205,10 +213,12 @@ def test_marks_in_seconds_come_once_however_often_the_fit_is_killed(tmp_path: Pa
     marks = SnapshotSchedule(seconds=(2.0, 4.0, 4.5, 20.0))
 
     def go(begin: tuple[int, float], steps: list[tuple[int, float]]) -> None:
-        keeper = SnapshotKeeper(tmp_path, marks, state_at(*begin))
-        for moment in steps:
-            state = state_at(*moment)
-            keeper.observe(state, state.surfels, state.environment)
+        state = state_at(*begin)
+        recorder = Recorder(tmp_path, marks, state)
+        for iteration, seconds in steps:
+            after = state_at(iteration, seconds)
+            took = seconds - sum(state.seconds.values())
+            recorder.after_step(iteration, took, lambda after=after: (after.geometry, after.training))
 
     go((0, 0.6), [(1, 1.5), (2, 2.0), (3, 3.9), (4, 5.0), (5, 6.0)])
     assert moments(tmp_path) == [2, 4]

@@ -1,13 +1,19 @@
 """A run folder: its state survives the disk, damage is named, and nobody else's folder is taken."""
 
-from dataclasses import fields, replace
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from panoless.geometry.revolution.model import SurfaceOfRevolution
+from panoless.capture.object_frame import ObjectFrame
+from panoless.geometry.base import Geometry, Training
+from panoless.geometry.height_field.kind import HeightFieldMirror
+from panoless.geometry.plane.kind import PlaneMirror
+from panoless.geometry.revolution.kind import RevolutionMirror
+from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.presets import PRESETS
 from panoless.reconstruct.state import (
     CHECKPOINT,
@@ -18,6 +24,7 @@ from panoless.reconstruct.state import (
     read_description,
     save_state,
 )
+from panoless.selection.candidates import Candidate, Selection, Verdict
 from shinypartial.core.errors import InputError
 from tests.support.mirror_height_field import bumpy
 from tests.support.mirror_plane import L_SHAPE, plane_of
@@ -28,104 +35,85 @@ CONFIG = PRESETS["default"]
 DATASET = Path("datasets/vase")
 
 
-def some_state(final: bool) -> FitState:
+def some_state(final: bool, geometry: Geometry | None = None) -> FitState:
+    optimizer = {
+        "adam": {"state": {0: {"exp_avg": torch.rand(7, 3)}}, "param_groups": [{"lr": 0.1, "name": "means"}]},
+        "gradients": [torch.rand(7), torch.ones(7)],
+    }
+    refused = Candidate("plane", Verdict.REFUSED_BY_SILHOUETTES, "misses the silhouettes", math.inf, 0.5)
+    chosen = Candidate("surfels", Verdict.CHOSEN, "no simpler kind explains the views")
     return FitState(
-        surfels=sphere_surfels(7),
-        environment=torch.rand(6, 3, 4, 4),
-        iteration=42,
-        optimizer={"state": {0: {"exp_avg": torch.rand(7, 3)}}, "param_groups": [{"lr": 0.1, "name": "means"}]},
-        gradient_sum=torch.rand(7),
-        gradient_count=torch.ones(7),
-        evidence=torch.rand(6, 4, 4),
-        center=[1.0, 2.0, 3.0],
-        radius=0.5,
-        final_environment=torch.rand(6, 3, 8, 8) if final else None,
+        geometry=geometry or SurfelMirror(sphere_surfels(7), curved=False),
+        frame=ObjectFrame(np.array([1.0, 2.0, 1 / 3]), 0.5),
+        selection=Selection("surfels", (refused, chosen)),
+        training=Training(torch.rand(6, 3, 4, 4), torch.rand(6, 4, 4), 42, optimizer),
+        environment=torch.rand(6, 3, 8, 8) if final else None,
         seconds={"optimize": 1.5},
         curves={"loss": [3.0, 2.0]},
         peak_memory_bytes=10,
     )
 
 
+def reloaded(folder: Path, state: FitState) -> FitState:
+    save_state(folder, state)
+    loaded = load_state(folder)
+    assert isinstance(loaded, FitState)
+    return loaded
+
+
 @pytest.mark.parametrize("final", [False, True])
 def test_a_state_survives_the_disk(tmp_path: Path, final: bool) -> None:
     state = some_state(final)
-    save_state(tmp_path, state)
+    loaded = reloaded(tmp_path, state)
     assert [path.name for path in tmp_path.iterdir()] == [CHECKPOINT]
-    loaded = load_state(tmp_path)
-    assert isinstance(loaded, FitState)
-    torch.testing.assert_close(loaded.surfels.named(), state.surfels.named(), rtol=0, atol=0)
-    for name in set(vars(state)) - {"surfels", "optimizer", "final_environment"}:
-        first, second = getattr(loaded, name), getattr(state, name)
-        assert torch.equal(first, second) if isinstance(first, torch.Tensor) else first == second, name
-    assert loaded.optimizer["param_groups"] == state.optimizer["param_groups"]
-    assert torch.equal(loaded.optimizer["state"][0]["exp_avg"], state.optimizer["state"][0]["exp_avg"])
-    assert (loaded.final_environment is not None) == final
+    assert isinstance(loaded.geometry, SurfelMirror)
+    assert isinstance(state.geometry, SurfelMirror)
+    torch.testing.assert_close(loaded.geometry.surfels.named(), state.geometry.surfels.named(), rtol=0, atol=0)
+    assert not loaded.geometry.curved
+    np.testing.assert_array_equal(loaded.frame.center, state.frame.center)
+    for name in ("selection", "seconds", "curves", "peak_memory_bytes", "iteration", "device"):
+        assert getattr(loaded, name) == getattr(state, name), name
+    assert loaded.training is not None
+    assert state.training is not None
+    for name in ("environment", "evidence"):
+        assert torch.equal(getattr(loaded.training, name), getattr(state.training, name)), name
+    adam, expected = loaded.training.optimizer["adam"], state.training.optimizer["adam"]
+    assert adam["param_groups"] == expected["param_groups"]
+    assert torch.equal(adam["state"][0]["exp_avg"], expected["state"][0]["exp_avg"])
+    assert (loaded.environment is not None) == final
     if final:
-        assert torch.equal(loaded.final_environment, state.final_environment)
+        assert torch.equal(loaded.environment, state.environment)
 
 
-@pytest.mark.parametrize("flat", [True, False], ids=["plane", "bent from a plane"])
-def test_a_plane_survives_the_disk(tmp_path: Path, flat: bool) -> None:
-    """To the last bit, with the outline's corners and why it was taken; it is the geometry only when it is flat."""
+def exact_kinds() -> list[Geometry]:
     plane = plane_of(L_SHAPE, frame_height=0.1 / 3, offset=1 / 7)
-    save_state(tmp_path, replace(some_state(True), plane=plane, flat=flat, rung="plane (asked for)"))
-    loaded = load_state(tmp_path)
-    assert loaded is not None
-    assert loaded.plane is not None
-    for name, value in vars(plane).items():
-        np.testing.assert_array_equal(getattr(loaded.plane, name), value)
-    assert isinstance(loaded.plane.offset, float)
-    assert loaded.rung == "plane (asked for)"
-    assert loaded.geometry is (loaded.plane if flat else loaded.surfels)
+    return [
+        PlaneMirror(plane, occlusion_test=False),
+        HeightFieldMirror(bumpy(plane, 0.02)),
+        RevolutionMirror(funnel(1 / 3)),
+    ]
 
 
-@pytest.mark.parametrize("bent", [True, False], ids=["bent plane", "surfels that began on it"])
-def test_a_bent_plane_survives_the_disk(tmp_path: Path, bent: bool) -> None:
-    """To the last bit, with the plane of its frame; it is the geometry only when it was taken."""
-    height_field = bumpy(plane_of(L_SHAPE, frame_height=0.1 / 3, offset=1 / 7), 0.02)
-    save_state(tmp_path, replace(some_state(True), height_field=height_field, plane=height_field.plane, bent=bent))
-    loaded = load_state(tmp_path)
-    assert loaded is not None
-    assert loaded.height_field is not None
-    for first, second in ((loaded.height_field, height_field), (loaded.height_field.plane, height_field.plane)):
-        for item in fields(second):
-            if item.name != "plane":
-                np.testing.assert_array_equal(getattr(first, item.name), getattr(second, item.name))
-    assert loaded.stepless == bent
-    assert loaded.geometry is (loaded.height_field if bent else loaded.surfels)
-
-
-@pytest.mark.parametrize("turned", [True, False], ids=["revolution", "surfels that began on it"])
-def test_a_surface_of_revolution_survives_the_disk(tmp_path: Path, turned: bool) -> None:
-    """To the last bit, and with it what its rays meet; it is the geometry only when it was taken."""
-    surface = funnel(1 / 3)
-    save_state(tmp_path, replace(some_state(True), surface=surface, turned=turned, rung="revolution (asked for)"))
-    loaded = load_state(tmp_path)
-    assert loaded is not None
-    assert loaded.surface is not None
-    for item in fields(surface):
-        np.testing.assert_array_equal(getattr(loaded.surface, item.name), getattr(surface, item.name))
-    assert type(loaded.surface.lip) is int
-    rays = rays_of(around(3, 24)[2])
-    for name, values in vars(surface.hits(*rays)).items():
-        np.testing.assert_array_equal(getattr(loaded.surface.hits(*rays), name), values)
-    assert loaded.stepless == turned
-    assert loaded.geometry is (loaded.surface if turned else loaded.surfels)
+@pytest.mark.parametrize("geometry", exact_kinds(), ids=lambda geometry: geometry.kind)
+def test_every_exact_kind_survives_the_disk(tmp_path: Path, geometry: Geometry) -> None:
+    """To the last bit, and what a camera sees of it; also as what surfels started on."""
+    camera = around(3, 24)[2]
+    started = SurfelMirror(sphere_surfels(7), started_on=geometry)
+    for name, each in (("itself", geometry), ("start", started)):
+        (tmp_path / name).mkdir()
+        loaded = reloaded(tmp_path / name, some_state(True, each)).geometry
+        again = getattr(loaded, "started_on", loaded)
+        assert type(again) is type(geometry)
+        assert again.state_dict() == geometry.state_dict()
+        for field, values in vars(geometry.buffers(camera)).items():
+            assert torch.equal(getattr(again.buffers(camera), field), values), field
 
 
 def test_a_surface_of_revolution_that_was_used_is_saved_like_a_new_one(tmp_path: Path) -> None:
     """What it computed about itself meanwhile is no part of it."""
-    for name, surface in (("new", goblet()), ("used", goblet())):
-        (tmp_path / name).mkdir()
-        if name == "used":
-            surface.hits(*rays_of(around(1, 8)[0]))
-        save_state(tmp_path / name, replace(some_state(True), surface=surface, turned=True))
-    first, second = (load_state(tmp_path / name) for name in ("new", "used"))
-    assert first is not None
-    assert second is not None
-    assert (
-        vars(first.surface).keys() == vars(second.surface).keys() == {item.name for item in fields(SurfaceOfRevolution)}
-    )
+    new, used = RevolutionMirror(goblet()), RevolutionMirror(goblet())
+    used.surface.hits(*rays_of(around(1, 8)[0]))
+    assert used.state_dict() == new.state_dict()
 
 
 def test_before_the_first_checkpoint_there_is_none(tmp_path: Path) -> None:
@@ -153,7 +141,7 @@ def test_a_failed_save_keeps_the_last_checkpoint(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OSError, match="No space"):
-        save_state(tmp_path, replace(some_state(False), iteration=43))
+        save_state(tmp_path, replace(some_state(False), peak_memory_bytes=43))
     assert [path.name for path in tmp_path.iterdir()] == [CHECKPOINT]
     loaded = load_state(tmp_path)
     assert loaded is not None

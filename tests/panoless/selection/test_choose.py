@@ -1,4 +1,4 @@
-"""The rung of a scene: the outline refuses a plane, held-out views tell a bent mirror from a flat one."""
+"""Which kind a scene gets: silhouettes refuse a plane, held-out views tell a bent mirror from a flat one."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,12 +9,14 @@ import torch
 
 from panoless.capture.views import Views
 from panoless.config import FitConfig
+from panoless.geometry.base import Geometry, usable_views
+from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.plane.model import Plane, unoccluded_share
-from panoless.geometry.surfels.model import Surfels
-from panoless.geometry.surfels.placement import surfels_on_plane
-from panoless.reconstruct.fit import _first_state, _trial, fit
+from panoless.geometry.surfels.mirror import SurfelMirror
+from panoless.reconstruct.fit import begin, fit
 from panoless.reconstruct.snapshots import SnapshotSchedule
-from panoless.selection.choose import choose_rung, without_frame_reflections
+from panoless.selection.candidates import Selection, Verdict
+from panoless.selection.choose import choose_geometry
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
 from tests.support.mirror_plane import NORMAL, RECTANGLE, arc, make_plane_dataset, plane_of, reflecting_views
@@ -29,19 +31,24 @@ def framed(frame_height: float, bend: float = 0.0) -> Views:
     return reflecting_views(plane_of(RECTANGLE, frame_height), arc(12, size=SIZE_PX), bend)
 
 
-def no_trial(views: Views, config: FitConfig, start: Surfels) -> Surfels:
+def no_trial(views: Views, config: FitConfig, start: Geometry) -> Geometry:
     pytest.fail("nothing was to be fitted")
 
 
-def as_started(views: Views, config: FitConfig, start: Surfels) -> Surfels:
+def as_started(views: Views, config: FitConfig, start: Geometry) -> Geometry:
     return start
 
 
-def dome(plane: Plane, bend: float, count: int) -> Surfels:
+def verdicts(selection: Selection) -> dict[str, Verdict]:
+    return {each.kind: each.verdict for each in selection.candidates}
+
+
+def dome(plane: Plane, bend: float, count: int) -> SurfelMirror:
     """Surfels on a plane with the normals n + bend·(p₁ t_u + p₂ t_v) of the traced dome."""
     from scipy.spatial.transform import Rotation
 
-    flat = surfels_on_plane(plane, count, seed=0)
+    config = replace(CONFIG, surfels=replace(CONFIG.surfels, count=count))
+    flat = PlaneMirror(plane).to_surfels(config).surfels
     points = flat.means.double().numpy()
     tangents = np.stack([plane.tangent_u, plane.tangent_v])
     normals = plane.normal + bend * (points @ tangents.T) @ tangents
@@ -51,104 +58,121 @@ def dome(plane: Plane, bend: float, count: int) -> Surfels:
     frames = np.stack([first, np.cross(normals, first), normals], 2)
     quats = torch.from_numpy(Rotation.from_matrix(frames).as_quat()[:, [3, 0, 1, 2]]).float()
     curvatures = torch.tensor([-bend, 0.0, -bend]).expand(flat.count, 3).clone()
-    return replace(flat, quats=quats, curvatures=curvatures)
+    return SurfelMirror.of(replace(flat, quats=quats, curvatures=curvatures), config)
 
 
 @pytest.mark.parametrize("frame_height", [0.0, 0.1])
 @pytest.mark.parametrize("bend", [0.0, 0.1])
-def test_a_flat_mirror_takes_the_plane_and_a_bent_one_in_the_same_outline_does_not(
+def test_a_flat_mirror_takes_the_plane_and_a_bent_one_in_the_same_boundary_does_not(
     frame_height: float, bend: float
 ) -> None:
     """A dome whose normals turn by 4° at most has the same masks; a frame that mirrors itself misleads neither."""
-    rung = choose_rung(framed(frame_height, bend), CONFIG, _trial)
-    assert (rung.model == "plane") == (bend == 0)
-    assert ("not flat" in rung.reason) == (bend > 0)
-    assert rung.plane is not None
-    assert rung.plane.normal @ NORMAL > np.cos(np.radians(0.2))
+    geometry, selection = choose_geometry(framed(frame_height, bend), CONFIG)
+    assert (geometry.kind == "plane") == (bend == 0)
+    assert (verdicts(selection)["plane"] == Verdict.REFUSED_BY_HELD_OUT_VIEWS) == (bend > 0)
+    plane = getattr(geometry, "plane", None) or geometry.height_field.plane
+    assert plane.normal @ NORMAL > np.cos(np.radians(0.2))
 
 
 def test_right_surfels_beat_the_plane_of_a_bent_mirror() -> None:
-    """With the traced dome's own normals, however far they turn, here by 11°."""
-    rung = choose_rung(framed(0.0, 0.3), CONFIG, lambda *_: dome(plane_of(RECTANGLE), 0.3, 800))
-    assert rung.model == "surfels"
+    """With the traced dome's own normals, however far they turn, here by 11°; they start on what was tried last."""
+    geometry, selection = choose_geometry(framed(0.0, 0.3), CONFIG, lambda *_: dome(plane_of(RECTANGLE), 0.3, 800))
+    assert geometry.kind == selection.chosen == "surfels"
+    assert verdicts(selection) == {
+        "plane": Verdict.REFUSED_BY_HELD_OUT_VIEWS,
+        "height_field": Verdict.REFUSED_BY_HELD_OUT_VIEWS,
+        "revolution": Verdict.NOT_PROPOSED,
+        "surfels": Verdict.CHOSEN,
+    }
+    assert isinstance(geometry, SurfelMirror)
+    assert geometry.started_on is not None
+    assert geometry.started_on.kind == "height_field"
 
 
 def test_surfels_that_explain_as_much_do_not_beat_the_plane() -> None:
     """Flat surfels on the plane say the same as the plane does."""
-    assert choose_rung(framed(0.0), CONFIG, as_started).model == "plane"
+    geometry, selection = choose_geometry(framed(0.0), CONFIG, as_started)
+    assert geometry.kind == "plane"
+    (row,) = selection.candidates
+    assert row.silhouette_px is not None
+    assert row.silhouette_px < 0.5
+    assert row.held_out_error == pytest.approx(row.surfels_error, abs=0.05)
+    assert f"held-out error {row.held_out_error:.4f}" in selection.sentence
 
 
 def test_a_plane_that_explains_nothing_goes_even_if_the_trial_does_no_better() -> None:
-    """A bent mirror in a flat outline, and surfels that did not learn to bend: the plane goes, and heights come."""
-    rung = choose_rung(framed(0.0, 0.3), CONFIG, as_started)
-    assert rung.model == "bent"
-    assert ": not flat; " in rung.reason
-    assert rung.plane is not None
+    """A bent mirror in a flat boundary, and surfels that did not learn to bend: the plane goes, and heights come."""
+    geometry, selection = choose_geometry(framed(0.0, 0.3), CONFIG, as_started)
+    assert geometry.kind == "height_field"
+    assert "plane: leaves too much unexplained" in selection.sentence
 
 
 def test_surfels_that_cover_nothing_do_not_beat_the_plane() -> None:
     """What nobody sees explains nothing."""
 
-    def vanished(views: Views, config: FitConfig, start: Surfels) -> Surfels:
-        return replace(start, opacity_logits=start.opacity_logits - 20)
+    def vanished(views: Views, config: FitConfig, start: Geometry) -> Geometry:
+        assert isinstance(start, SurfelMirror)
+        faint = replace(start.surfels, opacity_logits=start.surfels.opacity_logits - 20)
+        return replace(start, surfels=faint)
 
-    assert choose_rung(framed(0.0), CONFIG, vanished).model == "plane"
+    assert choose_geometry(framed(0.0), CONFIG, vanished)[0].kind == "plane"
 
 
-def test_a_box_is_refused_by_its_outline() -> None:
-    """Before anything is fitted, as plane and as surface of revolution; the reason says how far away the plane is."""
-    rung = choose_rung(pillar_views(around(16)), CONFIG, no_trial)
-    assert rung.model == "surfels"
-    assert rung.plane is None
-    assert rung.surface is None
-    assert rung.reason.startswith("no plane explains the outlines: ")
-    assert "revolution" in rung.reason
+def test_a_box_is_refused_by_its_silhouettes() -> None:
+    """Before anything is fitted, as plane and as surface of revolution; the table says how far away they are."""
+    geometry, selection = choose_geometry(pillar_views(around(16)), CONFIG, no_trial)
+    assert geometry.kind == "surfels"
+    refused = Verdict.REFUSED_BY_SILHOUETTES, Verdict.NOT_PROPOSED
+    assert all(verdicts(selection)[kind] in refused for kind in ("plane", "height_field", "revolution"))
+    plane = selection.candidates[0]
+    assert plane.verdict == Verdict.NOT_PROPOSED or plane.silhouette_px > 0.5 or plane.overlap < 0.98
+    assert selection.sentence.startswith("surfels (no simpler kind explains the views); before it plane: ")
 
 
 def test_a_fit_remembers_why_it_took_surfels() -> None:
-    """The reason of the ladder becomes part of the state, from which it goes into the prediction."""
-    state = _first_state(pillar_views(around(16)), replace(CONFIG, model="auto"))
-    assert state.rung.startswith("surfels (no plane explains the outlines: ")
-    assert state.rung.endswith(")")
-    assert not state.stepless
-    assert state.geometry is state.surfels
+    """The table becomes part of the state, from which it goes into the prediction."""
+    state = begin(pillar_views(around(16)), CONFIG)
+    assert state.selection.chosen == state.geometry.kind == "surfels"
+    assert [each.kind for each in state.selection.candidates] == ["plane", "height_field", "revolution", "surfels"]
+    assert state.training is not None
 
 
 def test_a_goblet_takes_the_surface_of_revolution() -> None:
     """Surfels that only start on it explain no more."""
-    rung = choose_rung(revolution_views(goblet(), around(12)), CONFIG, as_started)
-    assert rung.model == "revolution"
-    assert rung.surface is not None
-    assert rung.reason.endswith("no better")
+    geometry, selection = choose_geometry(revolution_views(goblet(), around(12)), CONFIG, as_started)
+    assert geometry.kind == "revolution"
+    assert selection.candidates[-1].reason == "surfels are no better"
 
 
 def test_the_configuration_overrides_both_ways(views: Views) -> None:
     """Surfels for a flat mirror, a plane for a bent one and even for a sphere; nothing is compared."""
     chosen = {model: replace(CONFIG, model=model) for model in ("plane", "surfels")}
-    rung = choose_rung(framed(0.0), chosen["surfels"], no_trial)
-    assert (rung.model, rung.reason, rung.plane) == ("surfels", "asked for", None)
+    geometry, selection = choose_geometry(framed(0.0), chosen["surfels"], no_trial)
+    assert geometry.kind == "surfels"
+    assert selection.sentence == "surfels (asked for)"
+    assert getattr(geometry, "started_on", None) is None
     for shown in (framed(0.0, 0.3), views):
-        rung = choose_rung(shown, chosen["plane"], no_trial)
-        assert rung.model == "plane"
-        assert rung.reason.startswith("asked for")
-        assert rung.plane is not None
+        geometry, selection = choose_geometry(shown, chosen["plane"], no_trial)
+        assert geometry.kind == "plane"
+        assert selection.sentence == "plane (asked for)"
 
 
 def test_two_views_determine_no_plane() -> None:
     """That is a reason for surfels, and an error only for who asks for a plane."""
     views = framed(0.0)
     two = replace(views, train=views.train[:2])
-    rung = choose_rung(two, CONFIG, no_trial)
-    assert (rung.model, rung.plane) == ("surfels", None)
+    geometry, selection = choose_geometry(two, CONFIG, no_trial)
+    assert geometry.kind == "surfels"
+    assert verdicts(selection)["plane"] == Verdict.NOT_PROPOSED
     with pytest.raises(InputError, match="at least 3 distinct places"):
-        choose_rung(two, replace(CONFIG, model="plane"), no_trial)
+        choose_geometry(two, replace(CONFIG, model="plane"), no_trial)
 
 
 def test_what_mirrors_the_frame_is_left_out() -> None:
-    """Exactly the solid pixels that see the environment stay: all without a rim, fewer with a rim."""
+    """Exactly the solid pixels that see the environment stay: all without a frame, fewer with one."""
     for frame_height in (0.0, 0.1):
         plane, views = plane_of(RECTANGLE, frame_height), framed(frame_height)
-        cleared = without_frame_reflections(views, plane)
+        cleared = usable_views(views, PlaneMirror(plane))
         before, after = (sum(len(view.solid) for view in each.train) for each in (views, cleared))
         assert after == before if frame_height == 0 else 0.5 * before < after < before
         for view, clear in zip(views.train, cleared.train, strict=True):
@@ -167,14 +191,14 @@ def test_a_plane_has_a_solved_map_whatever_the_preset(tmp_path: Path, plane_data
     """No steps are taken with it, so what gradient descent left or accumulated online would say nothing."""
     config = replace(tiny_config(preset, iterations=4, count=40), model="plane")
     state = fit(plane_dataset, config, tmp_path / "run")
-    assert state.flat
-    assert state.rung.startswith("plane (asked for")
-    assert state.final_environment is not None
+    assert state.geometry.kind == "plane"
+    assert state.selection.sentence == "plane (asked for)"
+    assert state.environment is not None
     assert state.visibility is not None
     assert state.peak_memory_bytes > 1e7
     seen = state.visibility > 0.5 * float(state.visibility.max())
     assert 0.005 < float(seen.float().mean()) < 0.5
     # 0.45 + 0.35 ω and a sun; random logits would be uniform in [0, 1].
-    assert 0.05 < float(state.final_environment.permute(0, 2, 3, 1)[seen].mean()) < 0.95
+    assert 0.05 < float(state.environment.permute(0, 2, 3, 1)[seen].mean()) < 0.95
     again = fit(plane_dataset, config, tmp_path / "run", SnapshotSchedule(iterations=frozenset({2})))
-    assert again.flat
+    assert again.geometry.kind == "plane"

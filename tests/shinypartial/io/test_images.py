@@ -1,13 +1,28 @@
-"""Image files at the door: exact round trips, and one clear message for whatever can't be read."""
+"""Pictures in and out: exact round trips, and one clear message for whatever can't be read."""
 
+import errno
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
 from shinypartial.core.errors import InputError
-from shinypartial.io.images import read_exr, read_exr_rgb, read_png, stack_channels, write_exr, write_exr_rgb, write_png
+from shinypartial.io.images import (
+    picture_size,
+    read_exr,
+    read_exr_rgb,
+    read_picture,
+    read_png,
+    stack_channels,
+    unit_values,
+    write_exr,
+    write_exr_rgb,
+    write_png,
+)
 
 GENERATOR = np.random.default_rng(0)
 
@@ -102,9 +117,9 @@ def test_gray_with_alpha_becomes_rgba(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_png(tmp_path / "a.png"), [[[7, 7, 7, 0], [9, 9, 9, 255]]])
 
 
-def test_black_and_white_becomes_rgb(tmp_path: Path) -> None:
+def test_black_and_white_becomes_gray(tmp_path: Path) -> None:
     Image.fromarray(np.array([[0, 255]], np.uint8)).convert("1").save(tmp_path / "a.png")
-    np.testing.assert_array_equal(read_png(tmp_path / "a.png"), [[[0, 0, 0], [255, 255, 255]]])
+    np.testing.assert_array_equal(read_png(tmp_path / "a.png"), [[[0], [255]]])
 
 
 @pytest.mark.parametrize("content", [b"", b"not an image", None], ids=["empty", "text", "truncated"])
@@ -114,3 +129,137 @@ def test_a_damaged_png_is_an_input_error(tmp_path: Path, content: bytes | None) 
     path.write_bytes(path.read_bytes()[:2000] if content is None else content)
     with pytest.raises(InputError, match="a complete image"):
         read_png(path)
+
+
+def test_importing_the_module_loads_no_library() -> None:
+    code = "import sys, shinypartial.io.images; print(sorted({'OpenImageIO', 'OpenEXR', 'PIL'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def store(path: Path, image: np.ndarray, straight: bool = True) -> None:
+    """Write with OpenImageIO in the format that the suffix names."""
+    spec = oiio.ImageSpec(image.shape[1], image.shape[0], image.shape[2], str(image.dtype).replace("float32", "float"))
+    spec.attribute("oiio:UnassociatedAlpha", int(straight))
+    file = oiio.ImageOutput.create(str(path))
+    assert file.open(str(path), spec), file.geterror()
+    assert file.write_image(image)
+    assert file.close()
+
+
+def some_codes(dtype: type, channels: int) -> np.ndarray:
+    return GENERATOR.integers(0, np.iinfo(dtype).max, (5, 7, channels), dtype=dtype, endpoint=True)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".tiff"])
+def test_codes_of_8_and_16_bits_come_back_exactly(tmp_path: Path, dtype: type, channels: int, suffix: str) -> None:
+    image, path = some_codes(dtype, channels), tmp_path / f"a{suffix}"
+    store(path, image)
+    found = read_picture(path)
+    assert found.dtype == dtype
+    np.testing.assert_array_equal(found, image)
+    assert picture_size(path) == (7, 5)
+
+
+@pytest.mark.parametrize("mode", ["L", "RGB", "RGBA"])
+def test_png_is_read_as_pillow_reads_it(tmp_path: Path, mode: str) -> None:
+    image = some_codes(np.uint8, {"L": 1, "RGB": 3, "RGBA": 4}[mode])
+    Image.fromarray(image if mode != "L" else image[..., 0]).save(tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as stored:
+        np.testing.assert_array_equal(read_picture(tmp_path / "a.png"), np.asarray(stored).reshape(5, 7, -1))
+
+
+def test_jpeg_is_read_as_pillow_reads_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.JPG"
+    Image.fromarray(some_codes(np.uint8, 3)).save(path, "JPEG")
+    with Image.open(path) as stored:
+        # Decoders may round the inverse cosine transform and the color conversion differently.
+        np.testing.assert_allclose(read_picture(path), np.asarray(stored), atol=2)
+
+
+def test_light_of_hdr_comes_back_to_its_shared_exponent(tmp_path: Path) -> None:
+    light = GENERATOR.uniform(0, 40, (5, 7, 3)).astype(np.float32)
+    store(tmp_path / "a.hdr", light)
+    found = read_picture(tmp_path / "a.hdr")
+    assert found.dtype == np.float32
+    # Eight bits of the largest channel of a pixel.
+    assert (np.abs(found - light) <= light.max(-1, keepdims=True) * 2**-7).all()
+
+
+@pytest.mark.parametrize("straight", [True, False])
+def test_light_of_tiff_is_premultiplied_as_that_of_exr(tmp_path: Path, straight: bool) -> None:
+    light = GENERATOR.uniform(0, 1, (5, 7, 4)).astype(np.float32)
+    store(tmp_path / "a.tif", light, straight)
+    expected = light * np.append(light[..., 3:].repeat(3, -1), np.ones((5, 7, 1)), -1) if straight else light
+    np.testing.assert_allclose(read_picture(tmp_path / "a.tif"), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("names", ["Y", "RGB", "RGBA"])
+def test_exr_is_a_picture_too(tmp_path: Path, names: str) -> None:
+    planes = {name: GENERATOR.uniform(size=(5, 7)).astype(np.float32) for name in names}
+    write_exr(tmp_path / "a.exr", planes)
+    np.testing.assert_array_equal(read_picture(tmp_path / "a.exr"), np.stack([planes[name] for name in names], -1))
+
+
+def test_unit_values_reach_0_and_1() -> None:
+    for dtype in (np.uint8, np.uint16):
+        np.testing.assert_array_equal(unit_values(np.array([0, np.iinfo(dtype).max], dtype)), [0, 1])
+    assert unit_values(np.array([3.5])) == 3.5
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+def test_a_picture_on_its_side_is_refused(tmp_path: Path, suffix: str, orientation: int) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = tmp_path / f"a{suffix}"
+    Image.fromarray(some_codes(np.uint8, 3)).save(path, exif=exif)
+    if orientation == 1:
+        assert read_picture(path).shape == (5, 7, 3)
+        return
+    with pytest.raises(InputError, match=f"the EXIF orientation {orientation}"):
+        read_picture(path)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".tif", ".hdr", ".png"])
+def test_a_truncated_picture_is_an_input_error(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    noise = GENERATOR.integers(0, 256, (40, 50, 3), dtype=np.uint8)
+    store(path, noise.astype(np.float32) if suffix == ".hdr" else noise)
+    path.write_bytes(path.read_bytes()[:-300])
+    with pytest.raises(InputError, match="a complete image"):
+        read_picture(path)
+
+
+def test_premultiplied_codes_are_refused(tmp_path: Path) -> None:
+    store(tmp_path / "a.tif", some_codes(np.uint8, 4), straight=False)
+    with pytest.raises(InputError, match="straight"):
+        read_picture(tmp_path / "a.tif")
+
+
+def test_other_types_are_refused(tmp_path: Path) -> None:
+    Image.fromarray(np.ones((5, 7), np.int32)).save(tmp_path / "a.tif")
+    with pytest.raises(InputError, match="type int32"):
+        read_picture(tmp_path / "a.tif")
+
+
+def test_an_unknown_format_is_refused_with_those_that_are_read(tmp_path: Path) -> None:
+    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
+    with pytest.raises(InputError, match="export it again as PNG, JPEG, TIFF, HDR or EXR"):
+        read_picture(tmp_path / "a.heic")
+
+
+def test_a_full_disk_leaves_no_short_png(tmp_path: Path) -> None:
+    """The libraries report a success there; a limit on the size of files stands for the disk."""
+    resource = pytest.importorskip("resource")
+    path = tmp_path / "a.png"
+    code = (
+        "import resource, sys, numpy as np; from pathlib import Path; from shinypartial.io.images import write_png\n"
+        "image = np.random.default_rng(0).integers(0, 256, (40, 40, 3), dtype=np.uint8)\n"
+        f"resource.setrlimit(resource.RLIMIT_FSIZE, (4300, {resource.RLIM_INFINITY}))\n"
+        f"try: write_png(Path({str(path)!r}), image)\nexcept OSError as error: sys.exit(error.errno)"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == errno.ENOSPC
+    assert list(tmp_path.iterdir()) == []

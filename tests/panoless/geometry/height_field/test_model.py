@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 
 from panoless.capture.rays import pixel_rays, reflect
+from panoless.config import FitConfig, SurfelConfig
+from panoless.geometry.height_field.kind import HeightFieldMirror
 from panoless.geometry.height_field.model import (
     HeightField,
     edge_points,
@@ -15,14 +17,14 @@ from panoless.geometry.height_field.model import (
     height_field_buffers,
     visible_reflections,
 )
+from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.plane.model import plane_buffers, unoccluded_share
 from panoless.geometry.surfels.model import Surfels
-from panoless.geometry.surfels.placement import surfels_on_height_field, surfels_on_plane
 from panoless.kernels.reference.rasterize import rotation_matrices
 from tests.support.mirror_height_field import bumpy
 from tests.support.mirror_plane import L_SHAPE, NORMAL, RECTANGLE, arc, mirror_views, plane_of, train_view
 
-COUNT = 300
+CONFIG = replace(FitConfig(), surfels=SurfelConfig(count=300))
 PLANE = plane_of(RECTANGLE)
 
 
@@ -94,8 +96,8 @@ def test_without_height_it_is_seen_as_its_plane(boundary: np.ndarray, frame_heig
         flat, expected = height_field_buffers(flat_height_field(plane, 6), camera), plane_buffers(plane, camera)
         assert torch.allclose(flat.alpha, expected.alpha, atol=1e-5)
         inside = expected.alpha > 0.99
-        assert torch.allclose(flat.surface_depth[inside], expected.surface_depth[inside], atol=1e-5)
-        assert torch.allclose(flat.raster_normals_camera, expected.raster_normals_camera, atol=1e-5)
+        assert torch.allclose(flat.depth[inside], expected.depth[inside], atol=1e-5)
+        assert torch.allclose(flat.normals_camera, expected.normals_camera, atol=1e-5)
 
 
 def test_its_edge_bounds_what_is_seen() -> None:
@@ -147,7 +149,8 @@ def test_only_planes_do_not_bend() -> None:
 
 
 def test_surfels_of_a_flat_height_field_are_those_of_its_plane() -> None:
-    found, expected = surfels_on_height_field(flat_height_field(PLANE, 8), COUNT, 0), surfels_on_plane(PLANE, COUNT, 0)
+    mirrors = HeightFieldMirror(flat_height_field(PLANE, 8)), PlaneMirror(PLANE)
+    found, expected = (mirror.to_surfels(CONFIG).surfels for mirror in mirrors)
     for name, values in expected.named().items():
         torch.testing.assert_close(getattr(found, name), values)
 
@@ -155,7 +158,7 @@ def test_surfels_of_a_flat_height_field_are_those_of_its_plane() -> None:
 def test_surfels_have_the_normals_heights_and_curvatures_of_a_quadratic() -> None:
     """h = ½ pᵀ B p has the gradient B p and the bending B everywhere."""
     bend = np.array([[0.1, 0.03], [0.03, -0.08]])
-    surfels = surfels_on_height_field(parabolic(8, bend), COUNT, 0)
+    surfels = HeightFieldMirror(parabolic(8, bend)).to_surfels(CONFIG).surfels
     means = surfels.means.numpy().astype(np.float64)
     p = coordinates_of(means)
     slope = p @ bend

@@ -7,8 +7,9 @@ import torch
 from torch.nn.functional import max_pool2d, normalize
 
 from panoless.capture.views import Views
+from panoless.environment.footprints import PixelFootprints, deblur_map
 from panoless.environment.solve import solve_environment
-from panoless.geometry.revolution.deblurred_map import PixelFootprints, _divided, deblur_map
+from panoless.geometry.revolution.deblurred_map import pixel_footprints
 from panoless.geometry.revolution.model import revolution_buffers, revolution_rays
 from panoless.geometry.revolution.render import mean_light
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap
@@ -57,7 +58,7 @@ def under_a_lamp() -> tuple[torch.Tensor, torch.Tensor]:
     """Maps of centers and sharpened, of the bowl under the lamp."""
     views = photographed(lit_scene(64))
     start = solve_environment([revolution_rays(bowl(), view, view.solid)[0] for view in views.train], 64)
-    return start, deblur_map(views, bowl(), start, ONE)
+    return start, deblur_map(pixel_footprints(views, bowl()), start, ONE)
 
 
 def test_areas_tell_the_map_better_than_centers(photographs) -> None:
@@ -65,10 +66,10 @@ def test_areas_tell_the_map_better_than_centers(photographs) -> None:
     truth, views, surface = scene(64), photographs, bowl()
     rays = [revolution_rays(surface, view, view.solid)[0] for view in views.train]
     start = solve_environment(rays, 64)
-    directions = torch.cat([each.directions.flatten(0, 1) for each in _divided(views, surface).smooth])
+    directions = torch.cat([each.directions.flatten(0, 1) for each in pixel_footprints(views, surface).smooth])
     errors = [
         float((sample_cubemap(found, directions) - sample_cubemap(truth, directions)).square().mean())
-        for found in (start, deblur_map(views, surface, start, ONE))
+        for found in (start, deblur_map(pixel_footprints(views, surface), start, ONE))
     ]
     assert errors[1] < 0.6 * errors[0]
 
@@ -76,14 +77,14 @@ def test_areas_tell_the_map_better_than_centers(photographs) -> None:
 def test_the_true_map_stays(photographs) -> None:
     """Its pixels are what was photographed, but for the difference of 4 and of 16 rays."""
     truth = scene(64)
-    found = deblur_map(photographs, bowl(), truth, ONE)
+    found = deblur_map(pixel_footprints(photographs, bowl()), truth, ONE)
     assert float((found - truth).abs().mean()) < 0.02
 
 
 def test_seeing_and_spreading_are_adjoint() -> None:
     """⟨A E, w⟩ = ⟨E, Aᵀ w⟩ for any map E and any values w of pixels."""
     generator = torch.Generator().manual_seed(0)
-    areas = _divided(revolution_views(bowl(), around(2, 48)), bowl()).smooth[0]
+    areas = pixel_footprints(revolution_views(bowl(), around(2, 48)), bowl()).smooth[0]
     image = torch.rand(6, 3, 32, 32, generator=generator)
     values = torch.rand(len(areas.radiance), 3, generator=generator)
     left = (areas.seen(image) * values).double().sum()
@@ -129,7 +130,9 @@ def test_light_above_one_costs_nothing_below(under_a_lamp) -> None:
 def test_without_saturated_pixels_saturation_is_nothing(photographs) -> None:
     """Views that end at 1 and views without an end give the same map, where nothing is brighter than 0.9."""
     start = solve_environment([revolution_rays(bowl(), view, view.solid)[0] for view in photographs.train], 64)
-    ended, endless = (deblur_map(photographs, bowl(), start, each * ONE) for each in (1.0, float("inf")))
+    ended, endless = (
+        deblur_map(pixel_footprints(photographs, bowl()), start, each * ONE) for each in (1.0, float("inf"))
+    )
     torch.testing.assert_close(ended, endless.clamp(max=1))
 
 

@@ -12,9 +12,9 @@ from panoless.geometry.revolution.fit import propose_revolution
 from panoless.geometry.revolution.interior import search_interior
 from panoless.geometry.revolution.model import RAY_EPSILON, SurfaceOfRevolution, revolution_buffers, trace_reflections
 from panoless.geometry.revolution.photometric import photometric_equations, select_observations
+from panoless.geometry.revolution.placement import surfels_on_revolution
 from panoless.geometry.revolution.profile import ProfileSplines, apply_step, resample_profile
 from panoless.geometry.revolution.silhouette import contour_rays, silhouette_residuals
-from panoless.geometry.surfels.placement import surfels_on_revolution
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.kernels.reference.rasterize import rotation_matrices
 from tests.support.mirror_revolution import TILTED, around, funnel, goblet, rays_of, revolution_views
@@ -103,8 +103,8 @@ def test_buffers_cover_what_the_rays_cover() -> None:
     np.testing.assert_allclose(buffers.alpha.numpy(), view.mask.numpy(), atol=1e-6)
     solid = buffers.alpha == 1
     rays = view.rays_camera
-    assert ((buffers.raster_normals_camera * rays).sum(0)[solid] < 0).all()
-    lengths = buffers.raster_normals_camera.norm(dim=0)[solid]
+    assert ((buffers.normals_camera * rays).sum(0)[solid] < 0).all()
+    lengths = buffers.normals_camera.norm(dim=0)[solid]
     np.testing.assert_allclose(lengths.numpy(), 1, atol=1e-5)
 
 

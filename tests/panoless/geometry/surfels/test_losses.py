@@ -6,9 +6,11 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from panoless.geometry.surfels.losses import normal_consistency, photometric_masked, photometric_paper, silhouette
-from panoless.geometry.surfels.rendering import SurfaceBuffers, surface_buffers
+from panoless.geometry.surfels.losses import photometric_paper
+from panoless.geometry.surfels.rendering import rasterize_surfels
+from panoless.kernels.image import depth_normals
 from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.reference.objective import normal_consistency, photometric_masked, silhouette, surface_depth
 from tests.support.mirror_sphere import sphere_surfels
 
 CAMERA = RasterCamera(torch.eye(4), 30.0, 30.0, 12.0, 12.0, 24, 24)
@@ -92,15 +94,18 @@ def test_the_silhouette_pulls_alpha_toward_the_mask() -> None:
     assert torch.sign(alpha.grad).tolist() == [[-1.0, 1.0, -1.0, 1.0]]
 
 
-def plane_buffers(normal: torch.Tensor, raster_normal: torch.Tensor, distance: float = 3.0) -> SurfaceBuffers:
-    """What the camera sees of the opaque plane normal·P = −distance, with other rasterized normals."""
+def inconsistency(normal: torch.Tensor, normals_camera: torch.Tensor, weight: torch.Tensor) -> float:
+    """Eq. 12 for the opaque plane normal·P = −3 with other rasterized normals."""
+    distance = 3.0
     step = (torch.arange(24) + 0.5 - 12.0) / 30.0
     y, x = torch.meshgrid(step, step, indexing="ij")
     depth = -distance / (normal[0] * x + normal[1] * y + normal[2])
-    flat = torch.ones(24, 24)
-    normals = raster_normal[:, None, None].expand(3, 24, 24).clone()
-    nothing = torch.zeros(3, 24, 24)
-    return SurfaceBuffers(nothing, flat, normals, depth, depth, depth, flat * 0, torch.ones(1, dtype=torch.bool))
+    from_depth = depth_normals(depth, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
+    return float(normal_consistency(normals_camera, torch.ones(24, 24), from_depth, weight))
+
+
+def everywhere(normal: torch.Tensor) -> torch.Tensor:
+    return normal[:, None, None].expand(3, 24, 24).clone()
 
 
 def tilted(angle_deg: float) -> torch.Tensor:
@@ -112,25 +117,25 @@ def tilted(angle_deg: float) -> torch.Tensor:
 @pytest.mark.parametrize("length", [0.2, 1.0])
 def test_normals_of_a_plane_agree_with_its_depth(tilt_deg: float, length: float) -> None:
     """Eq. 12 is zero whatever the length of the blended normals."""
-    buffers = plane_buffers(tilted(tilt_deg), length * tilted(tilt_deg))
+    found = inconsistency(tilted(tilt_deg), everywhere(length * tilted(tilt_deg)), torch.ones(24, 24))
     # Differences of single-precision depths: 1e-6.
-    assert float(normal_consistency(buffers, CAMERA, torch.ones(24, 24))) == pytest.approx(0.0, abs=1e-5)
+    assert found == pytest.approx(0.0, abs=1e-5)
 
 
 @pytest.mark.parametrize("angle_deg", [10.0, 45.0, 120.0])
 def test_a_wrong_normal_costs_one_minus_the_cosine(angle_deg: float) -> None:
-    buffers = plane_buffers(tilted(0.0), tilted(angle_deg))
+    found = inconsistency(tilted(0.0), everywhere(tilted(angle_deg)), torch.ones(24, 24))
     expected = 1 - math.cos(math.radians(angle_deg))
-    assert float(normal_consistency(buffers, CAMERA, torch.ones(24, 24))) == pytest.approx(expected, abs=1e-5)
+    assert found == pytest.approx(expected, abs=1e-5)
 
 
 def test_only_chosen_pixels_count() -> None:
-    buffers = plane_buffers(tilted(0.0), tilted(0.0))
-    buffers.raster_normals_camera[:, :, 12:] = tilted(90.0)[:, None, None]
+    normals = everywhere(tilted(0.0))
+    normals[:, :, 12:] = tilted(90.0)[:, None, None]
     left = torch.zeros(24, 24)
     left[:, :12] = 1
-    assert float(normal_consistency(buffers, CAMERA, left)) == pytest.approx(0.0, abs=1e-5)
-    assert float(normal_consistency(buffers, CAMERA, 1 - left)) == pytest.approx(1.0, abs=1e-5)
+    assert inconsistency(tilted(0.0), normals, left) == pytest.approx(0.0, abs=1e-5)
+    assert inconsistency(tilted(0.0), normals, 1 - left) == pytest.approx(1.0, abs=1e-5)
 
 
 @pytest.mark.parametrize("distance", [3.0, -3.0], ids=["a sphere", "nothing in view"])
@@ -141,15 +146,17 @@ def test_every_gradient_is_finite(distance: float, curved: bool) -> None:
     matrix = torch.eye(4)
     matrix[2, 3] = distance
     camera = RasterCamera(matrix, 30.0, 30.0, 12.0, 12.0, 24, 24)
-    buffers = surface_buffers(type(surfels)(**leaves), camera, curved=curved, depth_blend=0.5)
+    buffers = rasterize_surfels(type(surfels)(**leaves), camera, curved=curved)
+    depth = surface_depth(buffers.accumulated_depth, buffers.median_depth, buffers.alpha, 0.5)
+    from_depth = depth_normals(depth, camera.fx, camera.fy, camera.cx, camera.cy)
     assert bool((buffers.alpha > 0).any()) == (distance > 0)
     mask = torch.ones(24, 24)
     target = torch.rand(3, 24, 24)
     terms = [
-        photometric_paper(buffers.albedo, target, 0.2),
-        photometric_masked(buffers.albedo.flatten(1).T, target.flatten(1).T, 0.3),
+        photometric_paper(buffers.colors, target, 0.2),
+        photometric_masked(buffers.colors.flatten(1).T, target.flatten(1).T, 0.3),
         silhouette(buffers.alpha, mask),
-        normal_consistency(buffers, camera, mask),
+        normal_consistency(buffers.normals_camera, buffers.alpha, from_depth, mask),
         buffers.distortion.mean(),
     ]
     total = torch.stack(terms).sum()

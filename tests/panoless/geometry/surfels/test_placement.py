@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from panoless.capture.views import Views
-from panoless.config import SurfelConfig
+from panoless.config import FitConfig, SurfelConfig
 from panoless.first_surface.visual_hull import HULL_HALF_SIDE, carve_hull
+from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.surfels.model import Surfels
 from panoless.geometry.surfels.placement import (
     LEAST_RADIUS_PX,
@@ -17,12 +18,17 @@ from panoless.geometry.surfels.placement import (
     _radii,
     _reach,
     initial_surfels,
-    surfels_on_plane,
 )
 from panoless.kernels.reference.rasterize import rotation_matrices
 from tests.support.mirror_plane import L_SHAPE, NORMAL, RECTANGLE, plane_of
 
 CONFIG = SurfelConfig(count=800, hull_resolution=48)
+
+
+def config_of(count: int, seed: int) -> FitConfig:
+    return replace(FitConfig(), surfels=SurfelConfig(count=count), seed=seed)
+
+
 VOXEL = 2 * HULL_HALF_SIDE / 47
 
 
@@ -136,7 +142,7 @@ def test_surfels_on_a_plane_fill_its_outline(boundary: np.ndarray, count: int) -
     from scipy.spatial import cKDTree
 
     plane = plane_of(boundary)
-    shifted = [surfels_on_plane(plane, count, seed) for seed in range(4)]
+    shifted = [PlaneMirror(plane).to_surfels(config_of(count, seed)).surfels for seed in range(4)]
     assert all(abs(surfels.count - count) < 0.1 * count for surfels in shifted)
     assert not torch.equal(shifted[0].means[:100], shifted[1].means[:100])
     surfels = shifted[0]

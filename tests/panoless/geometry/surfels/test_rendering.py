@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch.nn.functional import normalize
 
 from panoless.geometry.surfels.model import Surfels
-from panoless.geometry.surfels.rendering import compose, reflection_directions_world, surface_buffers
+from panoless.geometry.surfels.rendering import compose, rasterize_surfels, reflection_directions_world, surface_buffers
 from panoless.kernels.rasterize import RasterCamera
 from panoless.kernels.reference.rasterize import rotation_matrices
 from shinypartial.core.camera import reflect
@@ -45,30 +45,30 @@ def buffers_of(surfels: Surfels, depth_blend: float):
 @pytest.mark.parametrize("depth_blend", [0.0, 0.3, 0.5, 1.0])
 def test_surface_depth_blends_expected_and_median(depth_blend: float) -> None:
     """Eq. 3."""
-    buffers = buffers_of(sphere_surfels(300, opacity_logit=0.0), depth_blend)
+    surfels = sphere_surfels(300, opacity_logit=0.0)
+    buffers, expected, median = (buffers_of(surfels, blend) for blend in (depth_blend, 0.0, 1.0))
     inside = buffers.alpha > 0.5
     assert inside.any()
-    assert (buffers.expected_depth - buffers.median_depth)[inside].abs().max() > 0.01
-    expected = (1 - depth_blend) * buffers.expected_depth + depth_blend * buffers.median_depth
-    torch.testing.assert_close(buffers.surface_depth, expected)
+    assert (expected.depth - median.depth)[inside].abs().max() > 0.01
+    torch.testing.assert_close(buffers.depth, (1 - depth_blend) * expected.depth + depth_blend * median.depth)
 
 
 def test_depths_of_an_opaque_sphere_are_those_of_its_surface() -> None:
-    buffers = buffers_of(sphere_surfels(4000), 0.5)
     # The ray through (16.5, 16.5) meets the near pole at depth 2; flat disks of 0.045 lie within 0.01 of it.
-    for name in ("expected_depth", "median_depth", "surface_depth"):
-        assert float(getattr(buffers, name)[16, 16]) == pytest.approx(2.0, abs=0.01)
+    for blend in (0.0, 1.0, 0.5):
+        buffers = buffers_of(sphere_surfels(4000), blend)
+        assert float(buffers.depth[16, 16]) == pytest.approx(2.0, abs=0.01)
     assert float(buffers.alpha[16, 16]) == pytest.approx(1.0, abs=1e-3)
     torch.testing.assert_close(
-        normalize(buffers.raster_normals_camera[:, 16, 16], dim=0), torch.tensor([0.0, 0.0, -1.0]), rtol=0, atol=0.03
+        normalize(buffers.normals_camera[:, 16, 16], dim=0), torch.tensor([0.0, 0.0, -1.0]), rtol=0, atol=0.03
     )
 
 
 def test_an_attribute_takes_the_place_of_the_albedo() -> None:
     surfels = sphere_surfels(300, opacity_logit=0.0)
     ones = torch.ones(surfels.count, 3)
-    buffers = surface_buffers(surfels, camera_before(3.0), curved=False, depth_blend=0.0, attribute=ones)
-    torch.testing.assert_close(buffers.albedo, buffers.alpha.expand(3, -1, -1))
+    buffers = rasterize_surfels(surfels, camera_before(3.0), curved=False, attribute=ones)
+    torch.testing.assert_close(buffers.colors, buffers.alpha.expand(3, -1, -1))
     assert float(buffers_of(surfels, 0.0).albedo.abs().max()) == 0.0
 
 

@@ -40,6 +40,6 @@ def test_a_fit_ends_as_on_the_cpu(
         # whole steps, all others by rounding.
         apart = (found.surfels.named()[name] - value).abs() > 1e-4 * value.abs().max() + 1e-6
         assert apart.float().mean() < 0.05, name
-    torch.testing.assert_close(found.final_environment, expected.final_environment, rtol=0, atol=0.02)
+    torch.testing.assert_close(found.environment, expected.environment, rtol=0, atol=0.02)
     for name, series in expected.curves.items():
         assert found.curves[name] == pytest.approx(series, rel=1e-4), name

@@ -1,0 +1,247 @@
+"""What any mirror can do, and how a kind of mirror is proposed from silhouettes and fitted."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from panoless.capture.object_frame import ObjectFrame
+from panoless.capture.views import TrainView, Views
+from panoless.config import FitConfig
+from panoless.environment.footprints import Footprints
+from panoless.environment.rays import Rays
+from panoless.kernels.rasterize import RasterCamera
+
+Numbers = TypeVar("Numbers")
+SOLID_SURFACE_ALPHA = 0.9
+"""A pixel with more alpha than this shows the surface."""
+
+
+@dataclass(frozen=True)
+class SurfaceBuffers:
+    """What one camera sees of a surface. All is zero where alpha is.
+
+    `normals_camera` is alpha times the normal in camera axes; `depth` is camera z-depth in the object frame, Eq. 3 for
+    surfels; `albedo` is unshaded diffuse radiance, premultiplied.
+    """
+
+    alpha: Float[Tensor, "H W"]
+    normals_camera: Float[Tensor, "3 H W"]
+    depth: Float[Tensor, "H W"]
+    albedo: Float[Tensor, "3 H W"]
+
+
+def buffers_from_arrays(
+    alpha: Float[np.ndarray, "H W"],
+    depth: Float[np.ndarray, "H W"],
+    normals_camera: Float[np.ndarray, "3 #H #W"],
+    camera: RasterCamera,
+) -> SurfaceBuffers:
+    """Coverage in [0, 1], depth along the camera's axis and unit normals in camera axes, as buffers without albedo.
+
+    All is float32 on the device of the camera.
+    """
+    covered, distance, normals = (
+        torch.from_numpy(np.ascontiguousarray(values)).float().to(camera.world_to_camera.device)
+        for values in (alpha, depth, normals_camera)
+    )
+    return SurfaceBuffers(covered, normals * covered, distance, covered.new_zeros(3, *covered.shape))
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A surface as a file holds it, in world units: vertices with named columns beside x, y, z, and polygons."""
+
+    vertices: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F N"] | None = None
+    """Indices of the vertices of every face, counterclockwise from outside; None for a cloud of points."""
+    columns: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass
+class Training:
+    """What an iterative fit needs to continue. `iteration` counts finished steps.
+
+    `environment` is the map as the optimizer holds it; `evidence` is what online visibility has accumulated.
+    """
+
+    environment: Float[Tensor, "6 3 L L"]
+    evidence: Float[Tensor, "6 L L"]
+    iteration: int = 0
+    optimizer: dict[str, Any] = field(default_factory=dict)
+
+    def to(self, device: torch.device) -> "Training":
+        """The same on a device; the optimizer's part follows its parameters when it is loaded."""
+        return Training(self.environment.to(device), self.evidence.to(device), self.iteration, self.optimizer)
+
+
+@runtime_checkable
+class Geometry(Protocol):
+    """A mirror of one kind in the object frame, and how rays meet it. It is immutable."""
+
+    kind: ClassVar[str]
+
+    @property
+    def num_parameters(self) -> int:
+        """How many numbers it is made of."""
+        ...
+
+    @property
+    def num_primitives(self) -> int:
+        """Of how many primitives it consists."""
+        ...
+
+    def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
+        """Those of the solid pixels of a view (flat indices) that show the surroundings, not the object again."""
+        ...
+
+    def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
+        """What pixels of a view observed of the environment: reflected directions and radiance."""
+        ...
+
+    def footprints(self, views: Views) -> Footprints | None:
+        """Directions over the areas of pixels, for a map that knows of them; None: a pixel is its center."""
+        ...
+
+    def solve_map(self, views: Views, config: FitConfig) -> tuple[Float[Tensor, "6 3 L L"], list[Rays]]:
+        """The closed-form map, in the encoding of the views, and the rays that it was solved from."""
+        ...
+
+    def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
+        """What a camera sees of the surface."""
+        ...
+
+    def shade(
+        self,
+        environment: Float[Tensor, "6 3 L L"],
+        camera: RasterCamera,
+        pixels: Int[Tensor, "P"],
+        normals_camera: Float[Tensor, "3 P"],
+    ) -> Float[Tensor, "P 3"]:
+        """The specular radiance of pixels (flat indices) whose blended normals are given."""
+        ...
+
+    def to_surfels(self, config: FitConfig) -> "Geometry":
+        """Surfels on the surface, as many as configured: the start of a free fit."""
+        ...
+
+    def mesh(self, frame: ObjectFrame) -> Mesh:
+        """The surface in world units."""
+        ...
+
+    def to(self, device: torch.device) -> "Geometry":
+        """The same numbers on a device, as far as they are tensors."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """All numbers as tensors, lists and plain values, which torch reads without running code."""
+        ...
+
+    @classmethod
+    def from_state_dict(cls, content: dict[str, Any]) -> "Geometry":
+        """The geometry that `state_dict` was taken from."""
+        ...
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A shape from silhouettes alone, and how well it explains them: medians over views."""
+
+    shape: Any
+    """What the kind's fit starts from."""
+    silhouette_px: float
+    """Distance of the mask's contour from that of the shape; infinite where no view sees it."""
+    overlap: float
+    """Intersection of shape and mask over their union, in [0, 1]."""
+
+
+@runtime_checkable
+class Family(Protocol):
+    """A kind of geometry as a candidate in model selection."""
+
+    kind: ClassVar[str]
+    geometry: ClassVar[type[Geometry]]
+    label: ClassVar[str]
+    """With its article, as sentences name it."""
+    refines: ClassVar[str | None]
+    """The kind whose proposal it takes on where that one is not chosen; None: it makes its own."""
+
+    def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
+        """A shape that explains the silhouettes; None where they determine none.
+
+        Raises InputError in that case when the kind was `asked` for.
+        """
+        ...
+
+    def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
+        """The geometry that explains silhouettes and photographs best; of an iterative kind, its start."""
+        ...
+
+    def begin(self, views: Views, geometry: Geometry, config: FitConfig) -> Training | None:
+        """What an iterative fit starts from; None where `fit` has done everything."""
+        ...
+
+    def train(
+        self,
+        views: Views,
+        geometry: Geometry,
+        training: Training,
+        config: FitConfig,
+        observer: "TrainingObserver",
+    ) -> tuple[Geometry, Training]:
+        """Take the remaining steps; `observer` is told of each."""
+        ...
+
+
+@runtime_checkable
+class TrainingObserver(Protocol):
+    """Who is told of the steps of an iterative fit."""
+
+    title: str
+    """What the progress is called."""
+
+    def after_step(self, iteration: int, seconds: float, current: Callable[[], tuple[Geometry, Training]]) -> None:
+        """That many steps are finished, the last in so many seconds; `current` gives the state after it."""
+        ...
+
+    def record(self, point: dict[str, float]) -> None:
+        """Values of the curves at one iteration."""
+        ...
+
+
+def to_plain(value: Any) -> Any:
+    """A dataclass of numbers and arrays as dictionaries, lists and numbers."""
+    if is_dataclass(value):
+        return {item.name: to_plain(getattr(value, item.name)) for item in fields(value)}
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+
+def from_plain(cls: type[Numbers], content: dict[str, Any]) -> Numbers:
+    """The dataclass of that class from `to_plain`; lists become arrays."""
+    values: dict[str, Any] = {}
+    for item in fields(cls):  # type: ignore[arg-type]
+        value = content[item.name]
+        if is_dataclass(item.type):
+            value = from_plain(item.type, value)  # type: ignore[arg-type]
+        values[item.name] = np.array(value) if isinstance(value, list) else value
+    return cls(**values)
+
+
+def usable_views(views: Views, geometry: Geometry) -> Views:
+    """The views with the usable pixels of a geometry as their solid ones."""
+    clear = tuple(replace(view, solid=geometry.usable_pixels(view)) for view in views.train)
+    return replace(views, train=clear)
+
+
+def observe_views(views: Views, geometry: Geometry, max_rays: int) -> Iterator[Rays]:
+    """What solid pixels observed, a batch a view.
+
+    When the views hold more than `max_rays` such pixels, every k-th is taken, beginning elsewhere in each view.
+    """
+    stride = max(1, -(-sum(len(view.solid) for view in views.train) // max_rays))
+    for index, view in enumerate(views.train):
+        yield geometry.observe(view, view.solid[index % stride :: stride])

@@ -1,0 +1,110 @@
+"""What kinds in closed form share: exact rays, one map, no steps of optimization."""
+
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from panoless.capture.encoding import encoding_of
+from panoless.capture.rays import unit_rays_camera
+from panoless.capture.views import TrainView, Views
+from panoless.config import FitConfig
+from panoless.environment.footprints import Footprints, deblur_map
+from panoless.environment.rays import Rays, normalize_confidence
+from panoless.environment.resolution import densest_resolution
+from panoless.environment.solve import solve_environment
+from panoless.geometry.base import Geometry, Training, TrainingObserver, from_plain, observe_views, to_plain
+from panoless.kernels.cubemap import sample_cubemap
+from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.reference.objective import reflection_directions_world
+
+
+class ExactGeometry:
+    """A surface that rays meet exactly: one primitive, whose map is solved from all rays at once."""
+
+    @property
+    def num_primitives(self) -> int:
+        """One."""
+        return 1
+
+    def footprints(self, views: Views) -> Footprints | None:
+        """None: a pixel is its center."""
+        return None
+
+    def solve_map(self: Geometry, views: Views, config: FitConfig) -> tuple[Float[Tensor, "6 3 L L"], list[Rays]]:
+        """The map from all rays, and from footprints where the kind has them.
+
+        It starts from nothing, because a coarse start would reject what is finer. Footprints are means of radiance, so
+        they take no part where radiance is encoded.
+        """
+        rays = normalize_confidence(list(observe_views(views, self, config.environment.rays)))
+        resolution = config.environment.solve_resolution or densest_resolution(rays)
+        environment = solve_environment(rays, resolution)
+        encoding = encoding_of(config)
+        if not encoding.high_dynamic_range:
+            footprints = self.footprints(views)
+            if footprints is not None:
+                environment = deblur_map(footprints, environment, encoding.saturation)
+        return environment, rays
+
+    def shade(
+        self,
+        environment: Float[Tensor, "6 3 L L"],
+        camera: RasterCamera,
+        pixels: Int[Tensor, "P"],
+        normals_camera: Float[Tensor, "3 P"],
+    ) -> Float[Tensor, "P 3"]:
+        """The map where the normals mirror the pixels' centers to."""
+        return shade_centers(environment, camera, pixels, normals_camera)
+
+    def to(self, device: torch.device) -> Any:
+        """Itself: its numbers are arrays in main memory."""
+        return self
+
+    def state_dict(self) -> dict[str, Any]:
+        """All numbers as lists and plain values."""
+        plain: dict[str, Any] = to_plain(self)
+        return plain
+
+    @classmethod
+    def from_state_dict(cls, content: dict[str, Any]) -> Any:
+        """The geometry that `state_dict` was taken from."""
+        return from_plain(cls, content)
+
+
+class ExactFamily:
+    """A kind whose `fit` does everything."""
+
+    refines: ClassVar[str | None] = None
+
+    def begin(self, views: Views, geometry: Geometry, config: FitConfig) -> Training | None:
+        """None: no steps are left to take."""
+        return None
+
+    def train(
+        self, views: Views, geometry: Geometry, training: Training, config: FitConfig, observer: TrainingObserver
+    ) -> tuple[Geometry, Training]:
+        """Never called, as `begin` gives nothing to train."""
+        raise ValueError("a kind in closed form is not trained")
+
+
+def shade_centers(
+    environment: Float[Tensor, "6 3 L L"],
+    camera: RasterCamera,
+    pixels: Int[Tensor, "P"],
+    normals_camera: Float[Tensor, "3 P"],
+) -> Float[Tensor, "P 3"]:
+    """E(ω) of the rays through pixel centers, reflected at the given normals (of any length)."""
+    rays = unit_rays_camera(camera).flatten(1)[:, pixels]
+    directions = reflection_directions_world(normals_camera, rays, camera.world_to_camera[:3, :3].T)
+    return sample_cubemap(environment, directions)
+
+
+def reflections(view: TrainView, normals_camera: Float[Tensor, "3 H W"], pixels: Tensor) -> Float[Tensor, "P 3"]:
+    """World directions that the given pixels (flat indices) of a view mirror."""
+    return reflection_directions_world(
+        normals_camera.flatten(1)[:, pixels],
+        view.rays_camera.flatten(1)[:, pixels],
+        view.camera_to_world_rotation,
+    )

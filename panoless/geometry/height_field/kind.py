@@ -1,0 +1,95 @@
+"""The height field as a kind of geometry."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Int
+from torch import Tensor
+
+from panoless.capture.object_frame import ObjectFrame
+from panoless.capture.views import TrainView, Views
+from panoless.config import FitConfig
+from panoless.environment.rays import Rays
+from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers
+from panoless.geometry.exact import ExactFamily, ExactGeometry
+from panoless.geometry.height_field.fit import fit_height_field
+from panoless.geometry.height_field.model import (
+    HeightField,
+    height_field_buffers,
+    height_field_rays,
+    visible_reflections,
+)
+from panoless.geometry.surfels.mirror import SurfelMirror
+from panoless.geometry.surfels.placement import places_within, surfels_at
+from panoless.kernels.rasterize import RasterCamera
+from shinypartial.core.errors import InputError
+
+
+@dataclass(frozen=True)
+class HeightFieldMirror(ExactGeometry):
+    """A mirror that bends: a smooth height over a plane."""
+
+    kind: ClassVar[str] = "height_field"
+    height_field: HeightField
+
+    @property
+    def num_parameters(self) -> int:
+        """The plane's numbers and the coefficients of the height."""
+        return self.height_field.num_parameters
+
+    def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
+        """Solid pixels whose reflected rays pass the frame."""
+        return visible_reflections(self.height_field, view, view.solid).pixels
+
+    def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
+        """The rays of those of the pixels whose reflected rays pass the frame."""
+        return height_field_rays(self.height_field, view, pixels)
+
+    def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
+        """Coverage by the mirror's edge; depth and normals by intersection."""
+        return height_field_buffers(self.height_field, camera)
+
+    def to_surfels(self, config: FitConfig) -> SurfelMirror:
+        """Surfels over the places of the plane's, tilted and curved as the mirror is.
+
+        Curvatures are D²h/√(1 + |∇h|²), the shape operator but for terms of second order in the slope.
+        """
+        field = self.height_field
+        places, radius = places_within(field.plane.boundary, config.surfels.count, config.seed)
+        h, h_u, h_v, *bends = field.heights(places)
+        points = field.plane.points(places) + h[:, None] * field.plane.normal
+        norm, zero = np.sqrt(1 + h_u**2 + h_v**2), np.zeros_like(h)
+        normals = np.stack([-h_u, -h_v, zero + 1], 1) / norm[:, None]
+        tangents = np.stack([zero + 1, zero, h_u], 1) / np.sqrt(1 + h_u**2)[:, None]
+        frames = np.einsum("iw,pij->pwj", field.frame, np.stack([tangents, np.cross(normals, tangents), normals], 2))
+        scales, curvatures = np.full((len(places), 2), radius), np.stack(bends, 1) / norm[:, None]
+        return SurfelMirror.of(surfels_at(points, frames, scales, curvatures), config, self)
+
+    def mesh(self, frame: ObjectFrame) -> Mesh:
+        """Quadrilaterals within the boundary."""
+        points, faces = self.height_field.quadrilaterals()
+        return Mesh(frame.to_world(points), faces)
+
+
+class HeightFieldFamily(ExactFamily):
+    """Heights over a plane that explains the silhouettes, but not what it mirrors."""
+
+    kind: ClassVar[str] = "height_field"
+    geometry: ClassVar[type[Geometry]] = HeightFieldMirror
+    label: ClassVar[str] = "a height field over it"
+    refines: ClassVar[str | None] = "plane"
+
+    def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
+        """None: a height field starts from the proposal of a plane."""
+        if asked:
+            raise InputError(
+                expected="a plane that a height field may bend, for --model height_field",
+                found="silhouettes that determine none",
+                remedy="Take --model auto or --model surfels.",
+            )
+        return None
+
+    def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
+        """Heights, plane and boundary by silhouettes and photographs together."""
+        return HeightFieldMirror(fit_height_field(views, proposal.shape, config.height_field))

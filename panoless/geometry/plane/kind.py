@@ -1,0 +1,91 @@
+"""The plane as a kind of geometry."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Int
+from torch import Tensor
+
+from panoless.capture.object_frame import ObjectFrame
+from panoless.capture.views import TrainView, Views
+from panoless.config import FitConfig
+from panoless.environment.rays import Rays
+from panoless.geometry.base import SOLID_SURFACE_ALPHA, Geometry, Mesh, Proposal, SurfaceBuffers
+from panoless.geometry.exact import ExactFamily, ExactGeometry, reflections
+from panoless.geometry.plane.fit import fit_plane
+from panoless.geometry.plane.model import Plane, plane_buffers, unoccluded_share
+from panoless.geometry.surfels.mirror import SurfelMirror
+from panoless.geometry.surfels.placement import places_within, surfels_at
+from panoless.kernels.rasterize import RasterCamera
+from shinypartial.core.errors import InputError
+
+UNOCCLUDED_SHARE = 0.99
+
+
+@dataclass(frozen=True)
+class PlaneMirror(ExactGeometry):
+    """A flat mirror with a boundary and, perhaps, a frame that stands out before it."""
+
+    kind: ClassVar[str] = "plane"
+    plane: Plane
+    occlusion_test: bool = True
+    """Whether pixels that show the frame in the mirror are left out."""
+
+    @property
+    def num_parameters(self) -> int:
+        """Normal and offset, the boundary's vertices, the frame's height."""
+        return self.plane.num_parameters
+
+    def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
+        """Solid pixels that do not show the frame in the mirror."""
+        if not self.occlusion_test:
+            return view.solid
+        share = unoccluded_share(self.plane, view.camera).flatten()[view.solid]
+        return view.solid[share > UNOCCLUDED_SHARE]
+
+    def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
+        """The rays of those of the pixels that the plane covers."""
+        buffers = plane_buffers(self.plane, view.camera)
+        pixels = pixels[buffers.alpha.flatten()[pixels] > SOLID_SURFACE_ALPHA]
+        directions = reflections(view, buffers.normals_camera, pixels)
+        return Rays(directions, view.radiance.flatten(1)[:, pixels].T.contiguous())
+
+    def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
+        """Exact coverage and depth."""
+        return plane_buffers(self.plane, camera)
+
+    def to_surfels(self, config: FitConfig) -> SurfelMirror:
+        """Flat surfels evenly within the boundary, on a hexagonal grid shifted by the seed."""
+        places, radius = places_within(self.plane.boundary, config.surfels.count, config.seed)
+        axes = np.stack([self.plane.tangent_u, self.plane.tangent_v, self.plane.normal], 1)
+        frames = np.broadcast_to(axes, (len(places), 3, 3))
+        scales, curvatures = np.full((len(places), 2), radius), np.zeros((len(places), 3))
+        return SurfelMirror.of(surfels_at(self.plane.points(places), frames, scales, curvatures), config, self)
+
+    def mesh(self, frame: ObjectFrame) -> Mesh:
+        """One polygon."""
+        corners = frame.to_world(self.plane.points(self.plane.boundary))
+        return Mesh(corners, np.arange(len(corners))[None])
+
+
+class PlaneFamily(ExactFamily):
+    """Planes that explain silhouettes."""
+
+    kind: ClassVar[str] = "plane"
+    geometry: ClassVar[type[Geometry]] = PlaneMirror
+    label: ClassVar[str] = "a plane"
+
+    def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
+        """Plane, boundary and frame by silhouettes."""
+        try:
+            found = fit_plane(views, thorough=asked, options=config.plane)
+        except InputError:
+            if asked:
+                raise
+            return None
+        return Proposal(found.plane, float(np.median(found.median_px)), float(np.median(found.iou)))
+
+    def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
+        """The proposal itself: silhouettes tell a plane to the end."""
+        return PlaneMirror(proposal.shape, config.environment.trace)

@@ -1,0 +1,111 @@
+"""The surface of revolution as a kind of geometry."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from panoless.capture.object_frame import ObjectFrame
+from panoless.capture.views import TrainView, Views
+from panoless.config import FitConfig
+from panoless.environment.footprints import Footprints
+from panoless.environment.rays import Rays
+from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers
+from panoless.geometry.exact import ExactFamily, ExactGeometry
+from panoless.geometry.revolution.deblurred_map import pixel_footprints
+from panoless.geometry.revolution.fit import propose_revolution, refine_revolution
+from panoless.geometry.revolution.lip import CLEARANCE_PX, beside_lip
+from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_buffers, revolution_rays
+from panoless.geometry.revolution.placement import surfels_on_revolution
+from panoless.geometry.revolution.render import mean_light
+from panoless.geometry.surfels.mirror import SurfelMirror
+from panoless.kernels.rasterize import RasterCamera
+from shinypartial.core.errors import InputError
+
+MERIDIANS = 128
+
+
+@dataclass(frozen=True)
+class RevolutionMirror(ExactGeometry):
+    """An axis and a meridian profile."""
+
+    kind: ClassVar[str] = "revolution"
+    surface: SurfaceOfRevolution
+    occlusion_test: bool = True
+    """Whether pixels that see the object again are left out."""
+
+    @property
+    def num_parameters(self) -> int:
+        """Axis and origin, and the profile's vertices."""
+        return self.surface.num_parameters
+
+    def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
+        """Solid pixels, but for those beside the lip of an open wall, which mix two surfaces."""
+        if not self.surface.is_open:
+            return view.solid
+        mixed = torch.from_numpy(beside_lip(view.camera, self.surface, CLEARANCE_PX).ravel())
+        return view.solid[~mixed.to(view.solid.device)[view.solid]]
+
+    def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
+        """The rays of the pixels; where all solid ones are taken, trusted by the solid angle of each."""
+        weighted = len(pixels) == len(view.solid)
+        return revolution_rays(self.surface, view, pixels, int(self.occlusion_test), weighted=weighted)[0]
+
+    def footprints(self, views: Views) -> Footprints:
+        """Of all pixels that see the environment at once, and of a sample of the others."""
+        return pixel_footprints(views, self.surface, int(self.occlusion_test))
+
+    def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
+        """By intersection; alpha by 4×4 rays where neighbors disagree."""
+        return revolution_buffers(self.surface, camera)
+
+    def shade(
+        self,
+        environment: Float[Tensor, "6 3 L L"],
+        camera: RasterCamera,
+        pixels: Int[Tensor, "P"],
+        normals_camera: Float[Tensor, "3 P"],
+    ) -> Float[Tensor, "P 3"]:
+        """Mean over the pixels' areas, followed through all their reflections."""
+        return mean_light(self.surface, environment, camera, pixels)
+
+    def to_surfels(self, config: FitConfig) -> SurfelMirror:
+        """Rings of surfels, curved as the surface is."""
+        return SurfelMirror.of(surfels_on_revolution(self.surface, config.surfels.count), config)
+
+    def mesh(self, frame: ObjectFrame) -> Mesh:
+        """Quadrilaterals between 128 meridians."""
+        rings = frame.to_world(self.surface.rings(MERIDIANS))
+        count, around = rings.shape[:2]
+        index = np.arange(count * around).reshape(count, around)
+        following = np.roll(index, -1, 1)
+        faces = np.stack([index[:-1], following[:-1], following[1:], index[1:]], -1).reshape(-1, 4)
+        return Mesh(rings.reshape(-1, 3), faces)
+
+
+class RevolutionFamily(ExactFamily):
+    """Surfaces of revolution that explain silhouettes."""
+
+    kind: ClassVar[str] = "revolution"
+    geometry: ClassVar[type[Geometry]] = RevolutionMirror
+    label: ClassVar[str] = "a surface of revolution"
+
+    def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
+        """Axis and outer profile by silhouettes."""
+        found = propose_revolution(views)
+        if found is not None:
+            return Proposal(found.surface, float(np.median(found.median_px)), float(np.median(found.iou)))
+        if asked:
+            raise InputError(
+                expected="masks of a surface of revolution, for --model revolution",
+                found="no axis around which their silhouettes agree",
+                remedy="Take --model auto or --model surfels.",
+            )
+        return None
+
+    def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
+        """Profile and axis by what is reflected."""
+        return RevolutionMirror(refine_revolution(views, proposal.shape), config.environment.trace)

@@ -1,0 +1,54 @@
+"""Surfels as a kind of geometry: what fits when nothing simpler does, in steps of gradient descent."""
+
+from typing import ClassVar, cast
+
+import torch
+
+from panoless.capture.views import Views
+from panoless.config import FitConfig
+from panoless.environment.cubemap import initial_environment, resample
+from panoless.environment.solve import solve_environment
+from panoless.geometry.base import Geometry, Proposal, Training, TrainingObserver, observe_views
+from panoless.geometry.surfels.mirror import SurfelMirror
+from panoless.geometry.surfels.placement import initial_surfels
+from panoless.geometry.surfels.train import train_surfels
+
+INITIAL_RAYS = 1_000_000
+
+
+class SurfelFamily:
+    """Free surfels."""
+
+    kind: ClassVar[str] = "surfels"
+    geometry: ClassVar[type[Geometry]] = SurfelMirror
+    label: ClassVar[str] = "surfels"
+    refines: ClassVar[str | None] = None
+
+    def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
+        """Surfels explain any silhouettes."""
+        return Proposal(None, 0.0, 1.0)
+
+    def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
+        """Those that the steps begin with: on a geometry that was proposed, else on the first surface."""
+        if proposal.shape is not None:
+            start: Geometry = proposal.shape.to_surfels(config)
+            return start.to(views.train[0].mask.device)
+        surfels = initial_surfels(views, config.surfels, config.seed, config.first_surface)
+        return SurfelMirror.of(surfels, config)
+
+    def begin(self, views: Views, geometry: Geometry, config: FitConfig) -> Training:
+        """The map that fits the first surfels best; the configured one where maps are not solved."""
+        device = views.train[0].mask.device
+        environment = initial_environment(config.environment, torch.Generator().manual_seed(config.seed)).to(device)
+        length = environment.shape[-1]
+        if config.environment.solve and config.environment.activation == "clamp":
+            with torch.no_grad():
+                rays = list(observe_views(views, geometry, INITIAL_RAYS))
+                environment = resample(solve_environment(rays, length // 2), length)
+        return Training(environment, environment.new_zeros(6, length, length))
+
+    def train(
+        self, views: Views, geometry: Geometry, training: Training, config: FitConfig, observer: TrainingObserver
+    ) -> tuple[Geometry, Training]:
+        """The remaining steps."""
+        return train_surfels(views, cast(SurfelMirror, geometry), training, config, observer)

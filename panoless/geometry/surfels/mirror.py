@@ -1,0 +1,227 @@
+"""Surfels as a geometry: what they observed, how far each is to be trusted, and the map that follows."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from panoless.capture.object_frame import ObjectFrame
+from panoless.capture.views import TrainView, Views
+from panoless.config import FitConfig
+from panoless.environment.footprints import Footprints
+from panoless.environment.rays import Rays
+from panoless.environment.resolution import finest_resolution
+from panoless.environment.solve import solve_environment
+from panoless.geometry.base import SOLID_SURFACE_ALPHA, Geometry, Mesh, SurfaceBuffers
+from panoless.geometry.exact import reflections, shade_centers
+from panoless.geometry.surfels.model import Surfels
+from panoless.geometry.surfels.rendering import ALPHA_FLOOR, rasterize_surfels, surface_buffers, tiles_of
+from panoless.kernels.cubemap import sample_cubemap
+from panoless.kernels.rasterize import Channels, RasterBuffers, RasterCamera
+from panoless.kernels.reference.rasterize import rotation_matrices
+from panoless.numeric.robust import robust_weight
+from shinypartial.core.conventions import SOLID_ALPHA
+
+#: Share of the rays that is enough to find out whom to trust and how fine a map is worth it.
+TRIAL_SHARE = 1 / 8
+TRUST_VIEWS = 40
+TRIAL_RESOLUTION = 128
+TRUST_SCALE = 0.15
+#: Pixels' worth of an opinion that every surfel starts with, so that one that is hardly seen is hardly believed.
+PRIOR_PIXELS, PRIOR_TRUST = 1.0, 0.2
+TRUST_POWER = 4
+SH_DEGREE_0 = 0.28209479177387814
+
+
+@dataclass(frozen=True)
+class SurfelMirror:
+    """A set of surfels, and which of their parameters count."""
+
+    kind: ClassVar[str] = "surfels"
+    surfels: Surfels
+    curved: bool = True
+    albedo: bool = False
+    roughness: bool = False
+    depth_blend: float = 0.5
+    """λ_d of Eq. 3."""
+    started_on: Geometry | None = None
+    """The geometry that the surfels were placed on, if what it occludes stays occluded: the mirror in a frame."""
+
+    @classmethod
+    def of(cls, surfels: Surfels, config: FitConfig, started_on: Geometry | None = None) -> "SurfelMirror":
+        """Surfels as a configuration takes them."""
+        loss = config.loss
+        return cls(surfels, config.surfels.curved, config.albedo, loss.roughness_weighted, loss.depth_blend, started_on)
+
+    @property
+    def num_parameters(self) -> int:
+        """Center, rotation, radii and opacity of each, and what else is learned."""
+        return (3 + 4 + 2 + 1 + 3 * self.albedo + 3 * self.curved + self.roughness) * self.surfels.count
+
+    @property
+    def num_primitives(self) -> int:
+        """The number of surfels."""
+        return self.surfels.count
+
+    def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
+        """Those that the geometry it started on calls usable; all solid ones where there is none."""
+        return view.solid if self.started_on is None else self.started_on.usable_pixels(view)
+
+    def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
+        """The rays of those of the pixels that surfels cover, less what is diffuse."""
+        return self.observe_covered(view, pixels)[0]
+
+    def observe_covered(self, view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Rays, Int[Tensor, "Q"]]:
+        """The rays, and which pixels they belong to."""
+        buffers = rasterize_surfels(
+            self.surfels,
+            view.camera,
+            curved=self.curved,
+            channels=Channels(colors=self.albedo, depth=False, distortion=False),
+            active_tiles=tiles_of(view.mask > SOLID_ALPHA),
+        )
+        pixels = pixels[buffers.alpha.flatten()[pixels] > SOLID_SURFACE_ALPHA]
+        diffuse = buffers.colors.flatten(1)[:, pixels]
+        radiance = (view.radiance.flatten(1)[:, pixels] - diffuse).T.contiguous()
+        return Rays(reflections(view, buffers.normals_camera, pixels), radiance), pixels
+
+    def footprints(self, views: Views) -> Footprints | None:
+        """None: normals are not known well enough beside a pixel's center."""
+        return None
+
+    def solve_map(self, views: Views, config: FitConfig) -> tuple[Float[Tensor, "6 3 L L"], list[Rays]]:
+        """The map from rays weighted by the trust in their surfels.
+
+        A trial map says which surfels to trust, and held-out views how fine the map should be, unless the
+        configuration does; then all rays are solved.
+        """
+        most = config.environment.rays
+        stride = max(1, math.ceil(sum(len(view.solid) for view in views.train) / most))
+        observed = [
+            (view, *self.observe_covered(view, view.solid[index % stride :: stride]))
+            for index, view in enumerate(views.train)
+        ]
+        resolution = config.environment.solve_resolution
+        few = most * TRIAL_SHARE
+        coarse = solve_environment(_thin([rays for _, rays, _ in observed], few), resolution or TRIAL_RESOLUTION)
+        trust = surfel_trust(views, self, coarse)
+        rays = [replace(rays, trust=self._trust_of(view, trust, pixels)) for view, rays, pixels in observed]
+        trial = _thin(rays, few)
+        coarse = solve_environment(trial, resolution or TRIAL_RESOLUTION)
+        return solve_environment(rays, resolution or finest_resolution(trial, coarse), coarse), rays
+
+    def _trust_of(self, view: TrainView, trust: Float[Tensor, "K"], pixels: Int[Tensor, "P"]) -> Float[Tensor, "P"]:
+        """The trust of the surfels that pixels see, blended, to the fourth power."""
+        buffers = rasterize_attribute(view, self.surfels, trust[:, None].expand(-1, 3).contiguous())
+        blended = buffers.colors[0].flatten()[pixels] / buffers.alpha.flatten()[pixels].clamp(min=ALPHA_FLOOR)
+        return blended.clamp(0, 1) ** TRUST_POWER
+
+    def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
+        """Blended over the surfels."""
+        return surface_buffers(self.surfels, camera, curved=self.curved, depth_blend=self.depth_blend)
+
+    def shade(
+        self,
+        environment: Float[Tensor, "6 3 L L"],
+        camera: RasterCamera,
+        pixels: Int[Tensor, "P"],
+        normals_camera: Float[Tensor, "3 P"],
+    ) -> Float[Tensor, "P 3"]:
+        """The map where the blended normals mirror the pixels' centers to (Eqs. 5–7)."""
+        return shade_centers(environment, camera, pixels, normals_camera)
+
+    def to_surfels(self, config: FitConfig) -> "SurfelMirror":
+        """Itself."""
+        return self
+
+    def mesh(self, frame: ObjectFrame) -> Mesh:
+        """A cloud with the column names that Gaussian-splat viewers read.
+
+        Colors are degree-0 spherical harmonics of the albedo; curvature_a, _b, _c are the shape operator.
+        """
+        surfels = self.surfels.detached()
+        normals = rotation_matrices(surfels.quats)[:, :, 2]
+        columns = {
+            **_columns(("nx", "ny", "nz"), normals),
+            **_columns(("f_dc_0", "f_dc_1", "f_dc_2"), (surfels.albedo - 0.5) / SH_DEGREE_0),
+            "opacity": surfels.opacity_logits,
+            **_columns(("scale_0", "scale_1"), surfels.log_scales + math.log(frame.radius)),
+            **_columns(("rot_0", "rot_1", "rot_2", "rot_3"), normalize(surfels.quats, dim=1)),
+            **_columns(("curvature_a", "curvature_b", "curvature_c"), surfels.curvatures / frame.radius),
+        }
+        centers = surfels.means * frame.radius + torch.from_numpy(frame.center).float()
+        return Mesh(centers.numpy(), columns={name: column.numpy() for name, column in columns.items()})
+
+    def to(self, device: torch.device) -> "SurfelMirror":
+        """The same numbers on a device."""
+        return replace(self, surfels=self.surfels.to(device))
+
+    def state_dict(self) -> dict[str, Any]:
+        """The surfels' tensors, the switches, and the geometry that they started on."""
+        start = self.started_on
+        return {
+            **vars(self),
+            "surfels": self.surfels.detached().named(),
+            "started_on": None if start is None else (start.kind, start.state_dict()),
+        }
+
+    @classmethod
+    def from_state_dict(cls, content: dict[str, Any]) -> "SurfelMirror":
+        """The geometry that `state_dict` was taken from."""
+        from panoless.geometry.registry import FAMILIES
+
+        start = content["started_on"]
+        started_on = None if start is None else FAMILIES[start[0]].geometry.from_state_dict(start[1])
+        return cls(**{**content, "surfels": Surfels(**content["surfels"]), "started_on": started_on})
+
+
+def _columns(names: Sequence[str], matrix: Tensor) -> dict[str, Tensor]:
+    return {name: matrix[:, index] for index, name in enumerate(names)}
+
+
+def _thin(rays: Sequence[Rays], most: float) -> list[Rays]:
+    """About `most` of the rays at most: every k-th, beginning elsewhere in each batch."""
+    stride = max(1, math.ceil(sum(len(batch.directions) for batch in rays) / most))
+    return [batch.every(stride, index % stride) for index, batch in enumerate(rays)]
+
+
+def surfel_trust(views: Views, mirror: SurfelMirror, environment: Float[Tensor, "6 3 L L"]) -> Float[Tensor, "K"]:
+    """Share of the pixels that a surfel makes up, over some forty views, whose radiance agrees with a map; in [0, 1].
+
+    A surfel whose normal is wrong disagrees in most views although its rays agree with each other in one; a pixel alone
+    cannot tell. Agreement is the Geman–McClure weight of the residual; a pixel counts for a surfel by its share in the
+    blend, which is the derivative of the blended image.
+    """
+    surfels = mirror.surfels
+    agreeing, total = torch.zeros_like(surfels.means[:, 0]), torch.zeros_like(surfels.means[:, 0])
+    for view in views.train[:: math.ceil(len(views.train) / TRUST_VIEWS)]:
+        rays, pixels = mirror.observe_covered(view, view.solid)
+        error = sample_cubemap(environment, rays.directions) - rays.radiance
+        shares = torch.zeros(surfels.count, 3, device=surfels.means.device, requires_grad=True)
+        with torch.enable_grad():
+            buffers = rasterize_attribute(view, surfels.detached(), shares)
+            votes = torch.zeros_like(buffers.colors).flatten(1)
+            votes[0, pixels], votes[1, pixels] = robust_weight(error, TRUST_SCALE), 1.0
+            # A scalar, because torch loads much code to check the shapes of other cotangents.
+            voted = (buffers.colors * votes.view_as(buffers.colors)).sum()
+        (gradient,) = torch.autograd.grad(voted, shares)
+        agreeing += gradient[:, 0]
+        total += gradient[:, 1]
+    return (agreeing + PRIOR_TRUST * PRIOR_PIXELS) / (total + PRIOR_PIXELS)
+
+
+def rasterize_attribute(view: TrainView, surfels: Surfels, attribute: Float[Tensor, "K 3"]) -> RasterBuffers:
+    """The blend of a value of each surfel over the solid pixels of a view."""
+    return rasterize_surfels(
+        surfels,
+        view.camera,
+        curved=False,
+        attribute=attribute,
+        channels=Channels(depth=False, distortion=False),
+        active_tiles=tiles_of(view.mask > SOLID_ALPHA),
+    )

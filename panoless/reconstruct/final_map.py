@@ -1,0 +1,35 @@
+"""The map of a finished geometry, and how well each of its directions was observed."""
+
+import torch
+
+from panoless.capture.encoding import encoding_of
+from panoless.capture.views import Views
+from panoless.config import FitConfig
+from panoless.environment.resolution import count_rays
+from panoless.environment.visibility import agreement, visibility_from_agreement, visibility_from_evidence
+from panoless.geometry.base import observe_views
+from panoless.reconstruct.state import FitState
+
+GRAY = 0.5
+
+
+def complete(state: FitState, views: Views, config: FitConfig) -> None:
+    """Set environment and visibility of a state from its geometry and the views' usable pixels.
+
+    The map is solved in closed form, unless the configuration keeps that of an iterative fit.
+    """
+    encoding, training = encoding_of(config), state.training
+    with torch.no_grad():
+        if config.environment.solve or training is None:
+            environment, rays = state.geometry.solve_map(views, config)
+            if not config.environment.fill:
+                environment = torch.where(count_rays(rays, environment.shape[-1]) > 0, environment, GRAY)
+        else:
+            rays = list(observe_views(views, state.geometry, config.environment.rays))
+            sigmoid = config.environment.activation == "sigmoid"
+            environment = torch.sigmoid(training.environment) if sigmoid else training.environment
+        if config.visibility == "online" and training is not None:
+            state.visibility = visibility_from_evidence(training.evidence)
+        else:
+            state.visibility = visibility_from_agreement(agreement(rays, environment, encoding.saturation))
+        state.environment = encoding.decoded(environment)

@@ -1,0 +1,70 @@
+"""What is kept of an iterative fit while it runs: seconds, curves, checkpoints and snapshots."""
+
+import resource
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from panoless.geometry.base import Geometry, Training
+from panoless.reconstruct.snapshots import SnapshotSchedule, snapshot_folders
+from panoless.reconstruct.state import FitState, save_state
+from shinypartial.prediction.format import SNAPSHOTS
+
+CHECKPOINT_INTERVAL_S = 20.0
+
+
+class Recorder:
+    """Observes the steps of one fit, and saves its state at every twentieth second and every snapshot.
+
+    A resumed fit repeats the steps since its checkpoint, so snapshots later than that are deleted and taken again: none
+    is lost, none is doubled, and all lie on the path of the fit that is finished in the end.
+    """
+
+    title = "fitting"
+
+    def __init__(self, run: Path, schedule: SnapshotSchedule, state: FitState) -> None:
+        """Begin or continue at `state`, whose seconds and curves are kept up to date."""
+        self._run, self._schedule, self._state = run, schedule, state
+        self._saved = time.monotonic()
+        for folder in snapshot_folders(run):
+            if int(folder.name) > state.iteration:
+                shutil.rmtree(folder)
+
+    def after_step(self, iteration: int, seconds: float, current: Callable[[], tuple[Geometry, Training]]) -> None:
+        """Count the step, and save what is due."""
+        stages = self._state.seconds
+        before = sum(stages.values())
+        stages["optimize"] = stages.get("optimize", 0.0) + seconds
+        if self._schedule.is_due(iteration, before, sum(stages.values())):
+            geometry, training = current()
+            kept = replace(self._state, geometry=geometry, training=replace(training, optimizer={}))
+            save_state(self._run / SNAPSHOTS / f"{iteration:06d}", kept)
+        if time.monotonic() - self._saved > CHECKPOINT_INTERVAL_S:
+            self._state.geometry, self._state.training = current()
+            note_peak_memory(self._state)
+            save_state(self._run, self._state)
+            self._saved = time.monotonic()
+
+    def record(self, point: dict[str, float]) -> None:
+        """Append to the curves."""
+        for name, value in point.items():
+            self._state.curves.setdefault(name, []).append(value)
+
+
+def note_peak_memory(state: FitState) -> None:
+    """Raise the state's peak to that of this process."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    state.peak_memory_bytes = max(state.peak_memory_bytes, peak)
+
+
+@contextmanager
+def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    """Add the time that a block takes to its stage."""
+    start = time.monotonic()
+    try:
+        yield
+    finally:
+        seconds[stage] = seconds.get(stage, 0.0) + time.monotonic() - start

@@ -1,0 +1,71 @@
+"""Candidates of model selection: the evidence for each as data, and the sentence that is made from it."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Verdict(StrEnum):
+    """What became of a candidate."""
+
+    CHOSEN = "chosen"
+    REFUSED_BY_SILHOUETTES = "refused by silhouettes"
+    REFUSED_BY_HELD_OUT_VIEWS = "refused by held-out views"
+    NOT_PROPOSED = "not proposed"
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One kind of geometry as a candidate. What was not measured is None."""
+
+    kind: str
+    verdict: Verdict
+    reason: str
+    silhouette_px: float | None = None
+    """Median distance of the masks' contours from the candidate's silhouette."""
+    overlap: float | None = None
+    """Intersection over union of silhouette and masks."""
+    held_out_error: float | None = None
+    """Mean of ‖e‖²/(‖e‖² + s²) over rays of held-out views, in [0, 1]."""
+    surfels_error: float | None = None
+    """The same of surfels that started on the candidate."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The kind that was chosen, and all candidates in the order in which they were examined."""
+
+    chosen: str
+    candidates: tuple[Candidate, ...]
+
+    @property
+    def sentence(self) -> str:
+        """The choice in one line."""
+        *refused, chosen = self.candidates
+        because = "; ".join(f"{each.kind}: {describe(each)}" for each in refused)
+        return f"{self.chosen} ({describe(chosen)})" + (f"; before it {because}" if because else "")
+
+
+def describe(candidate: Candidate) -> str:
+    """Verdict and figures of a candidate in words."""
+    parts = [candidate.reason]
+    if candidate.silhouette_px is not None and candidate.overlap is not None:
+        distance = candidate.silhouette_px
+        away = f"{distance:.2g} px away" if math.isfinite(distance) else "far away"
+        parts.append(f"silhouettes {away}, overlap {candidate.overlap:.0%}")
+    if candidate.held_out_error is not None:
+        text = f"held-out error {candidate.held_out_error:.4f}"
+        if candidate.surfels_error is not None:
+            text += f", {candidate.surfels_error:.4f} with surfels"
+        parts.append(text)
+    return "; ".join(parts)
+
+
+def selection_from_plain(chosen: str, candidates: Sequence[dict[str, object]]) -> Selection:
+    """The selection from dictionaries, as checkpoints hold it."""
+    listed = tuple(
+        Candidate(**{**each, "verdict": Verdict(str(each["verdict"]))})  # type: ignore[arg-type]
+        for each in candidates
+    )
+    return Selection(chosen, listed)
