@@ -1,6 +1,38 @@
 """Reconstruct the environment that a mirror-like object reflects, from photographs of one side of it.
 
-Importing this package loads no torch; its rooms do, and the command line imports them inside its commands.
+    import panoless
+
+    result = panoless.fit("datasets/vase-400")
+    result.environment, result.visibility, result.model, result.normals(0)
+
+Importing this package loads no torch and no numpy; its functions do when they are first asked for.
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from panoless.api import Reconstruction, fit, load
+    from panoless.config import FitConfig
+    from panoless.presets import PRESETS
+
 __version__ = "0.1.0"
+__all__ = ["PRESETS", "FitConfig", "Reconstruction", "fit", "load"]
+
+_PLACES = {
+    "PRESETS": "panoless.presets",
+    "FitConfig": "panoless.config",
+    "Reconstruction": "panoless.api",
+    "fit": "panoless.api",
+    "load": "panoless.api",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_PLACES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

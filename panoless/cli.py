@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from panoless.config import FitConfig
+from panoless.config import FitConfig, renamed_arguments, with_overrides
 from panoless.presets import PRESETS
-from shinypartial.core.errors import EXIT_BAD_INPUT, InputError, run_command
+from shinypartial.core.errors import InputError, parse_and_run
 
 if TYPE_CHECKING:
     from panoless.reconstruct.state import FitState
@@ -23,17 +23,22 @@ class Fit:
     """Fit a dataset: its surface, an environment map and a visibility map; then export the prediction."""
 
     dataset: Annotated[Path | None, tyro.conf.Positional] = None
-    """Dataset folder, also a plain NeRF-synthetic one; without it the newest below ./datasets."""
+    """Dataset folder, also a plain NeRF-synthetic one, or the name of a bundled one, such as tiny-vase; without it the
+    newest below ./datasets."""
     preset: Literal[tuple(PRESETS)] = "default"  # type: ignore[valid-type]
     """Starting values of the configuration."""
     output: Path | None = None
     """Prediction folder; default predictions/DATASET-PRESET. The run folder has the same name below ./runs."""
     snapshots: int = 0
-    """Keep this many moments of the fit: its end, half of the iterations, a quarter, and so on; see docs/chart.md."""
+    """Keep this many moments of the fit: its end, half of the iterations, a quarter, and so on; see
+    docs/how-to/compare-methods.md."""
     snapshot_seconds: tuple[float, ...] = ()
     """Keep the moments after these seconds of fitting."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where the fit computes; `cuda` (NVIDIA or AMD) needs a GPU, torch for it and Triton; see docs/gpu.md."""
+    """Where the fit computes; `cuda` (NVIDIA or AMD) needs a GPU, torch for it and Triton; see
+    docs/how-to/use-a-gpu.md."""
+    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="OPTION=VALUE")] = ()
+    """Change tuned numbers, such as plane.max_vertices=64; docs/reference/fit-options.md lists them."""
     config: FitConfig = field(default_factory=FitConfig)
 
     def run(self) -> None:
@@ -42,26 +47,24 @@ class Fit:
         from panoless.export.prediction import export_prediction
         from panoless.reconstruct.fit import find_device, fit
         from panoless.reconstruct.snapshots import snapshot_schedule
-        from shinypartial.dataset.read import newest_dataset, open_dataset
+        from shinypartial.dataset.bundled import resolve_dataset
+        from shinypartial.dataset.read import open_dataset
         from shinypartial.io.files import folder_lock
         from shinypartial.prediction.format import acquire_prediction
 
         _announce_compilation()
-        root = self.dataset
-        if root is None:
-            root = newest_dataset()
-            print(f"No dataset named; taking the newest one: {root}")
-        dataset = open_dataset(root)
-        name = f"{dataset.name}-{self.config.preset}"
+        config = with_overrides(self.config, self.set)
+        dataset = open_dataset(resolve_dataset(self.dataset))
+        name = f"{dataset.name}-{config.preset}"
         prediction = self.output or Path("predictions") / name
         run_folder = RUNS / prediction.resolve().name
         device = find_device(self.device)
-        schedule = snapshot_schedule(self.snapshots, self.snapshot_seconds, self.config.iterations)
+        schedule = snapshot_schedule(self.snapshots, self.snapshot_seconds, config.iterations)
         _refuse_run_folder(prediction, run_folder)
         with folder_lock(prediction):
             acquire_prediction(prediction)
-            state = fit(dataset, self.config, run_folder, schedule, device)
-            export_prediction(dataset, state, self.config, prediction)
+            state = fit(dataset, config, run_folder, schedule, device)
+            export_prediction(dataset, state, config, prediction)
         print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
         if schedule and state.training is None:
             print(f"No snapshots: this run took {_label(state)}, whose map is solved without steps.")
@@ -175,23 +178,23 @@ def _preset_of(arguments: list[str]) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns 0, 2 for bad input or usage, 130 when interrupted."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    arguments = renamed_arguments(sys.argv[1:] if arguments is None else arguments)
     preset = _preset_of(arguments)
     fit_default = Fit(preset=preset, config=PRESETS[preset])
     kinds = (
         Annotated[Fit, tyro.conf.subcommand("fit", default=fit_default)]
         | Annotated[Export, tyro.conf.subcommand("export")]
     )
-    try:
-        command: Fit | Export = tyro.cli(
+
+    def parse() -> Fit | Export:
+        return tyro.cli(
             kinds,  # type: ignore[arg-type]
             args=arguments,
             prog="panoless",
             description="The environment that a shiny object reflects, from photographs of one side of it.",
         )
-    except SystemExit as stop:
-        return EXIT_BAD_INPUT if stop.code else 0
-    return run_command(command.run)
+
+    return parse_and_run(parse)
 
 
 if __name__ == "__main__":

@@ -4,17 +4,25 @@ Durations are shares of `iterations`, so every schedule scales with the length o
 at its field; `check_config` applies it.
 """
 
+import json
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 from msgspec import Meta
 
+from panoless.first_surface.options import FirstSurfaceOptions
+from panoless.geometry.height_field.options import HeightFieldOptions
+from panoless.geometry.plane.options import PlaneOptions
 from panoless.selection.options import SelectionOptions
 from shinypartial.core.errors import InputError
-from shinypartial.io.records import Count, NonNegative, Positive, Share, check_record, read_record
+from shinypartial.io.records import Count, NonNegative, Positive, Share, check_record, read_record, write_record
 
+Options = TypeVar("Options")
+Tuned = Annotated[Options, tyro.conf.Suppress]
+"""Tuned numbers of a stage, which `--set` changes: too many for the help of a command."""
 Model = Literal["auto", "plane", "height_field", "revolution", "surfels"]
 #: Values of --model that an earlier version had, and today's.
 RENAMED_MODELS = {"bent": "height_field"}
@@ -171,13 +179,15 @@ class FitConfig:
     largest distance of a camera from the cameras' mean (Kerbl et al. 2023)."""
     visibility_alpha: Share = 0.5
     """τ: only pixels with alpha above it count as observations."""
-    # The options of each kind of geometry are nested here, beside those of surfels.
     surfels: SurfelConfig = field(default_factory=SurfelConfig)
     environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     rates: RateConfig = field(default_factory=RateConfig)
-    selection: SelectionOptions = field(default_factory=SelectionOptions)
+    first_surface: Tuned[FirstSurfaceOptions] = field(default_factory=FirstSurfaceOptions)
+    plane: Tuned[PlaneOptions] = field(default_factory=PlaneOptions)
+    height_field: Tuned[HeightFieldOptions] = field(default_factory=HeightFieldOptions)
+    selection: Tuned[SelectionOptions] = field(default_factory=SelectionOptions)
 
 
 def renamed_arguments(arguments: list[str]) -> list[str]:
@@ -198,6 +208,31 @@ def renamed_arguments(arguments: list[str]) -> list[str]:
         else:
             renamed.append(flag + equals + value)
     return renamed
+
+
+def with_overrides(config: FitConfig, overrides: Sequence[str]) -> FitConfig:
+    """The configuration with values set by `path=value`, such as `plane.max_vertices=64`; values are JSON or words.
+
+    Raises InputError for a path that is no option, and for a value out of its range.
+    """
+    content = write_record(config)
+    for override in overrides:
+        path, equals, text = override.partition("=")
+        *sections, name = path.replace("-", "_").split(".")
+        place = content
+        for section in sections:
+            place = place.get(section, {}) if isinstance(place, dict) else {}
+        if not equals or not isinstance(place, dict) or name not in place:
+            raise InputError(
+                expected="--set OPTION=VALUE with an option of the configuration, such as plane.max_vertices=64",
+                found=override,
+                remedy="The reference of options lists them all.",
+            )
+        try:
+            place[name] = json.loads(text)
+        except ValueError:
+            place[name] = text
+    return read_record(FitConfig, content, "the configuration", remedy="The reference of options gives every range.")
 
 
 def config_from_dict(content: Any) -> FitConfig:

@@ -20,6 +20,7 @@ from shinypartial.dataset.schema import (
     ENVIRONMENT_LATLONG,
     ENVIRONMENT_LATLONG_Y_UP,
     FORMAT_MINOR,
+    MANIFEST,
     SPLITS,
     Frame,
     View,
@@ -33,12 +34,12 @@ from shinypartial.dataset.write import (
     write_transforms,
     write_view,
 )
-from shinypartial.io.files import folder_lock, remove_partial_files
+from shinypartial.io.files import folder_lock, read_json, remove_partial_files
 from shinypartial.io.images import read_exr_rgb
 from shinypartial.io.progress import Progress
 from shinypartial.release.contact_sheet import write_contact_sheet
 from shinypartial.release.statistics import dataset_statistics
-from shinypartial.scene import FileWorld, SceneSpec
+from shinypartial.scene import FileWorld, SceneSpec, older_recipe
 
 STUDIO_LIGHT_SOURCE = "Blender's studio lights, by Greg Zaal (Poly Haven, https://polyhaven.com)"
 
@@ -60,7 +61,7 @@ def generate(spec: SceneSpec, root: Path) -> Generated:
     trajectory = plan_cameras(spec.camera, spec.render.resolution)
     frames = {split: make_frames(root, split, getattr(trajectory, split)) for split in SPLITS}
     every = [frame for split in SPLITS for frame in frames[split]]
-    recipe = {**spec.recipe(), "hemisphere_axis": trajectory.hemisphere_axis.tolist()}
+    recipe = _as_begun(root, {**spec.recipe(), "hemisphere_axis": trajectory.hemisphere_axis.tolist()})
     if not _is_complete(root, every):
         check_blender()
     with folder_lock(root):
@@ -92,6 +93,13 @@ def _generator() -> dict[str, Any]:
     except importlib.metadata.PackageNotFoundError:
         blender = "unknown"
     return {"shinypartial": __version__, "blender": blender}
+
+
+def _as_begun(root: Path, recipe: dict[str, Any]) -> dict[str, Any]:
+    """The recipe in the words of the version that began the folder, where they mean the same scene."""
+    manifest = read_json(root / MANIFEST, "the manifest") if (root / MANIFEST).exists() else None
+    begun = manifest.get("recipe") if isinstance(manifest, dict) else None
+    return begun if isinstance(begun, dict) and begun == older_recipe(recipe) else recipe
 
 
 def _is_complete(root: Path, frames: Sequence[Frame]) -> bool:

@@ -1,4 +1,4 @@
-"""The light in which a fit works: how the radiance of pixels is encoded before it, and the map's decoded after it."""
+"""How the radiance of pixels is encoded for a fit, and that of its map decoded after it."""
 
 import math
 from dataclasses import dataclass
@@ -65,5 +65,5 @@ LDR = RadianceEncoding()
 
 
 def encoding_of(config: FitConfig) -> RadianceEncoding:
-    """The light of a configuration."""
+    """The encoding that a configuration asks for."""
     return RadianceEncoding(config.environment.range == "hdr", config.tint)

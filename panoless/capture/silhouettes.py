@@ -1,35 +1,40 @@
-"""Silhouettes: sub-pixel contours of masks, as curves and as signed distances."""
+"""Silhouettes: sub-pixel contours of masks, as curves and as signed distances.
+
+Where a mask touches the border of its picture the object may go on, so there is no silhouette along that border, and
+what lies beyond it is unknown. Beyond the other borders there is no object.
+"""
 
 import math
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from panoless.capture.rays import pose_of
+from panoless.capture.masks import MASK_LEVEL, cut_sides
+from panoless.capture.rays import camera_rays, pose_of, project
 from panoless.capture.views import TrainView, Views, concatenated
 from panoless.kernels.rasterize import RasterCamera
 from shinypartial.core.conventions import PIXEL_CENTER
 
-if TYPE_CHECKING:
-    pass
-
-
-OUTLINE_LEVEL = 0.5
 #: Within this distance the curve itself is measured; beyond, pixels are.
 EXACT_BAND_PX = 3.0
 CURVE_STEP_PX = 0.5
+#: Contour points nearer to a border that the mask touches are left out.
+BORDER_PX = 1.0
 
 
 @dataclass(frozen=True)
 class MaskDistance:
-    """How far each pixel center of a view lies outside its mask's curve, in pixels; negative inside."""
+    """How far each pixel center of a view lies outside its mask's curve, in pixels; negative inside.
+
+    `cut` are the sides at which the mask touches the border of the picture: left, top, right, bottom.
+    """
 
     camera: RasterCamera
     distance_px: Float[Tensor, "H W"]
+    cut: tuple[bool, bool, bool, bool] = (False, False, False, False)
 
     @property
     def pixel(self) -> float:
@@ -37,12 +42,14 @@ class MaskDistance:
         return float(np.linalg.norm(pose_of(self.camera)[1])) / self.camera.fx
 
     def distances(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
-        """Signed distance of points from the outline's cone, to first order: pixels · depth / focal length."""
+        """Signed distance of points from the silhouette's cone, to first order: pixels · depth / focal length.
+
+        −∞ where the view doesn't tell: beyond the last pixel centers at a side of the picture that cuts the mask.
+        """
         camera = self.camera
-        seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        depth = seen[:, 2].clamp(min=camera.near)
-        column = seen[:, 0] / depth * camera.fx + (camera.cx - PIXEL_CENTER)
-        row = seen[:, 1] / depth * camera.fy + (camera.cy - PIXEL_CENTER)
+        points_camera = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        depth = points_camera[:, 2].clamp(min=camera.near)
+        column, row = project(camera, points_camera, first_center=0)
         inner_column, inner_row = column.clamp(0, camera.width - 1), row.clamp(0, camera.height - 1)
         beyond = torch.hypot(column - inner_column, row - inner_row)
         left, top = inner_column.floor().clamp(max=camera.width - 2), inner_row.floor().clamp(max=camera.height - 2)
@@ -51,36 +58,44 @@ class MaskDistance:
         values = self.distance_px.flatten()
         upper = torch.lerp(values[index], values[index + 1], across)
         lower = torch.lerp(values[index + camera.width], values[index + camera.width + 1], across)
-        # Behind a camera nothing is known to be outside but that it can't be in the picture.
-        outside = torch.where(seen[:, 2] > camera.near, torch.lerp(upper, lower, down) + beyond, beyond + camera.width)
+        before = points_camera[:, 2] > camera.near
+        outside = torch.where(before, torch.lerp(upper, lower, down) + beyond, beyond + camera.width)
+        if any(self.cut):
+            past = column, row, camera.width - 1 - column, camera.height - 1 - row
+            unknown = ~before
+            for side, cut in zip(past, self.cut, strict=True):
+                unknown = unknown | (side < 0) if cut else unknown
+            outside = outside.masked_fill(unknown, -math.inf)
         return outside * depth / camera.fx
 
 
 def mask_distance(view: TrainView) -> MaskDistance:
-    """The outline of a view's mask."""
-    distance = torch.from_numpy(mask_distance_px(view.mask.cpu().numpy())).to(view.mask.device)
-    return MaskDistance(view.camera, distance)
+    """The silhouette of a view as a signed distance."""
+    mask = view.mask.cpu().numpy()
+    return MaskDistance(view.camera, torch.from_numpy(mask_distance_px(mask)).to(view.mask.device), cut_sides(mask))
 
 
 def mask_distance_px(mask: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
     """Signed distance, positive outside, of pixel centers from the curve where the interpolated mask is one half.
 
-    Beyond six pixels it is counted from pixel centers. A mask of one kind only is half its size away from a curve.
+    Beyond `EXACT_BAND_PX` it is counted from pixel centers. A mask of one kind only is half its size away from a curve.
     """
     from scipy.ndimage import distance_transform_edt
     from scipy.spatial import cKDTree
     from skimage.measure import find_contours
 
-    inside: np.ndarray = mask >= OUTLINE_LEVEL
+    inside: np.ndarray = mask >= MASK_LEVEL
     if inside.all() or not inside.any():
         return np.full(mask.shape, (0.5 - inside.flat[0]) * sum(mask.shape), dtype=np.float32)
     distance = np.where(inside, 0.5 - distance_transform_edt(inside), distance_transform_edt(~inside) - 0.5)
-    # Beyond the picture there is no object.
-    curves = find_contours(np.pad(mask.astype(np.float64), 1), OUTLINE_LEVEL)
-    points = np.concatenate([_refined(curve - 1) for curve in curves])
+    padded = np.pad(mask.astype(np.float64), 1, mode="edge")
+    lines = padded[:, 0], padded[0], padded[:, -1], padded[-1]
+    for line, cut in zip(lines, cut_sides(mask), strict=True):
+        line *= cut
+    points = np.concatenate([_refined(curve - 1) for curve in find_contours(padded, MASK_LEVEL)])
     near = np.nonzero(np.abs(distance) < EXACT_BAND_PX)
-    found, _ = cKDTree(points).query(np.stack(near, 1).astype(np.float64))
-    distance[near] = np.where(inside[near], -found, found)
+    to_curve, _ = cKDTree(points).query(np.stack(near, 1).astype(np.float64))
+    distance[near] = np.where(inside[near], -to_curve, to_curve)
     return distance.astype(np.float32)
 
 
@@ -89,9 +104,6 @@ def _refined(curve: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "Q 2"]:
     parts = math.ceil(math.sqrt(2) / CURVE_STEP_PX)
     shares = (np.arange(parts) / parts)[:, None, None]
     return (curve[:-1] * (1 - shares) + curve[1:] * shares).reshape(-1, 2)
-
-
-CONTOUR_LEVEL = 0.5
 
 
 @dataclass(frozen=True)
@@ -110,21 +122,25 @@ class MaskContours:
 
 
 def mask_contours(views: Views) -> MaskContours:
-    """The longest closed or open contour of each mask."""
+    """The longest closed or open contour of each mask, without what runs along a border that the mask touches."""
     from skimage.measure import find_contours
 
     parts = []
     for index, view in enumerate(views.train):
-        found = find_contours(view.mask.cpu().numpy().astype(np.float64), CONTOUR_LEVEL)
-        if not found:
+        mask, camera = view.mask.cpu().numpy(), view.camera
+        contours = find_contours(mask.astype(np.float64), MASK_LEVEL)
+        if not contours:
             continue
-        pixels, camera = max(found, key=len)[:-1, ::-1] + PIXEL_CENTER, view.camera
+        pixels = max(contours, key=len)[:-1, ::-1] + PIXEL_CENTER
+        if any(cut := cut_sides(mask)):
+            inner = np.concatenate([pixels, [camera.width, camera.height] - pixels], 1) > BORDER_PX
+            pixels = pixels[(inner | ~np.array(cut)).all(1)]
         rotation, center = pose_of(camera)
-        x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
-        rays = np.stack([x, y, np.ones_like(x)], 1) @ rotation
-        columns = camera.fx * (rotation[0] - x[:, None] * rotation[2])
-        rows = camera.fy * (rotation[1] - y[:, None] * rotation[2])
-        parts.append(MaskContours(np.full(len(x), index), np.tile(center, (len(x), 1)), rays, columns, rows))
+        rays = camera_rays(camera, *pixels.T)
+        columns = camera.fx * (rotation[0] - rays[:, :1] * rotation[2])
+        rows = camera.fy * (rotation[1] - rays[:, 1:2] * rotation[2])
+        centers = np.tile(center, (len(rays), 1))
+        parts.append(MaskContours(np.full(len(rays), index), centers, rays @ rotation, columns, rows))
     if not parts:
         return MaskContours(np.zeros(0, dtype=np.int64), *(np.zeros((0, 3)) for _ in range(4)))
     return concatenated(parts)

@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from panoless.capture.encoding import LDR, RadianceEncoding
-from panoless.capture.object_frame import ObjectFrame, estimate_object_frame
+from panoless.capture.masks import MASK_LEVEL, estimate_object_frame, without_specks
+from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import pose_of, raster_camera, unit_rays_camera
 from panoless.kernels.objective import MirrorView
 from panoless.kernels.rasterize import RasterCamera, tiles_of
@@ -24,7 +25,7 @@ from shinypartial.io.progress import Progress
 
 #: Of the views, this one in turn is held out to judge by.
 HELD_OUT_EVERY = 5
-Each = TypeVar("Each")
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -111,8 +112,8 @@ class Views:
         return replace(self, train=tuple(view.to(device) for view in self.train))
 
 
-def load_views(dataset: Dataset, crop_margin_px: int, downscale: int = 1, light: RadianceEncoding = LDR) -> Views:
-    """Read the training split, averaged over blocks of `downscale` pixels a side, in the encoding of a light.
+def load_views(dataset: Dataset, crop_margin_px: int, downscale: int = 1, encoding: RadianceEncoding = LDR) -> Views:
+    """Read the training split, averaged over blocks of `downscale` pixels a side, its radiance encoded.
 
     Raises InputError for unreadable images and for masks that are all empty.
     """
@@ -120,14 +121,14 @@ def load_views(dataset: Dataset, crop_margin_px: int, downscale: int = 1, light:
     photographs = []
     for frame in dataset.train:
         view = read_view(frame)
-        if not (view.alpha >= 0.5).any():
+        alpha = _block_means(np.clip(view.alpha, 0, 1), downscale)
+        if not (alpha >= MASK_LEVEL).any():
             raise InputError(
                 expected=f"the object in {frame.name}: some mask pixel of at least one half",
                 found="an empty mask",
                 remedy="Correct the mask, or remove the frame from transforms_train.json.",
             )
-        radiance = light.encoded(_block_means(light.clipped(frame, view), downscale))
-        alpha = _block_means(np.clip(view.alpha, 0, 1), downscale)
+        radiance = encoding.encoded(_block_means(encoding.clipped(frame, view), downscale))
         photographs.append(cropped(frame.camera.downscaled(downscale), radiance, alpha, crop_margin_px))
         progress.advance()
     return views_of(photographs)
@@ -135,30 +136,30 @@ def load_views(dataset: Dataset, crop_margin_px: int, downscale: int = 1, light:
 
 def views_of(photographs: Sequence[Photograph]) -> Views:
     """The same pictures in the normalized frame that their masks determine."""
-    object_frame = estimate_object_frame([(each.camera, each.mask.numpy()) for each in photographs])
+    object_frame = estimate_object_frame([(photograph.camera, photograph.mask.numpy()) for photograph in photographs])
     near = 0.1 * min(
-        float(np.linalg.norm(each.camera.position_world - object_frame.center)) / object_frame.radius
-        for each in photographs
+        float(np.linalg.norm(photograph.camera.position_world - object_frame.center)) / object_frame.radius
+        for photograph in photographs
     )
     train = tuple(
         TrainView(
-            camera=raster_camera(each.camera, object_frame, near),
-            radiance=each.radiance,
-            mask=each.mask,
-            solid=torch.nonzero(each.mask.flatten() > SOLID_ALPHA)[:, 0],
+            camera=raster_camera(photograph.camera, object_frame, near),
+            radiance=photograph.radiance,
+            mask=photograph.mask,
+            solid=torch.nonzero(photograph.mask.flatten() > SOLID_ALPHA)[:, 0],
         )
-        for each in photographs
+        for photograph in photographs
     )
     return Views(train, object_frame, near)
 
 
-def concatenated(parts: Sequence[Each]) -> Each:
+def concatenated(parts: Sequence[Item]) -> Item:
     """Dataclasses of arrays as one: each field's arrays one after the other."""
     names = [item.name for item in fields(parts[0])]  # type: ignore[arg-type]
     return type(parts[0])(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
-def split_held_out(views: Sequence[Each]) -> tuple[list[Each], list[Each]]:
+def split_held_out(views: Sequence[Item]) -> tuple[list[Item], list[Item]]:
     """Things that stand for the views: four fifths to solve from, and every fifth to predict."""
     phase = HELD_OUT_EVERY // 2
     return [view for i, view in enumerate(views) if i % HELD_OUT_EVERY != phase], list(views[phase::HELD_OUT_EVERY])
@@ -183,12 +184,19 @@ def _block_means(image: Float[np.ndarray, "H W *C"], side: int) -> Float[np.ndar
 def cropped(
     camera: Camera, radiance: Float[np.ndarray, "H W 3"], alpha: Float[np.ndarray, "H W"], margin_px: int
 ) -> Photograph:
-    """The picture around its object, which a negative margin leaves whole."""
+    """The picture around its object, without specks; a negative margin leaves it whole.
+
+    A margin is at least a pixel, so that a mask touches the border of the crop only where it touches the picture's.
+    """
+    clean = without_specks(alpha)
+    if clean is not alpha:
+        radiance, alpha = radiance * (clean > 0)[..., None], clean
     if margin_px >= 0:
+        margin = max(margin_px, 1)
         rows, columns = np.nonzero(alpha.any(1))[0], np.nonzero(alpha.any(0))[0]
-        top, left = (max(int(places[0]) - margin_px, 0) for places in (rows, columns))
-        bottom = min(int(rows[-1]) + 1 + margin_px, camera.height)
-        right = min(int(columns[-1]) + 1 + margin_px, camera.width)
+        top, left = (max(int(places[0]) - margin, 0) for places in (rows, columns))
+        bottom = min(int(rows[-1]) + 1 + margin, camera.height)
+        right = min(int(columns[-1]) + 1 + margin, camera.width)
         radiance, alpha = radiance[top:bottom, left:right], alpha[top:bottom, left:right]
         center = camera.cx - left, camera.cy - top
         camera = Camera(camera.camera_to_world, camera.fx, camera.fy, *center, right - left, bottom - top)

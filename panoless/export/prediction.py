@@ -1,6 +1,7 @@
 """A finished fit → the prediction folder that the evaluator reads, pictures of the decomposition, and a PLY."""
 
 import json
+import math
 import os
 import platform
 from concurrent.futures import ThreadPoolExecutor
@@ -27,6 +28,7 @@ from panoless.reconstruct.final_map import complete
 from panoless.reconstruct.recorder import timed
 from panoless.reconstruct.snapshots import read_snapshot, snapshot_folders
 from panoless.reconstruct.state import FitState
+from panoless.selection.candidates import Selection
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import latlong_directions
 from shinypartial.dataset.schema import Dataset, Frame, View
@@ -39,6 +41,8 @@ from shinypartial.prediction.format import (
     DESCRIPTION,
     ENVIRONMENT,
     SNAPSHOTS,
+    Candidate,
+    ModelSelection,
     PredictionInfo,
     acquire_prediction,
     dataset_hash,
@@ -98,6 +102,7 @@ def export_prediction(
         primitives=state.geometry.num_primitives,
         model_bytes=sum((folder / name).stat().st_size for name in (mesh_file, ENVIRONMENT)),
         model=state.selection.sentence,
+        model_selection=_model_selection(state.selection),
         iteration=state.iteration if snapshot else None,
     )
     write_info(folder, info)
@@ -180,6 +185,22 @@ def cube_to_latlong(cube: Float[Tensor, "6 C L L"], height: int) -> Float[np.nda
     values = sample_cubemap(cube, torch.from_numpy(fine).to(torch.float32)).numpy()
     blocks = values.reshape(height, SUPERSAMPLING, 2 * height, SUPERSAMPLING, -1)
     return blocks.mean((1, 3))
+
+
+def _model_selection(selection: Selection) -> ModelSelection:
+    """The table of candidates as the prediction's format has it; what is infinitely far has no number."""
+    rows = (
+        Candidate(
+            kind=each.kind,
+            silhouette_px=each.silhouette_px if each.silhouette_px not in (None, math.inf) else None,
+            overlap=each.overlap,
+            held_out_error=each.held_out_error,
+            verdict=str(each.verdict),
+            reason=each.reason,
+        )
+        for each in selection.candidates
+    )
+    return ModelSelection(selection.chosen, tuple(rows))
 
 
 def _processor_name() -> str:

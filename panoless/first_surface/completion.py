@@ -9,20 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from panoless.capture.views import Views
-from panoless.first_surface.contact import TOLERANCE_PX, TRUST_FLOOR, outline_contact
+from panoless.first_surface.contact import outline_contact
 from panoless.first_surface.mesh import TriangleMesh, cotangent_laplacian, vertex_areas
-from panoless.first_surface.visual_hull import HULL_HALF_SIDE, Hull
-
-#: The thin plate smooths the trusted hull over this length.
-PLATE_LENGTH_PX = 5.0
-#: Of sharper images than this, a grid shows the shape no finer.
-MOST_PIXELS_A_VOXEL = 4.5
-#: A plate that leaves the hull by more is held on it, as if outlines touched it there.
-OBSTACLE_PX = 0.25
-OBSTACLE_TRUST = 0.5
-OBSTACLE_ROUNDS = 3
-PROJECTION_STEPS = 3
-LEAST_SLOPE = 0.5
+from panoless.first_surface.options import DEFAULTS, FirstSurfaceOptions
+from panoless.first_surface.visual_hull import Hull
 
 
 def hull_surface(hull: Hull) -> TriangleMesh:
@@ -30,32 +20,36 @@ def hull_surface(hull: Hull) -> TriangleMesh:
     from skimage.measure import marching_cubes
 
     vertices, triangles, _, _ = marching_cubes(hull.distance, 0.0)
-    return TriangleMesh(vertices * hull.voxel - HULL_HALF_SIDE, triangles.astype(np.int64))
+    return TriangleMesh(vertices * hull.voxel - hull.half_side, triangles.astype(np.int64))
 
 
-def completed_surface(hull: Hull, views: Views) -> TriangleMesh:
+def complete_surface(hull: Hull, views: Views, options: FirstSurfaceOptions = DEFAULTS) -> TriangleMesh:
     """The hull where outlines touch the object, continued as a thin plate that stays inside the hull.
 
     The plate is an obstacle problem: vertices that it would lift out of the hull are put on the hull, and held there
     while it is solved again; what is left outside is moved onto the hull.
     """
     surface = hull_surface(hull)
-    pixel = max(hull.pixel, hull.voxel / MOST_PIXELS_A_VOXEL)
-    trust = outline_contact(surface, views).trust(TOLERANCE_PX * pixel) + TRUST_FLOOR
-    target, plate = surface.vertices, surface
-    for _ in range(OBSTACLE_ROUNDS):
-        plate = thin_plate(surface, trust, PLATE_LENGTH_PX * pixel, target)
-        inside = _moved_inside(hull, plate.vertices)
-        out = np.linalg.norm(inside - plate.vertices, axis=1) > OBSTACLE_PX * hull.pixel
-        trust, target = np.where(out, np.maximum(trust, OBSTACLE_TRUST), trust), np.where(out[:, None], inside, target)
-    return TriangleMesh(_moved_inside(hull, plate.vertices), surface.triangles)
+    pixel = max(hull.pixel, hull.voxel / options.pixels_a_voxel)
+    contact = outline_contact(surface, views, options)
+    trust = contact.trust(options.contact_px * pixel, options.least_trust) + options.trust_floor
+    target, inside = surface.vertices, surface.vertices
+    for _ in range(options.obstacle_rounds):
+        plate = thin_plate(surface, trust, options.plate_length_px * pixel, target)
+        inside = _move_inside(hull, plate.vertices, options)
+        out = np.linalg.norm(inside - plate.vertices, axis=1) > options.obstacle_px * hull.pixel
+        trust = np.where(out, np.maximum(trust, options.obstacle_trust), trust)
+        target = np.where(out[:, None], inside, target)
+    return TriangleMesh(inside, surface.triangles)
 
 
-def _moved_inside(hull: Hull, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+def _move_inside(
+    hull: Hull, points: Float[np.ndarray, "P 3"], options: FirstSurfaceOptions
+) -> Float[np.ndarray, "P 3"]:
     """Points outside the hull on its surface, the others where they are: Newton steps along the gradient."""
-    for _ in range(PROJECTION_STEPS):
+    for _ in range(options.projection_steps):
         value, gradient = hull.sample(points)
-        step = np.maximum(value, 0) / np.maximum((gradient**2).sum(1), LEAST_SLOPE**2)
+        step = np.maximum(value, 0) / np.maximum((gradient**2).sum(1), options.least_slope**2)
         points = points - step[:, None] * gradient
     return points
 

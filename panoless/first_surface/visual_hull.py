@@ -1,7 +1,8 @@
 """The visual hull below the size of a pixel: where every outline, interpolated between mask pixels, allows the object.
 
 A mask's half level is a curve that lies between pixels. The hull function at a point is its largest signed distance
-over the views, outside these curves, in scene units; its zero level is the hull.
+over the views, outside these curves, in normalized units; its zero level is the hull. A view has no say about what it
+doesn't show.
 """
 
 import math
@@ -13,25 +14,21 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from panoless.capture.rays import pose_of
+from panoless.capture.rays import camera_rays, pose_of
 from panoless.capture.silhouettes import MaskDistance, mask_distance
 from panoless.capture.views import Views
+from panoless.first_surface.options import DEFAULTS, FirstSurfaceOptions
 from shinypartial.core.conventions import PIXEL_CENTER
 from shinypartial.core.errors import InputError
 
 HULL_HALF_SIDE = 1.1
-#: The grid is refined from about this many voxels a side, where the surface may be.
-COARSE_RESOLUTION = 48
-#: |h| of a voxel through whose refined cells the surface may pass: its half diagonal with something to spare.
-BAND_VOXELS = 1.5
+"""Half the side of the cube in which the hull is carved, in normalized units, unless the object reaches further."""
+SPARE = 1.1
+"""Then the cube holds the object's reach with this factor to spare."""
 POINTS_AT_ONCE = 1 << 18
-#: Rays through outlines tell whether the views agree, by how far from the hull they pass on average (up to a limit).
-#: Leaving out views is worth it when it closes gaps by more than a quarter of a pixel.
-TESTED_RAYS = 4000
-STEPS_ALONG_RAY = 128
-LARGEST_GAP_PX = 10.0
-WORTHWHILE_PX = 0.25
 FEWEST_VOXELS = 8
+DEEPEST = 4.0
+"""−h, in normalized units, where no view tells: deeper inside than any point of the usual cube."""
 
 
 @dataclass(frozen=True)
@@ -39,12 +36,17 @@ class Hull:
     """The hull function (normalized units, negative inside) on a cubic grid of points, axes x, y, z.
 
     Within a few voxels of its zero level it is exact; elsewhere it has the right sign and at least that size.
-    `pixel` is the size of a training pixel at the object.
+    `pixel` is the size of a training pixel at the object, `half_side` half a side of the cube.
     """
 
     distance: Float[np.ndarray, "N N N"]
-    voxel: float
+    half_side: float
     pixel: float
+
+    @property
+    def voxel(self) -> float:
+        """Spacing of the grid."""
+        return 2 * self.half_side / (len(self.distance) - 1)
 
     def sample(self, points: Float[np.ndarray, "P 3"]) -> tuple[Float[np.ndarray, "P"], Float[np.ndarray, "P 3"]]:
         """The function at points, interpolated, and its gradient by central differences over two voxels."""
@@ -56,14 +58,14 @@ class Hull:
         """The function at points, interpolated; beyond the grid it is that of the border."""
         from scipy.ndimage import map_coordinates
 
-        index = np.moveaxis((points + HULL_HALF_SIDE) / self.voxel, -1, 0)
+        index = np.moveaxis((points + self.half_side) / self.voxel, -1, 0)
         return map_coordinates(self.distance, index, order=1, mode="nearest")
 
 
 def largest_distances(
     outlines: Sequence[MaskDistance], points: Float[Tensor, "P 3"], count: int
 ) -> Float[Tensor, "count P"]:
-    """The largest, second largest, … signed distance of each point over the views."""
+    """The largest, second largest, … signed distance of each point over the views that tell."""
     blocks = []
     for block in points.split(POINTS_AT_ONCE):
         largest = torch.full((count, len(block)), -math.inf, device=points.device)
@@ -73,12 +75,14 @@ def largest_distances(
                 lower = torch.minimum(row, value)
                 torch.maximum(row, value, out=row)
                 value = lower
-        blocks.append(largest)
+        blocks.append(largest.clamp_(min=-DEEPEST))
     return torch.cat(blocks, 1)
 
 
-def carve_hull(views: Views, resolution: int, votes: float) -> Hull:
+def carve_hull(views: Views, resolution: int, votes: float, options: FirstSurfaceOptions = DEFAULTS) -> Hull:
     """Visual hull of as many views as agree, but at least the share `votes` of them, on about `resolution`³ points.
+
+    Those are points of the usual cube; a larger one, for an object that reaches out of it, has the same spacing.
 
     Where m views may be wrong, the hull function is the (m + 1)-th largest distance, and the hull larger than that of
     all views. A wrong view cuts the hull away from the rays of the others; m is the least with which rays through the
@@ -86,17 +90,19 @@ def carve_hull(views: Views, resolution: int, votes: float) -> Hull:
     and poses contradict each other.
     """
     outlines = [mask_distance(view) for view in views.train]
+    half_side = max(HULL_HALF_SIDE, SPARE * views.object_frame.reach)
+    resolution = math.ceil(resolution * half_side / HULL_HALF_SIDE)
     pixel = float(np.median([outline.pixel for outline in outlines]))
     allowed = math.floor((1 - votes) * len(views.train))
-    levels = max(0, round(math.log2(resolution / COARSE_RESOLUTION)))
+    levels = max(0, round(math.log2(resolution / options.coarse_voxels)))
     device = outlines[0].distance_px.device
     count = math.ceil((resolution - 1) / 2**levels) + 1
-    candidates = largest_distances(outlines, _grid_points(np.arange(count**3), count, device), allowed + 1)
-    grids = candidates.view(-1, count, count, count).cpu().numpy()
-    wrong = _wrong_views(grids, outlines, pixel)
+    points = _grid_points(np.arange(count**3), count, half_side, device)
+    grids = largest_distances(outlines, points, allowed + 1).view(-1, count, count, count).cpu().numpy()
+    wrong = _count_wrong_views(grids, half_side, outlines, pixel, options)
     distance = grids[wrong]
     for _ in range(levels):
-        distance = _refine(distance, outlines, wrong, device)
+        distance = _refine(distance, half_side, outlines, wrong, options.band_voxels)
     for axis in range(3):
         # A hull that leaves the cube is cut off there.
         border = np.moveaxis(distance, axis, 0)[[0, -1]]
@@ -107,17 +113,23 @@ def carve_hull(views: Views, resolution: int, votes: float) -> Hull:
             found=f"no point in space that {votes:.0%} of the masks contain",
             remedy="Check the axes of transform_matrix (OpenGL) and that masks mark the object, not the background.",
         )
-    return Hull(distance, 2 * HULL_HALF_SIDE / (distance.shape[0] - 1), pixel)
+    return Hull(distance, half_side, pixel)
 
 
-def _grid_points(flat: Int[np.ndarray, "P"], count: int, device: torch.device) -> Float[Tensor, "P 3"]:
+def _grid_points(
+    flat: Int[np.ndarray, "P"], count: int, half_side: float, device: torch.device
+) -> Float[Tensor, "P 3"]:
     index = np.stack(np.unravel_index(flat, (count, count, count)), 1)
-    points = index * (2 * HULL_HALF_SIDE / (count - 1)) - HULL_HALF_SIDE
+    points = index * (2 * half_side / (count - 1)) - half_side
     return torch.from_numpy(points.astype(np.float32)).to(device)
 
 
 def _refine(
-    distance: Float[np.ndarray, "N N N"], outlines: Sequence[MaskDistance], wrong: int, device: torch.device
+    distance: Float[np.ndarray, "N N N"],
+    half_side: float,
+    outlines: Sequence[MaskDistance],
+    wrong: int,
+    band_voxels: float,
 ) -> Float[np.ndarray, "M M M"]:
     """The hull function on a grid of half the spacing, evaluated where it is small and else interpolated."""
     count = 2 * distance.shape[0] - 1
@@ -130,41 +142,42 @@ def _refine(
         fine = np.moveaxis(twice, 0, axis)
     fine = np.ascontiguousarray(fine)
     # Signed distances are 1-Lipschitz, up to perspective, and so are their maxima.
-    spacing = 2 * HULL_HALF_SIDE / (distance.shape[0] - 1)
-    near = np.nonzero(np.abs(fine.ravel()) < BAND_VOXELS * spacing)[0]
-    points = _grid_points(near, count, device)
+    spacing = 2 * half_side / (distance.shape[0] - 1)
+    near = np.nonzero(np.abs(fine.ravel()) < band_voxels * spacing)[0]
+    points = _grid_points(near, count, half_side, outlines[0].distance_px.device)
     fine.ravel()[near] = largest_distances(outlines, points, wrong + 1)[wrong].cpu().numpy()
     return fine
 
 
-def _wrong_views(grids: Float[np.ndarray, "K N N N"], outlines: Sequence[MaskDistance], pixel: float) -> int:
+def _count_wrong_views(
+    grids: Float[np.ndarray, "K N N N"],
+    half_side: float,
+    outlines: Sequence[MaskDistance],
+    pixel: float,
+    options: FirstSurfaceOptions,
+) -> int:
     """How many of the largest distances to leave out: the fewest with which rays through outlines touch the hull."""
-    from scipy.ndimage import map_coordinates
-
-    count = grids.shape[1]
-    spacing = 2 * HULL_HALF_SIDE / (count - 1)
-    points = _points_on_rays(outlines)
-    index = ((points + HULL_HALF_SIDE) / spacing).reshape(-1, 3).T
+    points = _points_on_rays(outlines, half_side, options)
     gaps = []
     for grid in grids:
-        nearest = map_coordinates(grid, index, order=1, mode="nearest").reshape(points.shape[:2]).min(1)
-        gaps.append(float((nearest / pixel).clip(0, LARGEST_GAP_PX).mean()) if len(nearest) else 0.0)
-    return next(k for k, gap in enumerate(gaps) if gap <= gaps[-1] + WORTHWHILE_PX)
+        nearest = Hull(grid, half_side, pixel).at(points).min(1)
+        gaps.append(float((nearest / pixel).clip(0, options.largest_gap_px).mean()) if len(nearest) else 0.0)
+    return next(k for k, gap in enumerate(gaps) if gap <= gaps[-1] + options.worthwhile_px)
 
 
-def _points_on_rays(outlines: Sequence[MaskDistance]) -> Float[np.ndarray, "R S 3"]:
+def _points_on_rays(
+    outlines: Sequence[MaskDistance], half_side: float, options: FirstSurfaceOptions
+) -> Float[np.ndarray, "R S 3"]:
     """Points in the cube along the rays of pixels just inside the outlines."""
     points = []
-    each = max(1, TESTED_RAYS // len(outlines))
+    rays_a_view = max(1, options.tested_rays // len(outlines))
     for outline in outlines:
         camera, (rotation, center) = outline.camera, pose_of(outline.camera)
         distance = outline.distance_px.cpu().numpy()
         rows, columns = np.nonzero((distance < 0) & (distance > -1))
-        chosen = np.linspace(0, len(rows) - 1, min(each, len(rows))).round().astype(int)
-        x = (columns[chosen] + PIXEL_CENTER - camera.cx) / camera.fx
-        y = (rows[chosen] + PIXEL_CENTER - camera.cy) / camera.fy
-        rays = np.stack([x, y, np.ones_like(x)], 1) @ rotation
-        reach = np.linalg.norm(center) + HULL_HALF_SIDE * np.array([-1.0, 1.0]) * math.sqrt(3)
-        depths = np.linspace(max(reach[0], camera.near), reach[1], STEPS_ALONG_RAY)
+        chosen = np.linspace(0, len(rows) - 1, min(rays_a_view, len(rows))).round().astype(int)
+        rays = camera_rays(camera, columns[chosen] + PIXEL_CENTER, rows[chosen] + PIXEL_CENTER) @ rotation
+        reach = np.linalg.norm(center) + half_side * np.array([-1.0, 1.0]) * math.sqrt(3)
+        depths = np.linspace(max(reach[0], camera.near), reach[1], options.ray_samples)
         points.append(center + depths[:, None] * (rays / np.linalg.norm(rays, axis=1, keepdims=True))[:, None])
     return np.concatenate(points)

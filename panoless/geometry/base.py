@@ -35,6 +35,23 @@ class SurfaceBuffers:
     albedo: Float[Tensor, "3 H W"]
 
 
+def buffers_from_arrays(
+    alpha: Float[np.ndarray, "H W"],
+    depth: Float[np.ndarray, "H W"],
+    normals_camera: Float[np.ndarray, "3 #H #W"],
+    camera: RasterCamera,
+) -> SurfaceBuffers:
+    """Coverage in [0, 1], depth along the camera's axis and unit normals in camera axes, as buffers without albedo.
+
+    All is float32 on the device of the camera.
+    """
+    covered, distance, normals = (
+        torch.from_numpy(np.ascontiguousarray(values)).float().to(camera.world_to_camera.device)
+        for values in (alpha, depth, normals_camera)
+    )
+    return SurfaceBuffers(covered, normals * covered, distance, covered.new_zeros(3, *covered.shape))
+
+
 @dataclass(frozen=True)
 class Mesh:
     """A surface as a file holds it, in world units: vertices with named columns beside x, y, z, and polygons."""

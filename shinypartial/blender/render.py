@@ -1,7 +1,7 @@
 """Render views of an assembled scene and hand back their passes as arrays.
 
 Where the object mirrors perfectly, paths through a grid of points tell what smooth pixels show (`directions`,
-`footprint`), and only the others are path traced (`picked`). Any other object is path traced as a whole.
+`footprint`), and only the others are path traced (`sparse_pixels`). Any other object is path traced as a whole.
 """
 
 import contextlib
@@ -116,9 +116,9 @@ class Renderer:
         unsure = np.zeros((camera.height, camera.width), bool)
         unsure[inside] = _near_the_object(paths) & ~light.smooth
         if unsure.any():
-            picked = render_sparse(self.bpy, self.scratch / "picked.exr", unsure, depth)
+            sparse = render_sparse(self.bpy, self.scratch / "sparse.exr", unsure, depth)
             for name in PASSES:
-                passes[name][unsure] = picked[name]
+                passes[name][unsure] = sparse[name]
         meets_scene = np.zeros(unsure.shape, bool)
         meets_scene[inside] = paths.meets_scene[GRID // 2 :: GRID, GRID // 2 :: GRID]
         return _from_passes(passes, meets_scene)

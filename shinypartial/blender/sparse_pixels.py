@@ -1,9 +1,8 @@
 """Path tracing of chosen pixels alone: packed into a small image by a ray portal before the camera.
 
-The scene is the main one with a plane close to the camera in it. Each pixel of the small image finds on the plane which
-pixel of the view it stands for, and the plane sends its rays on from where those of that pixel would be. Cycles spreads
-samples over a pixel of the small image as over any other, so every pass is what a render of the whole view has there,
-but for noise.
+The scene is the main one with a plane before the camera. Each pixel of the small image stands for one pixel of the
+view; the plane moves its rays to where the rays of that pixel run. Cycles samples a pixel of the small image as it does
+any other, so every pass has the value that a render of the whole view has there, but for noise.
 """
 
 from pathlib import Path
@@ -16,7 +15,7 @@ from shinypartial.blender.passes import PASSES, read_passes
 from shinypartial.core.camera import Camera, project
 from shinypartial.core.trajectory import CameraPath
 
-PICKED, PORTAL, PIXELS = "picked", "portal", "picked pixels"
+SPARSE, PORTAL, PIXELS = "sparse pixels", "portal", "places of sparse pixels"
 #: The plane's distance, and that at which rays go on, as shares of the nearest surface's depth.
 PLANE_SHARE, EXIT_SHARE = 0.3, 0.45
 
@@ -25,7 +24,7 @@ def assemble_sparse(bpy: Any, spec: CameraPath) -> None:
     """Add the scene: everything of the open one, linked, and the plane."""
     main = bpy.context.scene
     scene = main.copy()
-    scene.name = PICKED
+    scene.name = SPARSE
     mesh = bpy.data.meshes.new(PORTAL)
     mesh.from_pydata([(-9, -9, 0), (9, -9, 0), (9, 9, 0), (-9, 9, 0)], [], [(0, 1, 2, 3)])
     mesh.materials.append(bpy.data.materials.new(PORTAL))
@@ -49,7 +48,7 @@ def render_sparse(
     rows, columns = np.nonzero(chosen)
     width = int(np.ceil(np.sqrt(len(rows))))
     height = -(-len(rows) // width)
-    scene = bpy.data.scenes[PICKED]
+    scene = bpy.data.scenes[SPARSE]
     scene.render.use_border = False
     scene.render.resolution_x, scene.render.resolution_y = width, height
     scene.objects[PORTAL].location = (0, 0, -PLANE_SHARE * depth)
@@ -62,7 +61,7 @@ def render_sparse(
     nodes["size"].inputs[1].default_value = (width, height, 0)
     scene.render.filepath = str(path)
     try:
-        bpy.ops.render.render(write_still=True, scene=PICKED)
+        bpy.ops.render.render(write_still=True, scene=SPARSE)
     finally:
         nodes["places"].image = None
         bpy.data.images.remove(image)

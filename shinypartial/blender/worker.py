@@ -1,4 +1,4 @@
-"""A process that renders what its parent asks for: `python -m shinypartial.blender.worker`, started by `pool`.
+"""A process that renders what its parent asks for: `python -m shinypartial.blender.worker`, started by `worker_pool`.
 
 Blender keeps memory that it no longer uses, must not be forked and may crash; in a process of its own it does no harm.
 """

@@ -1,4 +1,4 @@
-"""Rendering processes and the one place that starts, replaces and ends them; never imports bpy itself."""
+"""A pool of rendering processes: the one place that starts, replaces and ends them; never imports bpy itself."""
 
 import contextlib
 import os
@@ -36,7 +36,7 @@ class PoolPlan:
 
     def __post_init__(self) -> None:
         if min(self.workers, self.threads, self.frames_per_worker) < 1:
-            raise ValueError(f"a worker pool needs at least one of each, not {self}")
+            raise ValueError(f"a pool of workers needs at least one of each, not {self}")
 
 
 def plan_pool(cores: int | None = None) -> PoolPlan:
@@ -52,7 +52,7 @@ def plan_pool(cores: int | None = None) -> PoolPlan:
 
 
 class PoolClosed(Exception):
-    """Asked for a view after the worker pool was closed, or while it was."""
+    """A view was asked for when the pool was closed, or it was closed before the view was there."""
 
 
 class _WorkerDied(Exception):
@@ -108,7 +108,7 @@ class WorkerPool:
         """Render one view; a process that dies is replaced, once for each view.
 
         Raises InputError, which names the view, when the second process dies as well, or when Blender refuses;
-        CrewClosed when the worker pool is closed.
+        PoolClosed when the pool is closed.
         """
         died: list[str] = []
         while len(died) < ATTEMPTS:
@@ -124,7 +124,7 @@ class WorkerPool:
         )
 
     def close(self) -> None:
-        """End every process at once; a thread that waits for a view gets CrewClosed."""
+        """End every process at once; a thread that waits for a view gets PoolClosed."""
         with self._lock:
             self._closed = True
             live, self._live = self._live, set()
@@ -185,7 +185,7 @@ class WorkerPool:
 
 @contextlib.contextmanager
 def open_pool(spec: SceneSpec, plan: PoolPlan | None = None) -> Iterator[WorkerPool]:
-    """A worker pool whose processes and temporary folder end with the block."""
+    """A pool whose processes and temporary folder end with the block."""
     with tempfile.TemporaryDirectory(prefix="shinypartial-", ignore_cleanup_errors=True) as folder:
         pool = WorkerPool(spec, plan or plan_pool(), Path(folder))
         try:

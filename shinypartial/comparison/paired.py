@@ -1,39 +1,37 @@
-"""Two groups of scored predictions, several seeds or scenes each: means, spreads and paired differences."""
+"""Two groups of scored predictions, several seeds or scenes each: means, spreads and tests of paired differences."""
 
 import csv
 import functools
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from shinypartial.comparison.intervals import mean_interval
+from shinypartial.comparison.significance import (
+    MOST_ENUMERATED,
+    Spread,
+    mean_interval,
+    sign_flip_test,
+    summarize,
+)
 from shinypartial.core.errors import InputError
+from shinypartial.evaluation.key_metrics import key_metrics, path_metric
 from shinypartial.evaluation.scores import Scores, read_scores, score_rows
 from shinypartial.io.files import write_json, write_text
-from shinypartial.metrics.registry import Direction, Metric, metric
+from shinypartial.metrics.registry import Direction, Metric
 from shinypartial.prediction.format import read_info
 
-FORMAT, FORMAT_VERSION = "shinypartial-comparison", 1
-INTERVAL = "bootstrap-t"
+FORMAT, FORMAT_VERSION = "shinypartial-comparison", 2
+INTERVAL, TEST = "Student t", "sign-flip test"
 JSON, CSV = "comparison.json", "comparison.csv"
 CONFIDENCE = 0.95
-RESAMPLES = 10_000
-#: What the terminal shows; the files hold every metric.
-SHOWN = (
-    "environment.as_predicted.full.psnr_srgb",
-    "environment.as_predicted.full.psnr_linear",
-    "environment.as_predicted.full.ssim_srgb",
-    "environment.as_predicted.resolved.psnr_srgb",
-    "normals.mean_angular_error_deg",
-    "normals.median_angular_error_deg",
-    "render.psnr",
-    "render.ssim",
-    "calibration.visibility_error_auroc",
-)
+#: A first group is called better or worse from this p-value down.
+SIGNIFICANCE = 0.05
+#: The fewest pairs whose smallest p-value, 2¹⁻ⁿ, is below that.
+FEWEST_PAIRS = 6
 
 
 @dataclass(frozen=True)
@@ -53,22 +51,17 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Spread:
-    """Mean and sample standard deviation (n − 1) of one metric in one group; None with too few runs."""
-
-    number: int
-    mean: float | None
-    standard_deviation: float | None
-
-
-@dataclass(frozen=True)
 class PairedDifference:
-    """Mean of first − second over pairs, and its confidence interval; None with no pair, or fewer than two."""
+    """Mean of first − second over pairs, its confidence interval and the p-value of the sign-flip test.
+
+    What needs more pairs than there are is None.
+    """
 
     pairs: int
     mean: float | None
     low: float | None
     high: float | None
+    p_value: float | None
 
 
 @dataclass(frozen=True)
@@ -76,15 +69,15 @@ class ComparedMetric:
     """One metric in both groups; `verdict` says whether the first group is better, worse, or neither for certain."""
 
     path: str
-    first: Spread
-    second: Spread
+    first: Spread | None
+    second: Spread | None
     difference: PairedDifference
     verdict: str
 
     @property
     def metric(self) -> Metric:
         """Its definition."""
-        return metric(self.path.rpartition(".")[2])
+        return path_metric(self.path)
 
 
 @dataclass(frozen=True)
@@ -96,7 +89,6 @@ class Comparison:
     second: tuple[str, ...]
     unpaired: tuple[str, ...]
     confidence: float
-    resamples: int
     seed: int
     metrics: tuple[ComparedMetric, ...]
 
@@ -113,8 +105,8 @@ def read_run(folder: Path) -> Run:
     return Run(folder, info.method, scores.dataset_hash, str(info.config.get("seed", "")), scores)
 
 
-def compare(first: Sequence[Path], second: Sequence[Path], seed: int = 0, resamples: int = RESAMPLES) -> Comparison:
-    """Compare two groups of scored prediction folders.
+def compare(first: Sequence[Path], second: Sequence[Path], seed: int = 0) -> Comparison:
+    """Compare two groups of scored prediction folders; `seed` draws sign flips where there are too many to enumerate.
 
     Raises InputError when a group is empty, holds two runs of one dataset and seed, when protocols differ, or when no
     two runs form a pair.
@@ -141,9 +133,8 @@ def compare(first: Sequence[Path], second: Sequence[Path], seed: int = 0, resamp
         second=tuple(str(run.folder) for run in groups[1].values()),
         unpaired=tuple(str(run.folder) for group in groups for key, run in group.items() if key not in keys),
         confidence=CONFIDENCE,
-        resamples=resamples,
         seed=seed,
-        metrics=tuple(_compared(path, groups[0], groups[1], keys, seed, resamples) for path in paths),
+        metrics=tuple(_compare_metric(path, groups[0], groups[1], keys, seed) for path in paths),
     )
 
 
@@ -170,91 +161,79 @@ def _group(folders: Sequence[Path], name: str) -> dict[Key, Run]:
     return group
 
 
-def _compared(
-    path: str, first: Mapping[Key, Run], second: Mapping[Key, Run], keys: Sequence[Key], seed: int, resamples: int
+def _compare_metric(
+    path: str, first: Mapping[Key, Run], second: Mapping[Key, Run], keys: Sequence[Key], seed: int
 ) -> ComparedMetric:
     values = [{key: run.values[path] for key, run in group.items() if path in run.values} for group in (first, second)]
-    differences = np.array(
-        [values[0][key] - values[1][key] if all(key in v for v in values) else np.nan for key in keys]
-    )
-    found = paired_difference(differences, seed, resamples)
-    spreads = [_spread(list(group.values())) for group in values]
-    return ComparedMetric(path, spreads[0], spreads[1], found, _verdict(found, metric(path.rpartition(".")[2])))
+    known = [key for key in keys if all(key in group for group in values)]
+    difference = paired_difference(np.array([values[0][key] - values[1][key] for key in known]), seed)
+    spreads = [summarize(list(group.values())) if group else None for group in values]
+    return ComparedMetric(path, spreads[0], spreads[1], difference, _verdict(difference, path_metric(path)))
 
 
-def _spread(values: Sequence[float]) -> Spread:
-    return Spread(
-        len(values),
-        float(np.mean(values)) if values else None,
-        float(np.std(values, ddof=1)) if len(values) > 1 else None,
-    )
-
-
-def paired_difference(
-    differences: Float[np.ndarray, "P"], seed: int = 0, resamples: int = RESAMPLES
-) -> PairedDifference:
-    """Mean of paired differences and its bootstrap-t interval (`mean_interval`); NaN marks a pair without this metric.
-
-    Metrics of equally many pairs share the resamples.
-    """
-    known = differences[~np.isnan(differences)]
-    mean = float(known.mean()) if len(known) else None
-    interval = mean_interval(known, CONFIDENCE, resamples, seed)
-    if interval is None:
-        return PairedDifference(len(known), mean, None, None)
-    return PairedDifference(len(known), mean, interval.low, interval.high)
+def paired_difference(differences: Float[np.ndarray, "P"], seed: int = 0) -> PairedDifference:
+    """Mean, Student's interval and sign-flip test of paired differences."""
+    mean = float(differences.mean()) if len(differences) else None
+    interval = mean_interval(differences, CONFIDENCE)
+    low, high = (interval.low, interval.high) if interval else (None, None)
+    return PairedDifference(len(differences), mean, low, high, sign_flip_test(differences, seed))
 
 
 def _verdict(difference: PairedDifference, definition: Metric) -> str:
-    if difference.low is None or difference.high is None or definition.direction is Direction.DESCRIPTION:
+    if difference.mean is None or difference.p_value is None or definition.direction is Direction.DESCRIPTION:
         return "–"
-    if difference.low <= 0 <= difference.high:
+    if difference.p_value > SIGNIFICANCE:
         return "undecided"
-    return "better" if (difference.low > 0) == (definition.direction is Direction.HIGHER) else "worse"
+    return "better" if (difference.mean > 0) == (definition.direction is Direction.HIGHER) else "worse"
 
 
 def comparison_lines(comparison: Comparison) -> list[str]:
     """The most telling metrics as a table for a terminal."""
+    pairs = max(one.difference.pairs for one in comparison.metrics)
+    kind = "exact" if pairs <= MOST_ENUMERATED else "randomized"
     lines = [
         f"{len(comparison.first)} runs against {len(comparison.second)}, protocol {comparison.protocol}",
         "difference: first − second over pairs of one dataset and seed, "
         f"and its {comparison.confidence:.0%} {INTERVAL} interval",
+        f"p: {kind} {TEST} of the paired differences, two-sided, n pairs",
     ]
     if comparison.unpaired:
         lines.append(f"without a partner: {', '.join(comparison.unpaired)}")
-    rows: list[tuple[str, ...]] = [("metric", "first", "second", "difference", "pairs", "first is")]
-    rows += [_text_row(each) for each in comparison.metrics if each.path in SHOWN]
+    rows: list[tuple[str, ...]] = [("metric", "first", "second", "difference", "test", "first is")]
+    by_path = {one.path: one for one in comparison.metrics}
+    rows += [_text_row(by_path[key.path]) for key in key_metrics("comparison") if key.path in by_path]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
         lines.append("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
-    pairs = max(each.difference.pairs for each in comparison.metrics)
-    if pairs < 2:
-        lines.append("  One pair tells nothing about chance: score more seeds or scenes for an interval.")
+    if pairs < FEWEST_PAIRS:
+        least = f"{pairs} {'pair has' if pairs == 1 else 'pairs have'} p ≥ {2.0 ** (1 - pairs):.3g}"
+        lines.append(f"  {least}: score {FEWEST_PAIRS} seeds or scenes or more to tell a difference from chance.")
     return lines
 
 
-def _text_row(each: ComparedMetric) -> tuple[str, ...]:
-    definition, difference = each.metric, each.difference
+def _text_row(compared: ComparedMetric) -> tuple[str, ...]:
+    definition, difference = compared.metric, compared.difference
 
     def signed(value: float | None) -> str:
         return "–" if value is None else f"{value:+{definition.format_spec.lstrip('+')}}"
 
-    def spread(values: Spread) -> str:
-        if values.standard_deviation is None:
-            return definition.text(values.mean)
+    def text(values: Spread | None) -> str:
+        if values is None or values.standard_deviation is None:
+            return definition.text(values.mean if values else None)
         return f"{definition.text(values.mean)} ± {values.standard_deviation:{definition.format_spec.lstrip('+')}}"
 
     interval = "" if difference.low is None else f" [{signed(difference.low)}, {signed(difference.high)}]"
-    name = f"{each.path} {definition.direction.value}"
-    texts = (name, spread(each.first), spread(each.second), signed(difference.mean) + interval)
-    return (*texts, str(difference.pairs), each.verdict)
+    test = "–" if difference.p_value is None else f"p = {difference.p_value:.3g}, n = {difference.pairs}"
+    name = f"{compared.path} {definition.direction.value}"
+    texts = (name, text(compared.first), text(compared.second), signed(difference.mean) + interval)
+    return (*texts, test, compared.verdict)
 
 
 def write_comparison(folder: Path, comparison: Comparison) -> tuple[Path, Path]:
     """Write comparison.json and comparison.csv, every metric with unit and direction; return their paths."""
-    rows = [_record(each) for each in comparison.metrics]
-    content = asdict(comparison) | {"metrics": rows}
-    write_json(folder / JSON, {"format": FORMAT, "format_version": FORMAT_VERSION, "interval": INTERVAL, **content})
+    rows = [_record(one) for one in comparison.metrics]
+    content = asdict(comparison) | {"interval": INTERVAL, "test": TEST, "metrics": rows}
+    write_json(folder / JSON, {"format": FORMAT, "format_version": FORMAT_VERSION, **content})
     stream = io.StringIO()
     writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -263,17 +242,17 @@ def write_comparison(folder: Path, comparison: Comparison) -> tuple[Path, Path]:
     return folder / JSON, folder / CSV
 
 
-def _record(each: ComparedMetric) -> dict[str, str | float | None]:
-    groups = {
-        f"{name}_{key}": value
-        for name, part in (("first", each.first), ("second", each.second), ("difference", each.difference))
-        for key, value in asdict(part).items()
-    }
-    definition = each.metric
+def _record(compared: ComparedMetric) -> dict[str, str | float | None]:
+    groups: dict[str, float | None] = {}
+    for name, spread in (("first", compared.first), ("second", compared.second)):
+        values = asdict(spread) if spread else {"number": 0}
+        groups |= {f"{name}_{field.name}": values.get(field.name) for field in fields(Spread)}
+    groups |= {f"difference_{key}": value for key, value in asdict(compared.difference).items()}
+    definition = compared.metric
     return {
-        "metric": each.path,
+        "metric": compared.path,
         "unit": definition.unit,
         "direction": definition.direction.name.lower(),
         **groups,
-        "verdict": each.verdict,
+        "verdict": compared.verdict,
     }

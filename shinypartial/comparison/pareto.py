@@ -1,21 +1,22 @@
 """What a chart of quality against cost shows: runs of one dataset on one machine, seeds joined, the Pareto front.
 
 Reads `prediction.json` and `scores.json` only. What differs in dataset or hardware is refused, what can't be read or
-has no score is kept apart with the reason.
+has no score is excluded with the reason.
 """
 
 import json
-import statistics
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from shinypartial.comparison.runs import HASH_DIGITS, Entry, Excluded, read_entry
+from shinypartial.comparison.significance import Spread, summarize
 from shinypartial.core.errors import InputError
-from shinypartial.evaluation.scores import read_bound, score_rows
-from shinypartial.metrics.registry import Direction, metric
-from shinypartial.prediction.format import DESCRIPTION, PredictionInfo, prediction_folders, snapshot_folders
+from shinypartial.evaluation.key_metrics import key_metrics
+from shinypartial.evaluation.scores import read_oracle_baseline, score_rows
+from shinypartial.metrics.registry import Direction
+from shinypartial.prediction.format import DESCRIPTION, prediction_folders, snapshot_folders
 
 Cost = Literal["seconds", "parameters", "primitives", "bytes"]
 Size = Literal["parameters", "primitives", "bytes"]
@@ -23,39 +24,31 @@ Size = Literal["parameters", "primitives", "bytes"]
 
 @dataclass(frozen=True)
 class Measure:
-    """An axis: its name in the table of points, its title, and where the scores hold it; None for a cost."""
+    """An axis: its name in the table of points, its title and unit, and where the scores hold it; empty for a cost."""
 
     name: str
     title: str
-    path: str | None = None
+    unit: str = ""
+    path: str = ""
+    higher_is_better: bool = False
 
     @property
-    def higher_is_better(self) -> bool:
-        """Whether more is better; a cost is better when it is less."""
-        return self.path is not None and metric(self.path.rpartition(".")[2]).direction is Direction.HIGHER
+    def label(self) -> str:
+        """Title and unit."""
+        return f"{self.title} ({self.unit})" if self.unit else self.title
 
 
 COSTS: dict[Cost, Measure] = {
-    "seconds": Measure("seconds", "seconds of fitting"),
-    "parameters": Measure("parameters", "parameters"),
-    "primitives": Measure("primitives", "primitives"),
-    "bytes": Measure("bytes", "bytes of the exported model"),
+    "seconds": Measure("seconds", "Seconds of fitting"),
+    "parameters": Measure("parameters", "Parameters"),
+    "primitives": Measure("primitives", "Primitives"),
+    "bytes": Measure("bytes", "Bytes of the exported model"),
 }
-QUALITIES = (
-    Measure("environment_psnr", "environment PSNR (dB)", "environment.as_predicted.full.psnr_srgb"),
-    Measure("median_normal_error", "median normal error (°)", "normals.median_angular_error_deg"),
-    Measure("mean_normal_error", "mean normal error (°)", "normals.mean_angular_error_deg"),
+QUALITIES = tuple(
+    Measure(key.name, key.title, key.metric.unit, key.path, key.metric.direction is Direction.HIGHER)
+    for key in key_metrics("chart")
 )
 MEASURES = (*COSTS.values(), *QUALITIES)
-
-
-@dataclass(frozen=True)
-class Spread:
-    """The median over seeds, and the smallest and the largest of them."""
-
-    median: float
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)
@@ -84,14 +77,14 @@ class Point:
 
 @dataclass(frozen=True)
 class Comparable:
-    """Points that may share a chart; `bound` holds the oracle's value by the name of a measure."""
+    """Points that may share a chart; `oracle` holds the oracle baseline's value by the name of a measure."""
 
     dataset: str
     dataset_hash: str
     protocol: str
     hardware: str
     points: tuple[Point, ...]
-    bound: dict[str, float]
+    oracle: dict[str, float]
     excluded: tuple[Excluded, ...]
 
 
@@ -123,12 +116,13 @@ def collect_points(paths: Iterable[Path], dataset: str | None = None, hardware: 
     Raises InputError when there is none, or when more than one dataset, version of it or hardware is left.
     """
     entries, excluded = _read(paths)
-    bounds = [entry for _, entry in entries if entry.is_oracle]
+    oracles = [entry for _, entry in entries if entry.is_oracle]
     methods = [(folder, entry) for folder, entry in entries if not entry.is_oracle]
     if dataset is not None:
         methods = [(folder, entry) for folder, entry in methods if entry.scores.dataset == dataset]
     if hardware is not None:
-        methods = [each for each in methods if hardware.casefold() in hardware_text(each[1].info).casefold()]
+        words = hardware.casefold()
+        methods = [(folder, entry) for folder, entry in methods if words in entry.info.hardware_text.casefold()]
     if not methods:
         reasons = "; ".join(f"{one.folder}: {one.reason}" for one in excluded[:3])
         raise InputError(
@@ -155,17 +149,11 @@ def collect_points(paths: Iterable[Path], dataset: str | None = None, hardware: 
         dataset=scores.dataset,
         dataset_hash=scores.dataset_hash,
         protocol=scores.protocol,
-        hardware=hardware_text(methods[0][1].info),
+        hardware=methods[0][1].info.hardware_text,
         points=_points(runs),
-        bound=_oracle_line(bounds, runs),
+        oracle=_oracle_values(oracles, runs),
         excluded=tuple(excluded),
     )
-
-
-def hardware_text(info: PredictionInfo) -> str:
-    """What a prediction states about its hardware, with the names of the entries, in one line."""
-    stated = [f"{name} {value}" for name, value in info.hardware.items() if value not in ("", None)]
-    return ", ".join(stated) or "not stated"
 
 
 def _read(paths: Iterable[Path]) -> tuple[list[tuple[Path, Entry]], list[Excluded]]:
@@ -215,12 +203,12 @@ def _require_one_dataset(entries: Sequence[Entry]) -> None:
 
 
 def _require_one_hardware(entries: Sequence[Entry]) -> None:
-    kinds = sorted({hardware_text(entry.info) for entry in entries})
+    kinds = sorted({entry.info.hardware_text for entry in entries})
     if len(kinds) > 1:
         raise InputError(
             expected="predictions made on one hardware, for seconds on different ones don't compare",
             found="; ".join(kinds),
-            remedy="Choose with words that only one of them has, such as `--hardware 'threads 2'`.",
+            remedy="Choose with words that only one of them has, such as `--hardware 'device cpu'`.",
         )
 
 
@@ -234,9 +222,9 @@ def _values(entry: Entry) -> dict[str, float]:
     }
     values = {name: float(value) for name, value in costs.items() if value}
     for quality in QUALITIES:
-        row = entry.row(quality.path or "")
-        if row is not None and row.value is not None:
-            values[quality.name] = row.value
+        value = entry.value(quality.path)
+        if value is not None:
+            values[quality.name] = value
     return values
 
 
@@ -244,15 +232,15 @@ def _moments(folder: Path, whole: Entry) -> tuple[tuple[Moment, ...], list[Exclu
     """The scored snapshots of a prediction and its end, by time; and the snapshots that are not of this fit."""
     moments: list[Moment] = []
     excluded: list[Excluded] = []
-    for each in snapshot_folders(folder):
-        entry = read_entry(each, each.as_posix())
+    for snapshot in snapshot_folders(folder):
+        entry = read_entry(snapshot, snapshot.as_posix())
         if isinstance(entry, Entry):
             differing = _difference(entry, whole)
             if not differing and entry.seconds:
                 moments.append(Moment(entry.folder, entry.info.iteration, _values(entry)))
                 continue
             reason = f"a snapshot of another {differing} than {whole.folder}" if differing else "states no seconds"
-            entry = Excluded(each.as_posix(), reason, "Export the snapshots again, or delete that folder.")
+            entry = Excluded(snapshot.as_posix(), reason, "Export the snapshots again, or delete that folder.")
         excluded.append(entry)
     moments.sort(key=lambda moment: moment.values["seconds"])
     end = Moment(whole.folder, None, _values(whole))
@@ -267,7 +255,7 @@ def _difference(snapshot: Entry, whole: Entry) -> str:
         return "dataset"
     if (snapshot.info.method, snapshot.info.config) != (whole.info.method, whole.info.config):
         return "configuration"
-    return "" if hardware_text(snapshot.info) == hardware_text(whole.info) else "hardware"
+    return "" if snapshot.info.hardware_text == whole.info.hardware_text else "hardware"
 
 
 def _points(runs: Sequence[_Run]) -> tuple[Point, ...]:
@@ -293,31 +281,30 @@ def _key(run: _Run) -> str:
 
 
 def _point(group: Sequence[_Run]) -> Point:
-    each = [_values(run.entry) for run in group]
-    values = {}
+    runs = [_values(run.entry) for run in group]
+    spreads = {}
     for measure in MEASURES:
-        known = [one[measure.name] for one in each if measure.name in one]
+        known = [values[measure.name] for values in runs if measure.name in values]
         if known:
-            values[measure.name] = Spread(statistics.median(known), min(known), max(known))
+            spreads[measure.name] = summarize(known)
     method = group[0].entry.info.method
     return Point(
         label=method,
         method=method,
         folders=tuple(run.entry.folder for run in group),
         seeds=tuple(str(run.entry.info.config.get("seed", "")) for run in group),
-        values=values,
+        values=spreads,
         curves=tuple(run.moments for run in group if run.moments),
     )
 
 
-def _oracle_line(bounds: Sequence[Entry], runs: Sequence[_Run]) -> dict[str, float]:
-    """The oracle's environment, from the predictions named or from beside them; normals have none but zero."""
+def _oracle_values(oracles: Sequence[Entry], runs: Sequence[_Run]) -> dict[str, float]:
+    """The oracle baseline's environment, from the predictions named or from beside them; its normals are the truth."""
     wanted = runs[0].entry.scores.dataset_hash
-    found = [entry.scores for entry in bounds if entry.scores.dataset_hash == wanted]
-    found += [scores for run in runs if (scores := read_bound(run.folder, run.entry.scores)) is not None]
+    found = [entry.scores for entry in oracles if entry.scores.dataset_hash == wanted]
+    found += [scores for run in runs if (scores := read_oracle_baseline(run.folder, run.entry.scores)) is not None]
     if not found:
         return {}
     rows = {row.path: row.value for row in score_rows(found[0])}
-    paths = {quality.name: quality.path or "" for quality in QUALITIES}
-    values = {name: rows.get(path) for name, path in paths.items() if path.startswith("environment.")}
+    values = {one.name: rows.get(one.path) for one in QUALITIES if one.path.startswith("environment.")}
     return {name: value for name, value in values.items() if value is not None}

@@ -1,8 +1,10 @@
 """Errors caused by the user's input, and the single place that turns them into a message and an exit code."""
 
 import errno
+import os
 import sys
 from collections.abc import Callable
+from typing import Protocol
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -42,6 +44,8 @@ def run_command(command: Callable[[], None]) -> int:
         command()
     except InputError as error:
         message = error
+    except BrokenPipeError:
+        raise
     except OSError as error:
         message = from_os_error(error)
     except KeyboardInterrupt:
@@ -54,3 +58,30 @@ def run_command(command: Callable[[], None]) -> int:
         file=sys.stderr,
     )
     return EXIT_BAD_INPUT
+
+
+class Command(Protocol):
+    """What a command line was parsed to."""
+
+    def run(self) -> None:
+        """Do it."""
+        ...
+
+
+def parse_and_run(parse: Callable[[], Command]) -> int:
+    """Parse a command line and run the command; return 0, 2 for bad usage or bad input, 130 when interrupted.
+
+    It ends without an error when the reader of standard output, such as `head`, has seen enough.
+    """
+    try:
+        try:
+            command = parse()
+        except SystemExit as stop:
+            code = EXIT_BAD_INPUT if stop.code else 0
+        else:
+            code = run_command(command.run)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    return code

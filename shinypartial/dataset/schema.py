@@ -122,6 +122,12 @@ class Dataset:
         """Folder name, used to name runs and predictions."""
         return self.root.resolve().name
 
+    @property
+    def scene_split(self) -> str:
+        """`development` or `held-out`, as the recipe of the scene declares it; `unknown` where nothing does."""
+        recipe = self.manifest.get("recipe")
+        return str(recipe.get("split", "unknown")) if isinstance(recipe, dict) else "unknown"
+
     def split(self, split: str) -> tuple[Frame, ...]:
         """Frames of `train` or `test`."""
         return self.train if split == "train" else self.test

@@ -39,7 +39,7 @@ from shinypartial.evaluation.scores import (
     LeftOut,
     PerceptualScores,
     Scores,
-    read_bound,
+    read_oracle_baseline,
     write_scores,
 )
 from shinypartial.evaluation.view_scores import (
@@ -158,7 +158,7 @@ def evaluate(
         left_out=tuple(left_out),
         counts=count_all(data, results),
     )
-    read_bound(prediction, scores)
+    read_oracle_baseline(prediction, scores)
     write_scores(prediction, scores)
     return scores
 

@@ -4,14 +4,13 @@ The fields of the score types carry the names of `metrics.registry`, so a row kn
 """
 
 import dataclasses
-import types
-import typing
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from shinypartial.core.errors import InputError
 from shinypartial.io.files import read_json, write_json
+from shinypartial.io.records import read_record, write_record
 from shinypartial.metrics.angular import AngularStatistics
 from shinypartial.metrics.calibration import CalibrationScores
 from shinypartial.metrics.environment import Regions, UnweightedScores
@@ -88,8 +87,8 @@ class Counts:
 class Scores:
     """Everything that one evaluation found; None for a group that was left out, which `left_out` names.
 
-    All groups follow `protocol` but `paper`, which names its own. `oracle` is the folder of the dataset's bound when
-    it is not the usual one. `normals_environment` takes only the pixels whose mirror ray leaves the scene.
+    All groups follow `protocol` but `paper`, which names its own. `oracle` is the folder of the dataset's oracle
+    baseline when it is not the usual one. `normals_environment` takes pixels whose mirror ray leaves the scene.
     """
 
     protocol: str
@@ -143,7 +142,7 @@ def _rows(prefix: str, value: Any) -> list[ScoreRow]:
 
 def write_scores(prediction: Path, scores: Scores) -> None:
     """Write PREDICTION/scores.json (strict JSON; a metric that was left out is null)."""
-    write_json(prediction / SCORES, {"format": FORMAT, "format_version": FORMAT_VERSION, **asdict(scores)})
+    write_json(prediction / SCORES, {"format": FORMAT, "format_version": FORMAT_VERSION, **write_record(scores)})
 
 
 def read_scores(prediction: Path) -> Scores:
@@ -156,18 +155,16 @@ def read_scores(prediction: Path) -> Scores:
             remedy=f"Evaluate first: `shinypartial evaluate {prediction}`.",
         )
     content = read_json(path, "the scores")
+    content = content if isinstance(content, dict) else {}
     remedy = f"Evaluate again: `shinypartial evaluate {prediction}`."
     if content.pop("format", None) != FORMAT or content.pop("format_version", None) != FORMAT_VERSION:
         raise InputError(
             expected=f"{SCORES} with format {FORMAT} version {FORMAT_VERSION}", found="another format", remedy=remedy
         )
-    try:
-        return _restore(Scores, content)
-    except (KeyError, TypeError, AttributeError) as error:
-        raise InputError(expected=f"complete scores in {path}", found=f"{error!r}", remedy=remedy) from None
+    return read_record(Scores, content, str(path), remedy=remedy)
 
 
-def read_bound(prediction: Path, scores: Scores) -> Scores | None:
+def read_oracle_baseline(prediction: Path, scores: Scores) -> Scores | None:
     """Scores of the dataset's oracle, from the folder that the scores name or the sibling DATASET-oracle.
 
     None when there is no such sibling, when it is the prediction itself, or when it was made from another version of
@@ -176,27 +173,13 @@ def read_bound(prediction: Path, scores: Scores) -> Scores | None:
     folder = Path(scores.oracle) if scores.oracle else prediction.resolve().parent / (scores.dataset + ORACLE_SUFFIX)
     if folder.resolve() == prediction.resolve() or (scores.oracle is None and not (folder / SCORES).is_file()):
         return None
-    bound = read_scores(folder)
-    if bound.dataset_hash == scores.dataset_hash and bound.dataset_hash_matches:
-        return bound
+    baseline = read_scores(folder)
+    if baseline.dataset_hash == scores.dataset_hash and baseline.dataset_hash_matches:
+        return baseline
     if scores.oracle is None:
         return None
     raise InputError(
         expected=f"the oracle of {scores.dataset} (hash {scores.dataset_hash[:12]}…) in {folder}",
-        found=f"that of {bound.dataset} (hash {bound.dataset_hash[:12]}…)",
+        found=f"that of {baseline.dataset} (hash {baseline.dataset_hash[:12]}…)",
         remedy=f"Make it: `shinypartial oracle {scores.dataset}`, or leave out --oracle.",
     )
-
-
-def _restore(kind: Any, content: Any) -> Any:
-    """Rebuild nested frozen dataclasses, tuples of them and optional values from JSON."""
-    if content is None:
-        return None
-    if isinstance(kind, types.UnionType):
-        kind = next(option for option in typing.get_args(kind) if option is not type(None))
-    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
-        hints = typing.get_type_hints(kind)
-        return kind(**{name: _restore(hint, content[name]) for name, hint in hints.items()})
-    if typing.get_origin(kind) is tuple:
-        return tuple(_restore(typing.get_args(kind)[0], entry) for entry in content)
-    return content

@@ -1,6 +1,6 @@
 """The prediction folder: what every method writes, and all that the evaluator reads.
 
-PREDICTION/prediction.json            method, configuration, dataset hash, seconds, hardware, parameter counts
+PREDICTION/prediction.json            method, configuration, dataset hash, seconds, hardware, size, model selection
 PREDICTION/environment.exr            lat-long, linear radiance, world frame of the dataset
 PREDICTION/visibility.exr             lat-long, channel Y in [0, 1]: how well each direction was observed
 PREDICTION/test/r_000.exr r_000.png   linear premultiplied RGBA, unit world normals, z-depth; and the picture
@@ -8,7 +8,7 @@ PREDICTION/decomposition.jpg          optional: what a test view is made of
 PREDICTION/snapshots/000250           optional: earlier moments of the fit, each a prediction folder
 """
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from shinypartial.dataset.schema import CHECKSUMS, Dataset, Frame, View
 from shinypartial.dataset.write import write_view
 from shinypartial.io.files import newest_folder, read_json, sha256_of, write_json
 from shinypartial.io.images import read_exr, read_exr_rgb, stack_channels, write_exr, write_exr_rgb
+from shinypartial.io.records import NonNegative, Share, Text, read_record, write_record
 
 FORMAT = "shinypartial-prediction"
 FORMAT_VERSION = 1
@@ -27,7 +28,7 @@ DEFAULT_FOLDER = Path("predictions")
 DESCRIPTION = "prediction.json"
 #: Moments of a fit, each a prediction folder of its own, lie below the prediction in a folder of this name.
 SNAPSHOTS = "snapshots"
-#: The bound of a dataset lies beside the predictions made from it, under the dataset's name with this ending.
+#: The oracle baseline of a dataset lies beside the predictions made from it, under the dataset's name with this ending.
 ORACLE_SUFFIX = "-oracle"
 ENVIRONMENT = "environment.exr"
 VISIBILITY = "visibility.exr"
@@ -37,28 +38,68 @@ DECOMPOSITION = "decomposition.jpg"
 
 
 @dataclass(frozen=True)
+class Candidate:
+    """A kind of model that was considered, the evidence for it, and what became of it; None: not measured.
+
+    `silhouette_px` is its distance from the silhouettes, `overlap` the intersection over union with the masks,
+    `held_out_error` its error on views that were left out of the fit. `verdict` is a word such as "chosen" or
+    "rejected", `reason` says why.
+    """
+
+    kind: Text
+    silhouette_px: NonNegative | None
+    overlap: Share | None
+    held_out_error: NonNegative | None
+    verdict: Text
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class ModelSelection:
+    """The kind of model that a method chose, and all that it considered."""
+
+    chosen: Text
+    candidates: tuple[Candidate, ...]
+
+    def sentence(self) -> str:
+        """The choice in words, with the reason of every candidate that has one."""
+        reasons = {one.kind: f" ({one.reason})" if one.reason else "" for one in self.candidates}
+        others = [f"{one.kind}: {one.verdict}{reasons[one.kind]}" for one in self.candidates if one.kind != self.chosen]
+        return "; ".join([f"{self.chosen} was chosen{reasons.get(self.chosen, '')}", *others]) + "."
+
+
+@dataclass(frozen=True)
 class PredictionInfo:
     """Who made the prediction and at what cost; `curves` are per-iteration training series, for the report only.
 
-    `seconds` are those of making the model; their sum is its time in leaderboards and charts. `model` says what kind of
-    model was chosen and why, `primitives` is the number of surfels, Gaussians, voxels or vertices, `model_bytes` the
-    size of the files that a renderer needs, `iteration` the number of finished steps of a snapshot; each is None where
-    it is unknown or has no meaning.
+    `seconds` are those of making the model; their sum is its time in leaderboards and charts. `hardware` names under
+    `device` what the model was fitted on: "cpu", or the name of the GPU. `primitives` is the number of surfels,
+    Gaussians, voxels or vertices, `model_bytes` the size of the files that a renderer needs, `iteration` the number of
+    finished steps of a snapshot, `model_selection` how the kind of model was chosen; `model` says the same in free
+    words. Each is None where it is unknown or has no meaning.
     """
 
     method: str
     dataset: str
     dataset_hash: str
     config: dict[str, Any]
-    seconds: dict[str, float]
+    seconds: dict[str, NonNegative]
     hardware: dict[str, Any]
     parameter_counts: dict[str, int]
     peak_memory_bytes: int
     curves: dict[str, list[float]] = field(default_factory=dict)
     model: str | None = None
+    model_selection: ModelSelection | None = None
     primitives: int | None = None
     model_bytes: int | None = None
     iteration: int | None = None
+
+    @property
+    def hardware_text(self) -> str:
+        """The hardware in one line, the device first; seconds on different hardware don't compare."""
+        ordered = {"device": self.hardware.get("device"), **self.hardware}
+        stated = [f"{name} {value}" for name, value in ordered.items() if value not in ("", None)]
+        return ", ".join(stated) or "not stated"
 
 
 def dataset_hash(dataset: Dataset) -> str:
@@ -68,7 +109,7 @@ def dataset_hash(dataset: Dataset) -> str:
 
 
 def newest_prediction(parent: Path = DEFAULT_FOLDER) -> Path:
-    """The prediction below `parent` that was written last; bounds are passed over."""
+    """The prediction below `parent` that was written last; oracle baselines are passed over."""
     remedy = "Make one: `panoless fit`, or name a folder."
     return newest_folder(parent, DESCRIPTION, "a prediction", remedy, unless_suffix=ORACLE_SUFFIX)
 
@@ -107,7 +148,7 @@ def acquire_prediction(root: Path) -> None:
 
 def write_info(root: Path, info: PredictionInfo) -> None:
     """Write prediction.json; written last, it marks the folder as complete."""
-    stated = {name: value for name, value in asdict(info).items() if value is not None}
+    stated = {name: value for name, value in write_record(info).items() if value is not None}
     write_json(root / DESCRIPTION, {"format": FORMAT, "format_version": FORMAT_VERSION, **stated})
 
 
@@ -136,14 +177,15 @@ def read_info(root: Path) -> PredictionInfo:
             found="another format",
             remedy="Export the prediction again with this version.",
         )
-    try:
-        return PredictionInfo(**content)
-    except TypeError as error:
+    info = read_record(PredictionInfo, content, str(root / DESCRIPTION), remedy="See docs/prediction-format.md.")
+    selection = info.model_selection
+    if selection and selection.candidates and selection.chosen not in {one.kind for one in selection.candidates}:
         raise InputError(
-            expected=f"the fields of the prediction format in {root / DESCRIPTION}",
-            found=str(error),
+            expected=f"`model_selection.chosen` of {root / DESCRIPTION} to be the kind of one of its candidates",
+            found=repr(selection.chosen),
             remedy="See docs/prediction-format.md.",
-        ) from None
+        )
+    return info
 
 
 def read_environment_map(root: Path) -> Float[np.ndarray, "H W 3"]:

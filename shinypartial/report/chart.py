@@ -1,12 +1,11 @@
 """Quality against cost as one page, one SVG for each pair of axes, and a table of the points.
 
-The page needs no network and no other file. What the charts hold is decided in `chart_points`.
+The page needs no network and no other file. What the charts hold is decided in `comparison.pareto`.
 """
 
 import csv
-import html
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,21 +17,17 @@ from shinypartial.comparison.pareto import (
     Measure,
     Point,
     Size,
-    Spread,
     collect_points,
     pareto_front,
 )
 from shinypartial.comparison.runs import HASH_DIGITS
-from shinypartial.core.errors import InputError
+from shinypartial.comparison.significance import Spread, summarize
 from shinypartial.io.files import write_text
-from shinypartial.report.chart_svg import Curve, Mark, Plot, draw
+from shinypartial.report.chart_svg import Curve, Mark, Plot, draw, follow_page_colors
+from shinypartial.report.html import require_own_page, trusted, write_page
 from shinypartial.report.line_chart import short_number
-from shinypartial.report.style import STYLE
-from shinypartial.report.tables import excluded_section
 
 PAGE, TABLE = "chart.html", "chart.csv"
-GENERATOR = '<meta name="generator" content="shinypartial chart">'
-PAGE_STYLE = ".charts { grid-template-columns: repeat(auto-fill, minmax(min(460px, 100%), 1fr)); }"
 
 
 @dataclass(frozen=True)
@@ -42,6 +37,16 @@ class Chart:
     file_name: str
     plot: Plot
     front: dict[int, bool]
+
+
+@dataclass(frozen=True)
+class PointLine:
+    """A point as the page's table shows it: its values as texts, and how many fronts it is on."""
+
+    method: str
+    folders: tuple[str, ...]
+    texts: tuple[str, ...]
+    fronts: int
 
 
 def write_chart(
@@ -56,19 +61,25 @@ def write_chart(
 
     Raises InputError when the predictions can't share a chart, or `output` has a page of something else.
     """
-    page = output / PAGE
-    if page.exists() and GENERATOR not in page.read_text(encoding="utf-8", errors="replace"):
-        raise InputError(
-            expected=f"a new folder or earlier charts at {output}",
-            found=f"a {PAGE} of something else",
-            remedy="Choose another --output.",
-        )
+    require_own_page(output / PAGE, "chart")
     comparable = collect_points(paths, dataset, hardware)
     charts = make_charts(comparable, size)
-    for chart in charts:
-        write_text(output / chart.file_name, draw(chart.plot, alone=True) + "\n")
+    pictures = [draw(chart.plot) for chart in charts]
+    for chart, picture in zip(charts, pictures, strict=True):
+        write_text(output / chart.file_name, picture)
     write_text(output / TABLE, chart_csv(comparable, charts))
-    write_text(page, chart_html(comparable, charts))
+    measures = [measure for measure in MEASURES if any(measure.name in point.values for point in comparable.points)]
+    write_page(
+        output / PAGE,
+        "chart.html.j2",
+        generator="chart",
+        title=f"Quality against cost: {comparable.dataset}",
+        facts=_facts(comparable),
+        pictures=[trusted(follow_page_colors(picture)) for picture in pictures],
+        measures=measures,
+        points=list(_point_lines(comparable, charts, measures)),
+        excluded=comparable.excluded,
+    )
     return comparable
 
 
@@ -90,41 +101,37 @@ def _chart(comparable: Comparable, cost: Measure, quality: Measure) -> Chart | N
     front = pareto_front(
         [x.median for x, _ in places], [y.median for _, y in places], higher_is_better=quality.higher_is_better
     )
+    labels = [_label(number, point) for number, point in drawn]
     numbers = [number for number, _ in drawn]
-    marks = [Mark(number, x, y, best) for number, (x, y), best in zip(numbers, places, front, strict=True)]
+    marks = [Mark(*mark) for mark in zip(numbers, labels, *zip(*places, strict=True), front, strict=True)]
     curves = [curve for number, point in drawn for curve in _curves(number, point, quality)]
     plot = Plot(
-        title=f"{comparable.dataset}: {quality.title} against {cost.title}",
-        x_title=cost.title,
-        y_title=quality.title,
+        title=f"{comparable.dataset}: {quality.title} against {cost.title.lower()}",
+        x_title=cost.label,
+        y_title=quality.label,
         marks=marks,
         curves=curves if cost.name == "seconds" else [],
-        bound=comparable.bound.get(quality.name),
-        legend=[*(_legend(number, point) for number, point in drawn), *_facts(comparable)],
+        oracle=comparable.oracle.get(quality.name),
+        facts=_facts(comparable),
     )
     return Chart(f"{quality.name}_by_{cost.name}.svg", plot, dict(zip(numbers, front, strict=True)))
 
 
-def _curves(number: int, point: Point, quality: Measure) -> list[Curve]:
-    curves = []
+def _curves(number: int, point: Point, quality: Measure) -> Iterator[Curve]:
     for moments in point.curves:
         known = [moment.values for moment in moments if quality.name in moment.values]
         if len(known) > 1:
-            curves.append(Curve(number, [v["seconds"] for v in known], [v[quality.name] for v in known]))
-    return curves
+            yield Curve(number, [values["seconds"] for values in known], [values[quality.name] for values in known])
 
 
-def _legend(number: int, point: Point) -> str:
+def _label(number: int, point: Point) -> str:
     runs = f", median of {len(point.folders)} runs" if len(point.folders) > 1 else ""
     return f"{number}  {point.label}{runs}"
 
 
 def _facts(comparable: Comparable) -> list[str]:
-    return [f"Hardware: {comparable.hardware}", f"Dataset {_version(comparable)} · protocol {comparable.protocol}"]
-
-
-def _version(comparable: Comparable) -> str:
-    return f"{comparable.dataset} · hash {comparable.dataset_hash[:HASH_DIGITS]}"
+    version = f"{comparable.dataset} · hash {comparable.dataset_hash[:HASH_DIGITS]}"
+    return [f"Hardware: {comparable.hardware}", f"Dataset {version} · protocol {comparable.protocol}"]
 
 
 def chart_csv(comparable: Comparable, charts: Sequence[Chart]) -> str:
@@ -139,65 +146,30 @@ def chart_csv(comparable: Comparable, charts: Sequence[Chart]) -> str:
     fronts = [f"front_{chart.file_name.removesuffix('.svg')}" for chart in charts]
     writer.writerow([*facts, *statistics, *fronts])
     common = [comparable.dataset, comparable.dataset_hash, comparable.protocol, comparable.hardware]
-    if comparable.bound:
-        bound = {name: Spread(value, value, value) for name, value in comparable.bound.items()}
-        writer.writerow([*common, "bound", "oracle", "", "", "", *_statistics(bound), *("" for _ in charts)])
+    no_fronts = [""] * len(charts)
+    if comparable.oracle:
+        oracle = {name: summarize([value]) for name, value in comparable.oracle.items()}
+        writer.writerow([*common, "oracle baseline", "oracle", "", "", "", *_statistics(oracle), *no_fronts])
     for number, point in enumerate(comparable.points, 1):
         made = [point.label, " ".join(point.folders), " ".join(point.seeds)]
         fronts = ["" if number not in chart.front else str(int(chart.front[number])) for chart in charts]
         writer.writerow([*common, "result", *made, "", *_statistics(point.values), *fronts])
         for moment in (moment for curve in point.curves for moment in curve if moment.iteration is not None):
-            values = {name: Spread(value, value, value) for name, value in moment.values.items()}
+            values = {name: summarize([value]) for name, value in moment.values.items()}
             made = [point.label, moment.folder, "", str(moment.iteration)]
-            writer.writerow([*common, "snapshot", *made, *_statistics(values), *("" for _ in charts)])
+            writer.writerow([*common, "snapshot", *made, *_statistics(values), *no_fronts])
     return stream.getvalue()
 
 
 def _statistics(values: dict[str, Spread]) -> list[str]:
-    found = [values.get(measure.name) for measure in MEASURES]
-    return [text for one in found for text in (["", "", ""] if one is None else map(repr, vars(one).values()))]
+    spreads = [values.get(measure.name) for measure in MEASURES]
+    return [text for s in spreads for text in (map(repr, (s.median, s.low, s.high)) if s else ("", "", ""))]
 
 
-def chart_html(comparable: Comparable, charts: Sequence[Chart]) -> str:
-    """The page as text."""
-    title = f"Quality against cost: {comparable.dataset}"
-    note = (
-        "Filled marks are on the Pareto front: no other point costs at most as much and is at least as good. The "
-        "dotted line is the best that is reached at each cost. Several runs are shown by their median, and by a bar "
-        "from the lowest to the highest. A solid curve is one fit over time, from its snapshots: the seconds until "
-        "then and those of solving the environment from there. Snapshots take no part in the Pareto front."
-    )
-    figures = "".join(f"<figure>{draw(chart.plot)}</figure>" for chart in charts)
-    empty = '<p class="warn">No point has both a cost and a quality.</p>'
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">{GENERATOR}'
-        f"<title>{html.escape(title)}</title><style>{STYLE}{PAGE_STYLE}</style></head><body>\n"
-        f"<h1>{html.escape(title)}</h1>\n"
-        + "".join(f"<p>{html.escape(fact)}</p>\n" for fact in _facts(comparable))
-        + f'<p class="dim">{note}</p>\n<div class="charts">{figures or empty}</div>\n'
-        + _points_section(comparable, charts)
-        + excluded_section("Not charted", [(one.folder, one.reason, one.remedy) for one in comparable.excluded])
-        + "\n</body></html>\n"
-    )
-
-
-def _points_section(comparable: Comparable, charts: Sequence[Chart]) -> str:
-    shown = [measure for measure in MEASURES if any(measure.name in point.values for point in comparable.points)]
-    head = "".join(f'<th class="number">{html.escape(measure.title)}</th>' for measure in shown)
-    rows = []
+def _point_lines(comparable: Comparable, charts: Sequence[Chart], measures: Sequence[Measure]) -> Iterator[PointLine]:
     for number, point in enumerate(comparable.points, 1):
-        cells = "".join(f'<td class="number">{_text(point.values.get(measure.name))}</td>' for measure in shown)
-        fronts = sum(chart.front.get(number, False) for chart in charts)
-        folders = "<br>".join(html.escape(folder) for folder in point.folders)
-        rows.append(
-            f'<tr><td>{number}  {html.escape(point.method)}<br><span class="dim">{folders}</span></td>{cells}'
-            f'<td class="number">{fronts} of {len(charts)}</td></tr>'
-        )
-    return (
-        f'<h2>Points</h2><div class="scroll"><table><tr><th>Method</th>{head}<th class="number">on the front</th></tr>'
-        f"{''.join(rows)}</table></div>\n"
-    )
+        texts = tuple(_text(point.values.get(measure.name)) for measure in measures)
+        yield PointLine(point.method, point.folders, texts, sum(chart.front.get(number, False) for chart in charts))
 
 
 def _text(spread: Spread | None) -> str:

@@ -1,6 +1,5 @@
-"""Line charts and color legends as inline SVG and HTML, without scripts; colors follow the page's variables."""
+"""Small line charts and color bars, drawn by templates without scripts; colors follow the page's variables."""
 
-import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,14 +25,43 @@ class Series:
     x_title: str
 
 
-def is_logarithmic(series: Series) -> bool:
-    """Whether the chart of the series has a logarithmic axis."""
-    return min(series.y) > 0 and max(series.y) / min(series.y) > LOGARITHMIC_SPAN
+@dataclass(frozen=True)
+class LevelMark:
+    """A level of the vertical axis, in pixels and as text."""
+
+    y: float
+    text: str
 
 
-def line_chart(series: Series) -> str:
-    """The series as an SVG with its smallest, middle and largest value on the axes."""
-    logarithmic = is_logarithmic(series)
+@dataclass(frozen=True)
+class LineChart:
+    """What line_chart.svg.j2 draws: pixels of the line, and the ends of the axes as text."""
+
+    title: str
+    x_title: str
+    points: str
+    first: str
+    last: str
+    marks: tuple[LevelMark, ...]
+    logarithmic: bool
+    width: int = WIDTH
+    height: int = HEIGHT
+    left: int = LEFT
+    right: int = WIDTH - RIGHT
+
+
+@dataclass(frozen=True)
+class ColorBar:
+    """The colors of a scale as stops of a CSS gradient, and its ends in numbers."""
+
+    low: str
+    high: str
+    gradient: str
+
+
+def line_chart(series: Series) -> LineChart:
+    """The series with its smallest, middle and largest value on the axes."""
+    logarithmic = min(series.y) > 0 and max(series.y) / min(series.y) > LOGARITHMIC_SPAN
     x, y = _thin(series.x), _thin(series.y)
     levels = [math.log10(value) for value in y] if logarithmic else y
     low_x, high_x, low, high = min(x), max(x), min(levels), max(levels)
@@ -45,28 +73,12 @@ def line_chart(series: Series) -> str:
         f"{LEFT + (a - low_x) / span_x * plot_width:.1f},{TOP + (high - b) / (high - low) * plot_height:.1f}"
         for a, b in zip(x, levels, strict=True)
     )
-    marks = [_horizontal_mark(low + share * (high - low), share, logarithmic) for share in (0.0, 0.5, 1.0)]
-    ends = [
-        f'<text x="{place}" y="{HEIGHT - 8}" text-anchor="{anchor}">{html.escape(text)}</text>'
-        for place, anchor, text in (
-            (LEFT, "start", f"{low_x:g}"),
-            (LEFT + plot_width / 2, "middle", series.x_title),
-            (WIDTH - RIGHT, "end", f"{high_x:g}"),
-        )
-    ]
-    return (
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{html.escape(series.title, quote=True)}">'
-        f'{"".join(marks)}{"".join(ends)}<polyline class="line" points="{points}"/></svg>'
-    )
-
-
-def _horizontal_mark(level: float, share: float, logarithmic: bool) -> str:
-    place = TOP + (1 - share) * (HEIGHT - TOP - BOTTOM)
-    value = 10**level if logarithmic else level
-    return (
-        f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{place:.1f}" y2="{place:.1f}"/>'
-        f'<text x="{LEFT - 6}" y="{place + 4:.1f}" text-anchor="end">{short_number(value)}</text>'
-    )
+    marks = []
+    for share in (0.0, 0.5, 1.0):
+        level = low + share * (high - low)
+        text = short_number(10**level if logarithmic else level)
+        marks.append(LevelMark(round(TOP + (1 - share) * plot_height, 1), text))
+    return LineChart(series.title, series.x_title, points, f"{low_x:g}", f"{high_x:g}", tuple(marks), logarithmic)
 
 
 def short_number(value: float) -> str:
@@ -81,13 +93,10 @@ def _thin(values: Sequence[float]) -> list[float]:
     return [sum(values[edges[i] : edges[i + 1]]) / (edges[i + 1] - edges[i]) for i in range(MAX_POINTS)]
 
 
-def legend(scale: Scale) -> str:
-    """A bar with the colors of the scale and its ends in numbers."""
+def color_bar(scale: Scale) -> ColorBar:
+    """The bar below a picture in the colors of that scale."""
     colors = colormap_colors(scale.colormap)
-    picked = [colors[round(i * 255 / (LEGEND_STOPS - 1))] for i in range(LEGEND_STOPS)]
-    gradient = ", ".join(f"rgb({red} {green} {blue})" for red, green, blue in picked)
-    return (
-        f'<div class="legend"><span>{scale.low:g}{scale.unit}</span>'
-        f'<i style="background: linear-gradient(to right, {gradient})"></i>'
-        f"<span>{'' if scale.bounded else '≥ '}{scale.high:g}{scale.unit}</span></div>"
-    )
+    stops = [colors[round(i * 255 / (LEGEND_STOPS - 1))] for i in range(LEGEND_STOPS)]
+    gradient = ", ".join(f"rgb({red} {green} {blue})" for red, green, blue in stops)
+    high = f"{'' if scale.bounded else '≥ '}{scale.high:g}{scale.unit}"
+    return ColorBar(f"{scale.low:g}{scale.unit}", high, gradient)

@@ -4,14 +4,15 @@ Reads only the prediction folder, after an evaluation; everything is inlined, so
 """
 
 import base64
-import html
 import io
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from shinypartial.core.errors import InputError
+from shinypartial.evaluation.key_metrics import key_metrics
 from shinypartial.evaluation.pictures import (
     ENVIRONMENT_ERROR,
     ENVIRONMENT_ERROR_MAP,
@@ -27,14 +28,20 @@ from shinypartial.evaluation.pictures import (
     Scale,
     ViewPictures,
 )
-from shinypartial.evaluation.scores import ScoreRow, Scores, ViewScores, read_bound, read_scores, score_rows
-from shinypartial.io.files import write_text
+from shinypartial.evaluation.scores import (
+    ScoreRow,
+    Scores,
+    ViewScores,
+    read_oracle_baseline,
+    read_scores,
+    score_rows,
+)
 from shinypartial.io.progress import format_seconds
 from shinypartial.metrics.registry import Direction
 from shinypartial.prediction.format import DECOMPOSITION, PredictionInfo, read_info
-from shinypartial.report.line_chart import Series, is_logarithmic, legend, line_chart
-from shinypartial.report.style import STYLE
-from shinypartial.report.tables import Bounds, beside, bounds_by_path, metrics_section, paper_section
+from shinypartial.report.html import write_page
+from shinypartial.report.line_chart import ColorBar, LineChart, Series, color_bar, line_chart
+from shinypartial.report.tables import OracleRows, metric_tables, oracle_note, oracle_rows, paper_tables
 
 REPORT = "report.html"
 #: Pictures that the method itself exports, shown under the names of their files.
@@ -47,16 +54,53 @@ JPEG_QUALITY = 88
 #: A PNG of up to this size is inlined losslessly.
 LOSSLESS_BYTES = 24_000
 
-HEADLINES = (
-    ("environment.as_predicted.full.psnr_srgb", "environment PSNR, all directions"),
-    ("environment.as_predicted.resolved.psnr_srgb", "environment PSNR, directions that training views resolve"),
-    ("environment.as_predicted.full.ssim_srgb", "environment SSIM, all directions"),
-    ("normals.mean_angular_error_deg", "mean normal error, test views"),
-    ("render.psnr", "PSNR of rendered test views"),
-    ("calibration.visibility_error_auroc", "AUROC: low visibility announces error"),
-    ("resolved_coverage", "of the sphere is resolved by training views"),
+#: Lines of the summary: title and the group of scores.
+SUMMARY = (
+    ("environment", "environment.as_predicted.full"),
+    ("  resolved", "environment.as_predicted.resolved"),
+    ("  perceptual", "environment.perceptual"),
+    ("normals", "normals"),
+    ("renders", "render"),
+    ("visibility", "calibration"),
 )
-SUMMARY_OF_ENVIRONMENT = ("psnr_srgb", "ssim_srgb", "psnr_linear", "log_rmse_stops")
+MAPS = (
+    (ENVIRONMENT_TRUTH, "Ground truth: sRGB of radiance clipped to [0, 1].", None),
+    (ENVIRONMENT_PREDICTION, "Prediction, in the same encoding.", None),
+    (ENVIRONMENT_EXPOSED, "Prediction after the best global exposure.", None),
+    (
+        ENVIRONMENT_ERROR_MAP,
+        "Error of the prediction as it is: mean over channels of the absolute sRGB difference; dark is good.",
+        ENVIRONMENT_ERROR,
+    ),
+    (
+        VISIBILITY_MAP,
+        "Visibility as the method states it: how well each direction was observed; bright is well seen.",
+        VISIBILITY,
+    ),
+    (
+        OBSERVED_MAP,
+        "Directions in training views, by ground-truth normals: white resolved (0.7° or finer), gray seen.",
+        None,
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A picture as a data URI, with its caption and the colors of its scale."""
+
+    uri: str
+    caption: str
+    legend: ColorBar | None
+
+
+@dataclass(frozen=True)
+class ViewFigures:
+    """One test view: its name, its scores in words, and rows of truth, prediction and error."""
+
+    stem: str
+    text: str
+    trios: tuple[tuple[Figure, ...], ...]
 
 
 def write_report(prediction: Path, output: Path | None = None) -> Path:
@@ -72,207 +116,116 @@ def write_report(prediction: Path, output: Path | None = None) -> Path:
             found="a folder",
             remedy=f"Name a file, such as {page / REPORT}.",
         )
-    write_text(page, report_html(prediction, info, scores))
-    return page
+    rows, oracle = score_rows(scores), oracle_rows(read_oracle_baseline(prediction, scores))
+    pictures = sorted((prediction / METHOD_PICTURES).glob("*.png"))
+    size = LARGE_PX if len(pictures) <= FEW_PICTURES else SMALL_PX
+    return write_page(
+        page,
+        "report.html.j2",
+        generator="report",
+        title=f"{info.method} on {scores.dataset}",
+        info=info,
+        scores=scores,
+        cards=_cards(info, {row.path: row for row in rows}, oracle),
+        maps=_figures((prediction / EVALUATION / name, text, scale) for name, text, scale in MAPS),
+        views=_views(prediction / EVALUATION, scores),
+        view_charts=_line_charts(_view_series(scores)),
+        sheet=next(iter(_figures([(prediction / DECOMPOSITION, _SHEET_CAPTION, None)], SHEET_PX)), None),
+        gallery=_figures(((path, path.stem.replace("_", " "), None) for path in pictures), size),
+        with_oracle=bool(oracle),
+        tables=metric_tables(rows, oracle),
+        paper_tables=paper_tables(rows, oracle),
+        left_out=_left_out(scores),
+        training_charts=_line_charts(_training_series(info)),
+        costs=_costs(info),
+        provenance=_provenance(info, scores),
+        config=[(name, _plain(value)) for name, value in _flatten(info.config)],
+    )
+
+
+_SHEET_CAPTION = "What the method makes of one test view."
 
 
 def summary_lines(prediction: Path) -> list[str]:
     """The scores in a few lines for a terminal."""
     info, scores = read_info(prediction), read_scores(prediction)
     rows = {row.path: row for row in score_rows(scores)}
-    bounds = bounds_by_path(read_bound(prediction, scores))
+    oracle = oracle_rows(read_oracle_baseline(prediction, scores))
     lines = [f"{info.method} on {scores.dataset}, protocol {scores.protocol}"]
     if not scores.dataset_hash_matches:
         lines.append("  warning       the prediction was made from another version of this dataset")
-    groups = (
-        ("environment", "environment.as_predicted.full", SUMMARY_OF_ENVIRONMENT),
-        (
-            "  resolved",
-            "environment.as_predicted.resolved",
-            SUMMARY_OF_ENVIRONMENT,
-        ),
-        ("normals", "normals", ("mean_angular_error_deg", "median_angular_error_deg", "normal_coverage")),
-        ("renders", "render", ("psnr", "ssim", "alpha_iou")),
-        ("visibility", "calibration", ("visibility_error_auroc", "visibility_error_spearman")),
-    )
-    for title, group, names in groups:
-        found = [rows[path] for name in names if (path := f"{group}.{name}") in rows]
-        if found:
-            parts = [
-                f"{row.metric.name} {row.metric.text(row.value)} {row.metric.direction.value}{beside(row, bounds)}"
-                for row in found
-            ]
+    for title, group in SUMMARY:
+        shown = [rows[key.path] for key in key_metrics("summary") if key.group == group and key.path in rows]
+        parts = [
+            f"{row.metric.name} {row.metric.text(row.value)} {row.metric.direction.value}{oracle_note(row, oracle)}"
+            for row in shown
+            if row.value is not None
+        ]
+        if parts:
             lines.append(f"  {title:13s} {'   '.join(parts)}")
     if scores.coverage is not None:
         shares = [rows[name].metric.text(rows[name].value) for name in ("coverage", "resolved_coverage")]
         lines.append(f"  {'coverage':13s} training views see {shares[0]} of the sphere and resolve {shares[1]}")
-    if scores.environment is not None and not bounds and info.method != "oracle":
-        lines.append(f"  {'bound':13s} unknown: run `shinypartial oracle` to see how good a map these views allow")
-    if scores.left_out:
-        lines.append(f"  {'left out':13s} {', '.join(entry.name for entry in scores.left_out)}")
+    if scores.environment is not None and not oracle and info.method != "oracle":
+        lines.append(f"  {'oracle':13s} unknown: `shinypartial oracle` makes the map that ground-truth normals give")
+    lines += [f"  {'left out':13s} {names}: {reason}" for names, reason in _left_out(scores)]
     return lines
 
 
-def report_html(prediction: Path, info: PredictionInfo, scores: Scores) -> str:
-    """The page as text."""
-    rows, bounds = score_rows(scores), bounds_by_path(read_bound(prediction, scores))
-    title = f"{info.method} on {scores.dataset}"
-    sections = [
-        _header(info, scores, title),
-        _headlines(info, rows, bounds),
-        _environment_section(prediction),
-        _views_section(prediction, scores),
-        _method_section(prediction),
-        metrics_section(rows, bounds, scores.protocol),
-        paper_section(rows, bounds, scores),
-        _left_out_section(scores),
-        _curves_section(info),
-        _cost_section(info),
-        _provenance_section(info, scores),
-    ]
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{html.escape(title)}</title><style>{STYLE}</style></head><body>\n"
-        + "\n".join(section for section in sections if section)
-        + "\n</body></html>\n"
-    )
+def _left_out(scores: Scores) -> list[tuple[str, str]]:
+    """Names that were left out for the same reason, and that reason."""
+    by_reason: dict[str, list[str]] = {}
+    for one in scores.left_out:
+        by_reason.setdefault(one.reason, []).append(one.name)
+    return [(", ".join(names), reason) for reason, names in by_reason.items()]
 
 
-def _header(info: PredictionInfo, scores: Scores, title: str) -> str:
-    counts = scores.counts
-    line = (
-        f"Protocol {scores.protocol} · {counts.train_views} training views · {counts.test_views} test views · "
-        f"{counts.normal_pixels:,} normals compared, {counts.normal_holes:,} holes"
-    )
-    warning = (
-        ""
-        if scores.dataset_hash_matches
-        else '<p class="warn">The prediction was made from another version of this dataset: the hashes differ.</p>'
-    )
-    return f'<header><h1>{html.escape(title)}</h1><p class="dim">{html.escape(line)}</p>{warning}</header>'
-
-
-def _headlines(info: PredictionInfo, rows: Sequence[ScoreRow], bounds: Bounds) -> str:
-    by_path = {row.path: row for row in rows}
-    cards = [
-        _card(_with_arrow(by_path[path]), text + beside(by_path[path], bounds))
-        for path, text in HEADLINES
-        if path in by_path and by_path[path].value is not None
-    ]
+def _cards(info: PredictionInfo, rows: dict[str, ScoreRow], oracle: OracleRows) -> list[tuple[str, str]]:
+    """The headlines: a value and what it is."""
+    cards = []
+    for key in key_metrics("report"):
+        row = rows.get(key.path)
+        if row is not None and row.value is not None:
+            arrow = "" if row.metric.direction is Direction.DESCRIPTION else f" {row.metric.direction.value}"
+            cards.append((row.metric.text(row.value) + arrow, key.title + oracle_note(row, oracle)))
     if info.seconds:
-        cards.append(_card(format_seconds(sum(info.seconds.values())), "time of the method, all stages"))
-    return f'<div class="cards">{"".join(cards)}</div>'
+        cards.append((format_seconds(sum(info.seconds.values())), "Time of the method, all stages"))
+    return cards
 
 
-def _card(value: str, text: str) -> str:
-    return f'<div class="card"><b>{html.escape(value)}</b><span>{html.escape(text)}</span></div>'
-
-
-def _with_arrow(row: ScoreRow) -> str:
-    arrow = "" if row.metric.direction is Direction.DESCRIPTION else f" {row.metric.direction.value}"
-    return row.metric.text(row.value) + arrow
-
-
-def _environment_section(prediction: Path) -> str:
-    folder = prediction / EVALUATION
-    figures = [
-        _figure(folder / ENVIRONMENT_TRUTH, "Ground truth: sRGB of radiance clipped to [0, 1]."),
-        _figure(folder / ENVIRONMENT_PREDICTION, "Prediction, in the same encoding."),
-        _figure(folder / ENVIRONMENT_EXPOSED, "Prediction after the best global exposure."),
-        _figure(
-            folder / ENVIRONMENT_ERROR_MAP,
-            "Error of the prediction as it is: mean over channels of the absolute sRGB difference; dark is good.",
-            ENVIRONMENT_ERROR,
-        ),
-        _figure(
-            folder / VISIBILITY_MAP,
-            "Visibility as the method states it: how well each direction was observed; bright is well seen.",
-            VISIBILITY,
-        ),
-        _figure(
-            folder / OBSERVED_MAP,
-            "Directions in training views, by ground-truth normals: white resolved (0.7° or finer), gray seen.",
-        ),
-    ]
-    if not any(figures):
-        return ""
-    note = "Lat-long maps: top is +Z, the center looks along +X, azimuth falls to the right."
-    return f'<h2>Environment</h2><p class="dim">{note}</p><div class="maps">{"".join(figures)}</div>'
-
-
-def _views_section(prediction: Path, scores: Scores) -> str:
-    folder = prediction / EVALUATION
+def _views(folder: Path, scores: Scores) -> list[ViewFigures]:
     suffix = ViewPictures(folder, "", "render").truth.name
-    blocks = []
-    for path in sorted(folder.glob(f"*{suffix}")):
-        stem = path.name.removesuffix(suffix)
-        line = next((_view_line(view) for view in scores.views if view.name.rpartition("/")[2] == stem), "")
-        blocks.append(f"<div><h3>{html.escape(stem)}</h3><p class='dim'>{line}</p>{_view_trios(folder, stem)}</div>")
-    if not blocks:
-        return ""
-    note = (
-        "Renders are sRGB of premultiplied radiance, so the object stands on black. Normals are world normals as "
-        "(n + 1)/2; gray: no object or no normal. Normal errors are shown where the object fills the pixel; a hole "
-        "takes the last color."
-    )
-    charts = _charts(_view_series(scores))
-    return f'<h2>Test views</h2><p class="dim">{note}</p><div class="views">{"".join(blocks)}</div>{charts}'
+    texts = {view.name.rpartition("/")[2]: _view_text(view) for view in scores.views}
+    stems = [path.name.removesuffix(suffix) for path in sorted(folder.glob(f"*{suffix}"))]
+    return [ViewFigures(stem, texts.get(stem, ""), _trios(folder, stem)) for stem in stems]
 
 
-def _view_line(view: ViewScores) -> str:
+def _view_text(view: ViewScores) -> str:
     error = view.mean_angular_error_deg
     normals = "" if error is None else f", mean normal error {error:.2f}°"
     return f"PSNR {view.psnr:.2f} dB, SSIM {view.ssim:.4f}{normals}"
 
 
-def _view_trios(folder: Path, stem: str) -> str:
+def _trios(folder: Path, stem: str) -> tuple[tuple[Figure, ...], ...]:
     trios = []
     for kind, scale in (("render", RENDER_ERROR), ("normals", NORMAL_ERROR)):
         pictures = ViewPictures(folder, stem, kind)
-        figures = [
-            _figure(pictures.truth, f"Ground truth {kind}.", size=SMALL_PX),
-            _figure(pictures.prediction, f"Predicted {kind}.", size=SMALL_PX),
-            _figure(pictures.error, f"{scale.title[0].upper()}{scale.title[1:]}.", scale, SMALL_PX),
-        ]
-        if any(figures):
-            trios.append(f'<div class="trio">{"".join(figures)}</div>')
-    return "".join(trios)
+        trio = (
+            (pictures.truth, f"Ground truth {kind}.", None),
+            (pictures.prediction, f"Predicted {kind}.", None),
+            (pictures.error, f"{scale.title[0].upper()}{scale.title[1:]}.", scale),
+        )
+        trios.append(tuple(_figures(trio, SMALL_PX)))
+    return tuple(trio for trio in trios if trio)
 
 
-def _view_series(scores: Scores) -> list[Series]:
-    index = [float(i) for i in range(len(scores.views))]
-    errors = [view.mean_angular_error_deg for view in scores.views]
-    series = [Series("PSNR (dB) of every test view", index, [view.psnr for view in scores.views], "test view")]
-    known = [(i, error) for i, error in zip(index, errors, strict=True) if error is not None]
-    title = "mean normal error (°) of every test view"
-    series.append(Series(title, [i for i, _ in known], [error for _, error in known], "test view"))
-    return series
-
-
-def _method_section(prediction: Path) -> str:
-    """The sheet of the decomposition, then single pictures, folded away where they would only repeat the sheet."""
-    sheet = _figure(prediction / DECOMPOSITION, "What the method makes of one test view.", size=SHEET_PX)
-    paths = sorted((prediction / METHOD_PICTURES).glob("*.png"))
-    if not paths:
-        return f"<h2>Decomposition</h2>{sheet}" if sheet else ""
-    size = LARGE_PX if len(paths) <= FEW_PICTURES else SMALL_PX
-    figures = "".join(_figure(path, path.stem.replace("_", " "), size=size) for path in paths)
-    note = "Pictures that the method itself exported; the captions are the names of its files."
-    gallery = f'<p class="dim">{note}</p><div class="gallery">{figures}</div>'
-    if sheet:
-        gallery = f"{sheet}<details><summary>{len(paths)} single pictures</summary>{gallery}</details>"
-    return f"<h2>Decomposition</h2>{gallery}"
-
-
-def _figure(path: Path, caption: str, scale: Scale | None = None, size: int = LARGE_PX) -> str:
-    if not path.is_file():
-        return ""
-    bar = legend(scale) if scale else ""
-    text = html.escape(caption, quote=True)
-    return (
-        f'<figure><img src="{_inline_picture(path, size)}" alt="{text}">{bar}<figcaption>{text}</figcaption></figure>'
-    )
+def _figures(pictures: Iterable[tuple[Path, str, Scale | None]], longest_px: int = LARGE_PX) -> list[Figure]:
+    """Those of the pictures that exist, inlined."""
+    return [
+        Figure(_inline_picture(path, longest_px), caption, color_bar(scale) if scale else None)
+        for path, caption, scale in pictures
+        if path.is_file()
+    ]
 
 
 def _inline_picture(path: Path, longest_px: int) -> str:
@@ -295,13 +248,18 @@ def _inline_picture(path: Path, longest_px: int) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(lossy.getvalue()).decode()
 
 
-def _left_out_section(scores: Scores) -> str:
-    if not scores.left_out:
-        return ""
-    return "<h2>Left out</h2>" + _table((entry.name, entry.reason) for entry in scores.left_out)
+def _view_series(scores: Scores) -> list[Series]:
+    index = [float(i) for i in range(len(scores.views))]
+    errors = [view.mean_angular_error_deg for view in scores.views]
+    known = [(i, error) for i, error in zip(index, errors, strict=True) if error is not None]
+    title = "mean normal error (°) of every test view"
+    return [
+        Series("PSNR (dB) of every test view", index, [view.psnr for view in scores.views], "test view"),
+        Series(title, [i for i, _ in known], [error for _, error in known], "test view"),
+    ]
 
 
-def _curves_section(info: PredictionInfo) -> str:
+def _training_series(info: PredictionInfo) -> list[Series]:
     abscissa = info.curves.get(CURVE_ABSCISSA)
     series = []
     for name, values in info.curves.items():
@@ -310,34 +268,27 @@ def _curves_section(info: PredictionInfo) -> str:
         matching = abscissa is not None and len(abscissa) == len(values)
         x = abscissa if abscissa is not None and matching else [float(i) for i in range(len(values))]
         series.append(Series(name.replace("_", " "), x, values, CURVE_ABSCISSA if matching else "entry"))
-    charts = _charts(series)
-    return f"<h2>Training</h2>{charts}" if charts else ""
+    return series
 
 
-def _charts(series: Iterable[Series]) -> str:
-    figures = [
-        f"<figure>{line_chart(one)}<figcaption>{html.escape(one.title)}"
-        f"{', logarithmic axis' if is_logarithmic(one) else ''}</figcaption></figure>"
-        for one in series
-        if len(one.y) > 1
-    ]
-    return f'<div class="charts">{"".join(figures)}</div>' if figures else ""
+def _line_charts(series: Iterable[Series]) -> list[LineChart]:
+    return [line_chart(one) for one in series if len(one.y) > 1]
 
 
-def _cost_section(info: PredictionInfo) -> str:
+def _costs(info: PredictionInfo) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Tables of what the prediction cost: title and rows; those without a row are dropped."""
     seconds = [(stage, f"{value:.1f} s") for stage, value in info.seconds.items()]
     memory = [("peak memory", f"{info.peak_memory_bytes / 2**20:,.0f} MiB")] if info.peak_memory_bytes else []
     hardware = [(name, _plain(value)) for name, value in _flatten(info.hardware)]
     sizes = [("primitives", info.primitives), ("bytes of the exported model", info.model_bytes)]
     sizes += list(info.parameter_counts.items())
     size = [(name, f"{count:,}") for name, count in sizes if count is not None]
-    parts = [("Time by stage", seconds), ("Hardware", hardware + memory), ("Size", size)]
-    blocks = "".join(f"<div><h3>{title}</h3>{_table(lines)}</div>" for title, lines in parts if lines)
-    return f'<h2>Cost</h2><div class="maps">{blocks}</div>' if blocks else ""
+    tables = [("Time by stage", seconds), ("Hardware", hardware + memory), ("Size", size)]
+    return [(title, rows) for title, rows in tables if rows]
 
 
-def _provenance_section(info: PredictionInfo, scores: Scores) -> str:
-    lines = [
+def _provenance(info: PredictionInfo, scores: Scores) -> list[tuple[str, str]]:
+    return [
         ("dataset", scores.dataset),
         ("dataset hash (evaluated)", scores.dataset_hash),
         ("dataset hash (prediction)", info.dataset_hash),
@@ -345,16 +296,6 @@ def _provenance_section(info: PredictionInfo, scores: Scores) -> str:
         ("method", info.method),
         *([("model", info.model)] if info.model else []),
     ]
-    config = [(name, _plain(value)) for name, value in _flatten(info.config)]
-    details = f"<details><summary>Configuration, {len(config)} entries</summary>{_table(config)}</details>"
-    return f"<h2>Provenance</h2>{_table(lines)}{details if config else ''}"
-
-
-def _table(lines: Iterable[tuple[str, str]]) -> str:
-    body = "".join(
-        f"<tr><th>{html.escape(name)}</th><td class='text'>{html.escape(value)}</td></tr>" for name, value in lines
-    )
-    return f'<div class="scroll"><table>{body}</table></div>'
 
 
 def _flatten(content: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:

@@ -15,6 +15,13 @@ from shinypartial.scene.spec import DEVELOPMENT, HELD_OUT, STUDIO_LIGHTS, FileWo
 SCENES = Path(__file__).resolve().parents[2] / "blender_scenes"
 RECIPE = "scene.toml"
 BLEND = ".blend"
+#: Keys of a recipe that the first datasets don't have, and what they mean there.
+ADDED_KEYS = {
+    "max_bounces": 16,
+    "stretch": [1.0, 1.0, 1.0],
+    "turn_deg": [0.0, 0.0, 0.0],
+    "offset": [0.0, 0.0, 0.0],
+}
 
 
 def scene_names(split: str | None = None) -> list[str]:
@@ -166,6 +173,17 @@ def variant_name(original: SceneSpec, varied: SceneSpec) -> str:
     if varied.render.exposure != original.render.exposure:
         words.append(f"exposure{varied.render.exposure:g}")
     return "-".join(words)
+
+
+def older_recipe(recipe: Any) -> Any:
+    """A recipe without the keys that later versions added and that have the values which were fixed before.
+
+    A dataset that was begun with such a recipe is one of the same scene. `split` says nothing about its pictures.
+    """
+    if isinstance(recipe, dict):
+        added = {"split", *(key for key, value in ADDED_KEYS.items() if recipe.get(key) == value)}
+        return {key: older_recipe(value) for key, value in recipe.items() if key not in added}
+    return [older_recipe(each) for each in recipe] if isinstance(recipe, list) else recipe
 
 
 def parse_scene(table: dict[str, Any], source: str) -> SceneSpec:

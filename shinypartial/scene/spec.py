@@ -71,8 +71,8 @@ class Render:
     """Seed of the sampling pattern."""
     exposure: Annotated[float, limits(-20.0, 20.0)] = 0.0
     """Photographic stops: the light of the world is multiplied by 2^exposure, in pictures and in the stored map."""
-    max_bounces: Annotated[int, limits(1, 1024)] = 16
-    """Reflections that a path is followed through; light that would need more is lost."""
+    max_bounces: Annotated[int, limits(0, 1024)] = 16
+    """As Cycles counts: a path is reflected at most once more than this, and light that would need more is lost."""
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ class SceneResult:
 
 
 @dataclass(frozen=True)
-class CrewResult:
+class PoolResult:
     """Frames a second of one division of the cores, relative to one process with all threads."""
 
     workers: int
@@ -226,23 +226,23 @@ def measure_scene(name: str, resolution: int, error_resolution: int, views: int)
     )
 
 
-def time_crew(spec: SceneSpec, plan: PoolPlan, frames: int) -> float:
+def time_pool(spec: SceneSpec, plan: PoolPlan, frames: int) -> float:
     """Seconds for that many frames once every process has rendered one."""
     cameras = plan_cameras(spec.camera, spec.render.resolution).train
-    with open_pool(spec, plan) as pool, ThreadPoolExecutor(plan.workers + 1) as pool:
+    with open_pool(spec, plan) as pool, ThreadPoolExecutor(plan.workers + 1) as callers:
 
         def one(index: int) -> RenderedView:
             return pool.render(cameras[index % len(cameras)], "a view")
 
         one(0)  # The first tells its device, after which the others start.
-        list(pool.map(one, range(3 * plan.workers)))
+        list(callers.map(one, range(3 * plan.workers)))
         begin = time.perf_counter()
-        for each in [pool.submit(one, i) for i in range(frames)]:
+        for each in [callers.submit(one, i) for i in range(frames)]:
             each.result()
         return time.perf_counter() - begin
 
 
-def measure_crews(name: str, resolution: int, frames: int) -> list[CrewResult]:
+def measure_pools(name: str, resolution: int, frames: int) -> list[PoolResult]:
     """One process with all threads against several with a share of them."""
     cores = os.cpu_count() or 1
     plans = [PoolPlan(n, cores // n) for n in (1, 2, 4, 8) if n <= cores]
@@ -250,10 +250,10 @@ def measure_crews(name: str, resolution: int, frames: int) -> list[CrewResult]:
     times: list[list[float]] = [[] for _ in plans]
     for _ in range(REPEATS):
         for plan, taken in zip(plans, times, strict=True):
-            taken.append(time_crew(spec, plan, frames))
+            taken.append(time_pool(spec, plan, frames))
     medians = [statistics.median(taken) for taken in times]
     return [
-        CrewResult(plan.workers, plan.threads, resolution, frames, median, medians[0] / median)
+        PoolResult(plan.workers, plan.threads, resolution, frames, median, medians[0] / median)
         for plan, median in zip(plans, medians, strict=True)
     ]
 
@@ -304,7 +304,7 @@ def main() -> None:
         result["memory"] = [asdict(each) for each in kept]
         save()
     if options.frames:
-        pools = measure_crews(options.scene[0], options.resolution // 2, options.frames)
+        pools = measure_pools(options.scene[0], options.resolution // 2, options.frames)
         result["pools"] = [asdict(each) for each in pools]
         save()
     result["scenes"] = []

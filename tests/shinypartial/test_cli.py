@@ -1,5 +1,6 @@
 """The command line: help, bad usage, exit codes, and the newest folder where none is named."""
 
+import os
 import re
 import subprocess
 import sys
@@ -46,6 +47,17 @@ def test_help_is_fast() -> None:
         subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
         times.append(time.perf_counter() - start)
     assert min(times) < 1.0  # Measured 0.2 s on an idle machine.
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["generate", "--help"]], ids=" ".join)
+def test_a_reader_that_stops_early_is_no_error(arguments: list[str]) -> None:
+    """As in `shinypartial --help | head -1`: the pipe has no reader when the help is written."""
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    command = [sys.executable, "-m", "shinypartial.cli", *arguments]
+    done = subprocess.run(command, cwd=ROOT, stdout=write_end, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write_end)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 BAD_USAGE = {

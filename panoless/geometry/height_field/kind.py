@@ -92,4 +92,4 @@ class HeightFieldFamily(ExactFamily):
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """Heights, plane and boundary by silhouettes and photographs together."""
-        return HeightFieldMirror(fit_height_field(views, proposal.shape))
+        return HeightFieldMirror(fit_height_field(views, proposal.shape, config.height_field))

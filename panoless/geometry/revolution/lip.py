@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from panoless.capture.rays import pose_of
+from panoless.capture.rays import pose_of, project
 from panoless.capture.views import TrainView, Views
 from panoless.geometry.revolution.model import SurfaceOfRevolution
 from panoless.geometry.revolution.profile import resample_profile
@@ -117,7 +117,7 @@ def beside_lip(camera: RasterCamera, surface: SurfaceOfRevolution, reach_px: int
     ring = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(AROUND, height)], 1) @ surface.frame
     rotation, center = pose_of(camera)
     seen = (ring + surface.origin - center) @ rotation.T
-    x, y = (seen[:, k] / seen[:, 2] * f + c for k, f, c in ((0, camera.fx, camera.cx), (1, camera.fy, camera.cy)))
+    x, y = project(camera, seen)
     reach = np.arange(-reach_px, reach_px + 1)
     column, row = np.floor(x)[:, None, None] + reach, np.floor(y)[:, None, None] + reach[:, None]
     excluded = np.hypot(column + 0.5 - x[:, None, None], row + 0.5 - y[:, None, None])

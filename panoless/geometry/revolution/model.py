@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from panoless.capture.rays import pixel_rays, pose_of, reflect
+from panoless.capture.rays import pixel_rays, pose_of, project, reflect
 from panoless.capture.views import TrainView
 from panoless.environment.rays import Rays
 from panoless.geometry.base import SurfaceBuffers
@@ -176,10 +176,9 @@ def _hits_within(surface: SurfaceOfRevolution, camera: RasterCamera, pixels: Int
     corners = (surface.rings(BOX_AROUND).reshape(-1, 3) - center) @ rotation.T
     row, column = np.divmod(pixels, camera.width)
     traced = np.ones(len(pixels), dtype=bool)
-    if corners[:, 2].min() > 0:
+    if corners[:, 2].min() > camera.near:
         margin = 2 + (1 / np.cos(np.pi / BOX_AROUND) - 1) * max(camera.width, camera.height)
-        for place, axis, focal, middle in ((column, 0, camera.fx, camera.cx), (row, 1, camera.fy, camera.cy)):
-            seen = corners[:, axis] / corners[:, 2] * focal + middle
+        for place, seen in zip((column, row), project(camera, corners), strict=True):
             traced &= (place > seen.min() - margin) & (place < seen.max() + margin)
     found = surface.hits(*pixel_rays(camera, pixels[traced]))
     count = len(pixels)

@@ -10,12 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from panoless.capture.rays import pose_of
+from panoless.capture.rays import camera_rays, pose_of
 from panoless.capture.silhouettes import MaskContours, mask_contours
 from panoless.capture.views import Views
 from panoless.geometry.revolution.model import SurfaceOfRevolution
 from panoless.geometry.revolution.profile import ProfileSplines, apply_step, resample_profile
 from panoless.kernels.cpu.profile import closest_approach, distance_grid, envelope
+from shinypartial.core.conventions import PIXEL_CENTER
 
 REACH = 1.5
 TALLEST = 1.05
@@ -90,7 +91,7 @@ def axis_starts(views: Views) -> list[SurfaceOfRevolution]:
     for view in chosen:
         mask, camera = view.mask.cpu().numpy(), view.camera
         row, column = np.nonzero(mask > 0.5)
-        points = np.stack([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy], 1)
+        points = camera_rays(camera, column + PIXEL_CENTER, row + PIXEL_CENTER)[:, :2]
         middle = points.mean(0)
         _, vectors = np.linalg.eigh(np.cov((points - middle).T))
         rotation, center = pose_of(camera)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from panoless.capture.views import Views
 from panoless.config import SurfelConfig
-from panoless.first_surface.completion import completed_surface, hull_surface
+from panoless.first_surface.completion import complete_surface, hull_surface
 from panoless.first_surface.mesh import unit
 from panoless.first_surface.visual_hull import Hull, carve_hull
 from panoless.geometry.surfels.model import Surfels
@@ -34,7 +34,7 @@ def hull_surfels(views: Views, config: SurfelConfig, seed: int) -> Surfels:
     at most that of `_reach`, so that strong curvature gets smaller surfels, and more of them.
     """
     hull = carve_hull(views, config.hull_resolution, config.hull_votes)
-    surface = completed_surface(hull, views) if config.initial == "thin-plate" else hull_surface(hull)
+    surface = complete_surface(hull, views) if config.initial == "thin-plate" else hull_surface(hull)
     vertex_normals, tensors = surface.vertex_normals(), surface.shape_tensors()
     corners = surface.vertices[surface.triangles]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

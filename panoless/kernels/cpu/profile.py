@@ -17,11 +17,7 @@ def envelope(
     ranks: int,
     reach: float,
 ) -> Float[np.ndarray, "cells ranks"]:
-    """For every cell of heights the smallest of the rays' smallest radii in it, in order; infinite where fewer pass.
-
-    The axis is z. Rays have unit directions and are followed where they are within `reach` of the origin, by steps of
-    a quarter of a cell.
-    """
+    """See `panoless.kernels.revolution`."""
     best = np.full((cells, ranks), np.inf)
     for ray in range(len(origins)):
         o, d = origins[ray], directions[ray]
@@ -92,7 +88,7 @@ def _inside(x, y, polyline):
 def distance_grid(
     polyline: Float[np.ndarray, "N 2"], lowest: float, cell: float, rows: int, columns: int
 ) -> Float[np.ndarray, "rows columns"]:
-    """Signed distance (negative inside) at (ρ, h) = (column, row)·cell + (0, lowest)."""
+    """See `panoless.kernels.revolution`."""
     grid = np.empty((rows, columns))
     for row in range(rows):
         for column in range(columns):
@@ -112,9 +108,7 @@ def closest_approach(
     cell: float,
     reach: float,
 ) -> tuple[Float[np.ndarray, "P"], Float[np.ndarray, "P"], Int[np.ndarray, "P"], Float[np.ndarray, "P"]]:
-    """Where each unit ray comes nearest to the body, or deepest into it: distance along the ray, signed distance from
-    the profile, side of the profile and where on it. A ray that passes beyond `reach` has side −1.
-    """
+    """See `panoless.kernels.revolution`."""
     count = len(origins)
     where, signed = np.zeros(count), np.zeros(count)
     side, along = np.full(count, -1), np.zeros(count)

@@ -98,7 +98,7 @@ def test_a_high_dynamic_range_is_found_where_a_low_one_saturates(
 
 def test_views_without_light_above_one_are_the_same_in_both_ranges(sphere_dataset: Dataset) -> None:
     for usual, high in zip(
-        load_views(sphere_dataset, 2).train, load_views(sphere_dataset, 2, light=HDR).train, strict=True
+        load_views(sphere_dataset, 2).train, load_views(sphere_dataset, 2, encoding=HDR).train, strict=True
     ):
         dim = high.radiance <= 1
         assert torch.equal(usual.radiance[dim], high.radiance[dim])
@@ -145,7 +145,7 @@ def test_a_render_is_multiplied_by_the_tint() -> None:
 
 def test_pictures_of_8_bits_have_no_high_dynamic_range(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="8-bit"):
-        load_views(make_plain_sphere_dataset(tmp_path / "plain"), 2, light=HDR)
+        load_views(make_plain_sphere_dataset(tmp_path / "plain"), 2, encoding=HDR)
 
 
 @pytest.mark.parametrize(

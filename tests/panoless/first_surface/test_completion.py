@@ -8,7 +8,7 @@ import torch
 
 from panoless.capture.views import TrainView, Views
 from panoless.config import SurfelConfig
-from panoless.first_surface.completion import completed_surface, hull_surface, thin_plate
+from panoless.first_surface.completion import complete_surface, hull_surface, thin_plate
 from panoless.first_surface.contact import Contact, outline_contact
 from panoless.first_surface.mesh import TriangleMesh
 from panoless.first_surface.visual_hull import HULL_HALF_SIDE, carve_hull
@@ -143,7 +143,7 @@ def test_the_completed_surface_has_the_normals_of_the_sphere_where_no_outline_to
     hull = carve_hull(views, 48, votes=1.0)
     center, _ = sphere_of(views)
     errors = []
-    for surface in (hull_surface(hull), completed_surface(hull, views)):
+    for surface in (hull_surface(hull), complete_surface(hull, views)):
         outward = surface.vertices - center
         outward /= np.linalg.norm(outward, axis=1, keepdims=True)
         front = outward[:, 0] > 0.95

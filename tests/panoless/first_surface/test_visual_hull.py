@@ -10,7 +10,7 @@ import torch
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.silhouettes import mask_distance_px
 from panoless.capture.views import TrainView, Views
-from panoless.first_surface.completion import completed_surface, hull_surface
+from panoless.first_surface.completion import complete_surface, hull_surface
 from panoless.first_surface.visual_hull import HULL_HALF_SIDE, carve_hull
 from panoless.kernels.rasterize import RasterCamera
 
@@ -119,7 +119,7 @@ def test_the_completed_surface_stays_inside_the_hull(all_around: Views) -> None:
     front = tuple(view for view in all_around.train if view.position[0] > 1.0)
     views = replace(all_around, train=front)
     hull = carve_hull(views, RESOLUTION, votes=1.0)
-    assert hull.at(completed_surface(hull, views).vertices).max() < 0.25 * hull.pixel
+    assert hull.at(complete_surface(hull, views).vertices).max() < 0.25 * hull.pixel
 
 
 def test_outline_distances_are_those_of_the_curve_between_pixels() -> None:

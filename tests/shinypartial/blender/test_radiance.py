@@ -15,6 +15,7 @@ from shinypartial.core.camera import Camera, ray_directions_world, reflect
 from shinypartial.core.conventions import SOLID_ALPHA
 from shinypartial.core.sphere import sample_latlong
 from shinypartial.core.trajectory import plan_cameras
+from shinypartial.io.images import write_exr_rgb
 from shinypartial.scene import SceneSpec, SurfaceOfRevolution, load_scene, override
 from tests.support.tiny_scene import tiny_scene
 
@@ -174,3 +175,41 @@ def test_nothing_is_printed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -
     with open_renderer(spec) as renderer:
         renderer.render(plan_cameras(spec.camera, spec.render.resolution).train[0])
     assert capfd.readouterr() == ("", "")
+
+
+BOWL = '{ kind = "surface_of_revolution", profile = [[0.9, 0.5], [0.8, -0.1], [0.5, -0.4], [0.0, -0.5]] }'
+
+
+def test_max_bounces_is_the_recipe_s(tmp_path: Path) -> None:
+    """Without a bounce after the first reflection a bowl is black where it mirrors itself, and elsewhere the same."""
+    from scipy.ndimage import binary_erosion
+
+    spec = tiny_scene(tmp_path, shape=BOWL, elevation="[45, 55]", samples=16, resolution=48)
+    camera = plan_cameras(spec.camera, spec.render.resolution).train[0]
+
+    def render(bounces: int, path_traced: bool = False) -> RenderedView:
+        limited = replace(spec, render=replace(spec.render, max_bounces=bounces))
+        with open_renderer(limited, path_traced=path_traced) as renderer:
+            assert (renderer.mirror is None) == (path_traced or bounces > 21), "Paths count up to 22 reflections."
+            return renderer.render(camera)
+
+    many, none, traced, more = render(16), render(0), render(0, path_traced=True), render(64)
+    # Away from the edges of what is mirrored, where pixels hold some of both.
+    inner, outer = (binary_erosion((many.alpha == 1) & (many.self_reflection == each)) for each in (1, 0))
+    assert min(inner.sum(), outer.sum()) > 20
+    assert (many.radiance[inner].mean(-1) > 0.1).all()
+    np.testing.assert_allclose(more.radiance[inner].mean(), many.radiance[inner].mean(), rtol=0.02)
+    for single in (none, traced):
+        assert (single.radiance[inner] == 0).mean() > 0.95
+        assert np.median(np.abs(single.radiance - many.radiance)[outer]) < 1e-2
+
+
+def test_a_world_that_dips_below_zero_gives_no_negative_light(tmp_path: Path) -> None:
+    """Compression leaves such values in Blender's own maps; the stored environment has none either."""
+    spec = tiny_scene(tmp_path)
+    write_exr_rgb(tmp_path / "dark.exr", np.full((8, 16, 3), -0.005, np.float32))
+    dark = override(spec, world=str(tmp_path / "dark.exr"))
+    with open_renderer(dark, path_traced=True) as renderer:
+        view = renderer.render(plan_cameras(dark.camera, dark.render.resolution).train[0])
+    assert view.alpha.max() == 1
+    assert (view.radiance == 0).all()

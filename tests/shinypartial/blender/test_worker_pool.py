@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shinypartial.blender import worker_pool as pools
+from shinypartial.blender import worker_pool
 from shinypartial.blender.render import RenderedView, open_renderer
 from shinypartial.blender.worker_pool import PoolClosed, PoolPlan, WorkerPool, open_pool, plan_pool
 from shinypartial.core.camera import Camera
@@ -69,7 +69,7 @@ def is_running(pid: int) -> bool:
         return False
 
 
-def only_worker(pool: WorkerPool) -> "crews._Worker":
+def only_worker(pool: WorkerPool) -> "worker_pool._Worker":
     (worker,) = pool._live
     return worker
 
@@ -102,7 +102,7 @@ def test_a_killed_worker_is_replaced_and_its_view_rendered(
 def test_a_view_that_kills_two_workers_is_named(
     spec: SceneSpec, cameras: tuple[Camera, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pools, "WORKER", "shinypartial.no_such_module")
+    monkeypatch.setattr(worker_pool, "WORKER", "shinypartial.no_such_module")
     with open_pool(spec, ONE) as pool:
         with pytest.raises(InputError, match=r"train/r_007.*2 times: with status 1 \(.*no_such_module") as caught:
             pool.render(cameras[0], "train/r_007")
@@ -114,14 +114,14 @@ def test_a_view_that_kills_two_workers_is_named(
 def test_how_a_worker_ended_is_told(
     spec: SceneSpec, cameras: tuple[Camera, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ask = pools._Worker.ask
+    ask = worker_pool._Worker.ask
 
     def killed_first(worker, message):
         worker.process.send_signal(signal.SIGKILL)
         worker.process.wait()
         return ask(worker, message)
 
-    monkeypatch.setattr(pools._Worker, "ask", killed_first)
+    monkeypatch.setattr(worker_pool._Worker, "ask", killed_first)
     with open_pool(spec, ONE) as pool, pytest.raises(InputError, match="by SIGKILL"):
         pool.render(cameras[0], "a view")
 
@@ -137,7 +137,7 @@ def test_blender_s_refusal_arrives_as_it_was_raised(spec: SceneSpec, cameras: tu
         assert not pool._live, "One that has refused is not asked again."
 
 
-def test_a_closed_crew_renders_nothing_and_leaves_nothing(spec: SceneSpec, cameras: tuple[Camera, ...]) -> None:
+def test_a_closed_pool_renders_nothing_and_leaves_nothing(spec: SceneSpec, cameras: tuple[Camera, ...]) -> None:
     with open_pool(spec, ONE) as pool:
         pool.render(cameras[0], "a view")
         pid, folder = only_worker(pool).process.pid, pool.folder
@@ -149,17 +149,17 @@ def test_a_closed_crew_renders_nothing_and_leaves_nothing(spec: SceneSpec, camer
 
 
 PARENT = """
-import sys, time
-from shinypartial.blender.worker pool import CrewPlan, open_crew
+import sys
+from shinypartial.blender.worker_pool import PoolPlan, open_pool
+from shinypartial.core.trajectory import plan_cameras
 from shinypartial.scene import load_scene
-from shinypartial.trajectory import plan_cameras
 spec = load_scene(sys.argv[1])
 camera = plan_cameras(spec.camera, spec.render.resolution).train[0]
-with open_crew(spec, CrewPlan(1, 1)) as worker pool:
-    worker pool._seats.put(worker pool._start() if worker pool._seats.get() is None else None)
-    (worker,) = worker pool._live
-    print(worker.process.pid, worker pool.folder, flush=True)
-    worker pool.render(camera, "a view that takes long")
+with open_pool(spec, PoolPlan(1, 1)) as pool:
+    pool._seats.put(pool._start() if pool._seats.get() is None else None)
+    (worker,) = pool._live
+    print(worker.process.pid, pool.folder, flush=True)
+    pool.render(camera, "a view that takes long")
 """
 
 
@@ -186,6 +186,6 @@ def test_the_plan_divides_the_cores() -> None:
 
 
 @pytest.mark.parametrize("plan", [(0, 1), (1, 0), (-1, 1)])
-def test_an_empty_crew_is_refused(plan: tuple[int, int]) -> None:
+def test_an_empty_pool_is_refused(plan: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match="at least one"):
         PoolPlan(*plan)

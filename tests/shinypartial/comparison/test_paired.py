@@ -1,9 +1,10 @@
-"""Pairs by dataset and seed; equal groups differ by nothing, a known shift is found, the seed decides the rest."""
+"""Pairs by dataset and seed; equal groups differ by nothing, a known shift is found, few pairs decide nothing."""
 
 import csv
 import json
+import re
 import shutil
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,9 @@ from shinypartial.cli import main
 from shinypartial.comparison.paired import (
     ComparedMetric,
     Comparison,
+    PairedDifference,
     compare,
     comparison_lines,
-    paired_difference,
     write_comparison,
 )
 from shinypartial.core.errors import InputError
@@ -65,17 +66,16 @@ VALUES = [20.0, 22.0, 19.5, 24.0, 21.0, 23.0]
 def test_equal_groups_differ_by_nothing(scored: Path, tmp_path: Path) -> None:
     comparison = compare(make_group(scored, tmp_path / "a", VALUES), make_group(scored, tmp_path / "b", VALUES))
     for each in comparison.metrics:
-        difference = each.difference
-        assert difference.pairs == len(VALUES)
-        assert (difference.mean, difference.low, difference.high) == (0.0, 0.0, 0.0)
+        assert each.difference == PairedDifference(len(VALUES), 0.0, 0.0, 0.0, 1.0)
         assert each.verdict in ("undecided", "–")
     psnr = of(comparison, PSNR)
+    assert psnr.first is not None
     assert psnr.first.mean == pytest.approx(21.583333)
     assert psnr.first.standard_deviation == pytest.approx(np.std(VALUES, ddof=1))
 
 
 def test_a_known_shift_is_recovered_and_its_sign_judged(scored: Path, tmp_path: Path) -> None:
-    """The spread between seeds is large, but pairs cancel it."""
+    """The spread between seeds is large, but pairs cancel it; six of one sign have p = 2⁻⁵."""
     noise = [0.1, -0.1, 0.05, -0.05, 0.0, 0.0]
     better = [value + 0.5 + extra for value, extra in zip(VALUES, noise, strict=True)]
     groups = make_group(scored, tmp_path / "a", better), make_group(scored, tmp_path / "b", VALUES)
@@ -84,16 +84,20 @@ def test_a_known_shift_is_recovered_and_its_sign_judged(scored: Path, tmp_path: 
     assert found.difference.low is not None
     assert found.difference.high is not None
     assert 0.4 < found.difference.low < 0.5 < found.difference.high < 0.6
+    assert found.difference.p_value == 2**-5
     assert found.verdict == "better"
     assert of(compare(*reversed(groups)), PSNR).verdict == "worse"
 
 
-def test_the_same_seed_gives_the_same_numbers(scored: Path, tmp_path: Path) -> None:
-    first = make_group(scored, tmp_path / "a", VALUES)
-    second = make_group(scored, tmp_path / "b", VALUES[::-1])
-    once, again, other = (of(compare(first, second, seed, resamples=50), PSNR) for seed in (3, 3, 4))
-    assert once == again
-    assert once.difference != other.difference, "50 resamples leave the seed its mark."
+def test_five_pairs_are_never_called_better_and_the_table_says_why(scored: Path, tmp_path: Path) -> None:
+    """However large the difference: one of 2⁵ flips, and its opposite, are as extreme, p = 1/16."""
+    first = make_group(scored, tmp_path / "a", [value + 9 for value in VALUES[:5]])
+    comparison = compare(first, make_group(scored, tmp_path / "b", VALUES[:5]))
+    assert (of(comparison, PSNR).difference.p_value, of(comparison, PSNR).verdict) == (0.0625, "undecided")
+    lines = comparison_lines(comparison)
+    assert "p = 0.0625, n = 5" in "\n".join(lines)
+    assert "exact sign-flip test" in lines[2]
+    assert "5 pairs have p ≥ 0.0625: score 6 seeds or scenes or more" in lines[-1]
 
 
 def test_runs_are_paired_by_dataset_and_seed_not_by_order(scored: Path, tmp_path: Path) -> None:
@@ -104,6 +108,8 @@ def test_runs_are_paired_by_dataset_and_seed_not_by_order(scored: Path, tmp_path
     comparison = compare(first, second[::-1])
     found = of(comparison, PSNR)
     assert (found.difference.pairs, found.difference.mean) == (3, 0.0)
+    assert found.first is not None
+    assert found.second is not None
     assert (found.first.number, found.second.number) == (4, 4)
     assert set(comparison.unpaired) == {str(first[-1]), str(second[-1])}
     assert "without a partner" in "\n".join(comparison_lines(comparison))
@@ -127,15 +133,21 @@ def test_what_cannot_be_compared_is_refused(scored: Path, tmp_path: Path) -> Non
 
 def test_one_pair_has_a_difference_but_no_interval(scored: Path, tmp_path: Path) -> None:
     comparison = compare(make_group(scored, tmp_path / "a", [2.0]), make_group(scored, tmp_path / "b", [1.0]))
-    difference = of(comparison, PSNR).difference
-    assert (difference.mean, difference.low) == (1.0, None)
-    assert "One pair tells nothing about chance" in comparison_lines(comparison)[-1]
+    assert of(comparison, PSNR).difference == PairedDifference(1, 1.0, None, None, 1.0)
+    assert "1 pair has p ≥ 1" in comparison_lines(comparison)[-1]
 
 
-def test_a_metric_that_some_pairs_lack_is_compared_on_the_others() -> None:
-    found = paired_difference(np.array([1.0, np.nan, 1.0]))
-    assert asdict(found) == {"pairs": 2, "mean": 1.0, "low": 1.0, "high": 1.0}
-    assert paired_difference(np.full(3, np.nan)).mean is None
+def test_a_metric_that_some_runs_lack_is_compared_on_the_others(scored: Path, tmp_path: Path) -> None:
+    first, second = (make_group(scored, tmp_path / name, [2.0, 3.0, 4.0]) for name in "ab")
+    write_scores(first[1], replace(read_scores(first[1]), render=None))
+    found = of(compare(first, second), PSNR)
+    assert found.first is not None
+    assert (found.first.number, found.difference.pairs, found.difference.mean) == (2, 2, 0.0)
+    for folder in first:
+        write_scores(folder, replace(read_scores(folder), render=None))
+    found = of(compare(first, second), PSNR)
+    assert (found.first, found.difference) == (None, PairedDifference(0, None, None, None, None))
+    assert found.verdict == "–"
 
 
 def test_the_command_prints_a_table_and_writes_every_metric(
@@ -147,7 +159,7 @@ def test_the_command_prints_a_table_and_writes_every_metric(
     assert main(["compare", *map(str, first), "--against", *map(str, second), "--output", str(output)]) == 0
     out = capsys.readouterr().out
     assert "render.psnr ↑" in out
-    assert "+1.00 [+1.00, +1.00]" in out
+    assert re.search(r"\+1\.00 \[\+1\.00, \+1\.00\] +p = 0\.0312, n = 6 +better", out)
     content = json.loads((output / "comparison.json").read_text())
     with (output / "comparison.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
@@ -155,4 +167,6 @@ def test_the_command_prints_a_table_and_writes_every_metric(
     psnr = next(row for row in rows if row["metric"] == PSNR)
     assert (psnr["unit"], psnr["direction"], psnr["verdict"]) == ("dB", "higher", "better")
     assert float(psnr["difference_mean"]) == pytest.approx(1.0)
+    assert float(psnr["difference_p_value"]) == 2**-5
+    assert (content["test"], content["interval"]) == ("sign-flip test", "Student t")
     assert write_comparison(output, compare(first, second))[0] == output / "comparison.json"

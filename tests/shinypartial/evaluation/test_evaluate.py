@@ -235,8 +235,8 @@ def test_an_environment_that_is_not_two_to_one_is_named(truth: Path) -> None:
 
 def test_evaluation_loads_neither_method_nor_torch(truth: Path) -> None:
     program = (
-        "import sys; from pathlib import Path; from shinypartial.evaluate import evaluate; "
-        f"evaluate(Path({str(truth)!r})); from shinypartial.report import write_report; "
+        "import sys; from pathlib import Path; from shinypartial.evaluation.evaluate import evaluate; "
+        f"evaluate(Path({str(truth)!r})); from shinypartial.report.page import write_report; "
         f"write_report(Path({str(truth)!r})); "
         "print(sorted({'panoless', 'torch', 'bpy'} & set(sys.modules)))"
     )

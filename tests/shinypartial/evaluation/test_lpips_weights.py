@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from shinypartial.core.errors import InputError
+from shinypartial.evaluation import lpips_weights as weights
 from shinypartial.io.files import sha256_of
-from shinypartial.metrics import lpips_weights as weights
 from shinypartial.metrics import perceptual
 
 RANDOM = np.random.default_rng(0)

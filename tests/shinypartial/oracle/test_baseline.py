@@ -15,7 +15,7 @@ from shinypartial.dataset.read import open_dataset, read_environment, read_view
 from shinypartial.dataset.schema import Dataset
 from shinypartial.evaluation.evaluate import evaluate
 from shinypartial.evaluation.masks import environment_mask, solid_mask
-from shinypartial.evaluation.scores import read_bound, read_scores
+from shinypartial.evaluation.scores import read_oracle_baseline, read_scores
 from shinypartial.io.files import write_json
 from shinypartial.metrics import perceptual
 from shinypartial.metrics.environment import RegionMasks, region_scores
@@ -107,7 +107,7 @@ def test_a_named_bound_must_be_of_this_dataset(
     oracle: Oracle, dataset: Dataset, sphere_dataset: Dataset, tmp_path: Path
 ) -> None:
     other, mine = (write_truth_prediction(tmp_path / each.name, each) for each in (sphere_dataset, dataset))
-    assert read_bound(mine, evaluate(mine, oracle=oracle.root)) is not None
+    assert read_oracle_baseline(mine, evaluate(mine, oracle=oracle.root)) is not None
     with pytest.raises(InputError, match="the oracle of sphere"):
         evaluate(other, oracle=oracle.root)
     assert "shinypartial oracle" in "\n".join(summary_lines(_scored_alone(other)))
@@ -179,11 +179,11 @@ def test_an_older_bound_is_passed_over(oracle: Oracle, dataset: Dataset, tmp_pat
     scores = read_scores(oracle.root)
     prediction = write_truth_prediction(tmp_path / "mine", open_dataset(dataset.root))
     mine = evaluate(prediction)
-    assert read_bound(prediction, mine) is not None
-    assert read_bound(prediction, replace(mine, dataset_hash="0" * 64)) is None
+    assert read_oracle_baseline(prediction, mine) is not None
+    assert read_oracle_baseline(prediction, replace(mine, dataset_hash="0" * 64)) is None
     assert scores.paper is not None
     (tmp_path / "ball-oracle" / "scores.json").unlink()
-    assert read_bound(prediction, mine) is None
+    assert read_oracle_baseline(prediction, mine) is None
     write_json(tmp_path / "ball-oracle" / "scores.json", {})
     with pytest.raises(InputError, match="Evaluate again"):
-        read_bound(prediction, mine)
+        read_oracle_baseline(prediction, mine)

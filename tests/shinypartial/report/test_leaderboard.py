@@ -13,10 +13,11 @@ from typing import Any
 import pytest
 
 from shinypartial.cli import main
-from shinypartial.comparison.runs import BOUND, COLUMNS, Group, Line, collect
+from shinypartial.comparison.runs import ORACLE, Group, Line, collect
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
 from shinypartial.evaluation.evaluate import evaluate
+from shinypartial.evaluation.key_metrics import KEY_METRICS, key_metrics
 from shinypartial.evaluation.scores import read_scores, score_rows
 from shinypartial.metrics.registry import Direction
 from shinypartial.prediction.format import read_info, write_info
@@ -74,9 +75,9 @@ def methods(group: Group) -> list[str]:
     return [line.entry.info.method for line in group.lines]
 
 
-def cell_of(group: Group, line: Line, title: str) -> tuple[str, bool]:
+def cell_of(group: Group, line: Line, path: str) -> tuple[str, bool]:
     """Text and mark of a cell."""
-    cell = line.cells[[column.title for column in group.columns].index(title)]
+    cell = line.cells[[column.path for column in group.columns].index(path)]
     return cell.text, cell.best
 
 
@@ -103,29 +104,30 @@ class Page(HTMLParser):
         self.text.append(data)
 
 
-def test_columns_are_scores_that_the_registry_knows(scored: Path) -> None:
-    known = {row.path for row in score_rows(read_scores(scored))} | {
-        path.replace("full", "resolved") for path, _ in COLUMNS
-    }
-    assert {path for path, _ in COLUMNS} <= known
+def test_key_metrics_are_scores_that_the_registry_knows(scored: Path) -> None:
+    """The dataset resolves no direction, so these scores have no rows of that region."""
+    known = {row.path for row in score_rows(read_scores(scored))}
+    known |= {path.replace(".full.", ".resolved.") for path in known}
+    assert {key.path for key in KEY_METRICS} <= known
+    assert len({key.path for key in KEY_METRICS}) == len(KEY_METRICS)
+    assert all(key.name for key in key_metrics("chart"))
 
 
 def test_methods_are_ordered_best_first_and_the_oracle_stands_above(submit: Callable[..., Path]) -> None:
-    for name, value in (("low", 10.0), ("high", 30.0), ("middle", 20.0), (BOUND, 15.0)):
+    for name, value in (("low", 10.0), ("high", 30.0), ("middle", 20.0), (ORACLE, 15.0)):
         root = submit(name, **{place(ENVIRONMENT): value}).parent
-    assert methods(only_group(root)) == [BOUND, "high", "middle", "low"]
+    assert methods(only_group(root)) == [ORACLE, "high", "middle", "low"]
 
 
 def test_the_best_is_marked_by_the_direction_of_the_metric(submit: Callable[..., Path]) -> None:
     submit("a", **{place(ENVIRONMENT): 20.0, place(NORMALS): 1.0})
     submit("b", **{place(ENVIRONMENT): 30.0, place(NORMALS): 2.0})
-    group = only_group(submit(BOUND, **{place(ENVIRONMENT): 90.0, place(NORMALS): 0.0}).parent)
-    titles = dict(COLUMNS)
+    group = only_group(submit(ORACLE, **{place(ENVIRONMENT): 90.0, place(NORMALS): 0.0}).parent)
     oracle, high, low = group.lines
-    assert cell_of(group, high, titles[ENVIRONMENT]) == ("30.00 dB", True)
-    assert cell_of(group, low, titles[ENVIRONMENT]) == ("20.00 dB", False)
-    assert cell_of(group, low, titles[NORMALS]) == ("1.00°", True)
-    assert cell_of(group, high, titles[NORMALS]) == ("2.00°", False)
+    assert cell_of(group, high, ENVIRONMENT) == ("30.00 dB", True)
+    assert cell_of(group, low, ENVIRONMENT) == ("20.00 dB", False)
+    assert cell_of(group, low, NORMALS) == ("1.00°", True)
+    assert cell_of(group, high, NORMALS) == ("2.00°", False)
     assert not any(cell.best for cell in oracle.cells)
     assert all(column.metric.direction is not Direction.DESCRIPTION for column in group.columns)
 
@@ -134,7 +136,7 @@ def test_equal_numbers_are_equally_best_and_missing_ones_never(submit: Callable[
     submit("a", **{place(ENVIRONMENT): 20.001})
     submit("b", **{place(ENVIRONMENT): 20.002})
     group = only_group(submit("c", environment=None).parent)
-    assert [cell_of(group, line, dict(COLUMNS)[ENVIRONMENT])[1] for line in group.lines] == [True, True, False]
+    assert [cell_of(group, line, ENVIRONMENT)[1] for line in group.lines] == [True, True, False]
     assert methods(group)[-1] == "c"
 
 
@@ -154,17 +156,17 @@ def test_datasets_are_never_mixed(submit: Callable[..., Path]) -> None:
     assert [len(group.lines) for group in collect(other.parent).groups] == [1, 1]
 
 
-APART: dict[str, tuple[Callable[[Path], object], str]] = {
+EXCLUDED: dict[str, tuple[Callable[[Path], object], str]] = {
     "without scores": (lambda root: (root / "scores.json").unlink(), "not scored"),
     "broken scores": (lambda root: (root / "scores.json").write_text("{"), "JSON"),
-    "scores of another shape": (lambda root: (root / "scores.json").write_text("[]"), "unreadable"),
+    "scores of another shape": (lambda root: (root / "scores.json").write_text("[]"), "another format"),
     "another format": (lambda root: (root / "scores.json").write_text("{}"), "another format"),
     "no description": (lambda root: (root / "prediction.json").write_text("{}"), "another format"),
 }
 
 
-@pytest.mark.parametrize(("damage", "words"), APART.values(), ids=APART.keys())
-def test_what_cannot_be_read_is_listed_apart(
+@pytest.mark.parametrize(("damage", "words"), EXCLUDED.values(), ids=EXCLUDED.keys())
+def test_what_cannot_be_read_is_excluded_with_the_reason(
     submit: Callable[..., Path], damage: Callable[[Path], object], words: str
 ) -> None:
     submit("good")
@@ -183,12 +185,12 @@ UNCOMPARABLE: dict[str, tuple[dict[str, Any], str]] = {
     "another version of the dataset": ({"dataset_hash_matches": False}, "hashes differ"),
     "scored on another dataset": ({"dataset_hash": "0" * 64}, "hashes differ"),
     "a text for a number": ({place(ENVIRONMENT): "high"}, "scores.json"),
-    "not a number": ({place(ENVIRONMENT): float("nan")}, "finite"),
+    "not a number": ({place(ENVIRONMENT): float("nan")}, "found nan"),
 }
 
 
 @pytest.mark.parametrize(("scores", "words"), UNCOMPARABLE.values(), ids=UNCOMPARABLE.keys())
-def test_what_cannot_be_compared_is_listed_apart(
+def test_what_cannot_be_compared_is_excluded_with_the_reason(
     submit: Callable[..., Path], scores: dict[str, Any], words: str
 ) -> None:
     board = collect(submit("odd", **scores).parent)

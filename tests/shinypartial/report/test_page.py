@@ -16,8 +16,8 @@ from shinypartial.evaluation.scores import read_scores, score_rows
 from shinypartial.io.images import write_png
 from shinypartial.io.picture_sheet import write_picture_sheet
 from shinypartial.metrics import perceptual
-from shinypartial.prediction.format import DECOMPOSITION, read_info, write_info
-from shinypartial.report.line_chart import LEFT, Series, is_logarithmic, legend, line_chart
+from shinypartial.prediction.format import DECOMPOSITION, Candidate, ModelSelection, read_info, write_info
+from shinypartial.report.line_chart import LEFT, Series, color_bar, line_chart
 from shinypartial.report.page import summary_lines, write_report
 from tests.support.truth_prediction import write_truth_prediction
 
@@ -102,6 +102,23 @@ def test_a_method_cannot_write_into_the_page(evaluated: Path) -> None:
     write_info(evaluated, info)
 
 
+def test_the_choice_of_the_model_is_a_table_and_a_sentence(evaluated: Path) -> None:
+    info = read_info(evaluated)
+    assert "Model selection" not in write_report(evaluated).read_text(encoding="utf-8")
+    candidates = (
+        Candidate("plane", 16.2, 0.651, None, "rejected", "16 px away"),
+        Candidate("revolution", 0.0534, 0.9992, 0.03111, "chosen", "<better> by 4 σ"),
+    )
+    write_info(evaluated, replace(info, model_selection=ModelSelection("revolution", candidates)))
+    parsed = Page(write_report(evaluated).read_text(encoding="utf-8"))
+    assert parsed.open == []
+    text = re.sub(r"<[^>]+>", " ", write_report(evaluated).read_text(encoding="utf-8"))
+    assert "revolution was chosen (&lt;better&gt; by 4 σ); plane: rejected (16 px away)." in text
+    for word in ("16.2 px", "65.1%", "–", "0.0534 px", "99.9%", "0.0311"):
+        assert word in text
+    write_info(evaluated, info)
+
+
 def test_the_report_goes_where_it_is_told_and_is_reproducible(evaluated: Path, tmp_path: Path, page: str) -> None:
     output = tmp_path / "deep" / "page.html"
     assert write_report(evaluated, output) == output
@@ -135,7 +152,7 @@ def test_the_summary_names_numbers_and_what_was_left_out(evaluated: Path) -> Non
     lines = "\n".join(summary_lines(evaluated))
     assert "truth on sphere, protocol linear-v1" in lines
     assert "mean_angular_error_deg 0.00° ↓" in lines
-    assert "left out      lpips_alex" in lines
+    assert "left out      lpips_alex, lpips_vgg: no LPIPS weights found: run `shinypartial weights` once" in lines
     assert "warning" not in lines
 
 
@@ -150,13 +167,12 @@ def test_a_dataset_of_another_version_is_a_warning(tmp_path: Path, sphere_datase
 def test_charts_use_a_logarithm_only_for_wide_positive_ranges() -> None:
     x = [float(i) for i in range(1000)]
     narrow, wide = Series("a", x, [1 + i for i in x], "i"), Series("b", x, [1 + i % 2 for i in x], "i")
-    assert is_logarithmic(narrow)
-    assert not is_logarithmic(wide)
-    assert not is_logarithmic(Series("c", x, [i - 1 for i in x], "i"))
-    points = re.search(r'points="([^"]+)"', line_chart(narrow))
-    assert points is not None
-    assert len(points[1].split()) == 300
-    assert points[1].startswith(f"{LEFT}.0,")
+    assert line_chart(narrow).logarithmic
+    assert not line_chart(wide).logarithmic
+    assert not line_chart(Series("c", x, [i - 1 for i in x], "i")).logarithmic
+    points = line_chart(narrow).points
+    assert len(points.split()) == 300
+    assert points.startswith(f"{LEFT}.0,")
     line_chart(Series("constant", [0.0, 1.0], [2.0, 2.0], "i"))
 
 
@@ -168,8 +184,8 @@ def test_colors_follow_the_scale_and_holes_take_its_end() -> None:
     for column in (1, 2, 3):
         np.testing.assert_array_equal(picture[0, column], colors[255])
     assert (picture[0, 4] == NEUTRAL_GRAY).all()
-    assert "≥ 30°" in legend(NORMAL_ERROR)
-    assert "≥" not in legend(VISIBILITY)
+    assert color_bar(NORMAL_ERROR).high == "≥ 30°"
+    assert color_bar(VISIBILITY).high == "1"
 
 
 @pytest.mark.parametrize("name", ["magma", "viridis"])

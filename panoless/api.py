@@ -1,0 +1,193 @@
+"""What `import panoless` offers: the commands as functions, and a prediction to look into.
+
+Importing this module is cheap; torch is loaded by `fit`.
+"""
+
+import os
+import shutil
+import sys
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from panoless.config import FitConfig
+from panoless.presets import PRESETS
+from shinypartial.core.errors import InputError
+from shinypartial.dataset.bundled import resolve_dataset
+from shinypartial.dataset.read import open_dataset, read_view
+from shinypartial.dataset.schema import Dataset, Frame, View
+from shinypartial.io.files import folder_lock
+from shinypartial.prediction.format import (
+    DEFAULT_FOLDER,
+    PredictionInfo,
+    acquire_prediction,
+    prediction_frame,
+    read_environment_map,
+    read_info,
+    read_visibility,
+)
+
+RUNS = Path("runs")
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A prediction folder, read when it is asked for. Everything is in the world frame of the dataset."""
+
+    folder: Path
+    """The prediction folder, which `shinypartial.evaluate` scores."""
+
+    @cached_property
+    def info(self) -> PredictionInfo:
+        """What prediction.json says: method, configuration, seconds, hardware, numbers of parameters."""
+        return read_info(self.folder)
+
+    @property
+    def model(self) -> str:
+        """The kind of geometry that was taken: `plane`, `height_field`, `revolution` or `surfels`."""
+        return (self.info.model or "").split(" ")[0]
+
+    @property
+    def environment(self) -> Float[np.ndarray, "H W 3"]:
+        """Linear radiance as a lat-long map, twice as wide as high: +Z is up, +X is in the middle."""
+        return read_environment_map(self.folder)
+
+    @property
+    def visibility(self) -> Float[np.ndarray, "H W"]:
+        """How well each direction of the lat-long map was observed, from 0 to 1."""
+        visibility = read_visibility(self.folder)
+        if visibility is None:
+            raise InputError(
+                expected=f"a visibility map in {self.folder}",
+                found="none",
+                remedy="Write one with the method's export.",
+            )
+        return visibility
+
+    @cached_property
+    def dataset(self) -> Dataset:
+        """The dataset that was fitted; InputError when it isn't where it was."""
+        return open_dataset(Path(self.info.dataset))
+
+    def view(self, test_view: int | str = 0) -> View:
+        """The prediction of a test view, by its number or its name such as `test/r_003`: radiance, alpha, normals,
+        depth. InputError when the dataset has no such test view.
+        """
+        return read_view(prediction_frame(self.folder, self._frame(test_view)))
+
+    def normals(self, test_view: int | str = 0) -> Float[np.ndarray, "H W 3"]:
+        """Unit normals in a test view, in the world frame; zero where the object is not."""
+        normals = self.view(test_view).normals_world
+        assert normals is not None  # The format has them.
+        return normals
+
+    def save(self, folder: str | Path) -> "Reconstruction":
+        """Copy the prediction folder to a new one; InputError when that holds something."""
+        target = Path(folder)
+        if target.exists() and (not target.is_dir() or any(target.iterdir())):
+            raise InputError(expected=f"a new or empty folder at {target}", found="files", remedy="Choose another one.")
+        shutil.copytree(self.folder, target, dirs_exist_ok=True)
+        return Reconstruction(target)
+
+    def _frame(self, test_view: int | str) -> Frame:
+        frames = self.dataset.test
+        for index, frame in enumerate(frames):
+            if test_view in (index, frame.name):
+                return frame
+        raise InputError(
+            expected=f"a test view from 0 to {len(frames) - 1}, or its name"
+            if frames
+            else f"test views in {self.dataset.root}",
+            found=repr(test_view) if frames else "none",
+            remedy="Look into transforms_test.json of the dataset.",
+        )
+
+
+def fit(
+    dataset: str | Path | None = None,
+    *,
+    preset: str = "default",
+    model: str | None = None,
+    output: str | Path | None = None,
+    snapshots: int = 0,
+    snapshot_seconds: tuple[float, ...] = (),
+    device: Literal["cpu", "cuda"] = "cpu",
+    config: FitConfig | None = None,
+) -> Reconstruction:
+    """Fit a dataset and write its prediction folder: what the command `panoless fit` does, by the same names.
+
+    `dataset` is a folder, also a plain NeRF-synthetic one, or the name of a bundled dataset such as `tiny-vase`;
+    without it the newest below ./datasets is taken. `config` replaces the preset's values, and `model` those of both.
+    `output` is the prediction folder, predictions/DATASET-PRESET by default; checkpoints lie in the run folder of the
+    same name below ./runs. A call that was interrupted continues where it stopped, and one that had ended returns what
+    is there. Raises InputError for what can't be read or fitted.
+    """
+    if preset not in PRESETS:
+        raise InputError(expected=f"a preset: {', '.join(PRESETS)}", found=repr(preset), remedy="Choose one of them.")
+    config = PRESETS[preset] if config is None else config
+    config = config if model is None else replace(config, model=model)  # type: ignore[arg-type]
+    prepare_threads()
+    from panoless.export.prediction import export_prediction
+    from panoless.reconstruct.fit import find_device
+    from panoless.reconstruct.fit import fit as reconstruct
+    from panoless.reconstruct.snapshots import snapshot_schedule
+
+    announce_compilation()
+    data = open_dataset(resolve_dataset(dataset))
+    prediction = DEFAULT_FOLDER / f"{data.name}-{config.preset}" if output is None else Path(output)
+    run_folder = RUNS / prediction.resolve().name
+    place = find_device(device)
+    schedule = snapshot_schedule(snapshots, snapshot_seconds, config.iterations)
+    refuse_run_folder(prediction, run_folder)
+    with folder_lock(prediction):
+        acquire_prediction(prediction)
+        state = reconstruct(data, config, run_folder, schedule, place)
+        export_prediction(data, state, config, prediction)
+    return Reconstruction(prediction)
+
+
+def load(prediction: str | Path) -> Reconstruction:
+    """A prediction folder that was written before; InputError when it is none."""
+    found = Reconstruction(Path(prediction))
+    assert found.info
+    return found
+
+
+def refuse_run_folder(prediction: Path, run_folder: Path) -> None:
+    """Raise InputError when the prediction would be written into its run folder."""
+    if prediction.resolve() == run_folder.resolve():
+        raise InputError(
+            expected="a prediction folder apart from the run folder",
+            found=f"{prediction} for both",
+            remedy="Choose an --output that is not below ./runs.",
+        )
+
+
+def prepare_threads() -> None:
+    """Before torch loads: let idle OpenMP threads sleep, because spinning ones slow a busy machine tenfold."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+
+@cache
+def announce_compilation() -> None:
+    """Say once that kernels are compiled, when that begins; those that lie on disk load in a second."""
+    from numba.core import event
+
+    class Announcement(event.Listener):
+        made = False
+
+        def on_start(self, event: object) -> None:
+            if not self.made:
+                self.made = True
+                clear = "\r\x1b[2K" if sys.stderr.isatty() else ""
+                note = "some 20 seconds in all if none is there yet; later runs find them on disk"
+                print(f"{clear}Compiling kernels for this machine: {note} …", file=sys.stderr)
+
+        def on_end(self, event: object) -> None:
+            pass
+
+    event.register("numba:compile", Announcement())

@@ -1,0 +1,40 @@
+"""The command line `shinypartial`: one class a command. Imports every other room, inside the command that needs it."""
+
+from collections.abc import Sequence
+
+import tyro
+
+from shinypartial.cli.datasets import Release, Subset, Validate
+from shinypartial.cli.presenting import Chart, Leaderboard, Report
+from shinypartial.cli.scenes import Generate
+from shinypartial.cli.scoring import Compare, Evaluate, Oracle, Postprocess, Weights
+from shinypartial.core.errors import parse_and_run
+
+Command = (
+    Generate
+    | Subset
+    | Validate
+    | Evaluate
+    | Oracle
+    | Postprocess
+    | Compare
+    | Weights
+    | Report
+    | Release
+    | Leaderboard
+    | Chart
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse and run; return 0, 2 for bad usage or bad input, 130 when interrupted."""
+
+    def parse() -> Command:
+        return tyro.cli(
+            Command,  # type: ignore[arg-type]
+            args=arguments,
+            prog="shinypartial",
+            description="Scenes, ground truth and scores for environments seen in partial reflections.",
+        )
+
+    return parse_and_run(parse)

@@ -1,0 +1,110 @@
+"""Commands that cut, check and publish datasets."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from shinypartial.cli.newest import announce_newest
+from shinypartial.core.errors import InputError
+
+
+@dataclass(frozen=True)
+class Subset:
+    """Cut a 360° dataset down to one hemisphere: the cameras near the crossing of their looped path, split anew."""
+
+    source: tyro.conf.Positional[Path]
+    """Folder in the layout of Shiny Blender (or of NeRF-synthetic); it is only read."""
+    output: Path | None = None
+    """Folder to write; datasets/NAME-partial when not given."""
+    around: tuple[float, float] | None = None
+    """Azimuth (from +X toward +Y) and elevation of the middle in degrees; where the path crosses itself by default."""
+    radius_deg: float = 90.0
+    """Keep the cameras that are seen from the object less than this away from the middle; 90 keeps the hemisphere."""
+    seed: int = 0
+    """Seed of the new split: 40 % of the kept views for training, 60 % for testing."""
+    link: bool = False
+    """Make hard links in place of copies."""
+
+    def run(self) -> None:
+        """Make the subset and say what was kept."""
+        from shinypartial.dataset.read import DEFAULT_FOLDER
+        from shinypartial.dataset.subset import SubsetOptions, describe, make_subset
+
+        root = self.output or DEFAULT_FOLDER / f"{self.source.resolve().name}-partial"
+        options = SubsetOptions(self.around, self.radius_deg, self.seed)
+        made = make_subset(self.source, root, options, link=self.link)
+        kept = made.selection
+        print(f"Around {describe(kept.axis)}: {len(kept.train)} training and {len(kept.test)} test views,")
+        print(f"{len(kept.dropped)} left out, in {made.root}")
+        for split in made.without_normals:
+            print(f"No normals in {split}: only some of its views had any, and scores need all or none.")
+        print(f"Next: panoless fit {made.root}")
+
+
+@dataclass(frozen=True)
+class Validate:
+    """Check every promise of the dataset format; list each break with its file and its remedy."""
+
+    folder: tyro.conf.Positional[Path | None] = None
+    """Dataset folder, or a release of several; the newest dataset below datasets/ when not given."""
+
+    def run(self) -> None:
+        """Print every break; raise InputError when there is one."""
+        from shinypartial.dataset.read import newest_dataset
+        from shinypartial.dataset.validate import unscored, validate
+        from shinypartial.release.release import is_release, validate_release
+
+        folder = self.folder or announce_newest("dataset", newest_dataset())
+        violations = (validate_release if is_release(folder) else validate)(folder, progress=True)
+        for each in violations:
+            print(f"{'warning: ' if each.warning else ''}{each.file}: {each.problem}. {each.remedy}")
+        broken = sum(not each.warning for each in violations)
+        if broken:
+            raise InputError(
+                expected=f"every promise of the format kept in {folder}",
+                found=f"{broken} broken {'promise' if broken == 1 else 'promises'}, listed above",
+                remedy="Follow the remedies, then validate again.",
+            )
+        print(f"{folder} keeps every promise of the format.")
+        lacking = None if is_release(folder) else unscored(folder)
+        if lacking:
+            print(lacking)
+
+
+@dataclass(frozen=True)
+class Release:
+    """Make what is uploaded: data, archives, dataset card, Croissant metadata, licenses and checksums."""
+
+    datasets: tyro.conf.Positional[tuple[Path, ...]]
+    """Finished dataset folders."""
+    output: Path
+    """Folder to write; run again to continue where an earlier run stopped."""
+    name: str | None = None
+    """Name of the release; that of the output folder when not given."""
+    version: str = "1.0.0"
+    """MAJOR.MINOR.PATCH."""
+    date: str | None = None
+    """Date of publication, YYYY-MM-DD; the day on which the release was begun when not given."""
+    creator: str = "The panoless contributors"
+    """Who publishes the release, for its metadata and citation."""
+    url: str | None = None
+    """Where the release will be found."""
+    archive: Literal["tar", "tar.gz"] = "tar"
+    """Kind of the archives; images are compressed already, so tar.gz saves little."""
+
+    def run(self) -> None:
+        """Make the release and say what to do next."""
+        import datetime
+
+        from shinypartial.release.publication import Publication
+        from shinypartial.release.release import recorded_date, release
+
+        date = self.date or recorded_date(self.output) or datetime.datetime.now(datetime.UTC).date().isoformat()
+        name = self.name or self.output.resolve().name
+        publication = Publication(name, self.version, date, self.creator, self.url)
+        made = release(self.datasets, self.output, publication, f".{self.archive}", progress=True)
+        kept = f" ({made.kept} of the files were there already)" if made.kept else ""
+        print(f"Release: {made.root}{kept}")
+        print(f"Next: read {made.root / 'README.md'}, then upload the folder as it is")

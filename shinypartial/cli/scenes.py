@@ -1,0 +1,101 @@
+"""Commands that make pictures from scenes."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """The camera path, in the keys of the recipe's [camera]; what is not given is the recipe's."""
+
+    path: Literal["arc", "plus", "golden_spiral", "zigzag", "diamond"] | None = None
+    """Kind of path."""
+    radius: float | None = None
+    """Distance from the target in scene units; for a plus, that of its middle."""
+    target: tuple[float, float, float] | None = None
+    """World point that every camera looks at."""
+    facing_azimuth_deg: float | None = None
+    """Azimuth of the hemisphere's axis, from +X toward +Y: the side of the object that is photographed."""
+    azimuth_deg: tuple[float, float] | None = None
+    """First and last azimuth relative to the facing one."""
+    elevation_deg: tuple[float, float] | None = None
+    """First and last elevation from the horizon."""
+    sweeps: int | None = None
+    """Number of arcs, strokes of the zigzag or nested diamonds."""
+    lens_mm: float | None = None
+    """Focal length."""
+    sensor_mm: float | None = None
+    """Width of the square sensor."""
+    train: int | None = None
+    """Number of training views."""
+    test: int | None = None
+    """Number of test views."""
+    placement: Literal["interleaved", "random"] | None = None
+    """Training views evenly along the path, or drawn by chance."""
+    seed: int | None = None
+    """Seed of the placement."""
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Variations of a scene; what is not given is the recipe's."""
+
+    world: str | None = None
+    """What lights the scene: city, courtyard, forest, interior, night, studio, sunrise, sunset, or an EXR file."""
+    surroundings_distance: float | None = None
+    """Radius of the sphere about the origin that carries the world; infinitely far when not given."""
+    exposure: float | None = None
+    """Photographic stops: multiplies the light by 2^exposure."""
+    roughness: float | None = None
+    """Of the object's material, from 0 (mirror) to 1."""
+    base_color: tuple[float, float, float] | None = None
+    """Of the object's material, linear, each from 0 to 1."""
+    metallic: float | None = None
+    """Of the object's material, from 0 to 1."""
+    deformation: float | None = None
+    """Root mean square in scene units of a seeded smooth displacement along the object's normals."""
+    object_scale: float | None = None
+    """Enlarges the object, and what stands around it, about the origin."""
+
+
+@dataclass(frozen=True)
+class Generate:
+    """Render a benchmark dataset from a scene recipe; run again to continue where an earlier run stopped."""
+
+    scene: str
+    """Name of a scene in blender_scenes, or the path of a scene.toml or of a .blend file."""
+    object: str | None = None
+    """Name of the object of a .blend file that reflects; it becomes the mask."""
+    output: Path | None = None
+    """Folder to write; below datasets/, named after scene, path, resolution and variations when not given."""
+    resolution: int | None = None
+    """Pixels per side of the square images; the recipe's when not given (800 unless it says otherwise)."""
+    samples: int | None = None
+    """Samples per pixel; the recipe's when not given."""
+    variation: tyro.conf.OmitArgPrefixes[SceneOptions] = SceneOptions()
+    camera: tyro.conf.OmitArgPrefixes[CameraOptions] = CameraOptions()
+
+    def run(self) -> None:
+        """Make the dataset and say what to do next."""
+        from shinypartial.dataset.read import DEFAULT_FOLDER
+        from shinypartial.generate import generate
+        from shinypartial.scene import find_scene, override, variant_name
+
+        original = find_scene(self.scene, self.object)
+        spec = override(
+            original,
+            resolution=self.resolution,
+            samples=self.samples,
+            **asdict(self.variation),
+            **asdict(self.camera),
+        )
+        made = generate(spec, self.output or DEFAULT_FOLDER / variant_name(original, spec))
+        if made.rendered:
+            kept = f" (and kept {made.kept} that were there)" if made.kept else ""
+            print(f"Rendered {made.rendered} views{kept} into {made.root}")
+        else:
+            print(f"Complete: all {made.kept} views are in {made.root}")
+        print("Next: panoless fit")
