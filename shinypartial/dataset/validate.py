@@ -51,7 +51,7 @@ RADIANCE_TOLERANCE = 2e-3
 def validate(root: Path, progress: bool = False) -> list[Violation]:
     """Every violation of the format, warnings last; empty when there is none.
 
-    A folder in the plain layout (`plain.is_plain`) is held to less: `unscored` says what it lacks. Raises InputError when
+    Fewer rules hold for a plain folder (`plain.is_plain`): `unscored` says what it lacks. Raises InputError when
     there is no such folder.
     """
     if not root.is_dir():
