@@ -1,5 +1,6 @@
-# make demo    render a dataset, fit it, score it and write an HTML report
+# make demo    render a dataset, fit it, score it and write an HTML report: five minutes, installation included
 # make test    every check: format, lint, types, import contracts, documentation, tests
+# make results the tables of README and docs: RESOLUTION=400 SCENES="vase cola"; run again to continue
 # make docs    build the documentation into build/site
 # make format  let ruff rewrite what it can
 
@@ -12,11 +13,11 @@ NEED_PYTHON := expected Python 3.11 as python3.11 or python3 (the newest Blender
 PIP_INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 CODE := shinypartial panoless tests docs
 
-.PHONY: demo test docs format setup clean
+.PHONY: demo test results docs format setup clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/.installed-demo
-	$(BIN)/shinypartial generate --scene vase --resolution 400
+	$(BIN)/shinypartial generate --scene vase --resolution 240 --train 48 --test 8
 	$(BIN)/panoless fit
 	$(BIN)/shinypartial evaluate
 	$(BIN)/shinypartial report
@@ -27,7 +28,12 @@ test: setup
 	$(BIN)/mypy shinypartial panoless
 	$(BIN)/lint-imports
 	$(BIN)/mkdocs build --quiet --strict -f docs/mkdocs.yml
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --durations=15
+
+RESOLUTION ?= 400
+SCENES ?=
+results: $(VENV)/.installed-demo
+	$(BIN)/python docs/examples/main_scenes.py --resolution $(RESOLUTION) --scenes $(SCENES)
 
 docs: setup
 	$(BIN)/mkdocs build --strict -f docs/mkdocs.yml

@@ -6,7 +6,7 @@ Importing this module is cheap; torch is loaded by `fit`.
 import os
 import shutil
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Literal
@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from panoless.config import FitConfig
+from panoless.config import FitConfig, with_overrides
 from panoless.presets import PRESETS
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.bundled import resolve_dataset
@@ -49,7 +49,7 @@ class Reconstruction:
     @property
     def model(self) -> str:
         """The kind of geometry that was taken: `plane`, `height_field`, `revolution` or `surfels`."""
-        return (self.info.model or "").split(" ")[0]
+        return self.info.model_selection.chosen if self.info.model_selection else ""
 
     @property
     def environment(self) -> Float[np.ndarray, "H W 3"]:
@@ -116,12 +116,14 @@ def fit(
     snapshots: int = 0,
     snapshot_seconds: tuple[float, ...] = (),
     device: Literal["cpu", "cuda"] = "cpu",
+    set: tuple[str, ...] = (),
     config: FitConfig | None = None,
 ) -> Reconstruction:
     """Fit a dataset and write its prediction folder: what the command `panoless fit` does, by the same names.
 
     `dataset` is a folder, also a plain NeRF-synthetic one, or the name of a bundled dataset such as `tiny-vase`;
-    without it the newest below ./datasets is taken. `config` replaces the preset's values, and `model` those of both.
+    without it the newest below ./datasets is taken. `config` replaces the preset's values, `model` and `set`, such
+    as `("plane.max_vertices=64",)`, change some of them.
     `output` is the prediction folder, predictions/DATASET-PRESET by default; checkpoints lie in the run folder of the
     same name below ./runs. A call that was interrupted continues where it stopped, and one that had ended returns what
     is there. Raises InputError for what can't be read or fitted.
@@ -129,7 +131,7 @@ def fit(
     if preset not in PRESETS:
         raise InputError(expected=f"a preset: {', '.join(PRESETS)}", found=repr(preset), remedy="Choose one of them.")
     config = PRESETS[preset] if config is None else config
-    config = config if model is None else replace(config, model=model)  # type: ignore[arg-type]
+    config = with_overrides(config, set if model is None else (f"model={model}", *set))
     prepare_threads()
     from panoless.export.prediction import export_prediction
     from panoless.reconstruct.fit import find_device

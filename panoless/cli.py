@@ -1,21 +1,15 @@
 """The `panoless` command: fit a dataset, export a finished fit."""
 
-import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from panoless.config import FitConfig, renamed_arguments, with_overrides
 from panoless.presets import PRESETS
 from shinypartial.core.errors import InputError, parse_and_run
-
-if TYPE_CHECKING:
-    from panoless.reconstruct.state import FitState
-
-RUNS = Path("runs")
 
 
 @dataclass(frozen=True)
@@ -42,34 +36,30 @@ class Fit:
     config: FitConfig = field(default_factory=FitConfig)
 
     def run(self) -> None:
-        """Load, fit, export and say what to do next."""
-        _prepare_threads()
-        from panoless.export.prediction import export_prediction
-        from panoless.reconstruct.fit import find_device, fit
-        from panoless.reconstruct.snapshots import snapshot_schedule
-        from shinypartial.dataset.bundled import resolve_dataset
-        from shinypartial.dataset.read import open_dataset
-        from shinypartial.io.files import folder_lock
-        from shinypartial.prediction.format import acquire_prediction
+        """Fit, export and say what to do next."""
+        from panoless.api import RUNS, fit
 
-        _announce_compilation()
         config = with_overrides(self.config, self.set)
-        dataset = open_dataset(resolve_dataset(self.dataset))
-        name = f"{dataset.name}-{config.preset}"
-        prediction = self.output or Path("predictions") / name
-        run_folder = RUNS / prediction.resolve().name
-        device = find_device(self.device)
-        schedule = snapshot_schedule(self.snapshots, self.snapshot_seconds, config.iterations)
-        _refuse_run_folder(prediction, run_folder)
-        with folder_lock(prediction):
-            acquire_prediction(prediction)
-            state = fit(dataset, config, run_folder, schedule, device)
-            export_prediction(dataset, state, config, prediction)
-        print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
-        if schedule and state.training is None:
-            print(f"No snapshots: this run took {_label(state)}, whose map is solved without steps.")
-        elif schedule:
-            print(f"Snapshots: panoless export {run_folder} --output {prediction} --snapshots")
+        result = fit(
+            self.dataset,
+            output=self.output,
+            snapshots=self.snapshots,
+            snapshot_seconds=self.snapshot_seconds,
+            device=self.device,
+            config=config,
+        )
+        print(f"Prediction written to {result.folder}\nNext: shinypartial evaluate {result.folder}")
+        if not (self.snapshots or self.snapshot_seconds):
+            return
+        from panoless.geometry.registry import FAMILIES
+        from panoless.reconstruct.snapshots import snapshot_folders
+
+        run_folder = RUNS / result.folder.resolve().name
+        if snapshot_folders(run_folder):
+            print(f"Snapshots: panoless export {run_folder} --output {result.folder} --snapshots")
+        else:
+            label = FAMILIES[result.model].label
+            print(f"No snapshots: this run took {label}, whose map is solved without steps.")
 
 
 @dataclass(frozen=True)
@@ -85,14 +75,17 @@ class Export:
 
     def run(self) -> None:
         """Read the checkpoint and export it."""
-        _prepare_threads()
+        from panoless.api import RUNS, announce_compilation, prepare_threads, refuse_run_folder
+
+        prepare_threads()
         from panoless.export.prediction import export_prediction, export_snapshots
+        from panoless.geometry.registry import FAMILIES
         from panoless.reconstruct.state import CHECKPOINT, DESCRIPTION, load_state, read_description
         from shinypartial.dataset.read import open_dataset
         from shinypartial.io.files import folder_lock, newest_folder
         from shinypartial.prediction.format import acquire_prediction
 
-        _announce_compilation()
+        announce_compilation()
         folder = self.run_folder or newest_folder(RUNS, DESCRIPTION, "a run", "Make one: `panoless fit`.")
         description = read_description(folder)
         state = load_state(folder)
@@ -107,13 +100,13 @@ class Export:
         if self.snapshots and state.training is None:
             raise InputError(
                 expected=f"a run of surfels in {folder}, for --snapshots",
-                found=f"a run that took {_label(state)}, which is fitted without steps: "
+                found=f"a run that took {FAMILIES[state.geometry.kind].label}, which is fitted without steps: "
                 "there are no moments in between",
                 remedy="Leave --snapshots out; or fit surfels: "
                 "`panoless fit --model surfels --snapshots 6 --output NEW`.",
             )
         prediction = self.output or Path("predictions") / folder.resolve().name
-        _refuse_run_folder(prediction, folder)
+        refuse_run_folder(prediction, folder)
         with folder_lock(prediction):
             acquire_prediction(prediction)
             dataset = open_dataset(description.dataset)
@@ -124,46 +117,6 @@ class Export:
         print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
         if self.snapshots:
             print(f"Then: shinypartial evaluate {prediction} --snapshots")
-
-
-def _label(state: "FitState") -> str:
-    from panoless.geometry.registry import FAMILIES
-
-    return FAMILIES[state.geometry.kind].label
-
-
-def _refuse_run_folder(prediction: Path, run_folder: Path) -> None:
-    if prediction.resolve() == run_folder.resolve():
-        raise InputError(
-            expected="a prediction folder apart from the run folder",
-            found=f"{prediction} for both",
-            remedy="Choose an --output that is not below ./runs.",
-        )
-
-
-def _prepare_threads() -> None:
-    """Before torch loads: let idle OpenMP threads sleep, because spinning ones slow a busy machine tenfold."""
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
-
-def _announce_compilation() -> None:
-    """Say once that kernels are compiled, when that begins; those that lie on disk load in a second."""
-    from numba.core import event
-
-    class Announcement(event.Listener):
-        made = False
-
-        def on_start(self, event: object) -> None:
-            if not self.made:
-                self.made = True
-                clear = "\r\x1b[2K" if sys.stderr.isatty() else ""
-                note = "some 20 seconds in all if none is there yet; later runs find them on disk"
-                print(f"{clear}Compiling kernels for this machine: {note} …", file=sys.stderr)
-
-        def on_end(self, event: object) -> None:
-            pass
-
-    event.register("numba:compile", Announcement())
 
 
 def _preset_of(arguments: list[str]) -> str:

@@ -1,36 +1,90 @@
-"""Gather statistics, bounds and scores of datasets into one JSON file and one Markdown table.
+"""Make the tables of results: render what is missing, fit it, score it, and write the tables into README and docs.
 
-Make the folders first, for each scene S of vase, cola and mirror:
+    make results                                   # 400 px, every scene with a split
+    make results RESOLUTION=200 SCENES="vase idol"
+    python docs/examples/main_scenes.py --collect  # only write the tables of what is there
 
-    shinypartial generate --scene S --resolution 400
-    shinypartial oracle datasets/S-400
-    panoless fit datasets/S-400
-    shinypartial evaluate predictions/S-400-default
-
-Usage: python docs/examples/main_scenes.py OUTPUT.json DATASET…
+Every step is a command in a process of its own; finished ones are skipped and interrupted ones continue, so the same
+line may be started again at any moment. Delete a prediction to have it made anew. The numbers lie in
+docs/results/main-scenes.json, one entry a dataset; the tables show each scene at its largest resolution there.
 """
 
+import argparse
 import json
-import shutil
+import subprocess
 import sys
+import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from shinypartial.dataset.read import DEFAULT_FOLDER as DATASETS
 from shinypartial.dataset.read import open_dataset
-from shinypartial.evaluation.scores import Scores, read_scores
-from shinypartial.io.files import write_json
-from shinypartial.prediction.format import DEFAULT_FOLDER, read_info
+from shinypartial.dataset.schema import CHECKSUMS
+from shinypartial.evaluation.scores import read_scores
+from shinypartial.io.files import write_json, write_text
+from shinypartial.prediction.format import DEFAULT_FOLDER as PREDICTIONS
+from shinypartial.prediction.format import DESCRIPTION, ORACLE_SUFFIX, read_info
+
+SCENES = Path("blender_scenes")
+NUMBERS = Path("docs/results/main-scenes.json")
+PAGES = (Path("README.md"), Path("docs/results/index.md"))
+BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
+SPLITS = ("development", "held-out")
+SCORES = "scores.json"
 
 
-def method_row(folder: Path) -> dict[str, Any] | None:
-    """The figures of one prediction folder, or None when it isn't there."""
-    if not (folder / "scores.json").exists():
+def splits() -> dict[str, str]:
+    """The split of every scene that declares one, the development scenes first."""
+    found = {}
+    for path in sorted(SCENES.glob("*/scene.toml")):
+        recipe = tomllib.loads(path.read_text(encoding="utf-8"))
+        if recipe.get("split") in SPLITS:
+            found[path.parent.name] = recipe["split"]
+    return dict(sorted(found.items(), key=lambda item: SPLITS.index(item[1])))
+
+
+def make(scene: str, resolution: int) -> None:
+    """Render, fit and score a scene, as far as that is not done."""
+    dataset = DATASETS / f"{scene}-{resolution}"
+    prediction, oracle = PREDICTIONS / f"{dataset.name}-default", PREDICTIONS / f"{dataset.name}{ORACLE_SUFFIX}"
+    if not (dataset / CHECKSUMS).exists():
+        run("shinypartial", "generate", "--scene", scene, "--resolution", resolution, "--output", dataset)
+    if not is_scored(oracle):
+        run("shinypartial", "oracle", dataset, "--output", oracle)
+    if not (prediction / DESCRIPTION).exists():
+        run("panoless", "fit", dataset, "--output", prediction)
+    if not is_scored(prediction):
+        run("shinypartial", "evaluate", prediction, "--oracle", oracle)
+
+
+def is_scored(folder: Path) -> bool:
+    """Whether scores are there, and younger than what they score."""
+    scores, description = folder / SCORES, folder / DESCRIPTION
+    return scores.exists() and description.exists() and scores.stat().st_mtime >= description.stat().st_mtime
+
+
+def run(program: str, *arguments: object) -> None:
+    """A command of this environment; SystemExit with its status where it fails."""
+    words = [program, *map(str, arguments)]
+    print("—", *words, flush=True)
+    status = subprocess.run([Path(sys.executable).parent / program, *words[1:]], check=False).returncode
+    if status:
+        sys.exit(status)
+
+
+def figures(folder: Path) -> dict[str, Any] | None:
+    """The figures of a scored prediction folder, or None; dB, degrees and seconds."""
+    if not is_scored(folder):
         return None
-    scores: Scores = read_scores(folder)
-    info = read_info(folder)
+    scores, info = read_scores(folder), read_info(folder)
     environment = scores.environment.as_predicted if scores.environment else None
+    normals, seen = scores.normals, scores.normals_environment
     return {
         "method": info.method,
+        "model": info.model,
+        "parameter_counts": info.parameter_counts,
+        "primitives": info.primitives,
         "environment_psnr_linear_full_db": environment and environment.full.psnr_linear,
         "environment_psnr_linear_observed_db": environment
         and environment.observed
@@ -38,48 +92,101 @@ def method_row(folder: Path) -> dict[str, Any] | None:
         "environment_psnr_linear_resolved_db": environment
         and environment.resolved
         and environment.resolved.psnr_linear,
-        "normals_mean_deg": scores.normals and scores.normals.mean_angular_error_deg,
-        "normals_median_deg": scores.normals and scores.normals.median_angular_error_deg,
+        "normals_mean_deg": normals and normals.mean_angular_error_deg,
+        "normals_median_deg": normals and normals.median_angular_error_deg,
+        "normals_environment_mean_deg": seen and seen.mean_angular_error_deg,
+        "normals_environment_median_deg": seen and seen.median_angular_error_deg,
         "render_psnr_db": scores.render and scores.render.psnr,
         "visibility_error_auroc": scores.calibration and scores.calibration.visibility_error_auroc,
-        "seconds": sum(info.seconds.values()),
+        "seconds": round(sum(info.seconds.values()), 3),
         "seconds_by_stage": info.seconds,
         "hardware": info.hardware,
-        "surfels": info.primitives,
     }
 
 
-def main(output: Path, roots: list[Path]) -> None:
-    """Write the JSON file, copy contact height fields beside it and print the table."""
-    scenes = {}
-    for root in roots:
-        dataset = open_dataset(root)
-        rows = [method_row(DEFAULT_FOLDER / f"{dataset.name}-{kind}") for kind in ("oracle", "default")]
-        scenes[dataset.name] = {
-            "statistics": dataset.manifest.get("statistics"),
-            "methods": [row for row in rows if row],
-        }
-        height_fields = [path for path in root.glob("contact_sheet.*")]
-        for height_field in height_fields:
-            shutil.copyfile(height_field, output.parent / f"{dataset.name}-contact-height field{height_field.suffix}")
-    write_json(output, scenes)
-    print("| Dataset | Method | Environment, all / observed / resolved dB | Normals, mean / median ° | Render dB | s |")
-    print("| --- | --- | --- | --- | --- | --- |")
-    for name, scene in scenes.items():
-        for row in scene["methods"]:
-            environment = " / ".join(
-                number(row[f"environment_psnr_linear_{part}_db"]) for part in ("full", "observed", "resolved")
+def collect(resolution: int) -> None:
+    """Bring the numbers up to date with what is there at this resolution, then the tables."""
+    numbers = json.loads(NUMBERS.read_text(encoding="utf-8")) if NUMBERS.exists() else {}
+    for scene, split in splits().items():
+        name = f"{scene}-{resolution}"
+        made = figures(PREDICTIONS / f"{name}-default")
+        if made is not None:
+            statistics = open_dataset(DATASETS / name).manifest.get("statistics")
+            bound = figures(PREDICTIONS / f"{name}{ORACLE_SUFFIX}")
+            numbers[name] = {
+                "scene": scene,
+                "split": split,
+                "resolution": resolution,
+                "statistics": statistics,
+                "methods": [each for each in (bound, made) if each],
+            }
+    write_json(NUMBERS, numbers)
+    lines = table(numbers)
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8") if page.exists() else ""
+        if BEGIN in text and END in text:
+            before, _, rest = text.partition(BEGIN)
+            write_text(page, "\n".join([before + BEGIN, "", *lines, "", END + rest.partition(END)[2]]))
+
+
+def table(numbers: dict[str, Any]) -> list[str]:
+    """Markdown: a line for every scene with a split, at its largest resolution."""
+    chosen: dict[str, dict[str, Any]] = {}
+    for entry in numbers.values():
+        if "split" in entry and entry["resolution"] >= chosen.get(entry["scene"], entry)["resolution"]:
+            chosen[entry["scene"]] = entry
+    lines = [
+        "| Scene | Split | Model | Environment | Oracle baseline | Normals, mean / median | Seconds |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for split in SPLITS:
+        for entry in (each for each in chosen.values() if each["split"] == split):
+            methods = {("oracle" if each["method"] == "oracle" else "made"): each for each in entry["methods"]}
+            made = methods["made"]
+            cells = (
+                entry["scene"].replace("-", " ").capitalize(),
+                split,
+                model_words(made),
+                number(made["environment_psnr_linear_observed_db"], 1, " dB"),
+                number(methods.get("oracle", {}).get("environment_psnr_linear_observed_db"), 1, " dB"),
+                f"{number(made['normals_environment_mean_deg'], 2, '°')} / "
+                f"{number(made['normals_environment_median_deg'], 2, '°')}",
+                f"{made['seconds']:.0f}",
             )
-            normals = f"{number(row['normals_mean_deg'])} / {number(row['normals_median_deg'])}"
-            render = number(row["render_psnr_db"])
-            print(f"| {name} | {row['method']} | {environment} | {normals} | {render} | {row['seconds']:.0f} |")
-    print(json.dumps({name: scene["statistics"] for name, scene in scenes.items()}, indent=1))
+            lines.append("| " + " | ".join(cells) + " |")
+    return lines
 
 
-def number(value: float | None) -> str:
-    """Two decimals, or a dash."""
-    return "–" if value is None else f"{value:.2f}"
+def model_words(made: dict[str, Any]) -> str:
+    """The kind of geometry and how many numbers it has."""
+    kind = (made["model"] or "?").split(" ")[0].replace("_", " ")
+    if kind == "surfels":
+        return f"{made['primitives']:,} curved surfels"
+    count = sum(value for name, value in made["parameter_counts"].items() if not name.startswith("environment"))
+    return f"{'surface of revolution' if kind == 'revolution' else kind}, {count:,} parameters"
+
+
+def number(value: float | None, digits: int, unit: str) -> str:
+    """A value with its unit, or a dash."""
+    return "–" if value is None else f"{value:.{digits}f}{unit}"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Make what is missing, writing the tables after every scene."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="*", help="names of scenes; every scene with a split when not given")
+    parser.add_argument("--resolution", type=int, default=400)
+    parser.add_argument("--collect", action="store_true", help="only write the tables of what is there")
+    options = parser.parse_args(arguments)
+    known = splits()
+    unknown = sorted(set(options.scenes or ()) - set(known))
+    if unknown:
+        parser.error(f"no scenes with a split: {', '.join(unknown)}; there are: {', '.join(known)}")
+    for scene in () if options.collect else options.scenes or known:
+        make(scene, options.resolution)
+        collect(options.resolution)
+    collect(options.resolution)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), [Path(argument) for argument in sys.argv[2:]])
+    main()

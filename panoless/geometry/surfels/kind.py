@@ -33,7 +33,8 @@ class SurfelFamily:
         if proposal.shape is not None:
             start: Geometry = proposal.shape.to_surfels(config)
             return start.to(views.train[0].mask.device)
-        return SurfelMirror.of(initial_surfels(views, config.surfels, config.seed), config)
+        surfels = initial_surfels(views, config.surfels, config.seed, config.first_surface)
+        return SurfelMirror.of(surfels, config)
 
     def begin(self, views: Views, geometry: Geometry, config: FitConfig) -> Training:
         """The map that fits the first surfels best; the configured one where maps are not solved."""
