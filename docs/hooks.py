@@ -16,6 +16,13 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 OPTIONS = "<!-- options -->"
+ROOMS = re.compile(r"<!-- rooms of (?P<package>\w+) -->")
+ORDER = (
+    *("api", "capture", "first_surface", "environment", "geometry", "selection", "reconstruct", "export"),
+    *("core", "io", "scene", "blender", "generate", "dataset", "release", "prediction", "oracle"),
+    *("metrics", "evaluation", "comparison", "report", "numeric", "kernels", "config", "presets"),
+)
+"""Rooms in the order of the data; others come after them."""
 ROOT = Path(__file__).resolve().parents[1]
 FORMULA = re.compile(r'<(?P<tag>div|span) class="arithmatex">\\[\[(](?P<latex>.*?)\\[\])]</(?P=tag)>', re.DOTALL)
 LINK = re.compile(r"(?P<before>\]\()(?P<path>[^)#:\s]+)(?P<anchor>#[^)\s]*)?\)")
@@ -53,25 +60,57 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
     if OPTIONS in markdown:
         markdown = markdown.replace(OPTIONS, "\n".join(option_tables()))
+    markdown = ROOMS.sub(lambda match: "\n".join(rooms(match["package"])), markdown)
     return LINK.sub(rewritten, markdown)
 
 
+def rooms(package: str) -> Iterator[str]:
+    """Directives that document every room of a package; of the kernels only the public operators."""
+    names = {path.stem for path in (ROOT / package).glob("*.py") if not path.stem.startswith("_")}
+    names |= {path.parent.name for path in (ROOT / package).glob("*/__init__.py")}
+    ranks = {name: rank for rank, name in enumerate(ORDER)}
+    for name in sorted(names - {"cli"}, key=lambda name: (ranks.get(name, len(ORDER)), name)):
+        yield f"::: {package}.{name}"
+        if name == "kernels":
+            yield "    options: {show_submodules: false}\n"
+            operators = sorted(path.stem for path in (ROOT / package / name).glob("*.py") if path.stem != "__init__")
+            yield from (f"::: {package}.{name}.{each}\n    options: {{heading_level: 3}}\n" for each in operators)
+        yield ""
+
+
 def option_tables() -> Iterator[str]:
-    """Tables of all fields of `FitConfig`, from the source: name on the command line, default, meaning."""
-    package = griffe.load("panoless", search_paths=[ROOT], resolve_aliases=True)
-    main = package["config.FitConfig"]
-    groups = [(main, "config")]
-    for item in main.attributes.values():
-        nested = package["config"].members.get(str(item.annotation))
-        if nested is not None and nested.is_class:
-            groups.append((nested, f"config.{item.name}"))
-    names = {prefix.removeprefix("config.") for _, prefix in groups}
-    for group, prefix in groups:
-        yield f"\n### `--{prefix}.…`\n\n{text_of(group)}\n\n| Option | Default | Meaning |\n| --- | --- | --- |"
+    """Tables of all fields of `FitConfig`, from the source: name, default, meaning. Tuned numbers come last."""
+    loader = griffe.GriffeLoader(search_paths=[ROOT])
+    loader.load("shinypartial")
+    package = loader.load("panoless")
+    loader.resolve_aliases()
+    groups = sorted(option_groups(package["config.FitConfig"], "", tuned=False), key=lambda group: group[2])
+    for group, prefix, tuned in groups:
+        place = "" if tuned else "--config."
+        title = f"--set {prefix}…=" if tuned else f"--config.{prefix}…"
+        yield f"\n### `{title}`\n\n{text_of(group)}\n\n| Option | Default | Meaning |\n| --- | --- | --- |"
         for item in group.attributes.values():
-            if item.name not in names and "class-attribute" in item.labels:
-                option = f"--{prefix}.{item.name}".replace("_", "-").replace("--config.model", "--model")
-                yield f"| `{option}` | `{item.value}` | {text_of(item)} |"
+            if "class-attribute" in item.labels and nested_options(group, item) is None:
+                name = prefix + item.name if tuned else (prefix + item.name).replace("_", "-")
+                option = "--model" if name == "model" else place + name
+                yield f"| `{option}` | `{' '.join(str(item.value).split())}` | {text_of(item)} |"
+
+
+def option_groups(group: griffe.Class, prefix: str, *, tuned: bool) -> Iterator[tuple[griffe.Class, str, bool]]:
+    """A class of options and those that it nests, how their fields are named, and whether they are tuned numbers."""
+    yield group, prefix, tuned
+    for item in group.attributes.values():
+        nested = nested_options(group, item)
+        if nested is not None:
+            hidden = tuned or str(item.annotation).startswith("Tuned[")
+            yield from option_groups(nested, f"{prefix}{item.name}.", tuned=hidden)
+
+
+def nested_options(group: griffe.Class, item: griffe.Attribute) -> griffe.Class | None:
+    """The class of options that a field holds, or None for a value."""
+    name = str(item.annotation).removeprefix("Tuned[").removesuffix("]")
+    found = group.module.members.get(name) if name.endswith(("Config", "Options")) else None
+    return found.final_target if found is not None and found.is_alias else found  # type: ignore[return-value]
 
 
 def text_of(item: griffe.Object) -> str:

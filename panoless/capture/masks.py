@@ -1,6 +1,7 @@
 """What masks say before any surface: their pieces, the sides on which the picture cuts them, the object's frame."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -55,7 +56,7 @@ def cut_sides(alpha: Float[np.ndarray, "H W"]) -> tuple[bool, bool, bool, bool]:
     return left, top, right, bottom
 
 
-def estimate_object_frame(masks: list[tuple[Camera, Float[np.ndarray, "_ _"]]]) -> ObjectFrame:
+def estimate_object_frame(masks: Sequence[tuple[Camera, Float[np.ndarray, "_ _"]]]) -> ObjectFrame:
     """Center, radius and reach of the object from where the masks lie in the views.
 
     The center is the point nearest, in least squares, to the rays through the middles of the masks' boxes. Of a box
@@ -83,7 +84,7 @@ def estimate_object_frame(masks: list[tuple[Camera, Float[np.ndarray, "_ _"]]]) 
 
 
 def _center(
-    pieces: list[tuple[Camera, Bool[np.ndarray, "_ _"]]], cuts: list[tuple[bool, ...]]
+    pieces: Sequence[tuple[Camera, Bool[np.ndarray, "_ _"]]], cuts: Sequence[tuple[bool, ...]]
 ) -> Float[np.ndarray, "3"] | None:
     """The point nearest to the rays, or planes, through the middles of the boxes; None where they leave it open."""
     normal_matrix, right_side = np.zeros((3, 3)), np.zeros(3)

@@ -10,9 +10,12 @@ from jaxtyping import Float
 
 from panoless.capture.views import Views
 from panoless.first_surface.contact import outline_contact
-from panoless.first_surface.mesh import TriangleMesh, cotangent_laplacian, vertex_areas
+from panoless.first_surface.mesh import TriangleMesh
 from panoless.first_surface.options import DEFAULTS, FirstSurfaceOptions
 from panoless.first_surface.visual_hull import Hull
+
+LEAST_AREA = 1e-3
+"""Of the mean area of a vertex: a smaller one counts as this."""
 
 
 def hull_surface(hull: Hull) -> TriangleMesh:
@@ -62,15 +65,16 @@ def thin_plate(
 ) -> TriangleMesh:
     """Vertices x that minimize Σ A t ‖x − x₀‖² + ℓ⁴ Σ A ‖Δx‖², the bending of a plate through the trusted ones.
 
-    x₀ are the targets, or else the given vertices; A are vertex areas, t the trust, Δ the cotangent Laplacian of the
-    given mesh. Where t is 1, details shorter than ℓ are smoothed; where it is 0, the plate continues its surroundings'
-    position and slope.
+    x₀ are the targets, or else the given vertices; A are vertex areas, t the trust, Δ the intrinsic Delaunay Laplacian
+    of the given mesh (Sharp & Crane 2020), which slivers don't harm. Where t is 1, details shorter than ℓ are smoothed;
+    where it is 0, the plate continues its surroundings' position and slope.
     """
+    from robust_laplacian import mesh_laplacian
     from scipy import sparse
     from scipy.sparse.linalg import splu
 
-    areas = vertex_areas(surface)
-    laplacian = cotangent_laplacian(surface)
+    laplacian, mass = mesh_laplacian(surface.vertices.astype(np.float64), surface.triangles)
+    areas = np.maximum(mass.diagonal(), LEAST_AREA * mass.diagonal().mean())
     data = areas * trust
     goals = surface.vertices if target is None else target
     system = length**4 * (laplacian.T @ sparse.diags(1 / areas) @ laplacian) + sparse.diags(data)

@@ -1,17 +1,12 @@
-"""A triangle mesh: normals, shape operator, Laplacian."""
+"""A triangle mesh: normals and shape operator."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
 
-if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
-
-
-STEEPEST_COTANGENT = 5.0
 TENSOR_ROUNDS = 3
+"""Averagings of a shape tensor over neighboring faces: enough for the slivers of marching cubes."""
 
 
 @dataclass(frozen=True)
@@ -44,30 +39,6 @@ class TriangleMesh:
             at_vertices = _sum_at_vertices(np.repeat((flat * areas[:, None])[:, None], 3, 1), self) / total
             flat = at_vertices[self.triangles].mean(1)
         return at_vertices.reshape(-1, 3, 3)
-
-
-def cotangent_laplacian(surface: TriangleMesh) -> "csr_matrix":
-    """The Laplacian integrated over the surface, positive semidefinite."""
-    from scipy import sparse
-
-    count = len(surface.vertices)
-    weights = sparse.csr_matrix((count, count))
-    for k in range(3):
-        i, j, opposite = (surface.triangles[:, (k + step) % 3] for step in range(3))
-        first, second = (surface.vertices[end] - surface.vertices[opposite] for end in (i, j))
-        sine = np.maximum(np.linalg.norm(np.cross(first, second), axis=1), 1e-12)
-        half = np.clip((first * second).sum(1) / sine, -STEEPEST_COTANGENT, STEEPEST_COTANGENT) / 2
-        one_way = sparse.coo_matrix((half, (i, j)), shape=(count, count)).tocsr()
-        weights = weights + one_way + one_way.T
-    return sparse.diags(np.asarray(weights.sum(1)).ravel()) - weights
-
-
-def vertex_areas(surface: TriangleMesh) -> Float[np.ndarray, "V"]:
-    """A third of the area of each vertex's faces, bounded from below."""
-    first, second, third = surface.vertices[surface.triangles].transpose(1, 0, 2)
-    doubled = np.linalg.norm(np.cross(second - first, third - first), axis=1)
-    areas = _sum_at_vertices(np.repeat(doubled[:, None, None] / 6, 3, 1), surface)[:, 0]
-    return np.maximum(areas, 1e-3 * areas.mean())
 
 
 def _sum_at_vertices(values: Float[np.ndarray, "T 3 C"], surface: TriangleMesh) -> Float[np.ndarray, "V C"]:

@@ -40,13 +40,16 @@ from shinypartial.blender.region import SMALLEST_DEPTH, Region, image_region, se
 from shinypartial.blender.runtime import import_blender, interrupts_deferred, quiet, set_threads
 from shinypartial.blender.self_reflection import render_probe
 from shinypartial.blender.sparse_pixels import assemble_sparse, nearest_depth, render_sparse
-from shinypartial.core.camera import Camera, opencv_to_opengl
+from shinypartial.core.camera import Camera, opencv_to_opengl, ray_directions_world
 from shinypartial.core.errors import InputError
 from shinypartial.scene import BlendFile, SceneSpec
 
 PROBE_PASSES = (COLOR_CHANNELS[0],)
 #: With more samples every pixel is path traced, which has no limit but time.
 MOST_SAMPLES_OF_MIRRORS = 512
+#: Cosine from which a normal faces away from the camera; at outlines, interpolated normals come to 0.01.
+LEAST_AWAY = 0.02
+SPARSE_ATTEMPTS = 3
 
 
 @dataclass(frozen=True)
@@ -115,13 +118,26 @@ class Renderer:
             passes[name][inside] = channel
         unsure = np.zeros((camera.height, camera.width), bool)
         unsure[inside] = _near_the_object(paths) & ~light.smooth
-        if unsure.any():
-            sparse = render_sparse(self.bpy, self.scratch / "sparse.exr", unsure, depth)
-            for name in PASSES:
-                passes[name][unsure] = sparse[name]
+        self._path_trace_pixels(passes, unsure, camera, depth)
         meets_scene = np.zeros(unsure.shape, bool)
         meets_scene[inside] = paths.meets_scene[GRID // 2 :: GRID, GRID // 2 :: GRID]
         return _from_passes(passes, meets_scene)
+
+    def _path_trace_pixels(self, passes: Passes, unsure: Bool[np.ndarray, "H W"], camera: Camera, depth: float) -> None:
+        """Fill the passes at the unsure pixels.
+
+        A sample at the very border of a pixel may be rounded into its neighbor in the small image, which stands for
+        another place of the view. Where a normal betrays it by facing away, the pixel is traced again among others.
+        """
+        rays = ray_directions_world(camera)
+        for _ in range(SPARSE_ATTEMPTS):
+            if not unsure.any():
+                return
+            sparse = render_sparse(self.bpy, self.scratch / "sparse.exr", unsure, depth)
+            for name in PASSES:
+                passes[name][unsure] = sparse[name]
+            facing = np.sum(stacked(passes, NORMAL_CHANNELS) * rays, -1)
+            unsure = unsure & (facing > LEAST_AWAY * passes[ALPHA_CHANNEL])
 
 
 @dataclass(frozen=True)

@@ -58,9 +58,9 @@ class Validate:
 
         folder = self.folder or announce_newest("dataset", newest_dataset())
         violations = (validate_release if is_release(folder) else validate)(folder, progress=True)
-        for each in violations:
-            print(f"{'warning: ' if each.warning else ''}{each.file}: {each.problem}. {each.remedy}")
-        broken = sum(not each.warning for each in violations)
+        for one in violations:
+            print(f"{'warning: ' if one.warning else ''}{one.file}: {one.problem}. {one.remedy}")
+        broken = sum(not one.warning for one in violations)
         if broken:
             raise InputError(
                 expected=f"every promise of the format kept in {folder}",

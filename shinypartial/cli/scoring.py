@@ -39,9 +39,9 @@ class Evaluate:
                 found="none",
                 remedy="Fit with --snapshots, then export them: `panoless export --snapshots`.",
             )
-        for each in snapshots:
-            print(f"Snapshot {each.name}")
-            evaluate(each, self.dataset, protocol=self.protocol, oracle=self.oracle)
+        for snapshot in snapshots:
+            print(f"Snapshot {snapshot.name}")
+            evaluate(snapshot, self.dataset, protocol=self.protocol, oracle=self.oracle)
         evaluate(prediction, self.dataset, protocol=self.protocol, oracle=self.oracle)
         print("\n".join(summary_lines(prediction)))
         print("Next: shinypartial report")
@@ -67,9 +67,9 @@ class Oracle:
         dataset = self.dataset or announce_newest("dataset", newest_dataset())
         output = self.output or DEFAULT_FOLDER / (dataset.resolve().name + ORACLE_SUFFIX)
         made = make_oracle(dataset, output)
-        for each in made.candidates:
-            psnr = "no ground truth" if each.psnr_linear is None else f"psnr_linear {each.psnr_linear:.2f} dB"
-            print(f"{each.estimate:9s} {each.height}×{2 * each.height}  {psnr}{'  taken' * (each is made.chosen)}")
+        for one in made.candidates:
+            psnr = "no ground truth" if one.psnr_linear is None else f"psnr_linear {one.psnr_linear:.2f} dB"
+            print(f"{one.estimate:9s} {one.height}×{2 * one.height}  {psnr}{'  taken' * (one is made.chosen)}")
         evaluate(output, dataset)
         print("\n".join(summary_lines(output)))
         print(f"Oracle baseline: {output}")

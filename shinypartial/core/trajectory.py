@@ -1,18 +1,22 @@
 """Camera paths confined to one hemisphere, and which of their views are for training."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import Meta
 
 from shinypartial.core.camera import Camera, look_at
 from shinypartial.core.errors import InputError
 
-PATHS = ("arc", "plus", "golden_spiral", "zigzag", "diamond")
+PathKind = Literal["arc", "plus", "golden_spiral", "zigzag", "diamond"]
+PATHS = get_args(PathKind)
 #: The paths that `sweeps` shapes.
 SWEPT_PATHS = ("arc", "zigzag", "diamond")
-PLACEMENTS = ("interleaved", "random")
+Placement = Literal["interleaved", "random"]
+PLACEMENTS = get_args(Placement)
 GOLDEN_ANGLE_RAD = math.pi * (3 - math.sqrt(5))
 #: Multiples of the inverse golden ratio, modulo 1, stay far apart: one phase of the interleaving for each seed.
 PHASE_STEP = (math.sqrt(5) - 1) / 2
@@ -22,40 +26,47 @@ LARGEST_PLUS_ANGLE_DEG = 80.0
 SMALLEST_HEIGHT = 1e-12
 
 
-def limits(low: float, high: float) -> dict[str, tuple[float, float]]:
-    """Metadata of a number in a recipe (or of each number in a tuple): the closed range that is allowed."""
-    return {"limits": (low, high)}
+def limits(low: float, high: float) -> Meta:
+    """The closed range of a number, to stand at its field: `Annotated[float, limits(0, 1)]`."""
+    return Meta(ge=low, le=high)
+
+
+Coordinate = Annotated[float, limits(-1e6, 1e6)]
+AzimuthDeg = Annotated[float, limits(-89.9, 89.9)]
+ElevationDeg = Annotated[float, limits(-85.0, 85.0)]
+ViewCount = Annotated[int, limits(1, 100_000)]
+Seed = Annotated[int, limits(0, 2**31 - 1)]
 
 
 @dataclass(frozen=True)
 class CameraPath:
     """A path on the side of the object that is photographed; all cameras look at one point."""
 
-    path: str = field(default="arc", metadata={"choices": PATHS})
+    path: PathKind = "arc"
     """Kind of path: `arc`, `plus`, `golden_spiral`, `zigzag` or `diamond`."""
-    radius: float = field(default=3.2, metadata=limits(1e-3, 1e6))
+    radius: Annotated[float, limits(1e-3, 1e6)] = 3.2
     """Distance from the target in scene units; for `plus` that of its middle, from which the lines lead away."""
-    target: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), metadata=limits(-1e6, 1e6))
+    target: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
     """World point that every camera looks at."""
-    facing_azimuth_deg: float = field(default=-90.0, metadata=limits(-360.0, 360.0))
+    facing_azimuth_deg: Annotated[float, limits(-360.0, 360.0)] = -90.0
     """Azimuth of the hemisphere's axis, from +X toward +Y: the side of the object that is photographed."""
-    azimuth_deg: tuple[float, float] = field(default=(-75.0, 75.0), metadata=limits(-89.9, 89.9))
+    azimuth_deg: tuple[AzimuthDeg, AzimuthDeg] = (-75.0, 75.0)
     """First and last azimuth relative to the facing one."""
-    elevation_deg: tuple[float, float] = field(default=(-10.0, 50.0), metadata=limits(-85.0, 85.0))
+    elevation_deg: tuple[ElevationDeg, ElevationDeg] = (-10.0, 50.0)
     """First and last elevation from the horizon."""
-    sweeps: int = field(default=5, metadata=limits(1, 10_000))
+    sweeps: Annotated[int, limits(1, 10_000)] = 5
     """Number of arcs, strokes of the zigzag or nested diamonds; the other paths have none."""
-    lens_mm: float = field(default=50.0, metadata=limits(1.0, 10_000.0))
+    lens_mm: Annotated[float, limits(1.0, 10_000.0)] = 50.0
     """Focal length."""
-    sensor_mm: float = field(default=36.0, metadata=limits(1.0, 1000.0))
+    sensor_mm: Annotated[float, limits(1.0, 1000.0)] = 36.0
     """Width of the square sensor."""
-    train: int = field(default=100, metadata=limits(1, 100_000))
+    train: ViewCount = 100
     """Number of training views."""
-    test: int = field(default=200, metadata=limits(1, 100_000))
+    test: ViewCount = 200
     """Number of test views."""
-    placement: str = field(default="interleaved", metadata={"choices": PLACEMENTS})
+    placement: Placement = "interleaved"
     """Training views spread evenly along the path (`interleaved`) or drawn by chance (`random`)."""
-    seed: int = field(default=0, metadata=limits(0, 2**31 - 1))
+    seed: Seed = 0
     """Seed of the draw; for `interleaved` it chooses the view that is first."""
 
 

@@ -4,7 +4,6 @@ Original folders have no manifest; a subset of one has a manifest that says so. 
 format, but can't be scored either.
 """
 
-import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,10 +14,10 @@ from jaxtyping import Bool, Float
 from shinypartial.core.camera import ray_directions_world
 from shinypartial.core.conventions import SOLID_ALPHA
 from shinypartial.core.errors import InputError
-from shinypartial.dataset.read import image_size, image_stem, read_entry, read_view, refuse_distortion
+from shinypartial.dataset.read import read_view
 from shinypartial.dataset.schema import CHECKSUMS, ENVIRONMENT_LATLONG, LICENSES, MANIFEST, Frame, View
+from shinypartial.dataset.transforms import read_frames
 from shinypartial.dataset.violations import Violation, violation_of
-from shinypartial.io.files import read_json
 from shinypartial.io.images import read_picture, read_png
 
 RESTORE = "Restore the file from the original dataset."
@@ -43,47 +42,18 @@ def is_plain(root: Path, manifest: dict[str, Any]) -> bool:
 
 def read_plain_frames(root: Path, split: str) -> tuple[list[Frame], int, list[Violation]]:
     """The frames whose camera can be read, how many are listed, and what is wrong with `transforms_SPLIT.json`."""
-    file = f"transforms_{split}.json"
-    if split == "test" and not (root / file).exists():
-        return [], 0, []
     try:
-        content = read_json(root / file, f"the cameras of the {split} split")
-        entries = content.get("frames") if isinstance(content, dict) else None
-        if not isinstance(entries, list) or not entries:
-            return [], 0, [Violation(file, "`frames` is not a list with at least one frame", RESTORE)]
-        refuse_distortion(content, root / file)
-        width, height = _first_size(root, content, root / file)
+        frames, count, errors = read_frames(root, split)
     except InputError as error:
-        return [], 0, [violation_of(file, error, error.remedy)]
-    angle = content.get("camera_angle_x")
-    if "fl_x" not in content and isinstance(angle, int | float) and not 0 < angle < math.pi:
-        problem = f"expected `camera_angle_x` between 0 and π, in radians, found {angle}"
-        return [], 0, [Violation(file, problem, RESTORE)]
-    frames, violations = [], []
-    for entry in entries:
-        try:
-            frames.append(read_entry(root, entry, content, width, height, root / file))
-        except InputError as error:
-            violations.append(violation_of(file, error, error.remedy))
-    return frames, len(entries), violations
-
-
-def _first_size(root: Path, content: dict[str, Any], path: Path) -> tuple[int, int]:
-    """Of the transforms, or of the first picture that can be read: the others are named one by one."""
-    failure = None
-    for entry in content["frames"]:
-        try:
-            return image_size(content, image_stem(root, entry, path))
-        except InputError as error:
-            failure = failure or error
-    assert failure is not None
-    raise failure
+        frames, count, errors = [], 0, [error]
+    return frames, count, [violation_of(f"transforms_{split}.json", error, error.remedy) for error in errors]
 
 
 def check_plain_frame(root: Path, frame: Frame) -> Iterator[Violation]:
     """Every broken promise of a frame without an EXR."""
-    name = _name(root, frame.png)
-    if not frame.png.is_file():
+    photograph = frame.photograph
+    name = _name(root, photograph)
+    if not photograph.is_file():
         yield Violation(name, "the file is missing", RESTORE)
         return
     try:
@@ -120,12 +90,16 @@ def _check_alpha(root: Path, frame: Frame, view: View) -> Iterator[Violation]:
         yield violation_of(name, error, RESTORE)
         return
     if levels.shape != view.alpha.shape:
-        yield Violation(name, f"{levels.shape[1]}×{levels.shape[0]} pixels, other than {frame.png.name}", RESTORE)
+        yield Violation(
+            name, f"{levels.shape[1]}×{levels.shape[0]} pixels, other than {frame.photograph.name}", RESTORE
+        )
         return
     difference = np.abs(levels - 255.0 * view.alpha)
     wrong = int((difference > LEVEL_TOLERANCE + 1e-3).sum())
     if wrong:
-        problem = f"{wrong} pixels differ from the alpha of {frame.png.name} by up to {difference.max():.0f} of 255"
+        problem = (
+            f"{wrong} pixels differ from the alpha of {frame.photograph.name} by up to {difference.max():.0f} of 255"
+        )
         yield Violation(name, problem, RESTORE)
 
 

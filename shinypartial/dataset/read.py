@@ -1,13 +1,11 @@
 """Open a dataset folder, ours or a plain NeRF-synthetic one, and read its views."""
 
-import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Num
 
-from shinypartial.core.camera import Camera, check_pose, opengl_to_opencv
 from shinypartial.core.color import srgb_to_linear
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import (
@@ -24,11 +22,11 @@ from shinypartial.dataset.schema import (
     Frame,
     View,
 )
+from shinypartial.dataset.transforms import read_frames
 from shinypartial.io.files import newest_folder, read_json
-from shinypartial.io.images import read_exr, read_exr_rgb, read_png, stack_channels
+from shinypartial.io.images import EXR, read_exr, read_exr_rgb, read_picture, read_png, stack_channels, unit_values
 
 DEFAULT_FOLDER = Path("datasets")
-DISTORTION_FIELDS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def newest_dataset(parent: Path = DEFAULT_FOLDER) -> Path:
@@ -59,8 +57,13 @@ def open_dataset(root: Path) -> Dataset:
             found="one whose generation has not ended",
             remedy="Wait for it, or run the command that makes it again: it continues where it stopped.",
         )
-    train, test = (_read_frames(root, split) for split in SPLITS)
-    return Dataset(root, manifest, train, test)
+    splits = []
+    for split in SPLITS:
+        frames, _, errors = read_frames(root, split)
+        if errors:
+            raise errors[0]
+        splits.append(tuple(frames))
+    return Dataset(root, manifest, *splits)
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:
@@ -75,95 +78,14 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     return fields
 
 
-def _read_frames(root: Path, split: str) -> tuple[Frame, ...]:
-    path = root / f"transforms_{split}.json"
-    if split == "test" and not path.exists():
-        return ()
-    transforms = read_json(path, f"the cameras of the {split} split")
-    frames = transforms.get("frames") if isinstance(transforms, dict) else None
-    if not isinstance(frames, list) or not frames:
-        raise InputError(
-            expected=f"a non-empty list `frames` in {path}", found="none", remedy="Restore the file of the dataset."
-        )
-    refuse_distortion(transforms, path)
-    first = image_stem(root, frames[0], path)
-    width, height = image_size(transforms, first)
-    return tuple(read_entry(root, entry, transforms, width, height, path) for entry in frames)
-
-
-def refuse_distortion(transforms: dict[str, Any], path: Path) -> None:
-    """Raise InputError when transforms describe a lens with distortion."""
-    distorted = [name for name in DISTORTION_FIELDS if transforms.get(name)]
-    if distorted:
-        raise InputError(
-            expected=f"undistorted pinhole images in {path}",
-            found=f"lens distortion ({', '.join(distorted)} not zero)",
-            remedy="Undistort the images (for example with COLMAP's image_undistorter) and remove these fields.",
-        )
-
-
-def image_stem(root: Path, entry: Any, path: Path) -> Path:
-    """Where the images of a frame lie, without extension; `path` names the transforms in messages."""
-    name = entry.get("file_path") if isinstance(entry, dict) else None
-    if not isinstance(name, str):
-        raise InputError(
-            expected=f"`file_path` for every frame of {path}",
-            found=repr(name),
-            remedy="Restore the file of the dataset.",
-        )
-    stem = root / name
-    return stem.with_suffix("") if stem.suffix.lower() in (".png", ".exr") else stem
-
-
-def image_size(transforms: dict[str, Any], stem: Path) -> tuple[int, int]:
-    """Width and height in pixels: those of the transforms, else those of the picture."""
-    if "w" in transforms and "h" in transforms:
-        try:
-            return int(transforms["w"]), int(transforms["h"])
-        except (TypeError, ValueError):
-            raise InputError(
-                expected=f"the image size w, h in pixels for {stem}",
-                found=f"{transforms['w']!r}, {transforms['h']!r}",
-                remedy="Correct w and h of the transforms.",
-            ) from None
-    image = read_png(stem.with_name(stem.name + ".png"))
-    return image.shape[1], image.shape[0]
-
-
-def read_entry(root: Path, entry: Any, transforms: dict[str, Any], width: int, height: int, path: Path) -> Frame:
-    """The frame of an entry of `frames`; raises InputError for a pose that isn't rigid and for bad intrinsics."""
-    stem = image_stem(root, entry, path)
-    name = f"{path.stem.removeprefix('transforms_')}/{stem.name}"
-    try:
-        pose = np.array(entry["transform_matrix"], dtype=np.float64)
-        if "fl_x" in transforms:
-            fx = float(transforms["fl_x"])
-        else:
-            fx = 0.5 * width / math.tan(0.5 * float(transforms["camera_angle_x"]))
-        fy = float(transforms.get("fl_y", fx))
-        cx, cy = float(transforms.get("cx", width / 2)), float(transforms.get("cy", height / 2))
-    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-        raise InputError(
-            expected=f"transform_matrix (4×4) and camera_angle_x or fl_x for {name} in {path}",
-            found=f"{type(error).__name__}: {error}",
-            remedy="Restore the file of the dataset.",
-        ) from None
-    check_pose(pose, name)
-    if not all(map(math.isfinite, (fx, fy, cx, cy))) or fx <= 0 or fy <= 0:
-        raise InputError(
-            expected=f"positive finite focal lengths in {path}",
-            found=f"fx {fx}, fy {fy}",
-            remedy="Correct the intrinsics.",
-        )
-    return Frame(name, Camera(opengl_to_opencv(pose), fx, fy, cx, cy, width, height), stem)
-
-
 def read_view(frame: Frame) -> View:
-    """Read one view: from the EXR where there is one, else from the RGBA PNG.
+    """Read one view: from the EXR where there is one, else from a photograph of another format.
 
-    Raises InputError when the image is missing, truncated, of the wrong size, without a mask, or holds NaN.
+    Its mask is the file that the transforms name, else the alpha channel, else the companion `_alpha.png`. Raises
+    InputError when the image is missing, truncated, of the wrong size, without a mask, or holds NaN.
     """
-    view = _read_exr_view(frame) if frame.exr.exists() else _read_png_view(frame)
+    path = frame.photograph
+    view = _read_exr_view(frame, path) if path.suffix.lower() == EXR else _read_picture_view(frame, path)
     arrays = {
         "radiance": view.radiance,
         "alpha": view.alpha,
@@ -192,40 +114,33 @@ def require_normals(frame: Frame, view: View) -> Float[np.ndarray, "H W 3"]:
     return view.normals_world
 
 
-def _read_exr_view(frame: Frame) -> View:
-    channels = read_exr(frame.exr)
-    if "A" not in channels:
-        raise _missing_mask(frame, frame.exr)
-    rgba = stack_channels(channels, COLOR_CHANNELS, frame.exr)
-    _check_size(frame, rgba)
+def _read_exr_view(frame: Frame, path: Path) -> View:
+    channels = read_exr(path)
+    if "A" not in channels and frame.mask is None:
+        raise _missing_mask(frame, path)
+    color = stack_channels(channels, COLOR_CHANNELS if "A" in channels else COLOR_CHANNELS[:3], path)
+    _check_size(frame, color)
+    radiance, alpha = _cut_out(frame, path, color, premultiplied=True)
     has_normals = all(name in channels for name in NORMAL_CHANNELS)
-    normals = stack_channels(channels, NORMAL_CHANNELS, frame.exr) if has_normals else None
+    normals = stack_channels(channels, NORMAL_CHANNELS, path) if has_normals else None
     depth = channels[DEPTH_CHANNEL].astype(np.float32) if DEPTH_CHANNEL in channels else None
     self_reflection = channels.get(SELF_REFLECTION_CHANNEL)
-    return View(
-        rgba[..., :3],
-        rgba[..., 3],
-        normals,
-        depth,
-        high_dynamic_range=True,
-        self_reflection=None if self_reflection is None else self_reflection.astype(np.float32),
-    )
+    mask = None if self_reflection is None else self_reflection.astype(np.float32)
+    return View(radiance, alpha, normals, depth, high_dynamic_range=True, self_reflection=mask)
 
 
-def _read_png_view(frame: Frame) -> View:
-    image = read_png(frame.png)
+def _read_picture_view(frame: Frame, path: Path) -> View:
+    image = read_picture(path)
     _check_size(frame, image)
-    if image.shape[2] == 4:
-        alpha = image[..., 3].astype(np.float32) / 255
-    elif frame.alpha_png.exists():
-        alpha = _companion(frame, frame.alpha_png)[..., 0].astype(np.float32) / 255
-    else:
-        raise _missing_mask(frame, frame.png)
-    color = np.repeat(image, 3, 2) if image.shape[2] == 1 else image[..., :3]
-    radiance = srgb_to_linear(color.astype(np.float32) / 255) * alpha[..., None]
+    values, linear = unit_values(image), image.dtype.kind == "f"
+    if values.shape[2] == 1:
+        values = np.repeat(values, 3, 2)
+    color = values if linear else np.concatenate([srgb_to_linear(values[..., :3]), values[..., 3:]], -1)
+    radiance, alpha = _cut_out(frame, path, color, premultiplied=linear)
     normals = None
     if frame.normal_png.exists():
-        stored = _companion(frame, frame.normal_png)
+        stored = read_png(frame.normal_png)
+        _check_companion(frame, frame.normal_png, stored)
         if stored.shape[2] < 3:
             raise InputError(
                 expected=f"three channels in {frame.normal_png}",
@@ -235,10 +150,27 @@ def _read_png_view(frame: Frame) -> View:
         decoded = stored[..., :3].astype(np.float32) * (2 / 255) - 1
         length = np.linalg.norm(decoded, axis=-1, keepdims=True)
         normals = np.where((length > 0.5) & (alpha[..., None] > 0), decoded / np.maximum(length, 1e-6), 0)
-    return View(radiance, alpha, None if normals is None else normals.astype(np.float32), None, False)
+    return View(radiance, alpha, None if normals is None else normals.astype(np.float32), None, linear)
 
 
-def _check_size(frame: Frame, image: np.ndarray) -> None:
+def _cut_out(
+    frame: Frame, path: Path, color: Float[np.ndarray, "H W C"], premultiplied: bool
+) -> tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W"]]:
+    """Radiance premultiplied by the mask, and the mask; `premultiplied` tells what an alpha channel has done so far."""
+    radiance, alpha = color[..., :3], color[..., 3] if color.shape[2] == 4 else None
+    if frame.mask is None and alpha is not None:
+        return (radiance if premultiplied else radiance * alpha[..., None]), alpha
+    if frame.mask is None and not frame.alpha_png.exists():
+        raise _missing_mask(frame, path)
+    file = frame.mask or frame.alpha_png
+    mask = unit_values(read_picture(file)[..., 0])
+    _check_companion(frame, file, mask)
+    if premultiplied and alpha is not None:
+        radiance = radiance / np.where(alpha > 0, alpha, 1)[..., None]
+    return radiance * mask[..., None], mask
+
+
+def _check_size(frame: Frame, image: Num[np.ndarray, "H W C"]) -> None:
     if image.shape[:2] != (frame.camera.height, frame.camera.width):
         raise InputError(
             expected=f"{frame.camera.width}×{frame.camera.height} pixels for {frame.name}, as its transforms say",
@@ -247,21 +179,19 @@ def _check_size(frame: Frame, image: np.ndarray) -> None:
         )
 
 
-def _companion(frame: Frame, path: Path) -> UInt8[np.ndarray, "H W C"]:
-    image = read_png(path)
+def _check_companion(frame: Frame, path: Path, image: Num[np.ndarray, "H W *C"]) -> None:
     if image.shape[:2] != (frame.camera.height, frame.camera.width):
         raise InputError(
             expected=f"{path.name} in the size of {frame.name}",
             found=f"{image.shape[1]}×{image.shape[0]}",
             remedy="Remake it.",
         )
-    return image
 
 
 def _missing_mask(frame: Frame, path: Path) -> InputError:
     return InputError(
-        expected=f"a mask for {frame.name}: an alpha channel in {path.name} or the file {frame.alpha_png.name}",
-        found="neither",
+        expected=f"a mask for {frame.name}: an alpha channel in {path.name}, a mask_path, or {frame.alpha_png.name}",
+        found="none of them",
         remedy="Segment the object and save RGBA images with straight alpha.",
     )
 

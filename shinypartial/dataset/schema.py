@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from shinypartial.core.camera import Camera
+from shinypartial.io.images import EXR, PICTURE_SUFFIXES
 
 FORMAT = "shinypartial-dataset"
 FORMAT_VERSION = 1
@@ -33,7 +34,8 @@ class View:
 
     `radiance` is linear and premultiplied by alpha; `normals_world` are unit where the object is and zero elsewhere;
     `depth` is camera z-depth in scene units, zero where the object is not. `None`: the dataset doesn't hold it.
-    `high_dynamic_range` tells whether radiance came from EXR (unbounded) or from 8-bit PNG (in [0, 1]).
+    `high_dynamic_range` tells whether radiance came from EXR, HDR or a TIFF of floating point (unbounded), or from sRGB
+    codes (in [0, 1]).
     `self_reflection` is 1 where the mirror ray of the pixel's center meets the object again, or something else that
     stands near it, in place of the environment; 0 elsewhere, also where the object is not.
     """
@@ -46,13 +48,31 @@ class View:
     self_reflection: Float[np.ndarray, "H W"] | None = None
 
 
+def find_picture(stem: Path, suffix: str = "") -> Path:
+    """The file of a photograph: the EXR where there is one, else `suffix` if that is given, else what lies there."""
+    named = (suffix,) if suffix else (*PICTURE_SUFFIXES, *map(str.upper, PICTURE_SUFFIXES))
+    candidates = [stem.with_name(stem.name + each) for each in (EXR, *named)]
+    return next((path for path in candidates if path.exists()), candidates[1])
+
+
 @dataclass(frozen=True)
 class Frame:
-    """A named camera of a split; `stem` is the image path without extension or suffix."""
+    """A named camera of a split; `stem` is the image path without extension or suffix.
+
+    `suffix` is the extension of the photograph where the transforms name it, `mask` the file that holds its mask where
+    they name one.
+    """
 
     name: str
     camera: Camera
     stem: Path
+    suffix: str = ""
+    mask: Path | None = None
+
+    @property
+    def photograph(self) -> Path:
+        """What the view is read from."""
+        return find_picture(self.stem, self.suffix)
 
     @property
     def exr(self) -> Path:

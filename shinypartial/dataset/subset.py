@@ -231,7 +231,10 @@ def _renamed(dataset: Dataset, split: str, frames: Sequence[Frame]) -> dict[str,
         for name in tables
         for frame, entry in zip(dataset.split(name), tables[name]["frames"], strict=True)
     }
-    renamed = [entries[frame.stem] | {"file_path": f"./{split}/r_{i}"} for i, frame in enumerate(frames)]
+    renamed = []
+    for i, frame in enumerate(frames):
+        mask = {} if frame.mask is None else {"mask_path": f"./{split}/{_mask_name(frame.mask, i)}"}
+        renamed.append(entries[frame.stem] | {"file_path": f"./{split}/r_{i}{frame.suffix}"} | mask)
     return {**shared[present[0]], "frames": renamed}
 
 
@@ -270,11 +273,17 @@ def _copies(root: Path, split: str, frames: Sequence[Frame]) -> list[tuple[Path,
         name = frame.stem.name
         here = sorted(frame.stem.parent.iterdir()) if frame.stem.parent.is_dir() else []
         files = [path for path in here if path.name.startswith((f"{name}.", f"{name}_")) and path.is_file()]
-        if not {frame.png, frame.exr} & set(files):
+        if frame.photograph not in files:
             raise InputError(
-                expected=f"the image of {frame.name} at {frame.png}",
+                expected=f"the image of {frame.name} at {frame.photograph}",
                 found="no such file",
                 remedy="Restore it, or remove the frame from the transforms.",
             )
         pairs += [(path, root / split / f"r_{i}{path.name[len(name) :]}") for path in files if path not in dropped]
+        if frame.mask is not None:
+            pairs.append((frame.mask, root / split / _mask_name(frame.mask, i)))
     return pairs
+
+
+def _mask_name(mask: Path, index: int) -> str:
+    return f"r_{index}_mask_path{mask.suffix}"

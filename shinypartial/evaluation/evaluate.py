@@ -5,6 +5,7 @@ are in docs/metrics.md.
 """
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -114,20 +115,23 @@ class _MapScores:
 
 
 def evaluate(
-    prediction: Path,
-    dataset: Path | None = None,
+    prediction: Path | str,
+    dataset: Path | str | None = None,
     lpips_weights: Path | None = None,
     protocol: Protocols = "both",
-    oracle: Path | None = None,
+    oracle: Path | str | None = None,
 ) -> Scores:
-    """Score a prediction folder against its dataset and write scores.json and pictures into it.
+    """Score a prediction folder against its dataset; write scores.json and pictures into it and return the scores.
 
+    Like the command `shinypartial evaluate`, which also prints a summary: `evaluate("predictions/vase-400-default")`.
     `dataset` defaults to the path in prediction.json; `lpips_weights` to the places that `metrics.perceptual` names;
-    `oracle`, a folder with the scores of the dataset's bound, to the sibling DATASET-oracle where there is one.
-    What can't be computed is left out by name. Raises InputError for files that are missing, broken or misshapen.
+    `oracle`, a folder with the scores of the dataset's oracle baseline, to the sibling DATASET-oracle where there is
+    one. What can't be computed is None and named in `Scores.left_out`. Views and maps are scored in threads, with the
+    same results as one after the other. Raises InputError for files that are missing, broken or misshapen.
     """
+    prediction = Path(prediction)
     info = read_info(prediction)
-    data = _open_dataset(info, dataset, prediction)
+    data = _open_dataset(info, None if dataset is None else Path(dataset), prediction)
     left_out: list[LeftOut] = []
     networks = _load_networks(lpips_weights, left_out)
     for old in (prediction / EVALUATION).glob("*.png"):
@@ -135,9 +139,11 @@ def evaluate(
     progress = Progress("evaluate", total=len(data.train) + len(data.test) + 1)
     observed = _observed_directions(data, left_out, progress)
     with_paper = protocol == "both"
-    maps = _score_maps(prediction, data, observed, networks, left_out, with_paper)
+    with ThreadPoolExecutor(1) as beside:
+        scoring = beside.submit(_score_maps, prediction, data, observed, networks, left_out, with_paper)
+        results = list(_score_views(prediction, data, networks, progress, with_paper))
+        maps = scoring.result()
     progress.advance("environment")
-    results = list(_score_views(prediction, data, networks, progress, with_paper))
     if not with_paper:
         left_out.append(LeftOut(PAPER_PROTOCOL, "not asked for (--protocol both)"))
     scores = Scores(
@@ -153,7 +159,7 @@ def evaluate(
         render=pool_renders(results, networks.alex, left_out),
         calibration=maps.calibration,
         paper=_pool_paper(maps, results) if with_paper else None,
-        oracle=None if oracle is None else str(oracle.resolve()),
+        oracle=None if oracle is None else str(Path(oracle).resolve()),
         views=tuple(result.scores for result in results),
         left_out=tuple(left_out),
         counts=count_all(data, results),

@@ -19,7 +19,8 @@ from shinypartial.io.files import atomic_write
 
 Channels = Mapping[str, np.ndarray]
 
-#: What a photograph may be, besides EXR, in the order in which they are looked for.
+EXR = ".exr"
+#: What a photograph may be besides, in the order in which they are looked for.
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".hdr")
 #: Channels that `read_picture` returns: gray, RGB, RGBA; gray with alpha becomes the last.
 CHANNEL_COUNTS = (1, 3, 4)
@@ -48,7 +49,7 @@ def write_exr(path: Path, channels: Channels, *, y_up_environment: bool = False)
 def _require_complete_write(temporary: Path, path: Path) -> None:
     """Both libraries buffer: a full disk can leave a short file without an error, so it is read back."""
     try:
-        (read_exr if path.suffix == ".exr" else read_picture)(temporary)
+        (read_exr if path.suffix == EXR else read_picture)(temporary)
     except InputError:
         raise OSError(errno.ENOSPC, "the written picture can't be read back", str(path)) from None
 
@@ -165,7 +166,7 @@ def read_picture(path: Path) -> Num[np.ndarray, "H W C"]:
     of an unknown format, for pictures whose EXIF tag says that they lie on their side, for integers that were
     premultiplied, and for other types and numbers of channels.
     """
-    if path.suffix.lower() == ".exr":
+    if path.suffix.lower() == EXR:
         channels = read_exr(path)
         names = ("Y",) if "Y" in channels else ("R", "G", "B", "A") if "A" in channels else ("R", "G", "B")
         return stack_channels(channels, names, path)

@@ -1,4 +1,4 @@
-"""The bound of a dataset: the best environment map that its training views allow when the normals are known.
+"""The oracle baseline of a dataset: the map that its training views give when the normals are known.
 
 Written as a prediction folder, so that the evaluator scores it like any method: a score means little without it.
 """
@@ -68,8 +68,8 @@ def make_oracle(dataset: Path, output: Path) -> Oracle:
     """Solve the environment of a dataset from its training views and ground-truth normals; write it to `output`.
 
     Of the plain average and the robust least squares, on grids as fine as the rays allow, the one with the smallest
-    error against the ground truth over observed directions is taken: this makes the bound as tight as these estimators
-    can. Raises InputError when the dataset has no normals, and when `output` holds something else than a prediction.
+    error against the ground truth over observed directions is taken: this makes the baseline as good as they can be.
+    Raises InputError when the dataset has no normals, and when `output` holds something else than a prediction.
     """
     start, data = time.monotonic(), open_dataset(dataset)
     _require_normals(data)
@@ -80,8 +80,8 @@ def make_oracle(dataset: Path, output: Path) -> Oracle:
     rays = _read_rays(data, progress)
     after_reading = time.monotonic()
     candidates = _candidates(rays, data, progress)
-    known = [each for each in candidates if each.psnr_linear is not None]
-    chosen = max(known, key=lambda each: each.psnr_linear or 0.0) if known else candidates[1]
+    known = [candidate for candidate in candidates if candidate.psnr_linear is not None]
+    chosen = max(known, key=lambda candidate: candidate.psnr_linear or 0.0) if known else candidates[1]
     write_environment_map(output, chosen.radiance)
     write_visibility(output, chosen.evidence / (1 + chosen.evidence))
     after_solving = time.monotonic()
@@ -101,7 +101,7 @@ def _require_normals(data: Dataset) -> None:
         raise InputError(
             expected=f"ground-truth normals in the training views of {data.root}",
             found="none",
-            remedy="Bounds exist for rendered datasets only: make one with `shinypartial generate`.",
+            remedy="Oracle baselines exist for rendered datasets only: make one with `shinypartial generate`.",
         )
 
 
@@ -189,7 +189,7 @@ def _info(oracle: Oracle, data: Dataset) -> PredictionInfo:
         "estimate": chosen.estimate,
         "height": chosen.height,
         "rays": oracle.rays,
-        "candidates_psnr_linear": {f"{each.estimate}_{each.height}": each.psnr_linear for each in oracle.candidates},
+        "candidates_psnr_linear": {f"{one.estimate}_{one.height}": one.psnr_linear for one in oracle.candidates},
     }
     # Linux counts kibibytes, macOS bytes.
     unit = 1 if sys.platform == "darwin" else 1024

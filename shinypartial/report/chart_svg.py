@@ -23,8 +23,9 @@ INK, DIM, RULE, CARD = "#1b1d21", "#5d6470", "#dfe1e5", "#fefefe"
 VARIABLES = {INK: "--ink", DIM: "--dim", RULE: "--rule", CARD: "--card"}
 #: Positive values that span more than this factor get a logarithmic axis.
 LOGARITHMIC_SPAN = 20.0
-#: A logarithmic axis over a smaller factor has ticks at even distances, as it would hold hardly a power of ten.
-DECADE = 10.0
+#: A logarithmic axis over a smaller factor has ticks at even distances, as it would hold hardly a power of ten; over a
+#: larger one than the second it has them at powers of ten alone.
+DECADE, MANY_DECADES = 10.0, 500.0
 MARGIN = 0.08
 #: Characters of a line of facts.
 FACTS_WIDTH = 84
@@ -166,10 +167,11 @@ def _limits(values: Sequence[float], logarithmic: bool) -> tuple[float, float]:
 
 
 def _set_ticks(axis: "Axis", values: Sequence[float], logarithmic: bool) -> None:
-    """Ticks at 1, 2 and 5 times powers of ten where that is several, else at round values; short numbers."""
+    """Ticks at round values, or at 1, 2 and 5 times powers of ten over more than one of these; short numbers."""
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-    wide = logarithmic and max(values) / min(values) > DECADE
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)) if wide else MaxNLocator(6, steps=[1, 2, 5, 10]))
+    factor = max(values) / min(values) if logarithmic else 1.0
+    digits = (1.0, 2.0, 5.0) if factor < MANY_DECADES else (1.0,)
+    axis.set_major_locator(LogLocator(subs=digits) if factor > DECADE else MaxNLocator(6, steps=[1, 2, 5, 10]))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: short_number(value)))

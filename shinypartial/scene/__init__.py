@@ -1,7 +1,7 @@
 """Scene recipes: `blender_scenes/NAME/scene.toml` read into frozen dataclasses, strictly.
 
-`shapes` and `spec` say what a recipe may hold, `tables` reads nested tables into them, `check` refuses values that
-contradict each other, and `recipes` finds, loads and varies scenes. The same checks hold for values that the command
+`shapes` and `spec` say what a recipe may hold and in which range, `check` refuses values that contradict each other,
+and `recipes` finds, loads and varies scenes. The same checks hold for values that the command
 line overrides. May import trajectory and the core below it; never dataset, blender or bpy.
 """
 

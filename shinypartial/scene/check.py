@@ -1,11 +1,29 @@
 """Values of a recipe that are each in range but contradict one another."""
 
 import math
+from dataclasses import dataclass
 from itertools import pairwise
 
+from shinypartial.core.errors import InputError
 from shinypartial.scene.shapes import Assembly, BlendFile, Frame, Part, Plane, SoftBalls, SurfaceOfRevolution, Tube
 from shinypartial.scene.spec import SceneSpec
-from shinypartial.scene.tables import Place
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where in which recipe a value stands, for messages."""
+
+    source: str
+    key: str = ""
+
+    def below(self, key: str) -> "Place":
+        """The place of one entry of the table or list that stands here."""
+        return Place(self.source, f"{self.key}.{key}" if self.key else key)
+
+    def error(self, expected: str, found: str) -> InputError:
+        """What to raise for the value that stands here."""
+        what = f"`{self.key}` of {self.source}" if self.key else self.source
+        return InputError(expected=f"{what}: {expected}", found=found, remedy="Correct that value.")
 
 
 def check_scene(spec: SceneSpec, place: Place) -> None:

@@ -7,10 +7,10 @@ from typing import Any
 
 from shinypartial.core.errors import InputError
 from shinypartial.core.trajectory import SWEPT_PATHS
-from shinypartial.scene.check import check_scene
+from shinypartial.io.records import read_record
+from shinypartial.scene.check import Place, check_scene
 from shinypartial.scene.shapes import BlendFile, Material
 from shinypartial.scene.spec import DEVELOPMENT, HELD_OUT, STUDIO_LIGHTS, FileWorld, SceneSpec
-from shinypartial.scene.tables import Place, parse_table
 
 SCENES = Path(__file__).resolve().parents[2] / "blender_scenes"
 RECIPE = "scene.toml"
@@ -188,15 +188,14 @@ def older_recipe(recipe: Any) -> Any:
 
 def parse_scene(table: dict[str, Any], source: str) -> SceneSpec:
     """Build a SceneSpec from nested tables; `source` names their origin in messages."""
-    place = Place(source)
     if "split" not in table:
         raise InputError(
             expected=f"`split` of {source}: whether anything may be chosen by the scores of this scene",
             found="no such key",
             remedy=f'Add the line split = "{DEVELOPMENT}", or split = "{HELD_OUT}" where nothing ever is.',
         )
-    spec = parse_table(SceneSpec, table, place)
-    check_scene(spec, place)
+    spec = read_record(SceneSpec, table, source)
+    check_scene(spec, Place(source))
     return spec
 
 

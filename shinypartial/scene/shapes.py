@@ -1,34 +1,41 @@
 """What a recipe may put before the camera: shapes, their materials, and parts that join both."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Annotated
 
-from shinypartial.core.trajectory import limits
+from shinypartial.core.trajectory import Seed, limits
+from shinypartial.io.records import Share, Text
+
+Coordinate = Annotated[float, limits(-1e3, 1e3)]
+Length = Annotated[float, limits(1e-3, 1e3)]
+Component = Annotated[float, limits(-1.0, 1.0)]
+Edges = Annotated[int, limits(3, 4096)]
 
 
 @dataclass(frozen=True)
 class Material:
     """Parameters of Blender's Principled shader; the default is a perfect mirror."""
 
-    base_color: tuple[float, float, float] = field(default=(1.0, 1.0, 1.0), metadata=limits(0.0, 1.0))
-    metallic: float = field(default=1.0, metadata=limits(0.0, 1.0))
-    roughness: float = field(default=0.0, metadata=limits(0.0, 1.0))
+    base_color: tuple[Share, Share, Share] = (1.0, 1.0, 1.0)
+    metallic: Share = 1.0
+    roughness: Share = 0.0
 
 
 @dataclass(frozen=True)
 class SurfaceOfRevolution:
     """A smooth surface: a cubic spline through profile points (radius, z), turned about the Z axis."""
 
-    profile: tuple[tuple[float, float], ...] = field(metadata=limits(-1e3, 1e3))
+    profile: tuple[tuple[Coordinate, Coordinate], ...]
     """At least three points from bottom to top along the outside, so that the surface faces outward."""
     kind: str = "surface_of_revolution"
-    offset_z: float = field(default=0.0, metadata=limits(-1e3, 1e3))
+    offset_z: Coordinate = 0.0
     """Added to every z of the profile."""
-    segments: int = field(default=256, metadata=limits(3, 4096))
+    segments: Edges = 256
     """Faces around the axis."""
-    rings: int = field(default=320, metadata=limits(2, 4096))
+    rings: Annotated[int, limits(2, 4096)] = 320
     """Faces along the profile."""
-    creases: tuple[int, ...] = field(default=(), metadata=limits(1, 10_000))
+    creases: tuple[Annotated[int, limits(1, 10_000)], ...] = ()
     """Numbers of inner profile points, counted from 0 and rising, where the surface has a sharp edge."""
 
     @property
@@ -42,9 +49,9 @@ class Sphere:
     """A sphere about the origin."""
 
     kind: str = "sphere"
-    radius: float = field(default=1.0, metadata=limits(1e-3, 1e3))
-    segments: int = field(default=256, metadata=limits(3, 4096))
-    rings: int = field(default=128, metadata=limits(2, 4096))
+    radius: Length = 1.0
+    segments: Edges = 256
+    rings: Annotated[int, limits(2, 4096)] = 128
 
     @property
     def extent(self) -> float:
@@ -57,9 +64,9 @@ class Plane:
     """A flat rectangle about the origin."""
 
     kind: str = "plane"
-    size: tuple[float, float] = field(default=(1.6, 1.6), metadata=limits(1e-3, 1e3))
+    size: tuple[Length, Length] = (1.6, 1.6)
     """Width (horizontal) and height."""
-    normal: tuple[float, float, float] = field(default=(0.0, -1.0, 0.0), metadata=limits(-1.0, 1.0))
+    normal: tuple[Component, Component, Component] = (0.0, -1.0, 0.0)
     """Direction that the front faces; need not be unit."""
 
     @property
@@ -72,12 +79,12 @@ class Plane:
 class Frame:
     """A molding with flat faces around a rectangle about the origin, with mitered corners."""
 
-    profile: tuple[tuple[float, float], ...] = field(metadata=limits(-1e3, 1e3))
+    profile: tuple[tuple[Coordinate, Coordinate], ...]
     """At least two points (outward from the rectangle's edge, forward along the normal), from the inside outward."""
     kind: str = "frame"
-    size: tuple[float, float] = field(default=(1.6, 1.6), metadata=limits(1e-3, 1e3))
+    size: tuple[Length, Length] = (1.6, 1.6)
     """Width (horizontal) and height of the rectangle that it surrounds."""
-    normal: tuple[float, float, float] = field(default=(0.0, -1.0, 0.0), metadata=limits(-1.0, 1.0))
+    normal: tuple[Component, Component, Component] = (0.0, -1.0, 0.0)
     """Direction that the front faces; need not be unit."""
 
     @property
@@ -91,18 +98,18 @@ class Frame:
 class Tube:
     """A tube along a smooth curve (a cubic spline through points) whose ends are open."""
 
-    path: tuple[tuple[float, float, float], ...] = field(metadata=limits(-1e3, 1e3))
+    path: tuple[tuple[Coordinate, Coordinate, Coordinate], ...]
     """At least three points."""
-    radii: tuple[float, ...] = field(metadata=limits(1e-4, 1e3))
+    radii: tuple[Annotated[float, limits(1e-4, 1e3)], ...]
     """Radius at each point, in the plane in which the curve bends."""
     kind: str = "tube"
-    flatness: float = field(default=1.0, metadata=limits(0.01, 100.0))
+    flatness: Annotated[float, limits(0.01, 100.0)] = 1.0
     """Extent across that plane, as a multiple of the radius."""
     closed: bool = False
     """Whether the last point joins the first."""
-    segments: int = field(default=48, metadata=limits(3, 4096))
+    segments: Edges = 48
     """Faces around the curve."""
-    rings: int = field(default=160, metadata=limits(2, 4096))
+    rings: Annotated[int, limits(2, 4096)] = 160
     """Faces along the curve."""
 
     @property
@@ -117,17 +124,17 @@ class Blob:
     """A closed organic form without any symmetry: a level set of soft balls along a seeded closed curve in space."""
 
     kind: str = "blob"
-    seed: int = field(default=0, metadata=limits(0, 2**31 - 1))
+    seed: Seed = 0
     """Determines the curve and how thick the form is along it."""
-    harmonics: int = field(default=2, metadata=limits(1, 8))
+    harmonics: Annotated[int, limits(1, 8)] = 2
     """Waves of the curve around its length: 1 is a ring."""
-    radius: float = field(default=1.0, metadata=limits(1e-3, 1e3))
+    radius: Length = 1.0
     """Distance of its farthest point from the origin."""
-    thickness: float = field(default=0.35, metadata=limits(0.05, 1.0))
+    thickness: Annotated[float, limits(0.05, 1.0)] = 0.35
     """Radius of the form around the curve, in units of the curve's own radius."""
-    variation: float = field(default=0.4, metadata=limits(0.0, 0.9))
+    variation: Annotated[float, limits(0.0, 0.9)] = 0.4
     """By which share the thickness varies along the curve."""
-    resolution: int = field(default=96, metadata=limits(8, 512))
+    resolution: Annotated[int, limits(8, 512)] = 96
     """Cells per side of the grid in which the surface is found."""
 
     @property
@@ -145,17 +152,17 @@ class RadialHarmonics:
     """
 
     kind: str = "radial_harmonics"
-    seed: int = field(default=0, metadata=limits(0, 2**31 - 1))
+    seed: Seed = 0
     """Determines axes and coefficients, which fall with the square of the degree."""
-    degree: int = field(default=4, metadata=limits(2, 16))
+    degree: Annotated[int, limits(2, 16)] = 4
     """Highest degree: about the number of bumps around the form."""
-    variation: float = field(default=0.08, metadata=limits(0.0, 0.2))
+    variation: Annotated[float, limits(0.0, 0.2)] = 0.08
     """Root mean square of the radius about its mean, as a share of it."""
-    radius: float = field(default=1.0, metadata=limits(1e-3, 1e3))
+    radius: Length = 1.0
     """Distance of its farthest point from the origin."""
-    segments: int = field(default=512, metadata=limits(3, 4096))
+    segments: Edges = 512
     """Faces around the Z axis."""
-    rings: int = field(default=256, metadata=limits(2, 4096))
+    rings: Annotated[int, limits(2, 4096)] = 256
     """Faces from pole to pole."""
 
     @property
@@ -169,15 +176,15 @@ class Superquadric:
     """A rounded box (|x/a|^p + |y/b|^p)^(q/p) + |z/c|^q = 1 with half sizes a, b, c, twisted about the Z axis."""
 
     kind: str = "superquadric"
-    size: tuple[float, float, float] = field(default=(1.2, 1.2, 1.2), metadata=limits(1e-3, 1e3))
+    size: tuple[Length, Length, Length] = (1.2, 1.2, 1.2)
     """Full sizes along X, Y and Z: 2a, 2b, 2c."""
-    exponents: tuple[float, float] = field(default=(4.0, 4.0), metadata=limits(2.0, 12.0))
+    exponents: tuple[Annotated[float, limits(2.0, 12.0)], Annotated[float, limits(2.0, 12.0)]] = (4.0, 4.0)
     """p of horizontal and q of vertical sections: 2 is an ellipse, more is nearer to a box with rounded edges."""
-    twist_deg: float = field(default=0.0, metadata=limits(-720.0, 720.0))
+    twist_deg: Annotated[float, limits(-720.0, 720.0)] = 0.0
     """By how much the top is turned against the bottom; sections between in proportion to their height."""
-    segments: int = field(default=768, metadata=limits(3, 4096))
+    segments: Edges = 768
     """Faces around the Z axis."""
-    rings: int = field(default=384, metadata=limits(2, 4096))
+    rings: Annotated[int, limits(2, 4096)] = 384
     """Faces from pole to pole."""
 
     @property
@@ -194,21 +201,21 @@ class Ring:
     """
 
     kind: str = "ring"
-    radius: float = field(default=0.75, metadata=limits(1e-3, 1e3))
+    radius: Length = 0.75
     """R, from the axis to the tube's center."""
-    thickness: float = field(default=0.25, metadata=limits(1e-3, 1e3))
+    thickness: Length = 0.25
     """r, mean radius of the tube."""
-    waves: int = field(default=0, metadata=limits(0, 64))
+    waves: Annotated[int, limits(0, 64)] = 0
     """w, waves on the way around; without any the ring is a plain torus."""
-    bend: float = field(default=0.0, metadata=limits(0.0, 1e3))
+    bend: Annotated[float, limits(0.0, 1e3)] = 0.0
     """b, height of a wave."""
-    swell: float = field(default=0.0, metadata=limits(0.0, 0.9))
+    swell: Annotated[float, limits(0.0, 0.9)] = 0.0
     """s, share by which the thickness varies."""
-    phase_deg: float = field(default=0.0, metadata=limits(-360.0, 360.0))
+    phase_deg: Annotated[float, limits(-360.0, 360.0)] = 0.0
     """φ, between bend and swell."""
-    segments: int = field(default=256, metadata=limits(3, 4096))
+    segments: Edges = 256
     """Faces around the tube."""
-    rings: int = field(default=768, metadata=limits(3, 4096))
+    rings: Edges = 768
     """Faces along the ring."""
 
     @property
@@ -221,15 +228,15 @@ class Ring:
 class SoftBalls:
     """A smooth form that is drawn with balls: the level set Σ s exp(1 − |x − c|²/r²) = 1, moved and scaled to fit."""
 
-    balls: tuple[tuple[float, float, float, float, float], ...] = field(metadata=limits(-1e3, 1e3))
+    balls: tuple[tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate], ...]
     """Center (x, y, z), radius r > 0 and strength s. Alone, a ball of strength 1 is a sphere of its radius; balls near
     one another melt together, and those of negative strength carve hollows."""
     kind: str = "soft_balls"
-    radius: float = field(default=1.0, metadata=limits(1e-3, 1e3))
+    radius: Length = 1.0
     """Distance of the farthest point from the origin, which is the middle of the form's bounding box."""
-    resolution: int = field(default=128, metadata=limits(8, 512))
+    resolution: Annotated[int, limits(8, 512)] = 128
     """Cells per side of the grid in which the surface is found."""
-    refinements: int = field(default=1, metadata=limits(0, 3))
+    refinements: Annotated[int, limits(0, 3)] = 1
     """How often each triangle is divided into four on the level set."""
 
     @property
@@ -247,11 +254,15 @@ class Part:
 
     shape: Shape
     material: Material | None = None
-    stretch: tuple[float, float, float] = field(default=(1.0, 1.0, 1.0), metadata=limits(1e-3, 1e3))
+    stretch: tuple[Length, Length, Length] = (1.0, 1.0, 1.0)
     """Factors along X, Y and Z, first of all."""
-    turn_deg: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), metadata=limits(-360.0, 360.0))
+    turn_deg: tuple[
+        Annotated[float, limits(-360.0, 360.0)],
+        Annotated[float, limits(-360.0, 360.0)],
+        Annotated[float, limits(-360.0, 360.0)],
+    ] = (0.0, 0.0, 0.0)
     """Rotations about X, then Y, then Z, counterclockwise."""
-    offset: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), metadata=limits(-1e3, 1e3))
+    offset: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
     """Where the shape's origin lies, last of all."""
 
     @property
@@ -277,9 +288,9 @@ class Assembly:
 class BlendFile:
     """An object of a Blender file, moved and scaled so that its bounding sphere is the unit sphere."""
 
-    path: str
+    path: Text
     """Absolute, or relative to the folder of scene.toml."""
-    object: str
+    object: Text
     """Name of the object that reflects; the file's other objects stand around it as in the file."""
     kind: str = "blend"
 

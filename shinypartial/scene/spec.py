@@ -2,29 +2,32 @@
 
 import dataclasses
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, get_args
 
-from shinypartial.core.trajectory import CameraPath, limits
+from shinypartial.core.trajectory import CameraPath, Seed, limits
 from shinypartial.io.files import sha256_of
+from shinypartial.io.records import Text
 from shinypartial.scene.shapes import Assembly, BlendFile, Material, Part, Shape
 
 FORMAT_VERSION = 1
 #: What a scene may be used for: anything is chosen by its scores, or nothing ever is.
 DEVELOPMENT, HELD_OUT = "development", "held-out"
-SPLITS = (DEVELOPMENT, HELD_OUT)
-STUDIO_LIGHTS = ("city", "courtyard", "forest", "interior", "night", "studio", "sunrise", "sunset")
+Split = Literal["development", "held-out"]
+SPLITS = get_args(Split)
+StudioLight = Literal["city", "courtyard", "forest", "interior", "night", "studio", "sunrise", "sunset"]
+STUDIO_LIGHTS = get_args(StudioLight)
 
 
 @dataclass(frozen=True)
 class StudioWorld:
     """One of the eight CC0 environment maps that Blender brings along."""
 
-    name: str = field(metadata={"choices": STUDIO_LIGHTS})
+    name: StudioLight
     kind: str = "studiolight"
-    strength: float = field(default=1.0, metadata=limits(0.0, 1e4))
-    distance: float | None = field(default=None, metadata=limits(1e-3, 1e6))
+    strength: Annotated[float, limits(0.0, 1e4)] = 1.0
+    distance: Annotated[float, limits(1e-3, 1e6)] | None = None
     """Radius of the sphere about the origin that carries the map; infinitely far when not given."""
 
 
@@ -32,15 +35,15 @@ class StudioWorld:
 class FileWorld:
     """A linear lat-long EXR in the world frame (+Z up, image center along +X)."""
 
-    path: str
+    path: Text
     """Relative to the folder of scene.toml, or absolute."""
-    license: str
+    license: Text
     """License of the file, copied into the dataset."""
-    source: str
+    source: Text
     """Where the file comes from, copied into the dataset."""
     kind: str = "file"
-    strength: float = field(default=1.0, metadata=limits(0.0, 1e4))
-    distance: float | None = field(default=None, metadata=limits(1e-3, 1e6))
+    strength: Annotated[float, limits(0.0, 1e4)] = 1.0
+    distance: Annotated[float, limits(1e-3, 1e6)] | None = None
     """Radius of the sphere about the origin that carries the map; infinitely far when not given."""
 
 
@@ -48,11 +51,11 @@ class FileWorld:
 class Deformation:
     """A seeded smooth displacement of the object along its normals."""
 
-    amplitude: float = field(default=0.0, metadata=limits(0.0, 10.0))
+    amplitude: Annotated[float, limits(0.0, 10.0)] = 0.0
     """Root mean square of the displacement in scene units, before the object is scaled."""
-    wavelength: float = field(default=0.8, metadata=limits(1e-2, 1e3))
+    wavelength: Annotated[float, limits(1e-2, 1e3)] = 0.8
     """Typical distance between bumps in scene units."""
-    seed: int = field(default=0, metadata=limits(0, 2**31 - 1))
+    seed: Seed = 0
     """Determines where the bumps lie."""
 
 
@@ -60,15 +63,15 @@ class Deformation:
 class Render:
     """How Cycles samples an image; a pixel is the average over its area."""
 
-    samples: int = field(default=16, metadata=limits(1, 65536))
+    samples: Annotated[int, limits(1, 65536)] = 16
     """Samples per pixel."""
-    resolution: int = field(default=800, metadata=limits(4, 16384))
+    resolution: Annotated[int, limits(4, 16384)] = 800
     """Pixels per side."""
-    seed: int = field(default=0, metadata=limits(0, 2**31 - 1))
+    seed: Seed = 0
     """Seed of the sampling pattern."""
-    exposure: float = field(default=0.0, metadata=limits(-20.0, 20.0))
+    exposure: Annotated[float, limits(-20.0, 20.0)] = 0.0
     """Photographic stops: the light of the world is multiplied by 2^exposure, in pictures and in the stored map."""
-    max_bounces: int = field(default=16, metadata=limits(0, 1024))
+    max_bounces: Annotated[int, limits(0, 1024)] = 16
     """As Cycles counts: a path is reflected at most once more than this, and light that would need more is lost."""
 
 
@@ -76,11 +79,11 @@ class Render:
 class SceneSpec:
     """Everything that determines a dataset: object, material, world, camera path and sampling."""
 
-    name: str
-    title: str
-    provenance: str
-    license: str
-    split: str = field(metadata={"choices": SPLITS})
+    name: Text
+    title: Text
+    provenance: Text
+    license: Text
+    split: Split
     """Whether constants and presets may be chosen by this scene (`development`) or never (`held-out`)."""
     object: Shape | Assembly | BlendFile
     world: StudioWorld | FileWorld
@@ -89,11 +92,11 @@ class SceneSpec:
     props: tuple[Part, ...] = ()
     """What stands around the object: it hides it and is mirrored in it, and is no part of the mask."""
     deformation: Deformation = Deformation()
-    scale: float = field(default=1.0, metadata=limits(1e-3, 1e3))
+    scale: Annotated[float, limits(1e-3, 1e3)] = 1.0
     """Enlarges object and props about the origin."""
     camera: CameraPath = CameraPath()
     render: Render = Render()
-    format: int = field(default=FORMAT_VERSION, metadata=limits(FORMAT_VERSION, FORMAT_VERSION))
+    format: Annotated[int, limits(FORMAT_VERSION, FORMAT_VERSION)] = FORMAT_VERSION
 
     @property
     def light_factor(self) -> float:

@@ -61,7 +61,7 @@ def reads() -> set[tuple[str, str]]:
 @pytest.mark.parametrize("section", ["", *SECTIONS])
 def test_every_option_is_read(section: str) -> None:
     kind = SECTIONS[section] if section else FitConfig
-    owners = {"config", section} if section else {"config"}
+    owners = {"config", section, "options"} if section else {"config"}
     looked_up_by_name = {item.name for item in fields(Surfels)} | {"environment"} if kind is RateConfig else set()
     seen = {name for owner, name in reads() if owner in owners}
     assert {item.name for item in fields(kind)} - looked_up_by_name - seen == set()  # type: ignore[arg-type]

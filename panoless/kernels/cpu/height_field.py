@@ -5,11 +5,11 @@ from jaxtyping import Float
 from numba import njit
 
 from panoless.kernels.constants import MAX_NEWTON_STEPS, NEWTON_CONVERGED
+from panoless.kernels.cpu.compilation import PLAIN_LOOPS
 from panoless.kernels.cpu.simd_memory import fetch_add
 from panoless.kernels.cpu.workers import run_shared
 
 RAYS_PER_CLAIM = 4096
-EXACT = {"nogil": True, "cache": True, "error_model": "numpy"}
 
 
 def first_hits(
@@ -23,7 +23,7 @@ def first_hits(
     return distance, slopes
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _basis(t):
     """The four cubic B-splines over a cell, t in [0, 1], and their derivatives."""
     s = 1 - t
@@ -32,7 +32,7 @@ def _basis(t):
     return values, slopes
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _height(coefficients, x, y):
     """h and its two slopes."""
     rows, columns = coefficients.shape
@@ -52,7 +52,7 @@ def _height(coefficients, x, y):
     return h + along_x * (x - inside_x) + along_y * (y - inside_y), along_x, along_y
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _trace(counter, origins, directions, coefficients, distance, slopes):
     while True:
         begin = fetch_add(counter, RAYS_PER_CLAIM)

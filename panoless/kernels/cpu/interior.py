@@ -5,11 +5,10 @@ from jaxtyping import Float
 from numba import njit
 
 from panoless.kernels.constants import LEAST_FACING, LEAST_RISE
+from panoless.kernels.cpu.compilation import PLAIN_LOOPS
 
-EXACT = {"nogil": True, "cache": True, "error_model": "numpy"}
 
-
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def slope_votes(
     origins: Float[np.ndarray, "P 3"],
     directions: Float[np.ndarray, "P 3"],
@@ -61,7 +60,7 @@ def slope_votes(
     return result
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _squared_error(texels, frame, ox, oy, oz, color):
     """‖E(ω) − c‖² with the nearest texel of a cubemap, faces as in OpenGL's table 8.19."""
     x = ox * frame[0, 0] + oy * frame[1, 0] + oz * frame[2, 0]

@@ -4,10 +4,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 
-EXACT = {"nogil": True, "cache": True, "error_model": "numpy"}
+from panoless.kernels.cpu.compilation import PLAIN_LOOPS
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def envelope(
     origins: Float[np.ndarray, "P 3"],
     directions: Float[np.ndarray, "P 3"],
@@ -38,7 +38,7 @@ def envelope(
     return best
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _chord(origin, direction, reach):
     """Middle and half length of the part of a unit ray's line within `reach` of the origin; −1 for none."""
     middle = -(origin[0] * direction[0] + origin[1] * direction[1] + origin[2] * direction[2])
@@ -46,7 +46,7 @@ def _chord(origin, direction, reach):
     return middle, np.sqrt(reach**2 - clear) if clear <= reach**2 else -1.0
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _keep(best, index, value):
     if index < 0 or index >= len(best):
         return
@@ -56,7 +56,7 @@ def _keep(best, index, value):
             value, row[k] = row[k], value
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def polyline_distance(x: float, y: float, polyline: Float[np.ndarray, "N 2"]) -> tuple[float, int, float]:
     """Distance of a point from a polyline, the nearest side, and where on it, 0 to 1."""
     best, side, along = np.inf, 0, 0.0
@@ -71,7 +71,7 @@ def polyline_distance(x: float, y: float, polyline: Float[np.ndarray, "N 2"]) ->
     return np.sqrt(best), side, along
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _inside(x, y, polyline):
     """Whether a point lies in the polygon of a polyline and the axis x = 0, by crossings of a ray to x = ∞."""
     odd = False
@@ -84,7 +84,7 @@ def _inside(x, y, polyline):
     return odd
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def distance_grid(
     polyline: Float[np.ndarray, "N 2"], lowest: float, cell: float, rows: int, columns: int
 ) -> Float[np.ndarray, "rows columns"]:
@@ -98,7 +98,7 @@ def distance_grid(
     return grid
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def closest_approach(
     origins: Float[np.ndarray, "P 3"],
     directions: Float[np.ndarray, "P 3"],

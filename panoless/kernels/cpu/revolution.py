@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 
+from panoless.kernels.cpu.compilation import PLAIN_LOOPS
 from panoless.kernels.cpu.interior import slope_votes
 from panoless.kernels.cpu.profile import closest_approach, distance_grid, envelope
 from panoless.kernels.cpu.simd_memory import fetch_add
@@ -16,7 +17,6 @@ from panoless.kernels.cpu.workers import run_shared
 __all__ = ["closest_approach", "distance_grid", "envelope", "first_hits", "follow", "slope_votes"]
 
 RAYS_PER_CLAIM = 2048
-EXACT = {"nogil": True, "cache": True, "error_model": "numpy"}
 FLAT = 1e-7
 STACK_SIZE = 64
 
@@ -50,7 +50,7 @@ def follow(
     return final, bounces
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _tree(profile):
     """Boxes (ρ₀, ρ₁, h₀, h₁) of runs of sides: node k has the children 2k + 1 and 2k + 2; leaves come last."""
     sides = len(profile) - 1
@@ -74,7 +74,7 @@ def _tree(profile):
     return boxes
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _enters(box, a, b, c, h0, h1, limit):
     """Whether the part of a ray before `limit` may meet a box."""
     start, end = 0.0, limit
@@ -95,7 +95,7 @@ def _enters(box, a, b, c, h0, h1, limit):
     return farthest >= box[0] ** 2 - slack
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _meets(r0, z0, r1, z1, a, b, c, h0, h1, limit):
     """Distance to one side and where on it; infinite when it is missed."""
     best, where = limit, -1.0
@@ -129,7 +129,7 @@ def _meets(r0, z0, r1, z1, a, b, c, h0, h1, limit):
     return (best if where >= 0 else np.inf), where
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _nearest(x, y, h0, dx, dy, h1, profile, tree, stack):
     """Distance, side and place on it of the first hit of one ray."""
     leaves = (len(tree) + 1) // 2
@@ -153,7 +153,7 @@ def _nearest(x, y, h0, dx, dy, h1, profile, tree, stack):
     return best, hit, where
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _trace(counter, origins, directions, profile, tree, distance, side, along):
     stack = np.empty(STACK_SIZE, dtype=np.int64)
     while True:
@@ -166,7 +166,7 @@ def _trace(counter, origins, directions, profile, tree, distance, side, along):
             distance[ray], side[ray], along[ray] = _nearest(x, y, h, dx, dy, dh, profile, tree, stack)
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _follow(counter, points, directions, places, profile, tree, angles, epsilon, max_bounces, final, bounces):
     """Mirror rays that lie on the surface on, from their first side and the place on it."""
     side, along = places

@@ -118,9 +118,9 @@ def _intrinsics(camera: Camera) -> tuple:
 
 @pytest.mark.parametrize("every", [3, 1])
 def test_pictures_that_cut_the_object_keep_its_frame(clean, every: int) -> None:
-    """Within 2 % if a third are cut through the middle, and 10 % if all are."""
+    """Within half a percent if a third are cut, and 5 % if all are."""
     frame = estimate_object_frame(aimed_beside(every, 0.9))
-    assert change(frame, estimate_object_frame(clean)) < (0.02 if every == 3 else 0.1)
+    assert change(frame, estimate_object_frame(clean)) < (0.005 if every == 3 else 0.05)
 
 
 def test_a_long_object_reaches_out_of_the_ball_of_the_median(clean) -> None:

@@ -10,7 +10,6 @@ from shinypartial.blender.geometry import make_mesh, make_part, profile_outlines
 from shinypartial.blender.mesh import Mesh, deformed, displacement_field, polygon_normals
 from shinypartial.core.errors import InputError
 from shinypartial.scene import (
-    Assembly,
     Blob,
     Deformation,
     Frame,
@@ -27,6 +26,7 @@ from shinypartial.scene import (
     load_scene,
     scene_names,
 )
+from tests.support.coarse_scene import coarse_scene, parts_of
 
 
 def face_normals(mesh: Mesh) -> np.ndarray:
@@ -93,9 +93,8 @@ def test_faces_turn_the_way_the_normals_point(shape: Shape) -> None:
 
 @pytest.mark.parametrize("name", scene_names())
 def test_every_part_of_every_scene_is_sound(name: str) -> None:
-    spec = load_scene(name)
-    parts = spec.object.parts if isinstance(spec.object, Assembly) else (Part(spec.object),)
-    for part in (*parts, *spec.props):
+    spec = coarse_scene(name)
+    for part in (*parts_of(spec), *spec.props):
         mesh = make_part(part)
         assert np.isfinite(mesh.vertices).all()
         # Between its points a spline may bulge; measured 0.5 %.

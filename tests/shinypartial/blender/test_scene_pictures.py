@@ -14,7 +14,8 @@ from shinypartial.core.camera import Camera, project, ray_directions_world, refl
 from shinypartial.core.conventions import SOLID_ALPHA
 from shinypartial.core.sphere import sample_latlong
 from shinypartial.core.trajectory import SWEPT_PATHS, plan_cameras
-from shinypartial.scene import Assembly, Part, SceneSpec, load_scene, override, scene_names
+from shinypartial.scene import SceneSpec, override, scene_names
+from tests.support.coarse_scene import coarse_scene, parts_of
 
 pytest.importorskip("bpy")
 
@@ -45,7 +46,7 @@ class Seen:
 
 @cache
 def see(name: str) -> Seen:
-    scene = load_scene(name)
+    scene = coarse_scene(name)
     sweeps = 1 if scene.camera.path in SWEPT_PATHS else None
     spec = override(scene, resolution=RESOLUTION, samples=16, train=2, test=1, sweeps=sweeps)
     camera = plan_cameras(spec.camera, RESOLUTION).train[0]
@@ -76,10 +77,12 @@ def triangles_of(scene) -> Triangles:
     corners, normals = [], []
     for each in sorted((each for each in scene.objects if each.type == "MESH"), key=lambda each: each.name):
         mesh = each.data
-        vertices = np.array([vertex.co[:] for vertex in mesh.vertices])
-        directions = np.array([item.vector[:] for item in mesh.attributes["custom_normal"].data])
+        vertices, directions = np.empty((2, len(mesh.vertices), 3), np.float32)
+        mesh.vertices.foreach_get("co", vertices.ravel())
+        mesh.attributes["custom_normal"].data.foreach_get("vector", directions.ravel())
         mesh.calc_loop_triangles()
-        numbers = np.array([triangle.vertices[:] for triangle in mesh.loop_triangles])
+        numbers = np.empty((len(mesh.loop_triangles), 3), np.int32)
+        mesh.loop_triangles.foreach_get("vertices", numbers.ravel())
         corners.append(vertices[numbers])
         normals.append(directions[numbers])
     return Triangles(np.concatenate(corners), np.concatenate(normals), len(corners[0]))
@@ -116,9 +119,8 @@ def test_the_object_is_in_the_picture_and_does_not_leave_it(name: str) -> None:
 
 @pytest.mark.parametrize("name", scene_names())
 def test_the_object_does_not_leave_any_picture_of_the_dataset(name: str) -> None:
-    spec = load_scene(name)
-    parts = spec.object.parts if isinstance(spec.object, Assembly) else (Part(spec.object),)
-    points = np.concatenate([make_part(part).vertices[::25] for part in parts])
+    spec = coarse_scene(name)
+    points = np.concatenate([make_part(part).vertices[::5] for part in parts_of(spec)])
     trajectory = plan_cameras(spec.camera, 100)
     pixels = np.concatenate([project(camera, points)[:, :2] for camera in (*trajectory.train, *trajectory.test)])
     assert pixels.min() > 0

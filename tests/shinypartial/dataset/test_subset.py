@@ -153,8 +153,8 @@ def test_a_fit_reads_the_subset(source: Dataset, tmp_path: Path) -> None:
     views = load_views(dataset, 2)
     assert len(views.train) == len(made.selection.train)
     # The unit sphere at the origin, with a tenth to spare; 16 pixels are coarse.
-    np.testing.assert_allclose(views.normalization.center, 0, atol=0.05)
-    assert 1.0 < views.normalization.radius < 1.3
+    np.testing.assert_allclose(views.object_frame.center, 0, atol=0.05)
+    assert 1.0 < views.object_frame.radius < 1.3
     assert fit(dataset, tiny_config(iterations=10, count=100), tmp_path / "run").iteration == 10
 
 

@@ -5,6 +5,7 @@ import math
 import os
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -69,6 +70,40 @@ def test_scores_are_strict_json_and_read_back_as_written(truth: Path) -> None:
 
     json.loads((truth / "scores.json").read_text(), parse_constant=refuse)
     assert read_scores(truth) == scores
+
+
+def test_threads_change_no_score(truth: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Damaged, so that scores are no round numbers; views that finish in another order are pooled in theirs."""
+    write_environment_map(truth, np.random.default_rng(0).random((32, 64, 3)).astype(np.float32))
+    frame = sphere_dataset.test[0]
+    view = read_view(frame)
+    write_test_view(truth, frame, replace(view, radiance=view.radiance * 0.7))
+    in_parallel = evaluate(str(truth), str(sphere_dataset.root))
+    written = (truth / "scores.json").read_bytes()
+    monkeypatch.setattr("shinypartial.evaluation.evaluate.in_threads", map)
+    assert evaluate(truth) == in_parallel
+    assert (truth / "scores.json").read_bytes() == written
+    monkeypatch.setattr("shinypartial.evaluation.evaluate.in_threads", out_of_order)
+    assert evaluate(truth) == in_parallel
+
+
+def out_of_order(function: Callable[[object], object], items: Sequence[object]) -> list[object]:
+    """What threads may do: the last item is worked on first, the results come in the order of the items."""
+    return [function(item) for item in reversed(items)][::-1]
+
+
+def test_a_failing_map_and_a_failing_view_both_end_the_evaluation(truth: Path, sphere_dataset: Dataset) -> None:
+    """Although they are scored beside each other; the scores of an earlier evaluation stay as they were."""
+    evaluate(truth)
+    before = (truth / "scores.json").read_bytes()
+    write_environment_map(truth, np.zeros((32, 32, 3), np.float32))
+    with pytest.raises(InputError, match=r"environment\.exr"):
+        evaluate(truth)
+    for path in prediction_frame(truth, sphere_dataset.test[0]).files:
+        path.unlink()
+    with pytest.raises(InputError, match="test/r_000"):
+        evaluate(truth)
+    assert (truth / "scores.json").read_bytes() == before
 
 
 def test_normals_where_the_object_sees_itself_count_in_one_group_and_not_in_the_other(sphere_dataset: Dataset) -> None:

@@ -43,7 +43,7 @@ def oracle(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Oracle
     return made
 
 
-def test_the_bound_is_a_scored_prediction(oracle: Oracle, dataset: Dataset) -> None:
+def test_the_baseline_is_a_scored_prediction(oracle: Oracle, dataset: Dataset) -> None:
     scores, info = read_scores(oracle.root), read_info(oracle.root)
     assert info.method == "oracle"
     assert info.dataset_hash == dataset_hash(dataset)
@@ -65,7 +65,7 @@ def test_the_best_candidate_is_taken(oracle: Oracle) -> None:
     assert oracle.chosen.psnr_linear == max(known)
 
 
-def test_no_map_from_tilted_normals_comes_near_the_bound(oracle: Oracle, dataset: Dataset) -> None:
+def test_no_map_from_tilted_normals_comes_near_the_baseline(oracle: Oracle, dataset: Dataset) -> None:
     truth = read_environment(dataset)
     random = np.random.default_rng(0)
     parts = []
@@ -93,7 +93,7 @@ def test_visibility_is_highest_where_rays_are(oracle: Oracle) -> None:
     assert columns[columns.size // 2] > columns[0]
 
 
-def test_scores_stand_beside_the_bound(oracle: Oracle, dataset: Dataset) -> None:
+def test_scores_stand_beside_the_baseline(oracle: Oracle, dataset: Dataset) -> None:
     prediction = write_truth_prediction(oracle.root.parent / "mine", dataset)
     assert "shinypartial oracle" not in "\n".join(summary_lines(oracle.root))
     evaluate(prediction)
@@ -103,7 +103,7 @@ def test_scores_stand_beside_the_bound(oracle: Oracle, dataset: Dataset) -> None
     assert newest_prediction(oracle.root.parent) == prediction
 
 
-def test_a_named_bound_must_be_of_this_dataset(
+def test_a_named_baseline_must_be_of_this_dataset(
     oracle: Oracle, dataset: Dataset, sphere_dataset: Dataset, tmp_path: Path
 ) -> None:
     other, mine = (write_truth_prediction(tmp_path / each.name, each) for each in (sphere_dataset, dataset))
@@ -153,7 +153,7 @@ def test_maps_are_as_fine_as_the_rays_allow(rays: int, heights: tuple[int, ...])
     assert heights_to_try(rays) == heights
 
 
-def test_without_normals_there_is_no_bound(tmp_path: Path) -> None:
+def test_without_normals_there_is_no_baseline(tmp_path: Path) -> None:
     plain = make_plain_sphere_dataset(tmp_path / "plain")
     with pytest.raises(InputError, match="ground-truth normals"):
         make_oracle(plain.root, tmp_path / "oracle")
@@ -174,7 +174,7 @@ def test_the_command_writes_beside_the_predictions_and_never_into_the_dataset(
     assert "taken" in out
 
 
-def test_an_older_bound_is_passed_over(oracle: Oracle, dataset: Dataset, tmp_path: Path) -> None:
+def test_an_older_baseline_is_passed_over(oracle: Oracle, dataset: Dataset, tmp_path: Path) -> None:
     shutil.copytree(oracle.root, tmp_path / "ball-oracle")
     scores = read_scores(oracle.root)
     prediction = write_truth_prediction(tmp_path / "mine", open_dataset(dataset.root))

@@ -15,9 +15,6 @@ from shinypartial.scene import (
     DEVELOPMENT,
     HELD_OUT,
     SPLITS,
-    Assembly,
-    Part,
-    SceneSpec,
     load_scene,
     older_recipe,
     override,
@@ -25,14 +22,11 @@ from shinypartial.scene import (
     scene_names,
 )
 from tests.architecture.source import ROOT
+from tests.support.coarse_scene import coarse_scene, parts_of
 from tests.support.tiny_scene import tiny_scene
 
 #: Scenes whose names are words of geometry, which code uses without meaning them.
 WORDS = {"sphere"}
-
-
-def parts_of(spec: SceneSpec) -> tuple[Part, ...]:
-    return spec.object.parts if isinstance(spec.object, Assembly) else (Part(spec.object),)
 
 
 def test_the_five_scenes_that_anything_was_chosen_by_are_for_development() -> None:
@@ -54,7 +48,7 @@ def convexity(name: str) -> float:
     """The share of the convex hull's volume that a closed form of one part fills."""
     from scipy.spatial import ConvexHull
 
-    (part,) = parts_of(load_scene(name))
+    (part,) = parts_of(coarse_scene(name))
     mesh = make_part(part)
     triangles = np.array([(face[0], *face[i : i + 2]) for face in mesh.faces for i in range(1, len(face) - 1)])
     a, b, c = mesh.vertices[triangles].transpose(1, 0, 2)

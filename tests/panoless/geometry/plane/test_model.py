@@ -10,10 +10,12 @@ from matplotlib.path import Path as PolygonPath
 
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import pose_of, unit_rays_camera
+from panoless.capture.silhouettes import mask_contours
 from panoless.capture.views import Views
-from panoless.geometry.plane.fit import PlaneFit, fit_plane
+from panoless.geometry.plane.fit import PlaneFit, _descend, fit_plane
 from panoless.geometry.plane.model import Plane, plane_buffers, unoccluded_share
 from panoless.geometry.plane.options import PlaneOptions
+from panoless.geometry.plane.silhouette import apply_plane_step, boundary_residuals
 from shinypartial.core.errors import InputError
 from tests.support.mirror_plane import (
     L_SHAPE,
@@ -199,6 +201,22 @@ def test_giving_up_early_changes_no_plane(flat_fit: PlaneFit) -> None:
     quick = fit_plane(mirror_views(plane_of(L_SHAPE), arc(12)), thorough=False)
     np.testing.assert_array_equal(quick.plane.normal, flat_fit.plane.normal)
     np.testing.assert_array_equal(quick.plane.boundary, flat_fit.plane.boundary)
+
+
+@pytest.mark.parametrize("tilt_deg", [2.0, 40.0])
+def test_no_step_raises_the_cost_that_it_minimizes(tilt_deg: float) -> None:
+    """At the robust scale, and over the points, of where the step starts."""
+    contours, options, true = mask_contours(mirror_views(plane_of(L_SHAPE), arc(8))), PlaneOptions(), plane_of(L_SHAPE)
+    plane = apply_plane_step(true, np.append([np.tan(np.radians(tilt_deg)), 0, 0.1, 0], np.zeros(true.boundary.size)))
+    medians = []
+    for _ in range(8):
+        before = boundary_residuals(contours, plane, options)
+        scale = before.scale(2.0, options)
+        plane = _descend(contours, plane, (2.0,), options)
+        after = boundary_residuals(contours, plane, options)
+        assert after.cost(scale, before.counted) <= before.cost(scale, before.counted)
+        medians.append(np.median(np.abs(after.pixels)))
+    assert medians[-1] < medians[0] / 2
 
 
 def test_views_from_behind_are_not_explained() -> None:
