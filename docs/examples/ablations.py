@@ -1,4 +1,4 @@
-"""Make docs/ablations.md: figures of every scene, one lever less, surfels flat and curved, the paper's method.
+"""Make docs/results/ablations.md: figures of every scene, one lever less, surfels flat and curved, the paper's method.
 
     for S in vase cola mirror deformed-mirror sculpture; do shinypartial generate --scene $S --resolution 400; done
     for S in vase cola mirror deformed-mirror sculpture; do shinypartial oracle datasets/$S-400; done
@@ -23,7 +23,7 @@ from shinypartial.evaluation.scores import Scores, read_scores
 from shinypartial.io.files import atomic_write, write_json
 from shinypartial.prediction.format import read_info
 
-PAGE = Path("docs/ablations.md")
+PAGE = Path("docs/results/ablations.md")
 NUMBERS = Path("docs/results/ablations.json")
 PREDICTIONS = Path("predictions/ablations")
 THINNED = Path("build/ablations")

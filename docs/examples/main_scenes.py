@@ -28,8 +28,8 @@ from shinypartial.prediction.format import DESCRIPTION, ORACLE_SUFFIX, read_info
 
 SCENES = Path("blender_scenes")
 NUMBERS = Path("docs/results/main-scenes.json")
-PAGES = (Path("README.md"), Path("docs/results/index.md"))
-BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
+PAGES = {"results": Path("README.md"), "scenes": Path("docs/results/index.md")}
+"""The page of each table, which stands there between `<!-- NAME:begin -->` and `<!-- NAME:end -->`."""
 SPLITS = ("development", "held-out")
 SCORES = "scores.json"
 
@@ -82,7 +82,7 @@ def figures(folder: Path) -> dict[str, Any] | None:
     normals, seen = scores.normals, scores.normals_environment
     return {
         "method": info.method,
-        "model": info.model,
+        "model": info.model_selection.chosen if info.model_selection else info.model,
         "parameter_counts": info.parameter_counts,
         "primitives": info.primitives,
         "environment_psnr_linear_full_db": environment and environment.full.psnr_linear,
@@ -121,39 +121,37 @@ def collect(resolution: int) -> None:
                 "methods": [each for each in (bound, made) if each],
             }
     write_json(NUMBERS, numbers)
-    lines = table(numbers)
-    for page in PAGES:
+    for name, page in PAGES.items():
+        begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
         text = page.read_text(encoding="utf-8") if page.exists() else ""
-        if BEGIN in text and END in text:
-            before, _, rest = text.partition(BEGIN)
-            write_text(page, "\n".join([before + BEGIN, "", *lines, "", END + rest.partition(END)[2]]))
+        if begin in text and end in text:
+            lines = table(numbers, ("observed",) if page.name == "README.md" else ("observed", "full"))
+            before, _, rest = text.partition(begin)
+            write_text(page, "\n".join([before + begin, "", *lines, "", end + rest.partition(end)[2]]))
 
 
-def table(numbers: dict[str, Any]) -> list[str]:
-    """Markdown: a line for every scene with a split, at its largest resolution."""
+def table(numbers: dict[str, Any], regions: Sequence[str]) -> list[str]:
+    """Markdown: a line for every scene with a split, at its largest resolution; PSNR in those regions of the map."""
     chosen: dict[str, dict[str, Any]] = {}
     for entry in numbers.values():
         if "split" in entry and entry["resolution"] >= chosen.get(entry["scene"], entry)["resolution"]:
             chosen[entry["scene"]] = entry
+    words = "" if len(regions) == 1 else ": " + " / ".join("all" if each == "full" else each for each in regions)
     lines = [
-        "| Scene | Split | Model | Environment | Oracle baseline | Normals, mean / median | Seconds |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
+        f"| Scene | Split | Model | Environment{words} | Oracle baseline | Normals, mean / median | Seconds |",
+        "| --- " * 7 + "|",
     ]
-    for split in SPLITS:
-        for entry in (each for each in chosen.values() if each["split"] == split):
-            methods = {("oracle" if each["method"] == "oracle" else "made"): each for each in entry["methods"]}
-            made = methods["made"]
-            cells = (
-                entry["scene"].replace("-", " ").capitalize(),
-                split,
-                model_words(made),
-                number(made["environment_psnr_linear_observed_db"], 1, " dB"),
-                number(methods.get("oracle", {}).get("environment_psnr_linear_observed_db"), 1, " dB"),
-                f"{number(made['normals_environment_mean_deg'], 2, '°')} / "
-                f"{number(made['normals_environment_median_deg'], 2, '°')}",
-                f"{made['seconds']:.0f}",
-            )
-            lines.append("| " + " | ".join(cells) + " |")
+
+    def psnr(row: dict[str, Any]) -> str:
+        return " / ".join(number(row.get(f"environment_psnr_linear_{each}_db"), 1) for each in regions) + " dB"
+
+    for entry in sorted(chosen.values(), key=lambda each: SPLITS.index(each["split"])):
+        made = next(each for each in entry["methods"] if each["method"] != "oracle")
+        oracle = next((each for each in entry["methods"] if each["method"] == "oracle"), {})
+        normals = " / ".join(f"{number(made[f'normals_environment_{each}_deg'], 2)}°" for each in ("mean", "median"))
+        scene = entry["scene"].replace("-", " ").capitalize()
+        cells = (scene, entry["split"], model_words(made), psnr(made), psnr(oracle), normals, f"{made['seconds']:.0f}")
+        lines.append("| " + " | ".join(cells) + " |")
     return lines
 
 
@@ -166,9 +164,9 @@ def model_words(made: dict[str, Any]) -> str:
     return f"{'surface of revolution' if kind == 'revolution' else kind}, {count:,} parameters"
 
 
-def number(value: float | None, digits: int, unit: str) -> str:
-    """A value with its unit, or a dash."""
-    return "–" if value is None else f"{value:.{digits}f}{unit}"
+def number(value: float | None, digits: int) -> str:
+    """A value, or a dash."""
+    return "–" if value is None else f"{value:.{digits}f}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
