@@ -52,16 +52,10 @@ def observed_rays(views: Views, geometry: Geometry, config: FitConfig, max_rays:
             yield height_field_rays(geometry, view, pixels)
         elif isinstance(geometry, SurfaceOfRevolution):
             weighted = len(pixels) == len(view.solid)
-            yield revolution_rays(geometry, view, pixels, _mirrored_at_most(config), weighted=weighted)[0]
+            occluded = config.environment.trace
+            yield revolution_rays(geometry, view, pixels, occlusion_test=occluded, weighted=weighted)[0]
         else:
             yield _surfel_rays(view, geometry, config, pixels)[0]
-
-
-def _mirrored_at_most(config: FitConfig) -> int:
-    """What `surface.trace_reflections` calls so: pixels that see the object again take part only if nothing is
-    traced.
-    """
-    return 1 if config.environment.trace else 0
 
 
 def _chosen_pixels(views: Views, most: int) -> Iterator[tuple[TrainView, Tensor]]:
@@ -93,7 +87,7 @@ def solve_final_map(views: Views, geometry: Geometry, config: FitConfig) -> tupl
         found = solve_environment(rays, resolution)
         light = encoding_of(config)
         if isinstance(geometry, SurfaceOfRevolution) and not light.high_dynamic_range:
-            found = deblur_map(views, geometry, found, light.saturation, _mirrored_at_most(config))
+            found = deblur_map(views, geometry, found, light.saturation, occlusion_test=config.environment.trace)
         return found, rays
     seen = [
         (view, *_surfel_rays(view, geometry, config, pixels))

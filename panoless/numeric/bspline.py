@@ -1,12 +1,30 @@
-"""Uniform cubic B-splines."""
+"""Uniform cubic B-splines.
+
+Knots lie at whole places 0 … N − 3 for N coefficients; coefficient i has its peak at place i − 1.
+"""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 
-def cubic_bspline_basis(t: Float[np.ndarray, "P"]) -> list[Float[np.ndarray, "P 4"]]:
-    """The four uniform cubic B-splines over a cell, t in [0, 1], and their first and second derivatives by t."""
+def cubic_bspline_basis(t: Float[np.ndarray, "P"], derivatives: int = 2) -> Float[np.ndarray, "K P 4"]:
+    """The four B-splines over a cell, t in [0, 1], and as many of their derivatives by t, up to the second.
+
+    Closed forms, because scipy's design matrix has no derivatives.
+    """
     values = ((1 - t) ** 3 / 6, (3 * t**3 - 6 * t**2 + 4) / 6, (-3 * t**3 + 3 * t**2 + 3 * t + 1) / 6, t**3 / 6)
-    slopes = (-((1 - t) ** 2) / 2, (9 * t**2 - 12 * t) / 6, (-9 * t**2 + 6 * t + 3) / 6, t**2 / 2)
+    slopes = (-((1 - t) ** 2) / 2, (3 * t**2 - 4 * t) / 2, (-3 * t**2 + 2 * t + 1) / 2, t**2 / 2)
     bends = (1 - t, 3 * t - 2, 1 - 3 * t, t)
-    return [np.stack(each, 1) for each in (values, slopes, bends)]
+    return np.stack([np.stack(order, 1) for order in (values, slopes, bends)[: derivatives + 1]])
+
+
+def cubic_bsplines_at(
+    place: Float[np.ndarray, "P"], count: int | Int[np.ndarray, "P"], derivatives: int = 0
+) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "K P 4"]]:
+    """Which B-spline is the first of the four that act at each place, and the basis there, as of `cubic_bspline_basis`.
+
+    `count` is the number N of coefficients, one for all places or one each. Beyond the knots the outermost cell's
+    polynomial goes on.
+    """
+    cell = np.clip(np.floor(place), 0, np.maximum(np.asarray(count) - 4, 0)).astype(np.int64)
+    return cell, cubic_bspline_basis(place - cell, derivatives)

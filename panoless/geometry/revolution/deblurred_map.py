@@ -17,30 +17,16 @@ from torch.nn.functional import max_pool2d
 
 from panoless.capture.views import TrainView, Views
 from panoless.environment.cubemap import resample
-from panoless.geometry.revolution.footprints import SUBRAYS, trace_footprints
 from panoless.geometry.revolution.model import SurfaceOfRevolution
+from panoless.geometry.revolution.options import DEFAULTS, MapOptions, RevolutionOptions
+from panoless.geometry.revolution.pixels import PixelBundles
 from panoless.geometry.revolution.render import smooth_pixels
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap, scatter_cubemap
 from panoless.numeric.conjugate_gradients import conjugate_gradients
 from panoless.numeric.robust import robust_weight
 
 OFFSETS = (-0.25, 0.25)
-MOST_PIXELS = 3_500_000
-ROBUST_SCALE = 0.16
-PULL = 0.2
-"""λ, in rays."""
-BATCH_VIEWS = 4
-ROUNDS, STEPS = 4, 2
-"""Weights are found anew in every round of so many steps."""
-SATURATED, LIT = 0.998, 0.95
-"""Shares of the largest value from which a pixel, and a texel of E₀, count as saturated."""
-CEILING = 4.0
-"""Largest radiance of a map, over that of views."""
-MOST_TRACED = 60_000
-COARSE_RESOLUTION, COARSE_ROUNDS, COARSE_STEPS = 8, 2, 6
-COARSE_SCALE = 1.0
-"""Of robust weights: while a lamp is far too dark, pixels that see it in part must keep their votes."""
-
+"""Of a footprint's directions from the pixel's center, in pixels."""
 Linear = Callable[[Tensor], Tensor]
 
 
@@ -62,10 +48,12 @@ class PixelFootprints:
         each = (values[:, None] / count).expand(-1, count, -1).flatten(0, 1).contiguous()
         return scatter_cubemap(each, self.directions.flatten(0, 1), resolution)
 
-    def weights(self, seen: Float[Tensor, "P 3"], saturation: Float[Tensor, "3"], scale: float) -> Float[Tensor, "P 3"]:
+    def weights(
+        self, seen: Float[Tensor, "P 3"], saturation: Float[Tensor, "3"], scale: float, saturated: float
+    ) -> Float[Tensor, "P 3"]:
         """Robust weights of the errors of what is seen of a map; zero where it and the pixel are saturated."""
         weight = robust_weight(seen.minimum(saturation) - self.radiance, scale)[:, None]
-        return weight * ~(seen.minimum(self.radiance) >= SATURATED * saturation)
+        return weight * ~(seen.minimum(self.radiance) >= saturated * saturation)
 
 
 def deblur_map(
@@ -73,27 +61,31 @@ def deblur_map(
     surface: SurfaceOfRevolution,
     environment: Float[Tensor, "6 3 L L"],
     saturation: Float[Tensor, "3"],
-    most: int = 1,
+    *,
+    max_bounces: int = 1,
+    occlusion_test: bool = True,
+    options: RevolutionOptions = DEFAULTS,
 ) -> Float[Tensor, "6 3 L L"]:
     """The map E₀ of pixel centers, sharpened; texels that no area touches stay. Views are clipped at `saturation`, and
-    pixels taken that are mirrored up to `most` times (see `surface.trace_reflections`).
+    pixels taken that are mirrored up to `max_bounces` times (see `model.trace_reflections`).
 
-    It lies between 0 and that, or `CEILING` times that in channels in which pixels are saturated. Before each round,
+    It lies between 0 and that, or `ceiling` times that in channels in which pixels are saturated. Before each round,
     pixels that bend the light much, or mirror it often, and so see wide parts of it, tell how bright the inside of
     saturated regions is, coarsely.
     """
-    pixels = _divided(views, surface, most)
+    own = options.map
+    pixels = _divided(views, surface, options, max_bounces=max_bounces, occlusion_test=occlusion_test)
     if not pixels.smooth:
         return environment
     saturation = saturation.to(environment)
-    lit = torch.stack([(each.radiance >= SATURATED * saturation).any(0) for each in pixels.smooth]).any(0)
-    highest = (saturation * torch.where(lit, CEILING, 1.0))[:, None, None]
-    inner = _eroded(environment >= LIT * saturation[:, None, None])
-    others = pixels.traced(surface) if inner.any() else None
-    for _ in range(ROUNDS):
+    lit = torch.stack([(each.radiance >= own.saturated * saturation).any(0) for each in pixels.smooth]).any(0)
+    highest = (saturation * torch.where(lit, own.ceiling, 1.0))[:, None, None]
+    inner = _eroded(environment >= own.lit * saturation[:, None, None])
+    others = pixels.traced(surface, options) if inner.any() else None
+    for _ in range(own.rounds):
         if others is not None:
-            environment = _brightened(environment, others, inner, saturation).minimum(highest)
-        change = _change(environment, pixels.smooth, saturation, ROBUST_SCALE, STEPS)
+            environment = _brightened(environment, others, inner, saturation, own).minimum(highest)
+        change = _change(environment, pixels.smooth, saturation, own, own.robust_scale, own.steps)
         environment = (environment + change).clamp(min=0).minimum(highest)
     return environment
 
@@ -103,6 +95,7 @@ def _brightened(
     areas: PixelFootprints,
     inner: Float[Tensor, "6 3 L L"],
     saturation: Float[Tensor, "3"],
+    options: MapOptions,
 ) -> Float[Tensor, "6 3 L L"]:
     """The map plus what a coarse one adds within saturated regions; nothing there falls below saturation for it."""
     resolution = environment.shape[-1]
@@ -112,11 +105,14 @@ def _brightened(
         return inner * resample(coarse, resolution)
 
     def coarser(image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "6 C M M"]:
-        return scatter_cubemap((inner * image).permute(0, 2, 3, 1).reshape(len(texels), -1), texels, COARSE_RESOLUTION)
+        return scatter_cubemap(
+            (inner * image).permute(0, 2, 3, 1).reshape(len(texels), -1), texels, options.coarse_resolution
+        )
 
     lowest = environment.minimum(saturation[:, None, None])
-    for _ in range(COARSE_ROUNDS):
-        change = _change(environment, [areas], saturation, COARSE_SCALE, COARSE_STEPS, finer, coarser)
+    for _ in range(options.coarse_rounds):
+        scale, steps = options.coarse_scale, options.coarse_steps
+        change = _change(environment, [areas], saturation, options, scale, steps, finer, coarser)
         environment = (environment + change).maximum(lowest)
     return environment
 
@@ -129,6 +125,7 @@ def _change(
     environment: Float[Tensor, "6 3 L L"],
     areas: Sequence[PixelFootprints],
     saturation: Float[Tensor, "3"],
+    options: MapOptions,
     scale: float,
     steps: int,
     finer: Linear = _same,
@@ -142,7 +139,7 @@ def _change(
     weights, residual, total = [], torch.zeros_like(environment), torch.zeros_like(environment)
     for each in areas:
         seen = each.seen(environment)
-        weights.append(each.weights(seen, saturation, scale))
+        weights.append(each.weights(seen, saturation, scale, options.saturated))
         residual += each.spread((each.radiance - seen) * weights[-1], resolution)
         total += each.spread(weights[-1], resolution)
 
@@ -151,10 +148,10 @@ def _change(
         found = torch.zeros_like(image)
         for each, weight in zip(areas, weights, strict=True):
             found += each.spread(each.seen(image) * weight, resolution)
-        return PULL * change + coarser(found)
+        return options.pull * change + coarser(found)
 
     right_side = coarser(residual)
-    precondition = 1 / (PULL + coarser(total))
+    precondition = 1 / (options.pull + coarser(total))
     return finer(conjugate_gradients(normal, torch.zeros_like(right_side), right_side, precondition, steps))
 
 
@@ -173,28 +170,41 @@ class PixelsBySmoothness:
     others: list[Int[np.ndarray, "_"]]
     """Flat indices, a view each."""
 
-    def traced(self, surface: SurfaceOfRevolution) -> PixelFootprints:
-        """About `MOST_TRACED` of the others, as far as all of their rays leave, however often they are mirrored."""
-        stride = max(1, -(-sum(map(len, self.others)) // MOST_TRACED))
+    def traced(self, surface: SurfaceOfRevolution, options: RevolutionOptions) -> PixelFootprints:
+        """About `options.map.traced` of the others, as far as all of their rays leave."""
+        stride = max(1, -(-sum(map(len, self.others)) // options.map.traced))
         chosen = [pixels[index % stride :: stride] for index, pixels in enumerate(self.others)]
-        found, device = trace_footprints(self.views, surface, chosen), self.views[0].radiance.device
-        directions = torch.from_numpy(found.outgoing.reshape(-1, len(SUBRAYS), 3)).float().to(device)
-        return PixelFootprints(directions, torch.from_numpy(found.radiance).float().to(device))
+        bundles = PixelBundles.of(zip(self.views, chosen, strict=True))
+        paths, device = bundles.trace(surface, options.max_bounces), self.views[0].radiance.device
+        whole = (paths.bounces > 0).reshape(-1, bundles.rays_per_pixel).all(1)
+        directions = paths.directions.reshape(-1, bundles.rays_per_pixel, 3)[whole]
+        radiance = torch.from_numpy(bundles.radiance[whole])
+        return PixelFootprints(torch.from_numpy(directions).float().to(device), radiance.float().to(device))
 
 
-def _divided(views: Views, surface: SurfaceOfRevolution, most: int = 1) -> PixelsBySmoothness:
+def _divided(
+    views: Views,
+    surface: SurfaceOfRevolution,
+    options: RevolutionOptions = DEFAULTS,
+    *,
+    max_bounces: int = 1,
+    occlusion_test: bool = True,
+) -> PixelsBySmoothness:
     """All pixels of evenly chosen views."""
-    stride = -(-sum(len(view.solid) for view in views.train) // MOST_PIXELS)
-    chosen = views.train[:: max(stride, 1)]
+    stride = -(-sum(len(view.solid) for view in views.train) // options.map.pixels)
+    chosen, batch = views.train[:: max(stride, 1)], options.map.batch_views
     found, others = [], []
     for view in chosen:
         places = view.solid.cpu().numpy()
-        at, smooth = smooth_pixels(surface, view.camera, places, most)
+        bend = options.rendering.largest_bend
+        at, smooth = smooth_pixels(
+            surface, view.camera, places, bend, max_bounces=max_bounces, occlusion_test=occlusion_test
+        )
         pixels = view.solid[torch.from_numpy(smooth).to(view.solid.device)]
         directions = torch.stack(list(at.within(OFFSETS)), 1).to(view.radiance.device)
         found.append(PixelFootprints(directions, view.radiance.flatten(1)[:, pixels].T.contiguous()))
         others.append(places[~smooth])
-    joined = [_joined(found[first : first + BATCH_VIEWS]) for first in range(0, len(found), BATCH_VIEWS)]
+    joined = [_joined(found[first : first + batch]) for first in range(0, len(found), batch)]
     return PixelsBySmoothness(chosen, [each for each in joined if len(each.radiance)], others)
 
 
