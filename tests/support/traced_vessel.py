@@ -11,7 +11,6 @@ from jaxtyping import Float
 
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import TrainView, Views
-from panoless.kernels.cubemap import cubemap_directions
 from panoless.kernels.rasterize import RasterCamera
 from shinypartial.core.camera import look_at
 from shinypartial.core.conventions import SOLID_ALPHA
@@ -20,6 +19,7 @@ AROUND = 256
 SAMPLES = 4
 """Rays along either side of a pixel."""
 MAX_BOUNCES = 8
+UPRIGHT = np.eye(3)
 DISTANCE = 3.5
 WAVES = np.array([[7.0, 2.0, 1.0], [-2.0, 6.0, 3.0], [1.0, -4.0, 7.0]])
 
@@ -27,11 +27,6 @@ WAVES = np.array([[7.0, 2.0, 1.0], [-2.0, 6.0, 3.0], [1.0, -4.0, 7.0]])
 def stripes(directions: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
     """Radiance of unit directions: in each channel waves some fifty degrees long across another axis."""
     return 0.5 + 0.35 * np.sin(directions @ WAVES.T + [0.0, 1.0, 2.0])
-
-
-def stripes_map(resolution: int, turn: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "6 L L 3"]:
-    """The stripes, turned with the world, at the texels of a cubemap."""
-    return stripes(cubemap_directions(resolution).double().numpy() @ turn)
 
 
 @dataclass(frozen=True)
@@ -87,11 +82,11 @@ def dished_jar() -> Vessel:
     return Vessel([floor, np.stack([radius, height], 1)], [dish])
 
 
-def cameras_around(count: int, size: int) -> list[Float[np.ndarray, "4 4"]]:
-    """Poses on an arc of 200° at elevations between −8° and 50°."""
+def cameras_around(count: int, elevations_deg: tuple[float, ...]) -> list[Float[np.ndarray, "4 4"]]:
+    """Poses on an arc of 200° at elevations in turn."""
     poses = []
     for index, azimuth in enumerate(np.radians(np.linspace(-100, 100, count))):
-        elevation = np.radians((-8.0, 15.0, 35.0, 50.0)[index % 4])
+        elevation = np.radians(elevations_deg[index % len(elevations_deg)])
         across = np.cos(elevation)
         position = np.array([across * np.sin(azimuth), -across * np.cos(azimuth), np.sin(elevation)])
         poses.append(look_at(DISTANCE * position, np.zeros(3)))
@@ -141,12 +136,17 @@ class Photographs:
     normals: list[Float[np.ndarray, "P 3"]]
 
 
-def photograph(vessel: Vessel, count: int, size: int, turn: Float[np.ndarray, "3 3"] | None = None) -> Photographs:
+def photograph(
+    vessel: Vessel,
+    count: int,
+    size: int,
+    turn: Float[np.ndarray, "3 3"] = UPRIGHT,
+    elevations_deg: tuple[float, ...] = (-8.0, 15.0, 35.0, 50.0),
+) -> Photographs:
     """Views of a vessel under the stripes in a turned world (x ↦ turn·x), each pixel the mean of 4×4 rays."""
-    turn = np.eye(3) if turn is None else turn
     focal = 0.45 * size * DISTANCE
     train, truth = [], []
-    for pose in cameras_around(count, size):
+    for pose in cameras_around(count, elevations_deg):
         place = (np.arange(size * SAMPLES) + 0.5) / SAMPLES
         x, y = np.meshgrid((place - size / 2) / focal, (place - size / 2) / focal)
         rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3) @ pose[:3, :3].T
