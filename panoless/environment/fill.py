@@ -34,11 +34,11 @@ def fill_unobserved(values: Float[Tensor, "6 C L L"], weight: Float[Tensor, "6 L
     everywhere = color.sum(0, keepdim=True) / known.sum(0, keepdim=True).clamp(min=1e-9)
     filled = color + (1 - known) * everywhere
     for color, known in reversed(pyramid[:-1]):
-        filled = _relaxed(color, known, resample(filled, color.shape[-1]))
+        filled = _relax(color, known, resample(filled, color.shape[-1]))
     return filled
 
 
-def _relaxed(
+def _relax(
     color: Float[Tensor, "6 C L L"], known: Float[Tensor, "6 1 L L"], start: Float[Tensor, "6 C L L"]
 ) -> Float[Tensor, "6 C L L"]:
     """Damped Jacobi sweeps of u = color + (1 − known) · mean of the four neighbors, across edges too."""
@@ -61,10 +61,10 @@ def _neighbors(resolution: int) -> Int[Tensor, "4 P"]:
     centers = 2 * (np.arange(resolution) + 0.5) / resolution - 1
     face, t, s = np.meshgrid(np.arange(6), centers, centers, indexing="ij")
     beyond = 1 + 1e-6
-    found = []
+    neighbors = []
     for shift in np.array([[1, 0], [-1, 0], [0, 1], [0, -1]]) * 2 / resolution:
         shifted = np.clip(np.stack([s, t], -1) + shift, -beyond, beyond)
         other, st = directions_to_cube(cube_to_directions(face, shifted))
         column, row = np.moveaxis(np.clip((st + 1) * resolution / 2, 0, resolution - 1).astype(int), -1, 0)
-        found.append(((other * resolution + row) * resolution + column).ravel())
-    return torch.from_numpy(np.stack(found))
+        neighbors.append(((other * resolution + row) * resolution + column).ravel())
+    return torch.from_numpy(np.stack(neighbors))

@@ -1,4 +1,4 @@
-"""The environment as a cubemap: lookup with its activation, the closed-form robust map, and the fill of gaps."""
+"""The environment as a cubemap, by robust least squares of rays."""
 
 from collections.abc import Sequence
 
@@ -14,8 +14,10 @@ from panoless.numeric.conjugate_gradients import conjugate_gradients
 from panoless.numeric.robust import robust_weight
 
 ROBUST_SCALES = (None, 0.3, 0.15, 0.08, 0.05)
+"""Residuals (linear radiance) beyond which rays lose their vote, round by round; all vote in the first."""
 REFINING_SCALES = (0.08, 0.05)
-CONFIDENT_WEIGHT = 1.0
+START_WEIGHT = 1.0
+"""Pull of a texel to its splat, in rays."""
 MERGED_RAYS = 1_000_000
 
 
@@ -30,7 +32,7 @@ def solve_environment(
     From a `start`, a map of the same rays at any resolution, only the last scales are needed. The map lies between 0
     and the brightest ray, or 1 where that is more.
     """
-    rays = _merged(rays)
+    rays = _merge(rays)
     weights = [batch.initial_weight() for batch in rays]
     device = rays[0].directions.device if rays else None
     environment = torch.zeros(6, 3, resolution, resolution, device=device)
@@ -49,18 +51,18 @@ def solve_environment(
     return environment.clamp(0, brightest)
 
 
-def _merged(rays: Sequence[Rays]) -> list[Rays]:
+def _merge(rays: Sequence[Rays]) -> list[Rays]:
     """The same rays in batches of about a million: a lookup of ten thousand costs six times as much a ray."""
     groups: list[list[Rays]] = [[]]
     for batch in rays:
-        if sum(len(each.directions) for each in groups[-1]) >= MERGED_RAYS:
+        if sum(len(part.directions) for part in groups[-1]) >= MERGED_RAYS:
             groups.append([])
         groups[-1].append(batch)
     return [
         Rays(
-            torch.cat([each.directions for each in group]),
-            torch.cat([each.radiance for each in group]),
-            torch.cat([each.initial_weight() for each in group]),
+            torch.cat([batch.directions for batch in group]),
+            torch.cat([batch.radiance for batch in group]),
+            torch.cat([batch.initial_weight() for batch in group]),
         )
         for group in groups
         if group
@@ -83,8 +85,8 @@ def _normal_product(
     """EᵀWE applied to a map: look up, weigh, scatter."""
     result = torch.zeros_like(environment)
     for batch, weight in zip(rays, weights, strict=True):
-        seen = sample_cubemap(environment, batch.directions) * weight[:, None]
-        result += scatter_cubemap(seen, batch.directions, environment.shape[-1])
+        weighted = sample_cubemap(environment, batch.directions) * weight[:, None]
+        result += scatter_cubemap(weighted, batch.directions, environment.shape[-1])
     return result
 
 
@@ -97,8 +99,8 @@ def _sharpen(
 ) -> Float[Tensor, "6 3 L L"]:
     """A few preconditioned conjugate-gradient steps; a unit-weight pull to the start keeps thin texels stable."""
     return conjugate_gradients(
-        lambda image: _normal_product(image, rays, weights) + CONFIDENT_WEIGHT * image,
+        lambda image: _normal_product(image, rays, weights) + START_WEIGHT * image,
         start,
         right_side - _normal_product(start, rays, weights),
-        1 / (total + CONFIDENT_WEIGHT),
+        1 / (total + START_WEIGHT),
     )

@@ -1,6 +1,8 @@
-"""Stateless differentiable operators, each with a plain torch reference beside its fast kernels.
+"""Stateless operators, each with a plain reference beside its fast kernels.
 
-This room may import torch, numpy, numba, triton and its own constants; it imports no other room of the project. Shapes
-that do not fit raise `ValueError`. The modules at this level are the public operators; `reference`, `cpu` and `gpu`
-implement them.
+The modules at this level are the public operators; `reference` defines them in torch or numpy, `cpu` and `gpu` are
+fast. Those on tensors are differentiable, in float32, and run on a GPU, too; rays against surfaces of revolution and
+height fields are in numpy and float64, without derivatives, on the CPU only. Shapes that do not fit raise `ValueError`.
+
+This room may import torch, numpy, scipy, numba, triton and its own constants; it imports no other room of the project.
 """

@@ -1,7 +1,9 @@
-"""Which implementation of an operator runs: the definition in torch, or the kernels of the tensors' device."""
+"""Which implementation of an operator runs: its definition, or fast kernels."""
 
 from functools import lru_cache
+from importlib import import_module
 from importlib.util import find_spec
+from types import ModuleType
 from typing import Literal
 
 import torch
@@ -9,6 +11,8 @@ from torch import Tensor
 
 Backend = Literal["reference", "cpu", "gpu", "auto"]
 """`auto` takes the kernels of the device for float32 tensors, and the definition for everything else."""
+ArrayBackend = Literal["reference", "cpu"]
+"""For operators on numpy arrays in float64: the definition in numpy, or Numba."""
 
 
 def choose_backend(backend: str, **tensors: Tensor) -> Literal["reference", "cpu", "gpu"]:
@@ -35,6 +39,13 @@ def choose_backend(backend: str, **tensors: Tensor) -> Literal["reference", "cpu
     if backend != "reference":
         raise ValueError(f'expected the backend "reference", "cpu", "gpu" or "auto"; found {backend!r}.')
     return "reference"
+
+
+def array_kernels(backend: str, name: str) -> ModuleType:
+    """The module `name` of operators on arrays. Raises ValueError for a backend that is none of theirs."""
+    if backend not in ("reference", "cpu"):
+        raise ValueError(f'expected the backend "reference" or "cpu"; found {backend!r}.')
+    return import_module(f"panoless.kernels.{backend}.{name}")
 
 
 @lru_cache(maxsize=1)

@@ -51,3 +51,12 @@ ALPHA_MARGIN = 1e-4
 
 SURFACE_ALPHA = 0.5
 """Pixels with more alpha than this have a surface whose normals must be consistent."""
+
+MAX_NEWTON_STEPS, NEWTON_CONVERGED = 20, 1e-10
+"""Of a ray toward a height field; it is there when the height over it is below this, which float64 rounds to."""
+
+LEAST_RISE = 1e-6
+"""A ray looks into a mouth, or leaves it, if its unit direction falls or rises by more than this."""
+
+LEAST_FACING = 0.05
+"""A ray sees the front of a slope if the cosine between it and the normal's opposite is above this."""

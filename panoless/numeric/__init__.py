@@ -1,1 +1,1 @@
-"""Mathematics without a subject: robust weights, solvers, splines, polygons. Imports kernels at most."""
+"""Numerical methods without a subject: robust weights, Gauss–Newton, splines, polygons. Imports kernels at most."""

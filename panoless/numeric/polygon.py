@@ -1,7 +1,7 @@
-"""Polygons: exact coverage of pixels, signed distance, clipping."""
+"""Polygons, as vertices in order: exact coverage of pixels, nearest sides, signed distance, clipping."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from panoless.kernels.rasterize import RasterCamera
 
@@ -11,12 +11,12 @@ LEAST_ALPHA = 1e-6
 
 def projected_coverage(corners_camera: Float[np.ndarray, "N 3"], camera: RasterCamera) -> Float[np.ndarray, "H W"]:
     """Coverage of the part of a flat polygon that lies beyond the near plane."""
-    kept = _beyond(corners_camera, camera.near)
+    kept = _clip_to_near(corners_camera, camera.near)
     pixels = kept[:, :2] / kept[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     return polygon_coverage(pixels, camera.width, camera.height)
 
 
-def _beyond(corners: Float[np.ndarray, "N 3"], near: float) -> Float[np.ndarray, "M 3"]:
+def _clip_to_near(corners: Float[np.ndarray, "N 3"], near: float) -> Float[np.ndarray, "M 3"]:
     """The polygon clipped to z ≥ near (Sutherland and Hodgman 1974); edges along the cut may double and then cancel."""
     following = np.roll(corners, -1, 0)
     inside, next_inside = corners[:, 2] >= near, following[:, 2] >= near
@@ -34,7 +34,7 @@ def polygon_coverage(vertices_px: Float[np.ndarray, "N 2"], width: int, height: 
     """
     starts, ends = vertices_px, np.roll(vertices_px, -1, 0)
     for axis, limit in ((1, height), (0, width)):
-        starts, ends = _cut(starts, ends, axis, limit)
+        starts, ends = _cut_at_whole_numbers(starts, ends, axis, limit)
     middle, rise = (starts + ends) / 2, ends[:, 1] - starts[:, 1]
     row = np.floor(middle[:, 1]).astype(np.int64)
     keep = (row >= 0) & (row < height)
@@ -47,7 +47,7 @@ def polygon_coverage(vertices_px: Float[np.ndarray, "N 2"], width: int, height: 
     return np.where(area < LEAST_ALPHA, 0.0, area.clip(max=1.0))
 
 
-def _cut(
+def _cut_at_whole_numbers(
     starts: Float[np.ndarray, "N 2"], ends: Float[np.ndarray, "N 2"], axis: int, limit: int
 ) -> tuple[Float[np.ndarray, "M 2"], Float[np.ndarray, "M 2"]]:
     """Cut edges wherever their coordinate `axis` is a whole number in [0, limit]."""
@@ -65,14 +65,37 @@ def _cut(
     return starts[edge] + since[:, None] * along, starts[edge] + until[:, None] * along
 
 
-def depth_inside(points: Float[np.ndarray, "P 2"], boundary: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "P"]:
-    """Distance of points from an boundary, negative outside of it."""
+def nearest_side(
+    points: Float[np.ndarray, "P 2"], boundary: Float[np.ndarray, "N 2"]
+) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"], Float[np.ndarray, "P"]]:
+    """The side nearest to each point, where on it (0 at its first vertex, 1 at its second), and the distance from it.
+
+    Side i leads from vertex i to the next; infinite distances from a boundary without vertices.
+    """
     x, y = np.ascontiguousarray(points.T)
-    squared, inside = np.full(len(points), np.inf), np.zeros(len(points), dtype=bool)
-    for (x0, y0), (dx, dy) in zip(boundary, np.roll(boundary, -1, 0) - boundary, strict=True):
-        along = (((x - x0) * dx + (y - y0) * dy) / max(dx * dx + dy * dy, 1e-18)).clip(0, 1)
-        squared = np.minimum(squared, (x - x0 - along * dx) ** 2 + (y - y0 - along * dy) ** 2)
-        crossed = (y0 > y) != (y0 + dy > y)
+    least, side, along = np.full(len(points), np.inf), np.zeros(len(points), dtype=np.int64), np.zeros(len(points))
+    for index, ((x0, y0), (dx, dy)) in enumerate(zip(boundary, _sides(boundary), strict=True)):
+        share = (((x - x0) * dx + (y - y0) * dy) / max(dx * dx + dy * dy, 1e-18)).clip(0, 1)
+        squared = (x - x0 - share * dx) ** 2 + (y - y0 - share * dy) ** 2
+        nearer = squared < least
+        least[nearer], along[nearer], side[nearer] = squared[nearer], share[nearer], index
+    return side, along, np.sqrt(least)
+
+
+def contains(boundary: Float[np.ndarray, "N 2"], points: Float[np.ndarray, "P 2"]) -> Bool[np.ndarray, "P"]:
+    """Whether points lie inside a polygon: a ray from them to x = ∞ crosses it an odd number of times."""
+    x, y = np.ascontiguousarray(points.T)
+    inside = np.zeros(len(points), dtype=bool)
+    for (x0, y0), (dx, dy) in zip(boundary, _sides(boundary), strict=True):
         if dy:
-            inside ^= crossed & (x < x0 + (y - y0) * dx / dy)
-    return np.where(inside, 1.0, -1.0) * np.sqrt(squared)
+            inside ^= ((y0 > y) != (y0 + dy > y)) & (x < x0 + (y - y0) * dx / dy)
+    return inside
+
+
+def depth_inside(points: Float[np.ndarray, "P 2"], boundary: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "P"]:
+    """Distance of points from a boundary, negative outside of it."""
+    return np.where(contains(boundary, points), 1.0, -1.0) * nearest_side(points, boundary)[2]
+
+
+def _sides(boundary: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
+    return np.roll(boundary, -1, 0) - boundary

@@ -1,7 +1,4 @@
-"""A mirror that bends: a plane with an boundary and a smooth height over it, and what a camera sees of it.
-
-Like `plane` and `surface`, it needs no blending: rays are intersected with the surface itself.
-"""
+"""A mirror that bends: a plane with a boundary and a smooth height over it, and what a camera sees of it."""
 
 from dataclasses import dataclass
 
@@ -13,19 +10,19 @@ from torch import Tensor
 from panoless.capture.rays import pixel_rays, pose_of, reflect
 from panoless.capture.views import TrainView
 from panoless.environment.rays import Rays
+from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.model import Plane
+from panoless.geometry.surfaces import buffers_from_arrays
 from panoless.geometry.surfels.rendering import SurfaceBuffers
-from panoless.kernels.cpu.height_field import first_hits
+from panoless.kernels.height_field import first_hits
 from panoless.kernels.rasterize import RasterCamera
-from panoless.numeric.bspline import cubic_bspline_basis
+from panoless.numeric.bspline import cubic_bsplines_at
 from panoless.numeric.polygon import depth_inside, projected_coverage
 
 ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 """Derivatives along u and v: height, slopes, bending."""
 STEPS_A_CELL = 4
 """Straight pieces of the mirror's edge, for its coverage: cubic pieces are this smooth to a thousandth of a pixel."""
-CLEAR_PX = 1.0
-"""A mirrored ray has to pass the frame at least this far away: pixels are no points."""
 
 
 @dataclass(frozen=True)
@@ -77,13 +74,12 @@ class HeightField:
     def basis(self, places: Float[np.ndarray, "P 2"]) -> tuple[Int[np.ndarray, "P 16"], Float[np.ndarray, "6 P 16"]]:
         """Which coefficients act at plane coordinates, and by how much on h, h_u, h_v, h_uu, h_uv and h_vv there."""
         rows, columns = self.coefficients.shape
-        place = (places - self.low) / self.spacing
-        cell = np.clip(np.floor(place), 0, [rows - 4, columns - 4]).astype(np.int64)
-        along_u, along_v = (cubic_bspline_basis((place - cell)[:, axis]) for axis in (0, 1))
-        row, column = (cell[:, axis, None] + np.arange(4) for axis in (0, 1))
-        index = (row[:, :, None] * columns + column[:, None]).reshape(-1, 16)
+        u, v = ((places - self.low) / self.spacing).T
+        row, along_u = cubic_bsplines_at(u, rows, derivatives=2)
+        column, along_v = cubic_bsplines_at(v, columns, derivatives=2)
+        index = (row[:, None, None] + np.arange(4)[:, None]) * columns + column[:, None, None] + np.arange(4)
         weights = [(along_u[i][:, :, None] * along_v[j][:, None]) / self.spacing ** (i + j) for i, j in ORDERS]
-        return index, np.stack(weights).reshape(6, -1, 16)
+        return index.reshape(-1, 16), np.stack(weights).reshape(6, -1, 16)
 
     def heights(self, places: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "6 P"]:
         """h, h_u, h_v, h_uu, h_uv and h_vv at plane coordinates."""
@@ -135,59 +131,62 @@ class VisibleReflections:
     """Pixels of a view (flat indices) that see the environment by way of a height field, and how."""
 
     pixels: Int[Tensor, "P"]
-    directions_local: Float[np.ndarray, "P 3"]
-    """Rays of camera depth 1, in the axes of the plane."""
+    origins: Float[np.ndarray, "P 3"]
+    directions: Float[np.ndarray, "P 3"]
+    """Of camera depth 1, in the normalized frame."""
     hits: HeightFieldHits
     outgoing: Float[np.ndarray, "P 3"]
     """Unit, in the normalized frame."""
 
 
-def visible_reflections(height_field: HeightField, view: TrainView, pixels: Int[Tensor, "P"]) -> VisibleReflections:
-    """Those of the given pixels whose mirrored rays pass the frame of the frame, if there is one, by a pixel or
-    more.
-    """
+def visible_reflections(
+    height_field: HeightField,
+    view: TrainView,
+    pixels: Int[Tensor, "P"],
+    options: HeightFieldOptions = HeightFieldOptions(),
+) -> VisibleReflections:
+    """Those of the given pixels whose mirrored rays pass the frame, if there is one, by a pixel or more."""
     origins, directions = pixel_rays(view.camera, pixels.cpu().numpy())
-    hits, directions_local = height_field.hits(origins, directions), directions @ height_field.frame.T
+    plane, hits = height_field.plane, height_field.hits(origins, directions)
+    directions_local = directions @ height_field.frame.T
     outgoing = reflect(directions_local, hits.normals)
     kept = hits.met & (outgoing[:, 2] > 0)
-    if height_field.plane.frame_height > 0:
-        height = np.where(
-            kept,
-            (origins @ height_field.plane.normal - height_field.plane.offset) + hits.distance * directions_local[:, 2],
-            0.0,
-        )
-        rise = np.maximum(height_field.plane.frame_height - height, 0.0) / np.where(kept, outgoing[:, 2], 1.0)
+    if plane.frame_height > 0:
+        distance = np.where(kept, hits.distance, 0.0)
+        height = origins @ plane.normal - plane.offset + distance * directions_local[:, 2]
+        rise = np.maximum(plane.frame_height - height, 0.0) / np.where(kept, outgoing[:, 2], 1.0)
         passed = hits.places + rise[:, None] * outgoing[:, :2]
-        pixel = np.where(kept, hits.distance + rise, 0.0) / view.camera.fx
-        kept &= depth_inside(passed, height_field.plane.boundary) > CLEAR_PX * pixel
+        pixel = (distance + rise) / view.camera.fx
+        kept &= depth_inside(passed, plane.boundary) > options.clear_px * pixel
     chosen = HeightFieldHits(*(values[kept] for values in vars(hits).values()))
     outgoing = outgoing[kept] / np.linalg.norm(outgoing[kept], axis=1, keepdims=True)
     return VisibleReflections(
-        pixels[torch.from_numpy(kept).to(pixels.device)], directions_local[kept], chosen, outgoing @ height_field.frame
+        pixels[torch.from_numpy(kept).to(pixels.device)],
+        origins[kept],
+        directions[kept],
+        chosen,
+        outgoing @ height_field.frame,
     )
 
 
 def height_field_rays(height_field: HeightField, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
     """What pixels of a view observed of the environment."""
-    seen = visible_reflections(height_field, view, pixels)
-    outgoing = torch.from_numpy(seen.outgoing).float().to(view.radiance.device)
-    return Rays(outgoing, view.radiance.flatten(1)[:, seen.pixels].T.contiguous())
+    visible = visible_reflections(height_field, view, pixels)
+    outgoing = torch.from_numpy(visible.outgoing).float().to(view.radiance.device)
+    return Rays(outgoing, view.radiance.flatten(1)[:, visible.pixels].T.contiguous())
 
 
 def height_field_buffers(height_field: HeightField, camera: RasterCamera) -> SurfaceBuffers:
-    """The height field as surfels would be seen: alpha is the area of each pixel within the mirror's edge and the
-    frame, depth and normal those of the ray through its center. The three depths agree.
+    """What a camera sees of a height field: alpha is the area of each pixel within the mirror's edge and the frame,
+    depth and normal those of the ray through its center.
     """
-    shape, (rotation, center) = (camera.height, camera.width), pose_of(camera)
+    shape, plane, (rotation, center) = (camera.height, camera.width), height_field.plane, pose_of(camera)
     alpha = np.zeros(shape)
-    height_above = float(height_field.plane.normal @ center) - height_field.plane.offset
+    height_above = float(plane.normal @ center) - plane.offset
     if height_above > 0:
         alpha = projected_coverage((edge_points(height_field) - center) @ rotation.T, camera)
-        if 0 < height_field.plane.frame_height < height_above:
-            frame = (
-                height_field.plane.points(height_field.plane.boundary)
-                + height_field.plane.frame_height * height_field.plane.normal
-            )
+        if 0 < plane.frame_height < height_above:
+            frame = plane.points(plane.boundary) + plane.frame_height * plane.normal
             alpha = np.minimum(alpha, projected_coverage((frame - center) @ rotation.T, camera))
     pixels = np.flatnonzero(alpha)
     hits = height_field.hits(*pixel_rays(camera, pixels))
@@ -195,18 +194,7 @@ def height_field_buffers(height_field: HeightField, camera: RasterCamera) -> Sur
     depth, normals = np.zeros(alpha.size), np.zeros((alpha.size, 3))
     depth[pixels] = np.where(hits.met, hits.distance, 0.0)
     normals[pixels] = hits.normals @ height_field.frame @ rotation.T
-    device = camera.world_to_camera.device
-    covered, distance = (torch.from_numpy(image.reshape(shape)).float().to(device) for image in (alpha, depth))
-    return SurfaceBuffers(
-        albedo=covered.new_zeros(3, *shape),
-        alpha=covered,
-        raster_normals_camera=torch.from_numpy(normals.T.reshape(3, *shape)).float().to(device) * covered,
-        expected_depth=distance,
-        median_depth=distance,
-        surface_depth=distance,
-        distortion=torch.zeros_like(covered),
-        in_frustum=(covered > 0).any()[None],
-    )
+    return buffers_from_arrays(alpha, depth.reshape(shape), normals.T.reshape(3, *shape), camera)
 
 
 def edge_points(height_field: HeightField) -> Float[np.ndarray, "E 3"]:

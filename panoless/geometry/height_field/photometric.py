@@ -7,99 +7,151 @@ the mirror (variable projection, Golub and Pereyra 1973).
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.rays import reflect
 from panoless.capture.views import Views, concatenated, every_kth_pixel
 from panoless.environment.rays import Rays
 from panoless.geometry.height_field.model import HeightField, HeightFieldHits, visible_reflections
-from panoless.geometry.revolution.photometric import RADIANCE_SIGMA
+from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.kernels.cubemap import sample_cubemap
+from panoless.numeric.gauss_newton import jacobian_of_rows, normal_equations
+from panoless.numeric.robust import robust_weight
 from shinypartial.core.sphere import directions_to_cube
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 
 @dataclass(frozen=True)
 class Observations:
-    """Pixels of all views that see the environment by way of a height field."""
+    """Pixels of all views that see the environment by way of a height field: rays of camera depth 1 in the normalized
+    frame, where they meet it, and what they saw.
+    """
 
-    directions_local: Float[np.ndarray, "P 3"]
-    """Rays of camera depth 1, in the axes of the plane."""
+    origins: Float[np.ndarray, "P 3"]
+    directions: Float[np.ndarray, "P 3"]
     hits: HeightFieldHits
     rays: Rays
 
 
-def select_observations(views: Views, height_field: HeightField, most: int) -> Observations:
-    """About `most` pixels of all views, evenly."""
-    seen = [visible_reflections(height_field, *chosen) for chosen in every_kth_pixel(views, most)]
-    radiance = [view.radiance.flatten(1)[:, each.pixels].T for view, each in zip(views.train, seen, strict=True)]
-    outgoing = torch.from_numpy(np.concatenate([each.outgoing for each in seen])).float()
+def observe(
+    views: Views, height_field: HeightField, max_pixels: int, options: HeightFieldOptions = HeightFieldOptions()
+) -> Observations:
+    """About `max_pixels` pixels of all views, evenly."""
+    visible = [visible_reflections(height_field, *chosen, options) for chosen in every_kth_pixel(views, max_pixels)]
+    radiance = [view.radiance.flatten(1)[:, part.pixels].T for view, part in zip(views.train, visible, strict=True)]
+    outgoing = torch.from_numpy(np.concatenate([part.outgoing for part in visible])).float()
     return Observations(
-        np.concatenate([each.directions_local for each in seen]),
-        concatenated([each.hits for each in seen]),
+        np.concatenate([part.origins for part in visible]),
+        np.concatenate([part.directions for part in visible]),
+        concatenated([part.hits for part in visible]),
         Rays(outgoing.to(radiance[0]), torch.cat(radiance)),
     )
 
 
-def photometric_equations(
-    seen: Observations, height_field: HeightField, environment: Float[Tensor, "6 3 L L"], robust: float
-) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
-    """Gradient and matrix over the coefficients, the map eliminated, in units of the radiance's deviation.
+@dataclass(frozen=True)
+class Photographs:
+    """Least squares of what a height field shows under a map that follows it, linearized at `height_field`.
 
-    Zero when there are no rays, as where a high frame is mirrored everywhere.
+    The cost is ½ Σ w ‖r − r̄‖², r = E(ω) − c, with robust weights w and the texel of each ray as they are at
+    `height_field`, and r̄ the weighted mean over a texel: what the map takes over.
     """
-    from scipy import sparse
 
-    if not len(seen.rays.radiance):
-        return np.zeros(height_field.coefficients.size), np.zeros((height_field.coefficients.size,) * 2)
-    residual, by_slope = _residuals(seen, height_field, environment)
-    index, basis = height_field.basis(seen.hits.places)
-    _, _, _, h_uu, h_uv, h_vv = (basis * height_field.coefficients.ravel()[index]).sum(2)
-    rate = seen.directions_local[:, 2] - (seen.hits.slopes * seen.directions_local[:, :2]).sum(1)
-    slide = np.stack([h_uu, h_uv, h_uv, h_vv]).reshape(2, 2, -1)
-    slide = np.einsum("abp,pb->ap", slide, seen.directions_local[:, :2]) / rate
-    slopes = basis[1:3] + slide[:, :, None] * basis[0]
-    weights = (1 + (residual**2).sum(1) / robust**2) ** -2 / RADIANCE_SIGMA**2
-    count, num_parameters = len(weights), height_field.coefficients.size
-    texel = _texels(seen.rays.directions, environment.shape[-1])
-    gather = sparse.csr_matrix((weights, (texel, np.arange(count))), shape=(texel.max() + 1, count))
-    total = np.maximum(np.asarray(gather.sum(1)).ravel(), 1e-12)
-    gradient, matrix = np.zeros(num_parameters), np.zeros((num_parameters, num_parameters))
-    for channel in range(3):
-        values = by_slope[0, :, channel, None] * slopes[0] + by_slope[1, :, channel, None] * slopes[1]
-        rows = np.arange(count + 1) * 16
-        jacobian = sparse.csr_matrix((values.ravel(), index.ravel(), rows), shape=(count, num_parameters))
-        mean = (gather @ jacobian).toarray() / np.sqrt(total)[:, None]
-        mean_residual = (gather @ residual[:, channel]) / np.sqrt(total)
-        weighted = jacobian.multiply(weights[:, None]).tocsr()
-        gradient += weighted.T @ residual[:, channel] - mean.T @ mean_residual
-        matrix += (weighted.T @ jacobian).toarray() - mean.T @ mean
-    return gradient, matrix
+    height_field: HeightField
+    observed: Observations
+    environment: Float[Tensor, "6 3 L L"]
+    residual: Float[np.ndarray, "P 3"]
+    weights: Float[np.ndarray, "P"]
+    texel: Int[np.ndarray, "P"]
+
+    @classmethod
+    def at(
+        cls,
+        height_field: HeightField,
+        observed: Observations,
+        environment: Float[Tensor, "6 3 L L"],
+        robust_scale: float,
+        radiance_sigma: float,
+    ) -> "Photographs":
+        """Weights (1 + ‖r‖²/s²)⁻²/σ² and texels of observations at the height field that they were made with."""
+        radiance = observed.rays.radiance.cpu().numpy()
+        residual = _look_up(environment, height_field, observed.directions, observed.hits) - radiance
+        weights = robust_weight(residual, robust_scale) / radiance_sigma**2
+        texel = _texels(observed.rays.directions, environment.shape[-1])
+        return cls(height_field, observed, environment, residual, weights, texel)
+
+    def equations(self) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
+        """Gradient and Gauss–Newton matrix of the cost over the coefficients.
+
+        Zero when there are no rays, as where a high frame is mirrored everywhere.
+        """
+        height_field, hits, count = self.height_field, self.observed.hits, self.height_field.coefficients.size
+        gradient, matrix = np.zeros(count), np.zeros((count, count))
+        if not len(self.weights):
+            return gradient, matrix
+        directions = self.observed.directions @ height_field.frame.T
+        index, basis = height_field.basis(hits.places)
+        _, _, _, h_uu, h_uv, h_vv = (basis * height_field.coefficients.ravel()[index]).sum(2)
+        rate = directions[:, 2] - (hits.slopes * directions[:, :2]).sum(1)
+        slide = np.stack([h_uu, h_uv, h_uv, h_vv]).reshape(2, 2, -1)
+        slide = np.einsum("abp,pb->ap", slide, directions[:, :2]) / rate
+        slopes = basis[1:3] + slide[:, :, None] * basis[0]
+        by_slope, gather = self._radiance_by_slope(), self._gather()
+        for channel, residual in enumerate(self.residual.T):
+            values = by_slope[0, :, channel, None] * slopes[0] + by_slope[1, :, channel, None] * slopes[1]
+            jacobian = jacobian_of_rows(values, index, count)
+            by_rays, of_rays = normal_equations(jacobian, residual, self.weights)
+            mean = (gather @ jacobian).toarray()
+            gradient += by_rays - mean.T @ (gather @ residual)
+            matrix += of_rays - mean.T @ mean
+        return gradient, matrix
+
+    def cost(self, candidate: HeightField) -> float:
+        """The cost of another height field near to this one; a ray that misses it has a residual of 1."""
+        hits = candidate.hits(self.observed.origins, self.observed.directions)
+        shown = _look_up(self.environment, candidate, self.observed.directions, hits)
+        residual = np.where(hits.met[:, None], shown - self.observed.rays.radiance.cpu().numpy(), 1.0)
+        explained = self._gather() @ residual
+        return float((self.weights @ residual**2).sum() - (explained**2).sum()) / 2
+
+    def _gather(self) -> "csr_matrix":
+        """G with ‖G x‖² = Σ_texels (Σ w x)²/Σ w."""
+        from scipy import sparse
+
+        count = len(self.weights)
+        total = np.maximum(np.bincount(self.texel, self.weights), 1e-12)
+        values = self.weights / np.sqrt(total)[self.texel]
+        return sparse.csr_matrix((values, (self.texel, np.arange(count))), shape=(len(total), count))
+
+    def _radiance_by_slope(self) -> Float[np.ndarray, "2 P 3"]:
+        """Derivatives of what is seen by the slopes along u and v: differences over a texel."""
+        step, hits = np.pi / 2 / self.environment.shape[-1] / 2, self.observed.hits
+
+        def shifted(shift: Float[np.ndarray, "2"]) -> Float[np.ndarray, "P 3"]:
+            turned = HeightFieldHits(hits.distance, hits.places, hits.slopes + shift)
+            return _look_up(self.environment, self.height_field, self.observed.directions, turned)
+
+        return np.stack([(shifted(step * axis) - shifted(-step * axis)) / (2 * step) for axis in np.eye(2)])
 
 
-def _texels(directions: Float[Tensor, "P 3"], resolution: int) -> np.ndarray:
+def _look_up(
+    environment: Float[Tensor, "6 3 L L"],
+    height_field: HeightField,
+    directions: Float[np.ndarray, "P 3"],
+    hits: HeightFieldHits,
+) -> Float[np.ndarray, "P 3"]:
+    mirrored = reflect(directions, hits.normals @ height_field.frame)
+    return sample_cubemap(environment, torch.from_numpy(mirrored).to(environment)).cpu().numpy().astype(np.float64)
+
+
+def _texels(directions: Float[Tensor, "P 3"], resolution: int) -> Int[np.ndarray, "P"]:
     """Which of the texels that are seen each direction falls into, numbered from zero."""
     face, st = directions_to_cube(directions.cpu().numpy().astype(np.float64))
     column, row = np.clip((st + 1) * resolution / 2, 0, resolution - 1).astype(np.int64).T
     return np.unique((face * resolution + row) * resolution + column, return_inverse=True)[1].reshape(-1)
-
-
-def _residuals(
-    seen: Observations, height_field: HeightField, environment: Float[Tensor, "6 3 L L"]
-) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "2 P 3"]]:
-    """E(ω) − c, and its derivatives by the slopes along u and v: differences over a texel."""
-    step = np.pi / 2 / environment.shape[-1] / 2
-
-    def look(slopes: np.ndarray) -> np.ndarray:
-        turned = HeightFieldHits(seen.hits.distance, seen.hits.places, slopes)
-        directions = torch.from_numpy(reflect(seen.directions_local, turned.normals) @ height_field.frame)
-        return sample_cubemap(environment, directions.to(environment)).cpu().numpy().astype(np.float64)
-
-    residual = look(seen.hits.slopes) - seen.rays.radiance.cpu().numpy()
-    derivatives = [
-        (look(seen.hits.slopes + step * axis) - look(seen.hits.slopes - step * axis)) / (2 * step) for axis in np.eye(2)
-    ]
-    return residual, np.stack(derivatives)

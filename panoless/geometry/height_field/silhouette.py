@@ -1,42 +1,52 @@
 """Where the edge of a bent mirror is seen: the boundary of its plane, lifted to the mirror's height there.
 
-An boundary alone can't tell whether a mirror bends, but its edge is a curve in space: a height shifts it against views
+A boundary alone can't tell whether a mirror bends, but its edge is a curve in space: a height shifts it against views
 from either side. A frame in front of it is flat and says how the plane of the frame lies.
 """
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
 from panoless.capture.silhouettes import MaskContours
 from panoless.geometry.height_field.model import HeightField
-from panoless.geometry.plane.silhouette import boundary_jacobian, boundary_pull, boundary_residuals, robust_weights
+from panoless.geometry.height_field.options import HeightFieldOptions
+from panoless.geometry.plane.silhouette import BoundaryResiduals, boundary_jacobian, boundary_residuals, vertex_pull
+from panoless.numeric.gauss_newton import jacobian_of_rows, normal_equations
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 
-def edge_equations(
-    contours: MaskContours, height_field: HeightField, scale_px: float
-) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
-    """Gradient Jᵀ W e and matrix Jᵀ W J of the distances in pixels: four numbers of the plane, two of each vertex of
-    the boundary, then the coefficients.
+def edge_residuals(contours: MaskContours, height_field: HeightField, options: HeightFieldOptions) -> BoundaryResiduals:
+    """Distances of the contours from the mirror's edge or its frame, whichever hides the other."""
+    return boundary_residuals(
+        contours, height_field.plane, options.contours, lambda places: height_field.heights(places)[0]
+    )
+
+
+def edge_jacobian(residuals: BoundaryResiduals, height_field: HeightField) -> "csr_matrix":
+    """Derivatives of the distances by four numbers of the plane, two of each vertex of the boundary, the coefficients.
 
     The plane's offset is left to the coefficients. So is its tilt, unless a frame tells them apart.
     """
     from scipy import sparse
 
-    plane = height_field.plane
-    distances = boundary_residuals(contours, plane, lambda places: height_field.heights(places)[0])
-    weights, vertices = robust_weights(distances, scale_px), len(plane.boundary)
-    corners, count = plane.boundary, len(distances.edge)
-    foot = corners[distances.edge] + distances.along[:, None] * (np.roll(corners, -1, 0) - corners)[distances.edge]
-    index, basis = height_field.basis(foot)
-    by_height = sparse.csr_matrix(
-        ((distances.by_height[:, None] * basis[0]).ravel(), index.ravel(), np.arange(count + 1) * 16),
-        shape=(count, height_field.coefficients.size),
-    )
-    framed = plane.frame_height > 0
-    known = sparse.diags(np.append(np.array([framed, framed, 0.0, framed]), np.ones(2 * vertices)))
-    jacobian = sparse.hstack([boundary_jacobian(distances, vertices) @ known, by_height]).tocsr()
-    weighted = jacobian.multiply(weights[:, None]).tocsr()
-    matrix = (weighted.T @ jacobian).toarray()
-    held = np.arange(4, 4 + 2 * vertices)
-    matrix[held, held] += boundary_pull(distances, weights, vertices)
-    return weighted.T @ distances.pixels, matrix
+    boundary, framed = height_field.plane.boundary, height_field.plane.frame_height > 0
+    start, end = boundary[residuals.side], np.roll(boundary, -1, 0)[residuals.side]
+    index, basis = height_field.basis(start + residuals.along[:, None] * (end - start))
+    by_height = jacobian_of_rows(residuals.by_height[:, None] * basis[0], index, height_field.coefficients.size)
+    known = sparse.diags(np.append([framed, framed, 0.0, framed], np.ones(boundary.size)))
+    return sparse.hstack([boundary_jacobian(residuals, len(boundary)) @ known, by_height]).tocsr()
+
+
+def edge_equations(
+    residuals: BoundaryResiduals, height_field: HeightField, scale: float, options: HeightFieldOptions
+) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
+    """Gradient Jᵀ W e and matrix Jᵀ W J of the distances in pixels, at that robust scale."""
+    weights, size = residuals.weights(scale), height_field.plane.boundary.size
+    gradient, matrix = normal_equations(edge_jacobian(residuals, height_field), residuals.pixels, weights)
+    held = np.arange(4, 4 + size)
+    matrix[held, held] += vertex_pull(residuals, weights, size // 2, options.contours)
+    return gradient, matrix

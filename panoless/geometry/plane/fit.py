@@ -9,52 +9,27 @@ of each view's contour from the boundary that it should see.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from panoless.capture.rays import pose_of
 from panoless.capture.silhouettes import MaskContours, mask_contours
 from panoless.capture.views import TrainView, Views
 from panoless.geometry.plane.model import Plane, plane_buffers
+from panoless.geometry.plane.options import BoundaryRound, PlaneOptions
 from panoless.geometry.plane.silhouette import (
-    CORNER_DEG,
+    BoundaryResiduals,
     apply_plane_step,
     back_project,
+    boundary_jacobian,
     boundary_residuals,
-    normal_equations,
-    robust_weights,
+    vertex_pull,
 )
+from panoless.numeric.gauss_newton import accept_step, damped_step, normal_equations
 from shinypartial.core.conventions import PIXEL_CENTER
 from shinypartial.core.errors import InputError
-
-LEAST_VIEWS = 3
-LEAST_BASELINE = 0.02
-"""Distance between two cameras, as a share of their distance from the object, that makes them distinct views."""
-
-START_DIRECTIONS = 200
-START_OFFSETS = (-0.2, 0.0, 0.2)
-START_COSINE = 0.15
-START_GRID = 32
-START_VIEWS = 16
-START_HALF_SIDE = 1.2
-STARTS = 3
-
-MAX_POINTS = 40_000
-MAX_VERTICES = 128
-VOTING_VIEWS = 32
-LARGEST_STEP = 0.2
-CHAMFER_PX = 6.0
-"""Shorter sides that cut a corner of longer ones are what a vote makes of it."""
-SIMPLE_PX = 0.25
-"""A vertex goes if the boundary without it is nowhere further away than this."""
-HOPELESS_PX = 2.0
-FINAL_SCALE_PX = 0.5
-SIMPLIFICATIONS = 2
-FINAL_STEPS = 3
-CLEAR_PX = 1.0
-FRAME_SIGMAS = 3.0
-"""A frame is kept if it is this many standard deviations high."""
 
 
 @dataclass(frozen=True)
@@ -83,83 +58,63 @@ class PlaneFit:
     """Share of contour points more than a pixel outside: wrong masks or poses, or no plane."""
 
 
-@dataclass(frozen=True)
-class _Round:
-    """An boundary by vote on a grid, then one Gauss–Newton step on plane and boundary for each scale."""
-
-    grid: int
-    level: float
-    tolerance_cells: float
-    scales_px: tuple[float, ...]
-
-
-FIRST_ROUND = _Round(96, 0.5, 1.0, (16.0, 8.0, 8.0))
-LATER_ROUNDS = (_Round(128, 0.5, 1.0, (4.0, 4.0, 2.0, 2.0)), _Round(256, 0.4, 0.7, (1.0, 1.0, 0.5, 0.5, 0.5)))
-
-
-def fit_plane(views: Views, *, thorough: bool = True) -> PlaneFit:
+def fit_plane(views: Views, *, thorough: bool = True, options: PlaneOptions = PlaneOptions()) -> PlaneFit:
     """The plane and boundary that explain the masks best, from several starts; never a failure because none is good.
 
     Unless `thorough`, a plane that the first round leaves hopelessly far from the contours is returned as it is then,
     with no idea of its normal's error.
 
-    Raises InputError when masks have an boundary in fewer than three views taken from distinct places.
+    Raises InputError when masks have a boundary in fewer than three views taken from distinct places.
     """
     contours = mask_contours(views)
-    _require_distinct_views(contours)
-    sparse = contours.every(max(1, len(contours.view) // MAX_POINTS))
-    starts = [_refine(views, sparse, start, FIRST_ROUND) for start in _starts(views)]
-    plane = min(starts, key=lambda start: _cost(sparse, start))
-    if not thorough and _hopeless(sparse, plane):
-        return _score(views, contours, plane, math.inf)
-    for each in LATER_ROUNDS:
-        plane = _refine(views, sparse, plane, each)
-    for _ in range(SIMPLIFICATIONS):
-        plane = _simplified(plane, sparse)
-        for _ in range(FINAL_STEPS):
-            plane = _step(sparse, plane, FINAL_SCALE_PX)
-    frame = plane.frame_height > FRAME_SIGMAS * float(np.sqrt(max(_covariance(sparse, plane, frame=True)[2, 2], 0.0)))
+    _require_distinct_views(contours, options)
+    sparse = contours.every(max(1, len(contours.view) // options.max_points))
+    starts = [_refine(views, sparse, start, options.first_round, options) for start in _starts(views, options)]
+    plane = min(starts, key=lambda start: _cost(sparse, start, options))
+    if not thorough and _hopeless(sparse, plane, options):
+        return _score(views, contours, plane, math.inf, options)
+    for settings in options.later_rounds:
+        plane = _refine(views, sparse, plane, settings, options)
+    final_scales = (options.final_scale_px,) * options.final_steps
+    for _ in range(options.simplifications):
+        plane = _descend(sparse, _simplify_boundary(plane, sparse, options), final_scales, options)
+    sigma = float(np.sqrt(max(_covariance(sparse, plane, options, frame=True)[2, 2], 0.0)))
+    frame = plane.frame_height > options.frame_sigmas * sigma
     if not frame:
-        plane = replace(plane, frame_height=0.0)
-        for _ in range(FINAL_STEPS):
-            plane = _step(sparse, plane, FINAL_SCALE_PX, frame=False)
-    tilt = np.linalg.eigvalsh(_covariance(sparse, plane, frame)[:2, :2])[-1]
-    return _score(views, contours, plane, float(np.degrees(np.sqrt(max(tilt, 0.0)))))
+        plane = _descend(sparse, replace(plane, frame_height=0.0), final_scales, options, frame=False)
+    tilt = np.linalg.eigvalsh(_covariance(sparse, plane, options, frame)[:2, :2])[-1]
+    return _score(views, contours, plane, float(np.degrees(np.sqrt(max(tilt, 0.0)))), options)
 
 
-def _require_distinct_views(contours: MaskContours) -> None:
+def _require_distinct_views(contours: MaskContours, options: PlaneOptions) -> None:
     distinct: list[np.ndarray] = []
     for center in contours.centers[np.unique(contours.view, return_index=True)[1]]:
-        if all(np.linalg.norm(center - other) > LEAST_BASELINE * np.linalg.norm(center) for other in distinct):
+        if all(np.linalg.norm(center - other) > options.min_baseline * np.linalg.norm(center) for other in distinct):
             distinct.append(center)
-    if len(distinct) < LEAST_VIEWS:
-        raise _too_few_views(len(distinct))
+    if len(distinct) < options.min_views:
+        raise InputError(
+            expected=f"masks with a boundary, seen from at least {options.min_views} distinct places",
+            found=f"{len(distinct)} such views",
+            remedy="Add views from other directions, and check that masks end within the images.",
+        )
 
 
-def _too_few_views(found: int) -> InputError:
-    return InputError(
-        expected=f"masks with an boundary, seen from at least {LEAST_VIEWS} distinct places",
-        found=f"{found} such views",
-        remedy="Add views from other directions, and check that masks end within the images.",
-    )
-
-
-def _starts(views: Views) -> list[Plane]:
+def _starts(views: Views, options: PlaneOptions) -> list[Plane]:
     """The best few of many planes through the object that face as many cameras as a plane can."""
     centers = np.stack([view.position for view in views.train])
     centers /= np.linalg.norm(centers, axis=1, keepdims=True)
-    index = np.arange(START_DIRECTIONS) + 0.5
-    height, azimuth = 1 - 2 * index / START_DIRECTIONS, np.pi * (1 + 5**0.5) * index
+    index = np.arange(options.start_directions) + 0.5
+    height, azimuth = 1 - 2 * index / options.start_directions, np.pi * (1 + 5**0.5) * index
     level = np.sqrt(1 - height**2)
     # The mean view direction joins the lattice: with few cameras it can be the only one that all of them face.
     directions = np.concatenate(
         [centers.mean(0, keepdims=True), np.stack([level * np.cos(azimuth), level * np.sin(azimuth), height], 1)]
     )
-    facing = (directions @ centers.T > START_COSINE).sum(1)
-    voters = _spread(views.train, START_VIEWS)
-    planes = [_plane(n, offset) for n in directions[facing == facing.max()] for offset in START_OFFSETS]
-    planes.sort(key=lambda plane: -_agreement(plane, voters))
-    return planes[:STARTS]
+    facing = (directions @ centers.T > options.start_cosine).sum(1)
+    voters = _spread(views.train, options.start_views)
+    planes = [_plane(n, offset) for n in directions[facing == facing.max()] for offset in options.start_offsets]
+    planes.sort(key=lambda plane: -_agreement(plane, voters, options))
+    return planes[: options.starts]
 
 
 def _plane(direction: Float[np.ndarray, "3"], offset: float) -> Plane:
@@ -173,9 +128,9 @@ def _spread(views: Sequence[TrainView], count: int) -> Sequence[TrainView]:
     return views[:: max(1, len(views) // count)]
 
 
-def _agreement(plane: Plane, voters: Sequence[TrainView]) -> float:
+def _agreement(plane: Plane, voters: Sequence[TrainView], options: PlaneOptions) -> float:
     """Mean intersection over union, on the plane, of each mask with the majority of all."""
-    line = np.linspace(-START_HALF_SIDE, START_HALF_SIDE, START_GRID)
+    line = np.linspace(-options.start_half_side, options.start_half_side, options.start_grid)
     votes = _votes(plane, line, line, voters).reshape(len(voters), -1) > 0.5
     majority = votes.mean(0) > 0.5
     return float(((votes & majority).sum(1) / np.maximum((votes | majority).sum(1), 1)).mean())
@@ -201,14 +156,16 @@ def _votes(
     return result
 
 
-def _refine(views: Views, contours: MaskContours, plane: Plane, settings: _Round) -> Plane:
-    plane = replace(plane, boundary=_voted_outline(views, contours, plane, settings))
-    for scale in settings.scales_px:
-        plane = _step(contours, plane, scale)
-    return plane
+def _refine(
+    views: Views, contours: MaskContours, plane: Plane, settings: BoundaryRound, options: PlaneOptions
+) -> Plane:
+    plane = replace(plane, boundary=_vote_boundary(views, contours, plane, settings, options))
+    return _descend(contours, plane, settings.scales_px, options)
 
 
-def _voted_outline(views: Views, contours: MaskContours, plane: Plane, settings: _Round) -> Float[np.ndarray, "N 2"]:
+def _vote_boundary(
+    views: Views, contours: MaskContours, plane: Plane, settings: BoundaryRound, options: PlaneOptions
+) -> Float[np.ndarray, "N 2"]:
     """The level set of the mean of all masks on the plane, simplified; a box where they have no point in common."""
     from skimage.measure import find_contours
 
@@ -216,16 +173,16 @@ def _voted_outline(views: Views, contours: MaskContours, plane: Plane, settings:
     low, high = np.percentile(coordinates[valid], (2, 98), axis=0) if valid.any() else (-np.ones(2), np.ones(2))
     low, high = (low - 0.1 * (high - low), high + 0.1 * (high - low)) if (high > low).all() else (low - 1, high + 1)
     u, v = (np.linspace(low[axis], high[axis], settings.grid) for axis in (0, 1))
-    votes = _votes(plane, u, v, _spread(views.train, VOTING_VIEWS)).mean(0)
+    votes = _votes(plane, u, v, _spread(views.train, options.voting_views)).mean(0)
     votes[[0, -1]], votes[:, [0, -1]] = 0, 0
-    found = find_contours(votes, settings.level * votes.max()) if votes.max() > 0 else []
-    if not found:
+    curves = find_contours(votes, settings.level * votes.max()) if votes.max() > 0 else []
+    if not curves:
         return np.array([low, (high[0], low[1]), high, (low[0], high[1])])
-    cells = _simplify(max(found, key=len)[:-1], settings.tolerance_cells)
+    cells = _simplify(max(curves, key=len)[:-1], settings.tolerance_cells, options.max_vertices)
     return _counterclockwise(low + cells / (settings.grid - 1) * (high - low))
 
 
-def _simplify(boundary: Float[np.ndarray, "N 2"], tolerance: float) -> Float[np.ndarray, "M 2"]:
+def _simplify(boundary: Float[np.ndarray, "N 2"], tolerance: float, max_vertices: int) -> Float[np.ndarray, "M 2"]:
     """Fewer vertices, at most `tolerance` from the boundary, or more where that many would not do."""
     from skimage.measure import approximate_polygon
 
@@ -234,7 +191,7 @@ def _simplify(boundary: Float[np.ndarray, "N 2"], tolerance: float) -> Float[np.
     closed = np.roll(boundary, -start, 0)
     closed = np.concatenate([closed, closed[:1]])
     simple = approximate_polygon(closed, tolerance)[:-1]
-    while len(simple) > MAX_VERTICES:
+    while len(simple) > max_vertices:
         tolerance *= 1.5
         simple = approximate_polygon(closed, tolerance)[:-1]
     return simple if len(simple) >= 3 else boundary
@@ -245,44 +202,82 @@ def _counterclockwise(boundary: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "
     return boundary if (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() > 0 else boundary[::-1].copy()
 
 
-def _cost(contours: MaskContours, plane: Plane) -> float:
-    """Mean of the robust loss e²/(e² + s²) at the scale of the last step of the first round."""
-    distances = boundary_residuals(contours, plane)
-    squared = (distances.pixels / FIRST_ROUND.scales_px[-1]) ** 2
-    return float(np.where(distances.valid, squared / (1 + squared), 1.0).mean())
+def _cost(contours: MaskContours, plane: Plane, options: PlaneOptions) -> float:
+    """The robust cost of all contour points at the scale of the last step of the first round."""
+    residuals = boundary_residuals(contours, plane, options)
+    return residuals.cost(options.first_round.scales_px[-1], np.ones(len(contours.view), dtype=bool))
 
 
-def _hopeless(contours: MaskContours, plane: Plane) -> bool:
+def _hopeless(contours: MaskContours, plane: Plane, options: PlaneOptions) -> bool:
     """Whether half of the contour points are more than a cell of the first round's grid, and 2 px, from the boundary.
 
-    That boundary follows the vote to a cell before it is moved. Planes were within a tenth of a cell, a vase and a can
-    two to four cells away.
+    That boundary follows the vote to a cell before it is moved.
     """
-    distances = boundary_residuals(contours, plane)
-    size = np.where(distances.valid, np.abs(distances.pixels), np.inf)
-    pixels_per_unit = float(np.median(np.linalg.norm(distances.outward, axis=1)))
-    cell = float(np.ptp(plane.boundary, axis=0).max()) * pixels_per_unit / FIRST_ROUND.grid
-    return float(np.median(size)) > max(cell, HOPELESS_PX)
+    residuals = boundary_residuals(contours, plane, options)
+    size = np.where(residuals.valid, np.abs(residuals.pixels), np.inf)
+    pixels_per_unit = float(np.median(residuals.pixels_per_unit))
+    cell = float(np.ptp(plane.boundary, axis=0).max()) * pixels_per_unit / options.first_round.grid
+    return float(np.median(size)) > max(cell, options.hopeless_px)
 
 
-def _step(contours: MaskContours, plane: Plane, scale_px: float, frame: bool = True) -> Plane:
-    """One robust Gauss–Newton step of plane and boundary together, no longer than `LARGEST_STEP`."""
-    distances = boundary_residuals(contours, plane)
-    gradients, matrix = normal_equations(contours, distances, scale_px, len(plane.boundary), frame)
-    step = -np.linalg.lstsq(matrix, gradients.sum(0), rcond=None)[0]
-    step *= min(1.0, LARGEST_STEP / max(float(np.abs(step).max()), 1e-12))
-    step[3] *= frame
-    return apply_plane_step(plane, step)
+def _descend(
+    contours: MaskContours, plane: Plane, scales_px: Sequence[float], options: PlaneOptions, frame: bool = True
+) -> Plane:
+    """A robust Gauss–Newton step of plane and boundary together for each scale; none raises the cost at its scale."""
+
+    def residuals_of(plane: Plane) -> tuple[Plane, BoundaryResiduals]:
+        return plane, boundary_residuals(contours, plane, options)
+
+    state = residuals_of(plane)
+    for scale_px in scales_px:
+        plane, residuals = state
+        scale, counted = residuals.scale(scale_px, options), residuals.counted
+        gradients, matrix = _equations(contours, plane, residuals, scale, options, frame)
+        state = accept_step(
+            state,
+            damped_step(gradients.sum(0), matrix, largest=options.largest_step),
+            lambda state, step: residuals_of(apply_plane_step(state[0], step)),
+            partial(_cost_of_state, scale=scale, counted=counted),
+        )
+    return state[0]
 
 
-def _simplified(plane: Plane, contours: MaskContours) -> Plane:
+def _cost_of_state(state: tuple[Plane, BoundaryResiduals], scale: float, counted: Bool[np.ndarray, "P"]) -> float:
+    return state[1].cost(scale, counted)
+
+
+def _equations(
+    contours: MaskContours,
+    plane: Plane,
+    residuals: BoundaryResiduals,
+    scale: float,
+    options: PlaneOptions,
+    frame: bool,
+) -> tuple[Float[np.ndarray, "V D"], Float[np.ndarray, "D D"]]:
+    """The gradient Σ J w e of each view and the matrix Jᵀ W J, over four numbers of the plane and two of each vertex.
+
+    Without `frame`, the frame's height has no influence and no gradient.
+    """
+    from scipy import sparse
+
+    vertices, weights = len(plane.boundary), residuals.weights(scale)
+    residuals = replace(residuals, by_plane=residuals.by_plane * [1, 1, 1, frame])
+    jacobian = boundary_jacobian(residuals, vertices)
+    _, matrix = normal_equations(jacobian, residuals.pixels, weights)
+    matrix[4:, 4:] += vertex_pull(residuals, weights, vertices, options) * np.eye(2 * vertices)
+    points = np.arange(len(weights))
+    by_view = sparse.csr_matrix((weights * residuals.pixels, (contours.view, points)))
+    return (by_view @ jacobian).toarray(), matrix
+
+
+def _simplify_boundary(plane: Plane, contours: MaskContours, options: PlaneOptions) -> Plane:
     """The plane with sharp corners and as few vertices as a quarter of a pixel allows."""
-    distances = boundary_residuals(contours, plane)
-    pixel = 1 / max(float(np.median(np.linalg.norm(distances.outward, axis=1))), 1e-9)
-    return replace(plane, boundary=_sharpened(_simplify(plane.boundary, SIMPLE_PX * pixel), CHAMFER_PX * pixel))
+    pixel = 1 / max(float(np.median(boundary_residuals(contours, plane, options).pixels_per_unit)), 1e-9)
+    simple = _simplify(plane.boundary, options.simple_px * pixel, options.max_vertices)
+    return replace(plane, boundary=_sharpen(simple, options.chamfer_px * pixel, options.corner_deg))
 
 
-def _sharpened(boundary: Float[np.ndarray, "N 2"], reach: float) -> Float[np.ndarray, "M 2"]:
+def _sharpen(boundary: Float[np.ndarray, "N 2"], reach: float, corner_deg: float) -> Float[np.ndarray, "M 2"]:
     """Where short sides lead from one long side to the next, their common corner instead, if it is within `reach`."""
     sides = np.roll(boundary, -1, 0) - boundary
     lengths = np.linalg.norm(sides, axis=1)
@@ -292,7 +287,7 @@ def _sharpened(boundary: Float[np.ndarray, "N 2"], reach: float) -> Float[np.nda
         between = np.arange(index + 1, following + 1 + (len(boundary) if following <= index else 0)) % len(boundary)
         incoming, outgoing, gap = sides[index], sides[following], boundary[between[-1]] - boundary[between[0]]
         across = incoming[0] * outgoing[1] - incoming[1] * outgoing[0]
-        sharp = abs(across) > np.sin(np.radians(CORNER_DEG)) * lengths[index] * lengths[following]
+        sharp = abs(across) > np.sin(np.radians(corner_deg)) * lengths[index] * lengths[following]
         if len(between) > 1 and sharp:
             corner = boundary[between[0]] + (gap[0] * outgoing[1] - gap[1] * outgoing[0]) / across * incoming
             if max(np.linalg.norm(corner - boundary[end]) for end in (between[0], between[-1])) < reach:
@@ -302,16 +297,17 @@ def _sharpened(boundary: Float[np.ndarray, "N 2"], reach: float) -> Float[np.nda
     return np.concatenate(parts)
 
 
-def _covariance(contours: MaskContours, plane: Plane, frame: bool) -> Float[np.ndarray, "3 3"]:
+def _covariance(contours: MaskContours, plane: Plane, options: PlaneOptions, frame: bool) -> Float[np.ndarray, "3 3"]:
     """Covariance of the tilts along t_u and t_v and of the frame's height: σ² H⁻¹, or H⁻¹ (Σ_views g gᵀ) H⁻¹ if larger.
 
     The second takes views, not contour points, for independent, as errors of poses are (Liang and Zeger 1986).
     """
-    distances = boundary_residuals(contours, plane)
-    weights = robust_weights(distances, FINAL_SCALE_PX)
-    gradients, matrix = normal_equations(contours, distances, FINAL_SCALE_PX, len(plane.boundary), frame)
+    residuals = boundary_residuals(contours, plane, options)
+    scale = residuals.scale(options.final_scale_px, options)
+    weights = residuals.weights(scale)
+    gradients, matrix = _equations(contours, plane, residuals, scale, options, frame)
     inverse = np.linalg.pinv(matrix, hermitian=True)[[0, 1, 3]]
-    variance = (weights * distances.pixels**2).sum() / max(weights.sum(), 1.0)
+    variance = (weights * residuals.pixels**2).sum() / max(weights.sum(), 1.0)
     by_point = variance * inverse[:, [0, 1, 3]]
     views = len(np.unique(contours.view))
     moves = gradients @ inverse.T * np.sqrt(views / (views - 1))
@@ -319,9 +315,9 @@ def _covariance(contours: MaskContours, plane: Plane, frame: bool) -> Float[np.n
     return by_view if np.trace(by_view[:2, :2]) > np.trace(by_point[:2, :2]) else by_point
 
 
-def _score(views: Views, contours: MaskContours, plane: Plane, sigma_deg: float) -> PlaneFit:
-    distances = boundary_residuals(contours, plane)
-    size = np.where(distances.valid, np.abs(distances.pixels), np.inf)
+def _score(views: Views, contours: MaskContours, plane: Plane, sigma_deg: float, options: PlaneOptions) -> PlaneFit:
+    residuals = boundary_residuals(contours, plane, options)
+    size = np.where(residuals.valid, np.abs(residuals.pixels), np.inf)
     count = len(views.train)
     median_px, rms_px, iou = np.full(count, np.inf), np.full(count, np.inf), np.zeros(count)
     for index, view in enumerate(views.train):
@@ -337,6 +333,6 @@ def _score(views: Views, contours: MaskContours, plane: Plane, sigma_deg: float)
         median_px=median_px,
         rms_px=rms_px,
         iou=iou,
-        share_inside=float((distances.pixels[distances.valid] < -CLEAR_PX).sum() / len(size)),
-        share_outside=float((distances.pixels[distances.valid] > CLEAR_PX).sum() / len(size)),
+        share_inside=float((residuals.pixels[residuals.valid] < -1.0).sum() / len(size)),
+        share_outside=float((residuals.pixels[residuals.valid] > 1.0).sum() / len(size)),
     )

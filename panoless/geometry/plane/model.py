@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from panoless.capture.rays import pose_of
+from panoless.geometry.surfaces import buffers_from_arrays
 from panoless.geometry.surfels.rendering import SurfaceBuffers
 from panoless.kernels.rasterize import RasterCamera
 from panoless.numeric.polygon import projected_coverage
@@ -46,18 +47,17 @@ class Plane:
 
 
 def plane_buffers(plane: Plane, camera: RasterCamera) -> SurfaceBuffers:
-    """The plane as surfels would be seen: alpha is the covered area of each pixel, depths are those of its center.
+    """What a camera sees of a plane: alpha is the covered area of each pixel, depth that of its center.
 
-    Normals are alpha times the plane's normal in camera axes; the three depths agree, and where a pixel's center lies
-    beside the plane they stay within the depths of the boundary. All is zero where alpha is, and everywhere for a
-    camera behind the mirror. `in_frustum` has one element. With a frame, alpha is the smaller of the coverages of the
+    Where a pixel's center lies beside the plane, its depth stays within the depths of the boundary. All is zero where
+    alpha is, and everywhere for a camera behind the mirror. With a frame, alpha is the smaller of the coverages of the
     boundary and of the frame, which is exact but for pixels that both outlines cut.
     """
     rotation, center = pose_of(camera)
     height_above = float(plane.normal @ center) - plane.offset
     if height_above <= 0:
         nothing = np.zeros((camera.height, camera.width))
-        return _buffers(nothing, nothing, np.zeros(3), camera)
+        return buffers_from_arrays(nothing, nothing, np.zeros((3, 1, 1)), camera)
     corners = (plane.points(plane.boundary) - center) @ rotation.T
     normal = rotation @ plane.normal
     alpha = projected_coverage(corners, camera)
@@ -68,7 +68,7 @@ def plane_buffers(plane: Plane, camera: RasterCamera) -> SurfaceBuffers:
     slope = -(normal[0] * x + (normal[1] * y + normal[2])[:, None])
     nearest, farthest = max(corners[:, 2].min(), camera.near), max(corners[:, 2].max(), camera.near)
     depth = np.where(slope > 0, height_above / np.maximum(slope, 1e-12), farthest).clip(nearest, farthest)
-    return _buffers(alpha, depth * (alpha > 0), normal, camera)
+    return buffers_from_arrays(alpha, depth * (alpha > 0), normal[:, None, None], camera)
 
 
 def unoccluded_share(plane: Plane, camera: RasterCamera) -> Float[Tensor, "H W"]:
@@ -82,28 +82,5 @@ def unoccluded_share(plane: Plane, camera: RasterCamera) -> Float[Tensor, "H W"]
         return camera.world_to_camera.new_ones(camera.height, camera.width)
     boundary = (plane.points(plane.boundary) - center) @ rotation.T
     image = projected_coverage(boundary - plane.frame_height * (rotation @ plane.normal), camera)
-    return _tensor(np.where(projected_coverage(boundary, camera) > 0, image, 1.0), camera)
-
-
-def _buffers(
-    alpha: Float[np.ndarray, "H W"],
-    depth: Float[np.ndarray, "H W"],
-    normal_camera: Float[np.ndarray, "3"],
-    camera: RasterCamera,
-) -> SurfaceBuffers:
-    covered, distance = _tensor(alpha, camera), _tensor(depth, camera)
-    return SurfaceBuffers(
-        albedo=covered.new_zeros(3, *covered.shape),
-        alpha=covered,
-        raster_normals_camera=_tensor(normal_camera, camera)[:, None, None] * covered,
-        expected_depth=distance,
-        median_depth=distance,
-        surface_depth=distance,
-        distortion=torch.zeros_like(covered),
-        in_frustum=(covered > 0).any()[None],
-    )
-
-
-def _tensor(values: Float[np.ndarray, "*S"], camera: RasterCamera) -> Float[Tensor, "*S"]:
-    """In float32, on the device of a camera."""
-    return torch.from_numpy(values).float().to(camera.world_to_camera.device)
+    share = np.where(projected_coverage(boundary, camera) > 0, image, 1.0)
+    return torch.from_numpy(share).float().to(camera.world_to_camera.device)

@@ -1,9 +1,9 @@
-"""How far the masks' contours are from the boundary of a plane, in pixels, and what moves them: the plane's numbers and
-the boundary's vertices.
+"""How far the masks' contours are from the boundary of a plane, in pixels, and their derivatives by the plane's numbers
+and the boundary's vertices.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,37 +11,50 @@ from jaxtyping import Bool, Float, Int
 
 from panoless.capture.silhouettes import MaskContours
 from panoless.geometry.plane.model import Plane
+from panoless.geometry.plane.options import PlaneOptions
+from panoless.numeric.gauss_newton import jacobian_of_rows
+from panoless.numeric.polygon import nearest_side
+from panoless.numeric.robust import bounded_error, robust_scale, robust_weight
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 HeightOf = Callable[[Float[np.ndarray, "P 2"]], Float[np.ndarray, "P"]]
-CORNER_DEG = 20.0
-CORNER_PX = 1.5
-"""The level set of pixel averages is round at corners: points this near to one say nothing about it."""
-NOISE_SCALE = 3.0
-"""The robust scale is at least this times the median distance, so that wrong poses leave all views a say."""
-PULL = 1e-3
-"""Weight of a vertex's place against the contour points of its side: along a straight side nothing else holds it."""
 
 
 @dataclass(frozen=True)
 class BoundaryResiduals:
     """Signed distances (pixels, outward) of contour points from the projected boundary, and what they depend on."""
 
-    coordinates: Float[np.ndarray, "P 2"]
     pixels: Float[np.ndarray, "P"]
     by_plane: Float[np.ndarray, "P 4"]
     """Derivatives by the normal along t_u and t_v, by the offset, and by the frame's height."""
-    edge: Int[np.ndarray, "P"]
-    along: Float[np.ndarray, "P"]
-    outward: Float[np.ndarray, "P 2"]
-    """Outward unit normals of the boundary, times pixels per unit."""
-    valid: Bool[np.ndarray, "P"]
-    """In front of a camera that faces the mirror."""
-    corner: Bool[np.ndarray, "P"]
+    by_side: Float[np.ndarray, "P 2"]
+    """Derivatives by a shift of the nearest side."""
+    end_share: Float[np.ndarray, "P"]
+    """Share of the side's second vertex in these; the first has the rest."""
     by_height: Float[np.ndarray, "P"]
     """Derivatives by the height of the mirror's edge over the plane; zero where the frame hides that edge."""
+    side: Int[np.ndarray, "P"]
+    along: Float[np.ndarray, "P"]
+    """The nearest point is so far along this side of the boundary, 0 at its first vertex, 1 at its second."""
+    pixels_per_unit: Float[np.ndarray, "P"]
+    valid: Bool[np.ndarray, "P"]
+    """In front of a camera that faces the mirror."""
+    counted: Bool[np.ndarray, "P"]
+    """Valid, and not at a corner."""
+
+    def scale(self, scale_px: float, options: PlaneOptions) -> float:
+        """The robust scale: `scale_px`, or a multiple of the median distance if that is larger."""
+        return robust_scale(self.pixels[self.valid], scale_px, options.noise_scale)
+
+    def weights(self, scale: float) -> Float[np.ndarray, "P"]:
+        """Geman–McClure weights, zero for points that do not count."""
+        return self.counted * robust_weight(self.pixels, scale)
+
+    def cost(self, scale: float, counted: Bool[np.ndarray, "P"]) -> float:
+        """Sum of e²/(e² + s²) over some of the points; 1 for those that no camera sees in front of the mirror."""
+        return float(np.where(self.valid, bounded_error(self.pixels, scale), 1.0)[counted].sum())
 
 
 def back_project(contours: MaskContours, plane: Plane) -> tuple[Float[np.ndarray, "P 2"], Bool[np.ndarray, "P"]]:
@@ -53,21 +66,24 @@ def back_project(contours: MaskContours, plane: Plane) -> tuple[Float[np.ndarray
     return np.where(valid[:, None], coordinates, 0.0), valid
 
 
-def boundary_residuals(contours: MaskContours, plane: Plane, height_of: HeightOf | None = None) -> BoundaryResiduals:
-    """First-order pixel distances: the plane distance from an edge times |det J|/‖J τ‖, J = ∂pixel/∂coordinates.
+def boundary_residuals(
+    contours: MaskContours, plane: Plane, options: PlaneOptions = PlaneOptions(), height_of: HeightOf | None = None
+) -> BoundaryResiduals:
+    """First-order pixel distances: the plane distance from a side times |det J|/‖J τ‖, J = ∂pixel/∂coordinates.
 
     A turn of the normal by a t_u + b t_v and a shift of the offset by c move the hit point by r (c − a p₁ − b p₂)/(n·r)
-    along its ray r. What stands at height z over an edge is seen (ν·(camera − edge)) z/(H − z) inside of it by a camera
-    at height H, ν the outward normal. This is the frame where the camera stands beyond the edge, and elsewhere the edge
-    of the mirror itself, at height zero unless `height_of` gives one.
+    along its ray r. What stands at height z over a side is seen (ν·v) z/(H − z) inside of it, ν the outward normal,
+    v = camera − side and H = n·v. The same turn and shift change ν·v by −H ν·(a, b) and H by
+    a (v₁ + p₁) + b (v₂ + p₂) − c. What stands there is the frame where the camera stands beyond the side, and elsewhere
+    the edge of the mirror itself, at height zero unless `height_of` gives one.
     """
     coordinates, valid = back_project(contours, plane)
-    edge, along = _nearest(coordinates, plane.boundary)
-    corners = plane.boundary
+    corners, tangent_u, tangent_v = plane.boundary, plane.tangent_u, plane.tangent_v
+    side, along, _ = nearest_side(coordinates, corners)
     sides = np.roll(corners, -1, 0) - corners
     lengths = np.linalg.norm(sides, axis=1)
     tangents = sides / np.maximum(lengths, 1e-12)[:, None]
-    tangent, tangent_u, tangent_v = tangents[edge], plane.tangent_u, plane.tangent_v
+    tangent = tangents[side]
     slope = np.where(valid, contours.rays @ plane.normal, -1.0)
     depth = np.where(valid, (plane.offset - contours.centers @ plane.normal) / slope, 1.0)
     column_u, column_v = contours.columns @ tangent_u / depth, contours.columns @ tangent_v / depth
@@ -75,97 +91,63 @@ def boundary_residuals(contours: MaskContours, plane: Plane, height_of: HeightOf
     stretch = np.hypot(
         column_u * tangent[:, 0] + column_v * tangent[:, 1], row_u * tangent[:, 0] + row_v * tangent[:, 1]
     )
-    scale = np.abs(column_u * row_v - column_v * row_u) / np.maximum(stretch, 1e-12)
-    outward = scale[:, None] * np.stack([tangent[:, 1], -tangent[:, 0]], 1)
-    hit_moves = outward[:, 0] * (contours.rays @ tangent_u) + outward[:, 1] * (contours.rays @ tangent_v)
-    foot = corners[edge] + along[:, None] * sides[edge]
+    pixels_per_unit = np.abs(column_u * row_v - column_v * row_u) / np.maximum(stretch, 1e-12)
+    outward = pixels_per_unit[:, None] * np.stack([tangent[:, 1], -tangent[:, 0]], 1)
+    foot = corners[side] + along[:, None] * sides[side]
     camera = np.stack([contours.centers @ tangent_u, contours.centers @ tangent_v], 1)
-    toward_camera = (outward * (camera - foot)).sum(1)
-    own = np.zeros(len(edge)) if height_of is None else height_of(foot)
+    beyond = (outward * (camera - foot)).sum(1)
+    own_height = np.zeros(len(side)) if height_of is None else height_of(foot)
     framed = plane.frame_height > 0 or height_of is None
-    by_frame = (toward_camera > 0) & (own <= plane.frame_height) & framed
-    level = np.where(by_frame, plane.frame_height, own)
-    height = np.where(valid, contours.centers @ plane.normal - plane.offset, np.inf)
-    lean = toward_camera / np.where(height > 2 * np.abs(level), height - level, np.inf)
-    by_plane = (hit_moves / slope)[:, None] * np.concatenate([-coordinates, np.ones((len(edge), 1))], 1)
-    turns = np.einsum("ni,ni->n", tangents, np.roll(tangents, 1, 0)) < np.cos(np.radians(CORNER_DEG))
-    reach = stretch * lengths[edge]
+    by_frame = (beyond > 0) & (own_height <= plane.frame_height) & framed
+    level = np.where(by_frame, plane.frame_height, own_height)
+    camera_height = np.where(valid, contours.centers @ plane.normal - plane.offset, np.inf)
+    above = np.where(camera_height > 2 * np.abs(level), camera_height - level, np.inf)
+    parallax = level / above
+    hit_shift = (outward[:, 0] * (contours.rays @ tangent_u) + outward[:, 1] * (contours.rays @ tangent_v)) / slope
+    turn_of_camera = np.where(np.isfinite(above), camera_height, 0.0)[:, None] * outward
+    by_turn = -hit_shift[:, None] * coordinates - parallax[:, None] * (
+        turn_of_camera + (beyond / above)[:, None] * camera
+    )
+    by_level = beyond / above * (1 + parallax)
+    turns = np.einsum("ni,ni->n", tangents, np.roll(tangents, 1, 0)) < np.cos(np.radians(options.corner_deg))
+    reach = stretch * lengths[side]
+    at_corner = (turns[side] & (along * reach < options.corner_px)) | (
+        np.roll(turns, -1)[side] & ((1 - along) * reach < options.corner_px)
+    )
     return BoundaryResiduals(
-        coordinates=coordinates,
-        pixels=(outward * (coordinates - foot)).sum(1) + lean * level,
-        by_plane=np.concatenate([by_plane, (lean * by_frame)[:, None]], 1),
-        edge=edge,
+        pixels=(outward * (coordinates - foot)).sum(1) + beyond * parallax,
+        by_plane=np.stack([*by_turn.T, hit_shift + beyond / above * parallax, by_level * by_frame], 1),
+        by_side=-(1 + parallax)[:, None] * outward,
+        end_share=along
+        + ((camera - foot) * tangent).sum(1) * parallax / (1 + parallax) / np.maximum(lengths[side], 1e-12),
+        by_height=by_level * ~by_frame,
+        side=side,
         along=along,
-        outward=outward,
+        pixels_per_unit=pixels_per_unit,
         valid=valid,
-        corner=(turns[edge] & (along * reach < CORNER_PX))
-        | (np.roll(turns, -1)[edge] & ((1 - along) * reach < CORNER_PX)),
-        by_height=lean * ~by_frame,
+        counted=valid & ~at_corner,
     )
 
 
-def _nearest(
-    points: Float[np.ndarray, "P 2"], boundary: Float[np.ndarray, "N 2"]
-) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"]]:
-    """The side nearest to each point, and where on it: 0 at its first vertex, 1 at its second."""
-    best = np.full(len(points), np.inf)
-    edge, along = np.zeros(len(points), dtype=np.int64), np.zeros(len(points))
-    for index, (start, side) in enumerate(zip(boundary, np.roll(boundary, -1, 0) - boundary, strict=True)):
-        offset_x, offset_y = points[:, 0] - start[0], points[:, 1] - start[1]
-        share = ((offset_x * side[0] + offset_y * side[1]) / max(side @ side, 1e-18)).clip(0, 1)
-        squared = (offset_x - share * side[0]) ** 2 + (offset_y - share * side[1]) ** 2
-        nearer = squared < best
-        best[nearer], along[nearer], edge[nearer] = squared[nearer], share[nearer], index
-    return edge, along
-
-
-def robust_weights(distances: BoundaryResiduals, scale_px: float) -> Float[np.ndarray, "P"]:
-    """Geman–McClure weights (1 + e²/s²)⁻², where s is `scale_px` or, if larger, a multiple of the median |e|."""
-    typical = np.median(np.abs(distances.pixels[distances.valid])) if distances.valid.any() else 0.0
-    scale = max(scale_px, NOISE_SCALE * float(typical))
-    return (distances.valid & ~distances.corner) / (1 + (distances.pixels / scale) ** 2) ** 2
-
-
-def boundary_jacobian(distances: BoundaryResiduals, vertices: int) -> "csr_matrix":
+def boundary_jacobian(residuals: BoundaryResiduals, vertices: int) -> "csr_matrix":
     """Derivatives of the distances by the four numbers of the plane and by two of each vertex, P rows."""
-    from scipy.sparse import csr_matrix
-
-    count = len(distances.edge)
-    ends = np.stack([distances.edge, (distances.edge + 1) % vertices], 1)
-    shares = np.stack([1 - distances.along, distances.along], 1)
-    values = -shares[:, :, None] * distances.outward[:, None, :]
+    count = len(residuals.side)
+    ends = np.stack([residuals.side, (residuals.side + 1) % vertices], 1)
+    shares = np.stack([1 - residuals.end_share, residuals.end_share], 1)
+    values = shares[:, :, None] * residuals.by_side[:, None, :]
     columns = 4 + 2 * ends[:, :, None] + np.arange(2)
-    return csr_matrix(
-        (
-            np.concatenate([distances.by_plane, values.reshape(count, 4)], 1).ravel(),
-            np.concatenate([np.tile(np.arange(4), (count, 1)), columns.reshape(count, 4)], 1).ravel(),
-            np.arange(count + 1) * 8,
-        ),
-        shape=(count, 4 + 2 * vertices),
+    return jacobian_of_rows(
+        np.concatenate([residuals.by_plane, values.reshape(count, 4)], 1),
+        np.concatenate([np.tile(np.arange(4), (count, 1)), columns.reshape(count, 4)], 1),
+        4 + 2 * vertices,
     )
 
 
-def boundary_pull(distances: BoundaryResiduals, weights: Float[np.ndarray, "P"], vertices: int) -> float:
-    """What holds each number of a vertex against the sum of the contour points' weights."""
-    return float(PULL * weights.sum() / vertices * np.median((distances.outward**2).sum(1)))
-
-
-def normal_equations(
-    contours: MaskContours, distances: BoundaryResiduals, scale_px: float, vertices: int, frame: bool
-) -> tuple[Float[np.ndarray, "V D"], Float[np.ndarray, "D D"]]:
-    """The gradient Σ J w e of each view and the matrix Jᵀ W J, over four numbers of the plane and two of each vertex.
-
-    Without `frame`, the frame's height has no influence and no gradient.
-    """
-    from scipy import sparse
-
-    count, weights = len(distances.edge), robust_weights(distances, scale_px)
-    jacobian = boundary_jacobian(replace(distances, by_plane=distances.by_plane * [1, 1, 1, frame]), vertices)
-    matrix = (jacobian.T @ jacobian.multiply(weights[:, None]).tocsr()).toarray()
-    pull = boundary_pull(distances, weights, vertices)
-    matrix += np.diag(np.append(np.full(4, 1e-9 * np.trace(matrix[:4, :4])), np.full(2 * vertices, pull)))
-    by_view = sparse.csr_matrix((weights * distances.pixels, (contours.view, np.arange(count))))
-    return (by_view @ jacobian).toarray(), matrix
+def vertex_pull(
+    residuals: BoundaryResiduals, weights: Float[np.ndarray, "P"], vertices: int, options: PlaneOptions
+) -> float:
+    """What holds each number of a vertex where it is, against the sum of the contour points' weights."""
+    return float(options.vertex_pull * weights.sum() / vertices * np.median(residuals.pixels_per_unit**2))
 
 
 def apply_plane_step(plane: Plane, step: Float[np.ndarray, "D"]) -> Plane:

@@ -18,7 +18,7 @@ from panoless.geometry.revolution.model import SurfaceOfRevolution
 from panoless.geometry.revolution.options import DEFAULTS, MouthOptions
 from panoless.geometry.revolution.pixels import evenly
 from panoless.geometry.revolution.profile import resample_profile
-from panoless.kernels.cpu.interior import slope_votes
+from panoless.kernels.revolution import slope_votes
 
 
 def end_pixels(

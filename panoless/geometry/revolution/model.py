@@ -16,9 +16,10 @@ from panoless.capture.rays import pixel_rays, pose_of, reflect
 from panoless.capture.views import TrainView
 from panoless.environment.rays import Rays
 from panoless.geometry.revolution.options import DEFAULTS, MapOptions
+from panoless.geometry.surfaces import buffers_from_arrays
 from panoless.geometry.surfels.rendering import SurfaceBuffers
-from panoless.kernels.cpu.revolution import first_hits, follow
 from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.revolution import first_hits, follow
 from shinypartial.core.sphere import pixel_footprint_sr
 
 CREASE_RAD = math.radians(35.0)
@@ -175,20 +176,8 @@ def revolution_buffers(surface: SurfaceOfRevolution, camera: RasterCamera, sampl
     z[mixed[missed]] = (depth / np.maximum(share, 1))[missed]
     normals[mixed[missed]] = (normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12))[missed]
     rotation, _ = pose_of(camera)
-    device = camera.world_to_camera.device
-    covered, distance = (
-        torch.from_numpy(image.reshape(shape)).float().to(device) for image in (alpha, z * (alpha.ravel() > 0))
-    )
-    return SurfaceBuffers(
-        albedo=covered.new_zeros(3, *shape),
-        alpha=covered,
-        raster_normals_camera=torch.from_numpy((normals @ rotation.T).T.reshape(3, *shape)).float().to(device)
-        * covered,
-        expected_depth=distance,
-        median_depth=distance,
-        surface_depth=distance,
-        distortion=torch.zeros_like(covered),
-        in_frustum=(covered > 0).any()[None],
+    return buffers_from_arrays(
+        alpha, (z * (alpha.ravel() > 0)).reshape(shape), (normals @ rotation.T).T.reshape(3, *shape), camera
     )
 
 

@@ -5,7 +5,7 @@ number was chosen on the development scenes Vase (open, smooth) and Cola (closed
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -276,14 +276,14 @@ class RenderingOptions:
 class RevolutionOptions:
     """All of them."""
 
-    silhouette: SilhouetteOptions = field(default_factory=SilhouetteOptions)
-    photometric: PhotometricOptions = field(default_factory=PhotometricOptions)
-    mouth: MouthOptions = field(default_factory=MouthOptions)
-    floor: FloorOptions = field(default_factory=FloorOptions)
-    lip: LipOptions = field(default_factory=LipOptions)
-    footprints: FootprintOptions = field(default_factory=FootprintOptions)
-    map: MapOptions = field(default_factory=MapOptions)
-    rendering: RenderingOptions = field(default_factory=RenderingOptions)
+    silhouette: SilhouetteOptions = SilhouetteOptions()
+    photometric: PhotometricOptions = PhotometricOptions()
+    mouth: MouthOptions = MouthOptions()
+    floor: FloorOptions = FloorOptions()
+    lip: LipOptions = LipOptions()
+    footprints: FootprintOptions = FootprintOptions()
+    map: MapOptions = MapOptions()
+    rendering: RenderingOptions = RenderingOptions()
     max_bounces: int = 6
     """Reflections that a fit follows."""
     judged_scale: float = 0.1

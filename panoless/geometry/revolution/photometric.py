@@ -38,8 +38,6 @@ from panoless.geometry.revolution.silhouette import (
 from panoless.numeric.gauss_newton import accept_step, damped_step, jacobian_of_rows, normal_equations
 from panoless.numeric.robust import bounded_error, robust_weight
 
-RADIANCE_SIGMA = DEFAULTS.photometric.radiance_sigma
-
 
 def solve_map(
     views: Views, surface: SurfaceOfRevolution, rays: int, resolution: int, start: Tensor | None = None

@@ -17,7 +17,7 @@ from panoless.capture.views import Views
 from panoless.geometry.revolution.model import SurfaceOfRevolution
 from panoless.geometry.revolution.options import DEFAULTS, SilhouetteOptions
 from panoless.geometry.revolution.profile import ProfileSplines, apply_step, resample_profile
-from panoless.kernels.cpu.profile import closest_approach, distance_grid, envelope
+from panoless.kernels.revolution import closest_approach, distance_grid, envelope
 from panoless.numeric.gauss_newton import accept_step, damped_step, jacobian_of_rows, normal_equations
 from panoless.numeric.robust import bounded_error, robust_scale, robust_weight
 

@@ -1,1 +1,1 @@
-"""The same operators in Numba, vectorized and threaded, for float32 tensors on the CPU."""
+"""The same operators in Numba, threaded: vectorized for float32 tensors on the CPU, plain loops for float64 arrays."""

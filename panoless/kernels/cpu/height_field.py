@@ -4,25 +4,18 @@ import numpy as np
 from jaxtyping import Float
 from numba import njit
 
+from panoless.kernels.constants import MAX_NEWTON_STEPS, NEWTON_CONVERGED
+from panoless.kernels.cpu.compilation import PLAIN_LOOPS
 from panoless.kernels.cpu.simd_memory import fetch_add
 from panoless.kernels.cpu.workers import run_shared
 
 RAYS_PER_CLAIM = 4096
-EXACT = {"nogil": True, "cache": True, "error_model": "numpy"}
-MOST_STEPS = 20
-CONVERGED = 1e-10
-"""Of the coordinates' unit: below it float64 rounds."""
 
 
 def first_hits(
     origins: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"], coefficients: Float[np.ndarray, "M N"]
 ) -> tuple[Float[np.ndarray, "P"], Float[np.ndarray, "P 2"]]:
-    """Distance along each ray, in lengths of its direction, to the front of z = h(x, y), and the slopes of h there.
-
-    Knots lie at whole x in [0, M − 3] and y in [0, N − 3]; beyond them the surface goes on straight. A miss, or a ray
-    that no step brings nearer, has an infinite distance and no slope. Steps start where the ray meets z = 0, so a
-    surface that hides part of itself is not looked for.
-    """
+    """See `panoless.kernels.revolution`."""
     count = len(origins)
     distance, slopes = np.empty(count), np.empty((count, 2))
     rays = np.ascontiguousarray(origins, dtype=np.float64), np.ascontiguousarray(directions, dtype=np.float64)
@@ -30,7 +23,7 @@ def first_hits(
     return distance, slopes
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _basis(t):
     """The four cubic B-splines over a cell, t in [0, 1], and their derivatives."""
     s = 1 - t
@@ -39,7 +32,7 @@ def _basis(t):
     return values, slopes
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _height(coefficients, x, y):
     """h and its two slopes."""
     rows, columns = coefficients.shape
@@ -59,7 +52,7 @@ def _height(coefficients, x, y):
     return h + along_x * (x - inside_x) + along_y * (y - inside_y), along_x, along_y
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _trace(counter, origins, directions, coefficients, distance, slopes):
     while True:
         begin = fetch_add(counter, RAYS_PER_CLAIM)
@@ -72,13 +65,13 @@ def _trace(counter, origins, directions, coefficients, distance, slopes):
             if oz <= 0 or dz >= 0:
                 continue
             t = -oz / dz
-            for _ in range(MOST_STEPS):
+            for _ in range(MAX_NEWTON_STEPS):
                 h, along_x, along_y = _height(coefficients, ox + t * dx, oy + t * dy)
                 rate = dz - along_x * dx - along_y * dy
                 gap = oz + t * dz - h
                 if rate >= 0:
                     break
-                if abs(gap) < CONVERGED:
+                if abs(gap) < NEWTON_CONVERGED:
                     if t > 0:
                         distance[ray], slopes[ray, 0], slopes[ray, 1] = t, along_x, along_y
                     break

@@ -1,15 +1,14 @@
-"""What photographs say of every cell and slope below the mouth of a lathe, in Numba."""
+"""What photographs say of every cell and slope below the mouth of a surface of revolution, in Numba."""
 
 import numpy as np
 from jaxtyping import Float
 from numba import njit
 
-EXACT = {"nogil": True, "cache": True, "error_model": "numpy"}
-LEAST_RISE = 1e-6
-LEAST_FACING = 0.05
+from panoless.kernels.constants import LEAST_FACING, LEAST_RISE
+from panoless.kernels.cpu.compilation import PLAIN_LOOPS
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def slope_votes(
     origins: Float[np.ndarray, "P 3"],
     directions: Float[np.ndarray, "P 3"],
@@ -20,13 +19,7 @@ def slope_votes(
     angles: Float[np.ndarray, "S"],
     scale: float,
 ) -> Float[np.ndarray, "2 cells S"]:
-    """Sum of ‖e‖²/(‖e‖² + s²), and number of rays, for each cell and direction of the profile.
-
-    Rays have unit directions in the frame of the axis, whose rows are `frame`. `grid` holds the size of a cell, the
-    height of the uppermost ones, how many there are by column and by row, and the height of the mouth, as wide as the
-    columns. Only rays count that see the front of a slope and leave it through the mouth, or above. Radiance is that of
-    the texel in the mirrored direction.
-    """
+    """See `panoless.kernels.revolution`."""
     cell, top, mouth = grid[0], grid[1], grid[4]
     columns, rows = int(grid[2]), int(grid[3])
     radius = columns * cell
@@ -58,8 +51,8 @@ def slope_votes(
                 if oz <= LEAST_RISE:
                     continue
                 if z < mouth:
-                    way = (mouth - z) / oz
-                    if (x + way * ox) ** 2 + (y + way * oy) ** 2 >= radius * radius:
+                    t = (mouth - z) / oz
+                    if (x + t * ox) ** 2 + (y + t * oy) ** 2 >= radius * radius:
                         continue
                 squared = _squared_error(texels, frame, ox, oy, oz, radiance[ray])
                 result[0, at, k] += squared / (squared + scale * scale)
@@ -67,8 +60,8 @@ def slope_votes(
     return result
 
 
-@njit(**EXACT)
-def _squared_error(texels, frame, ox, oy, oz, seen):
+@njit(**PLAIN_LOOPS)
+def _squared_error(texels, frame, ox, oy, oz, color):
     """‖E(ω) − c‖² with the nearest texel of a cubemap, faces as in OpenGL's table 8.19."""
     x = ox * frame[0, 0] + oy * frame[1, 0] + oz * frame[2, 0]
     y = ox * frame[0, 1] + oy * frame[1, 1] + oz * frame[2, 1]
@@ -85,5 +78,5 @@ def _squared_error(texels, frame, ox, oy, oz, seen):
     row = min(int((t / m + 1) / 2 * side), side - 1)
     error = 0.0
     for channel in range(3):
-        error += (texels[face, row, column, channel] - seen[channel]) ** 2
+        error += (texels[face, row, column, channel] - color[channel]) ** 2
     return error

@@ -4,10 +4,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 
-EXACT = {"nogil": True, "cache": True, "error_model": "numpy"}
+from panoless.kernels.cpu.compilation import PLAIN_LOOPS
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def envelope(
     origins: Float[np.ndarray, "P 3"],
     directions: Float[np.ndarray, "P 3"],
@@ -17,11 +17,7 @@ def envelope(
     ranks: int,
     reach: float,
 ) -> Float[np.ndarray, "cells ranks"]:
-    """For every cell of heights the smallest of the rays' smallest radii in it, in order; infinite where fewer pass.
-
-    The axis is z. Rays have unit directions and are followed where they are within `reach` of the origin, by steps of
-    a quarter of a cell.
-    """
+    """See `panoless.kernels.revolution`."""
     best = np.full((cells, ranks), np.inf)
     for ray in range(len(origins)):
         o, d = origins[ray], directions[ray]
@@ -42,7 +38,7 @@ def envelope(
     return best
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _chord(origin, direction, reach):
     """Middle and half length of the part of a unit ray's line within `reach` of the origin; −1 for none."""
     middle = -(origin[0] * direction[0] + origin[1] * direction[1] + origin[2] * direction[2])
@@ -50,7 +46,7 @@ def _chord(origin, direction, reach):
     return middle, np.sqrt(reach**2 - clear) if clear <= reach**2 else -1.0
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _keep(best, index, value):
     if index < 0 or index >= len(best):
         return
@@ -60,7 +56,7 @@ def _keep(best, index, value):
             value, row[k] = row[k], value
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def polyline_distance(x: float, y: float, polyline: Float[np.ndarray, "N 2"]) -> tuple[float, int, float]:
     """Distance of a point from a polyline, the nearest side, and where on it, 0 to 1."""
     best, side, along = np.inf, 0, 0.0
@@ -75,7 +71,7 @@ def polyline_distance(x: float, y: float, polyline: Float[np.ndarray, "N 2"]) ->
     return np.sqrt(best), side, along
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _inside(x, y, polyline):
     """Whether a point lies in the polygon of a polyline and the axis x = 0, by crossings of a ray to x = ∞."""
     odd = False
@@ -88,11 +84,11 @@ def _inside(x, y, polyline):
     return odd
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def distance_grid(
     polyline: Float[np.ndarray, "N 2"], lowest: float, cell: float, rows: int, columns: int
 ) -> Float[np.ndarray, "rows columns"]:
-    """Signed distance (negative inside) at (ρ, h) = (column, row)·cell + (0, lowest)."""
+    """See `panoless.kernels.revolution`."""
     grid = np.empty((rows, columns))
     for row in range(rows):
         for column in range(columns):
@@ -102,7 +98,7 @@ def distance_grid(
     return grid
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def closest_approach(
     origins: Float[np.ndarray, "P 3"],
     directions: Float[np.ndarray, "P 3"],
@@ -112,9 +108,7 @@ def closest_approach(
     cell: float,
     reach: float,
 ) -> tuple[Float[np.ndarray, "P"], Float[np.ndarray, "P"], Int[np.ndarray, "P"], Float[np.ndarray, "P"]]:
-    """Where each unit ray comes nearest to the body, or deepest into it: distance along the ray, signed distance from
-    the profile, side of the profile and where on it. A ray that passes beyond `reach` has side −1.
-    """
+    """See `panoless.kernels.revolution`."""
     count = len(origins)
     where, signed = np.zeros(count), np.zeros(count)
     side, along = np.full(count, -1), np.zeros(count)

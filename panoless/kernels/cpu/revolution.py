@@ -8,22 +8,23 @@ import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 
+from panoless.kernels.cpu.compilation import PLAIN_LOOPS
+from panoless.kernels.cpu.interior import slope_votes
+from panoless.kernels.cpu.profile import closest_approach, distance_grid, envelope
 from panoless.kernels.cpu.simd_memory import fetch_add
 from panoless.kernels.cpu.workers import run_shared
 
+__all__ = ["closest_approach", "distance_grid", "envelope", "first_hits", "follow", "slope_votes"]
+
 RAYS_PER_CLAIM = 2048
-EXACT = {"nogil": True, "cache": True, "error_model": "numpy"}
 FLAT = 1e-7
-DEEPEST = 64
+STACK_SIZE = 64
 
 
 def first_hits(
     origins: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"], profile: Float[np.ndarray, "N 2"]
 ) -> tuple[Float[np.ndarray, "P"], Int[np.ndarray, "P"], Float[np.ndarray, "P"]]:
-    """Distance along each ray, in lengths of its direction, to the surface; side of the profile; where on it, 0 to 1.
-
-    The axis is z. Both faces of the surface count, from t = 0 on; a miss has an infinite distance and side −1.
-    """
+    """See `panoless.kernels.revolution`."""
     count = len(origins)
     distance, side, along = np.empty(count), np.empty(count, dtype=np.int64), np.empty(count)
     rays = np.ascontiguousarray(origins, dtype=np.float64), np.ascontiguousarray(directions, dtype=np.float64)
@@ -35,26 +36,21 @@ def first_hits(
 def follow(
     points: Float[np.ndarray, "P 3"],
     directions: Float[np.ndarray, "P 3"],
-    hits: tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"]],
+    places: tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"]],
     profile: Float[np.ndarray, "N 2"],
     angles: Float[np.ndarray, "S 2"],
-    leaving: float,
-    most: int,
+    epsilon: float,
+    max_bounces: int,
 ) -> tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, "P"]]:
-    """Unit directions in which rays leave the surface for good, and after how many reflections; zeros for those that
-    have not after `most`.
-
-    Rays come in `directions` and meet the surface at `points`, on that side and place of it; each next one starts
-    `leaving` from its point. `angles` are the profile's directions at both ends of every side (rad).
-    """
+    """See `panoless.kernels.revolution`."""
     final, bounces = np.zeros((len(points), 3)), np.zeros(len(points), dtype=np.int64)
     rays = np.ascontiguousarray(points, dtype=np.float64), np.ascontiguousarray(directions, dtype=np.float64)
     profile = np.ascontiguousarray(profile, dtype=np.float64)
-    run_shared(_follow, *rays, hits, profile, _tree(profile), angles, leaving, most, final, bounces)
+    run_shared(_follow, *rays, places, profile, _tree(profile), angles, epsilon, max_bounces, final, bounces)
     return final, bounces
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _tree(profile):
     """Boxes (ρ₀, ρ₁, h₀, h₁) of runs of sides: node k has the children 2k + 1 and 2k + 2; leaves come last."""
     sides = len(profile) - 1
@@ -78,7 +74,7 @@ def _tree(profile):
     return boxes
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _enters(box, a, b, c, h0, h1, limit):
     """Whether the part of a ray before `limit` may meet a box."""
     start, end = 0.0, limit
@@ -99,7 +95,7 @@ def _enters(box, a, b, c, h0, h1, limit):
     return farthest >= box[0] ** 2 - slack
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _meets(r0, z0, r1, z1, a, b, c, h0, h1, limit):
     """Distance to one side and where on it; infinite when it is missed."""
     best, where = limit, -1.0
@@ -133,7 +129,7 @@ def _meets(r0, z0, r1, z1, a, b, c, h0, h1, limit):
     return (best if where >= 0 else np.inf), where
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _nearest(x, y, h0, dx, dy, h1, profile, tree, stack):
     """Distance, side and place on it of the first hit of one ray."""
     leaves = (len(tree) + 1) // 2
@@ -157,9 +153,9 @@ def _nearest(x, y, h0, dx, dy, h1, profile, tree, stack):
     return best, hit, where
 
 
-@njit(**EXACT)
+@njit(**PLAIN_LOOPS)
 def _trace(counter, origins, directions, profile, tree, distance, side, along):
-    stack = np.empty(DEEPEST, dtype=np.int64)
+    stack = np.empty(STACK_SIZE, dtype=np.int64)
     while True:
         begin = fetch_add(counter, RAYS_PER_CLAIM)
         if begin >= len(origins):
@@ -170,11 +166,11 @@ def _trace(counter, origins, directions, profile, tree, distance, side, along):
             distance[ray], side[ray], along[ray] = _nearest(x, y, h, dx, dy, dh, profile, tree, stack)
 
 
-@njit(**EXACT)
-def _follow(counter, points, ways, alive, profile, tree, angles, leaving, most, final, bounces):
+@njit(**PLAIN_LOOPS)
+def _follow(counter, points, directions, places, profile, tree, angles, epsilon, max_bounces, final, bounces):
     """Mirror rays that lie on the surface on, from their first side and the place on it."""
-    side, along = alive
-    stack = np.empty(DEEPEST, dtype=np.int64)
+    side, along = places
+    stack = np.empty(STACK_SIZE, dtype=np.int64)
     while True:
         begin = fetch_add(counter, RAYS_PER_CLAIM)
         if begin >= len(points):
@@ -182,9 +178,9 @@ def _follow(counter, points, ways, alive, profile, tree, angles, leaving, most, 
         for ray in range(begin, min(begin + RAYS_PER_CLAIM, len(points))):
             i, u = side[ray], along[ray]
             x, y, h = points[ray]
-            dx, dy, dh = ways[ray]
+            dx, dy, dh = directions[ray]
             bounce = 0
-            while i >= 0 and bounce < most:
+            while i >= 0 and bounce < max_bounces:
                 bounce += 1
                 angle = angles[i, 0] + u * (angles[i, 1] - angles[i, 0])
                 radius = max(np.sqrt(x * x + y * y), 1e-12)
@@ -193,7 +189,7 @@ def _follow(counter, points, ways, alive, profile, tree, angles, leaving, most, 
                 dx, dy, dh = dx - twice * nx, dy - twice * ny, dh - twice * nh
                 length = np.sqrt(dx * dx + dy * dy + dh * dh)
                 dx, dy, dh = dx / length, dy / length, dh / length
-                x, y, h = x + leaving * dx, y + leaving * dy, h + leaving * dh
+                x, y, h = x + epsilon * dx, y + epsilon * dy, h + epsilon * dh
                 t, i, u = _nearest(x, y, h, dx, dy, dh, profile, tree, stack)
                 if i >= 0:
                     x, y, h = x + t * dx, y + t * dy, h + t * dh

@@ -1,1 +1,1 @@
-"""Every operator in plain torch: the definition that the fast kernels are checked against."""
+"""Every operator in plain torch or numpy: the definition that the fast kernels are checked against."""

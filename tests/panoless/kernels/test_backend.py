@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from panoless.kernels import backend
-from panoless.kernels.backend import choose_backend
+from panoless.kernels.backend import array_kernels, choose_backend
 
 GPU, CPU = torch.device("cuda"), torch.device("cpu")
 
@@ -28,3 +28,8 @@ def test_what_an_explicit_choice_lacks_is_named(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(backend, "gpu_kernels_installed", lambda: False)
     with pytest.raises(ValueError, match=r"expected Triton .* pip install"):
         choose_backend("gpu", tensor=tensor)
+
+
+def test_operators_on_arrays_run_on_the_cpu_only() -> None:
+    with pytest.raises(ValueError, match='expected the backend "reference" or "cpu"; found \'gpu\''):
+        array_kernels("gpu", "revolution")

@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from jaxtyping import Float
 from matplotlib.path import Path as PolygonPath
 
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import pose_of, unit_rays_camera
+from panoless.capture.silhouettes import mask_contours
 from panoless.capture.views import Views
-from panoless.geometry.plane.fit import MAX_VERTICES, PlaneFit, fit_plane
+from panoless.geometry.plane.fit import PlaneFit, _descend, fit_plane
 from panoless.geometry.plane.model import Plane, plane_buffers, unoccluded_share
-from panoless.numeric.polygon import polygon_coverage
+from panoless.geometry.plane.options import PlaneOptions
+from panoless.geometry.plane.silhouette import apply_plane_step, boundary_residuals
 from shinypartial.core.errors import InputError
 from tests.support.mirror_plane import (
     L_SHAPE,
@@ -33,55 +33,6 @@ from tests.support.mirror_plane import (
 
 def angle_deg(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> float:
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
-
-
-def area(polygon: Float[np.ndarray, "N 2"]) -> float:
-    x, y = polygon.T
-    return abs(float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum())) / 2
-
-
-@st.composite
-def star_polygons(draw: st.DrawFn) -> Float[np.ndarray, "N 2"]:
-    """Simple polygons around (15, 12) with vertices up to 11 pixels away, often on pixel borders."""
-    count = draw(st.integers(3, 12))
-    radii = draw(st.lists(st.floats(1.0, 11.0), min_size=count, max_size=count))
-    angles = 2 * np.pi * (np.arange(count) + draw(st.floats(0, 1))) / count
-    vertices = np.array([15.0, 12.0]) + np.array(radii)[:, None] * np.stack([np.cos(angles), np.sin(angles)], 1)
-    return vertices.round(draw(st.sampled_from([1, 9])))
-
-
-@given(star_polygons())
-def test_coverage_sums_to_the_area(polygon: np.ndarray) -> None:
-    """Σ coverage = the polygon's area by the shoelace formula, whichever way round it is."""
-    coverage = polygon_coverage(polygon, 30, 24)
-    assert coverage.sum() == pytest.approx(area(polygon), abs=1e-3)
-    assert coverage.min() >= 0
-    assert coverage.max() <= 1
-    np.testing.assert_allclose(polygon_coverage(polygon[::-1].copy(), 30, 24), coverage, atol=1e-9)
-
-
-@given(star_polygons(), st.integers(-14, 14), st.integers(-11, 11))
-def test_coverage_moves_with_the_polygon_and_ends_at_the_border(polygon: np.ndarray, right: int, down: int) -> None:
-    """A shift by whole pixels shifts the picture; what leaves it on any side changes nothing of what stays."""
-    wide = polygon_coverage(polygon + np.array([20, 20]), 70, 64)
-    part = polygon_coverage(polygon + np.array([right, down]), 30, 24)
-    np.testing.assert_allclose(part, wide[20 - down : 44 - down, 20 - right : 50 - right], atol=2e-6)
-
-
-def test_coverage_is_the_area_within_each_pixel() -> None:
-    """Against points on a 64×64 grid in each pixel, which a side through a pixel gets wrong by up to about 1/64."""
-    polygon = np.array([[3.2, 4.1], [30.7, 2.3], [25.1, 20.9], [38.0, 33.3], [10.5, 36.2], [14.0, 18.0]])
-    line = (np.arange(40 * 64) + 0.5) / 64
-    points = np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
-    counted = PolygonPath(polygon).contains_points(points).reshape(40, 64, 40, 64).mean((1, 3))
-    assert np.abs(polygon_coverage(polygon, 40, 40) - counted).max() < 1 / 64
-
-
-def test_a_polygon_around_the_picture_covers_it() -> None:
-    square = 1e7 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    assert (polygon_coverage(square, 9, 7) == 1).all()
-    assert (polygon_coverage(square + 3e7, 9, 7) == 0).all()
-    assert (polygon_coverage(np.zeros((0, 2)), 9, 7) == 0).all()
 
 
 @pytest.mark.parametrize("frame_height", [0.0, 0.15])
@@ -229,7 +180,7 @@ def test_wrong_poses_do_not_bias_the_normal() -> None:
 def test_a_round_mirror_needs_only_so_many_vertices() -> None:
     angles = np.linspace(0, 2 * np.pi, 90, endpoint=False)
     fit = fit_plane(mirror_views(plane_of(np.stack([0.6 * np.cos(angles), 0.5 * np.sin(angles)], 1)), arc(12)))
-    assert len(fit.plane.boundary) <= MAX_VERTICES
+    assert len(fit.plane.boundary) <= PlaneOptions().max_vertices
     assert angle_deg(fit.plane.normal, NORMAL) < 0.2
     assert float(fit.iou.min()) > 0.99
 
@@ -255,6 +206,22 @@ def test_giving_up_early_changes_no_plane(flat_fit: PlaneFit) -> None:
     quick = fit_plane(mirror_views(plane_of(L_SHAPE), arc(12)), thorough=False)
     np.testing.assert_array_equal(quick.plane.normal, flat_fit.plane.normal)
     np.testing.assert_array_equal(quick.plane.boundary, flat_fit.plane.boundary)
+
+
+@pytest.mark.parametrize("tilt_deg", [2.0, 40.0])
+def test_no_step_raises_the_cost_that_it_minimizes(tilt_deg: float) -> None:
+    """At the robust scale, and over the points, of where the step starts."""
+    contours, options, true = mask_contours(mirror_views(plane_of(L_SHAPE), arc(8))), PlaneOptions(), plane_of(L_SHAPE)
+    plane = apply_plane_step(true, np.append([np.tan(np.radians(tilt_deg)), 0, 0.1, 0], np.zeros(true.boundary.size)))
+    medians = []
+    for _ in range(8):
+        before = boundary_residuals(contours, plane, options)
+        scale = before.scale(2.0, options)
+        plane = _descend(contours, plane, (2.0,), options)
+        after = boundary_residuals(contours, plane, options)
+        assert after.cost(scale, before.counted) <= before.cost(scale, before.counted)
+        medians.append(np.median(np.abs(after.pixels)))
+    assert medians[-1] < medians[0] / 2
 
 
 def test_views_from_behind_are_not_explained() -> None:

@@ -1,0 +1,62 @@
+"""The tuned numbers of a height field's fit."""
+
+from dataclasses import dataclass
+
+from panoless.geometry.plane.options import PlaneOptions
+
+
+@dataclass(frozen=True)
+class HeightFieldRound:
+    """Gauss–Newton steps, the map solved anew before each."""
+
+    resolution: int
+    """Texels along a face side of the map."""
+    robust_scale: float
+    """Residual (linear radiance) beyond which a pixel loses its vote."""
+    rays: int
+    """About so many pixels of all views take part."""
+    steps: int
+    """Number of steps."""
+
+
+@dataclass(frozen=True)
+class HeightFieldOptions:
+    """How a height over a plane is fitted to silhouettes and photographs.
+
+    "Development scenes" are vase, cola, mirror, deformed-mirror and sculpture; "not tuned" is what only has to be large
+    or small enough.
+    """
+
+    cells: int = 16
+    """Cells of the spline along the longer side of the boundary. Chosen on the development scenes."""
+    max_points: int = 20_000
+    """Most contour points of all views. Not tuned."""
+    edge_scales_px: tuple[float, ...] = (2.0, 1.0, 1.0, 0.5, 0.5, 0.5)
+    """Robust scales, in pixels, of the first steps, which ask contours only. Not tuned."""
+    edge_bending: float = 1e-2
+    """Weight of the bending energy in these steps, against the mean diagonal of the data: contours say nothing of the
+    inside. Not tuned.
+    """
+    contour_scale_px: float = 0.5
+    """Robust scale of the contours, in pixels, beside photographs. Not tuned."""
+    contour_sigma_px: float = 0.05
+    """Standard deviation of a contour point, in pixels. Less than its median error of 0.07 px, because photographs
+    count pixel by pixel, but errors of the map are common to all rays of a texel. Chosen on the development scenes.
+    """
+    radiance_sigma: float = 0.05
+    """Standard deviation of a pixel (linear radiance). Chosen on the development scenes."""
+    bending: float = 1e-4
+    """Weight of the bending energy beside photographs. Chosen on the development scenes."""
+    rounds: tuple[HeightFieldRound, ...] = (
+        HeightFieldRound(16, 0.5, 60_000, 4),
+        HeightFieldRound(32, 0.3, 60_000, 3),
+        HeightFieldRound(64, 0.3, 60_000, 3),
+        HeightFieldRound(128, 0.1, 200_000, 4),
+    )
+    """From coarse to fine: the first texels are as wide as a ray turns when its normal does by 2.8°. Chosen on the
+    development scenes; one more round at 256 texels gave 0.023° instead of 0.030° for twice the time.
+    """
+    clear_px: float = 1.0
+    """A mirrored ray has to pass the frame at least this far away, in pixels: pixels are no points. Not tuned."""
+    contours: PlaneOptions = PlaneOptions()
+    """How contours are weighted; of these only corners, noise and the pull of vertices."""
