@@ -40,13 +40,16 @@ def fitted(vessel: Callable[[], Vessel], turned: bool) -> tuple[Photographs, Sur
 
 
 def normal_errors_deg(photographs: Photographs, surface: SurfaceOfRevolution) -> np.ndarray:
-    """Angles between normals, found and true, of all pixels that lie wholly on the vessel."""
-    errors = []
+    """Angles between normals, found and true, of pixels that lie wholly on the vessel; hardly any may miss the fit."""
+    errors, missed = [], 0
     for view, truth in zip(photographs.views.train, photographs.normals, strict=True):
         pixels = view.solid.numpy()
         hits = surface.hits(*pixel_rays(view.camera, pixels))
-        cosine = np.abs((hits.normals * truth[pixels]).sum(1)).clip(0, 1)
+        cosine = np.abs((hits.normals * truth[pixels]).sum(1))[hits.met].clip(0, 1)
+        missed += int((~hits.met).sum())
         errors.append(np.degrees(np.arccos(cosine)))
+    # Measured: a fifth of a percent, at the edge of a floor that no camera looks at from below.
+    assert missed < 0.01 * sum(map(len, errors))
     return np.concatenate(errors)
 
 
@@ -61,7 +64,9 @@ def map_error(photographs: Photographs, surface: SurfaceOfRevolution, turn: np.n
 
 
 def test_an_open_vessel_is_found_with_its_lip_its_wall_and_the_map() -> None:
-    """Measured: normals 0.11° in the mean and 0.07° in the median, the lip to 0.002 (a tenth of a pixel)."""
+    """Measured: normals 0.11° in the mean and 0.07° in the median, the lip to 0.001 (a pixel is 0.03), the map to
+    0.008.
+    """
     photographs, surface = fitted(cut_bowl, False)
     errors = normal_errors_deg(photographs, surface)
     assert surface.is_open
@@ -69,7 +74,7 @@ def test_an_open_vessel_is_found_with_its_lip_its_wall_and_the_map() -> None:
     assert np.median(errors) < 0.12
     lip = surface.origin + surface.profile[surface.lip, 1] * surface.axis
     assert lip[2] == pytest.approx(0.62, abs=0.005)
-    assert map_error(photographs, surface, UPRIGHT) < 0.03
+    assert map_error(photographs, surface, UPRIGHT) < 0.02
 
 
 def test_a_closed_vessel_is_found_with_the_dish_in_its_lid() -> None:
