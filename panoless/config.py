@@ -13,9 +13,11 @@ from typing import Annotated, Any, Literal, TypeVar
 import tyro
 from msgspec import Meta
 
+from panoless.environment.options import FootprintMapOptions
 from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.options import PlaneOptions
+from panoless.geometry.revolution.options import RevolutionOptions
 from panoless.selection.options import SelectionOptions
 from shinypartial.core.errors import InputError
 from shinypartial.io.records import Count, NonNegative, Positive, Share, check_record, read_record, write_record
@@ -187,6 +189,8 @@ class FitConfig:
     first_surface: Tuned[FirstSurfaceOptions] = field(default_factory=FirstSurfaceOptions)
     plane: Tuned[PlaneOptions] = field(default_factory=PlaneOptions)
     height_field: Tuned[HeightFieldOptions] = field(default_factory=HeightFieldOptions)
+    revolution: Tuned[RevolutionOptions] = field(default_factory=RevolutionOptions)
+    footprint_map: Tuned[FootprintMapOptions] = field(default_factory=FootprintMapOptions)
     selection: Tuned[SelectionOptions] = field(default_factory=SelectionOptions)
 
 

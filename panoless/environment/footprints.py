@@ -15,22 +15,10 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from panoless.environment.cubemap import resample
+from panoless.environment.options import DEFAULTS, FootprintMapOptions
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap, scatter_cubemap
 from panoless.numeric.conjugate_gradients import conjugate_gradients
 from panoless.numeric.robust import robust_weight
-
-ROBUST_SCALE = 0.16
-PULL = 0.2
-"""λ, in rays."""
-ROUNDS, STEPS = 4, 2
-"""Weights are found anew in every round of so many steps."""
-SATURATED, LIT = 0.998, 0.95
-"""Shares of the largest value from which a pixel, and a texel of E₀, count as saturated."""
-CEILING = 4.0
-"""Largest radiance of a map, over that of views."""
-COARSE_RESOLUTION, COARSE_ROUNDS, COARSE_STEPS = 8, 2, 6
-COARSE_SCALE = 1.0
-"""Of robust weights: while a lamp is far too dark, pixels that see it in part must keep their votes."""
 
 Linear = Callable[[Tensor], Tensor]
 
@@ -53,10 +41,12 @@ class PixelFootprints:
         each = (values[:, None] / count).expand(-1, count, -1).flatten(0, 1).contiguous()
         return scatter_cubemap(each, self.directions.flatten(0, 1), resolution)
 
-    def weights(self, seen: Float[Tensor, "P 3"], saturation: Float[Tensor, "3"], scale: float) -> Float[Tensor, "P 3"]:
+    def weights(
+        self, seen: Float[Tensor, "P 3"], saturation: Float[Tensor, "3"], scale: float, saturated: float
+    ) -> Float[Tensor, "P 3"]:
         """Robust weights of the errors of what is seen of a map; zero where it and the pixel are saturated."""
         weight = robust_weight(seen.minimum(saturation) - self.radiance, scale)[:, None]
-        return weight * ~(seen.minimum(self.radiance) >= SATURATED * saturation)
+        return weight * ~(seen.minimum(self.radiance) >= saturated * saturation)
 
 
 @dataclass(frozen=True)
@@ -66,29 +56,32 @@ class Footprints:
     smooth: list[PixelFootprints]
     """Of pixels that see the environment smoothly, a few views to a batch."""
     trace_others: Callable[[], PixelFootprints]
-    """Traces those of a sample of the other pixels, which bend the light much or mirror it often."""
+    """Traces those of a sample of the other pixels, which bend the light much or reflect it often."""
 
 
 def deblur_map(
-    footprints: Footprints, environment: Float[Tensor, "6 3 L L"], saturation: Float[Tensor, "3"]
+    footprints: Footprints,
+    environment: Float[Tensor, "6 3 L L"],
+    saturation: Float[Tensor, "3"],
+    options: FootprintMapOptions = DEFAULTS,
 ) -> Float[Tensor, "6 3 L L"]:
     """The map E₀ of pixel centers, sharpened; texels that no footprint touches stay. Views are clipped at `saturation`.
 
-    It lies between 0 and that, or `CEILING` times that in channels in which pixels are saturated. Before each round,
-    pixels that bend the light much, or mirror it often, and so see wide parts of it, tell how bright the inside of
+    It lies between 0 and that, or `ceiling` times that in channels in which pixels are saturated. Before each round,
+    pixels that bend the light much, or reflect it often, and so see wide parts of it, tell how bright the inside of
     saturated regions is, coarsely.
     """
     if not footprints.smooth:
         return environment
     saturation = saturation.to(environment)
-    lit = torch.stack([(each.radiance >= SATURATED * saturation).any(0) for each in footprints.smooth]).any(0)
-    highest = (saturation * torch.where(lit, CEILING, 1.0))[:, None, None]
-    inner = _eroded(environment >= LIT * saturation[:, None, None])
+    lit = torch.stack([(each.radiance >= options.saturated * saturation).any(0) for each in footprints.smooth]).any(0)
+    highest = (saturation * torch.where(lit, options.ceiling, 1.0))[:, None, None]
+    inner = _eroded(environment >= options.lit * saturation[:, None, None])
     others = footprints.trace_others() if inner.any() else None
-    for _ in range(ROUNDS):
+    for _ in range(options.rounds):
         if others is not None:
-            environment = _brightened(environment, others, inner, saturation).minimum(highest)
-        change = _change(environment, footprints.smooth, saturation, ROBUST_SCALE, STEPS)
+            environment = _brightened(environment, others, inner, saturation, options).minimum(highest)
+        change = _change(environment, footprints.smooth, saturation, options, options.robust_scale, options.steps)
         environment = (environment + change).clamp(min=0).minimum(highest)
     return environment
 
@@ -98,6 +91,7 @@ def _brightened(
     areas: PixelFootprints,
     inner: Float[Tensor, "6 3 L L"],
     saturation: Float[Tensor, "3"],
+    options: FootprintMapOptions,
 ) -> Float[Tensor, "6 3 L L"]:
     """The map plus what a coarse one adds within saturated regions; nothing there falls below saturation for it."""
     resolution = environment.shape[-1]
@@ -107,11 +101,14 @@ def _brightened(
         return inner * resample(coarse, resolution)
 
     def coarser(image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "6 C M M"]:
-        return scatter_cubemap((inner * image).permute(0, 2, 3, 1).reshape(len(texels), -1), texels, COARSE_RESOLUTION)
+        return scatter_cubemap(
+            (inner * image).permute(0, 2, 3, 1).reshape(len(texels), -1), texels, options.coarse_resolution
+        )
 
     lowest = environment.minimum(saturation[:, None, None])
-    for _ in range(COARSE_ROUNDS):
-        change = _change(environment, [areas], saturation, COARSE_SCALE, COARSE_STEPS, finer, coarser)
+    for _ in range(options.coarse_rounds):
+        scale, steps = options.coarse_scale, options.coarse_steps
+        change = _change(environment, [areas], saturation, options, scale, steps, finer, coarser)
         environment = (environment + change).maximum(lowest)
     return environment
 
@@ -124,6 +121,7 @@ def _change(
     environment: Float[Tensor, "6 3 L L"],
     areas: Sequence[PixelFootprints],
     saturation: Float[Tensor, "3"],
+    options: FootprintMapOptions,
     scale: float,
     steps: int,
     finer: Linear = _same,
@@ -137,7 +135,7 @@ def _change(
     weights, residual, total = [], torch.zeros_like(environment), torch.zeros_like(environment)
     for each in areas:
         seen = each.seen(environment)
-        weights.append(each.weights(seen, saturation, scale))
+        weights.append(each.weights(seen, saturation, scale, options.saturated))
         residual += each.spread((each.radiance - seen) * weights[-1], resolution)
         total += each.spread(weights[-1], resolution)
 
@@ -146,10 +144,10 @@ def _change(
         found = torch.zeros_like(image)
         for each, weight in zip(areas, weights, strict=True):
             found += each.spread(each.seen(image) * weight, resolution)
-        return PULL * change + coarser(found)
+        return options.pull * change + coarser(found)
 
     right_side = coarser(residual)
-    precondition = 1 / (PULL + coarser(total))
+    precondition = 1 / (options.pull + coarser(total))
     return finer(conjugate_gradients(normal, torch.zeros_like(right_side), right_side, precondition, steps))
 
 

@@ -45,7 +45,7 @@ class ExactGeometry:
         if not encoding.high_dynamic_range:
             footprints = self.footprints(views)
             if footprints is not None:
-                environment = deblur_map(footprints, environment, encoding.saturation)
+                environment = deblur_map(footprints, environment, encoding.saturation, config.footprint_map)
         return environment, rays
 
     def shade(

@@ -1,4 +1,7 @@
-"""A mirror of revolution as views: masks and reflections traced in numpy by marching, not by what is tested."""
+"""A mirror of revolution as views, made by the forward model that is tested: `SurfaceOfRevolution` and `mean_light`.
+
+They test steps of a fit for themselves, on data without model error. `traced_vessel` makes independent data.
+"""
 
 from dataclasses import replace
 

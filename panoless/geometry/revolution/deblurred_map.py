@@ -8,41 +8,57 @@ from jaxtyping import Int
 
 from panoless.capture.views import TrainView, Views
 from panoless.environment.footprints import Footprints, PixelFootprints
-from panoless.geometry.revolution.footprints import SUBRAYS, trace_footprints
 from panoless.geometry.revolution.model import SurfaceOfRevolution
+from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
+from panoless.geometry.revolution.pixels import PixelBundles
 from panoless.geometry.revolution.render import smooth_pixels
 
 OFFSETS = (-0.25, 0.25)
-MOST_PIXELS = 3_500_000
-BATCH_VIEWS = 4
-MOST_TRACED = 60_000
+"""Of a footprint's directions from the pixel's center, in pixels."""
 
 
-def pixel_footprints(views: Views, surface: SurfaceOfRevolution, most: int = 1) -> Footprints:
-    """Footprints of all pixels of evenly chosen views that are mirrored up to `most` times."""
-    stride = -(-sum(len(view.solid) for view in views.train) // MOST_PIXELS)
-    chosen = views.train[:: max(stride, 1)]
+def pixel_footprints(
+    views: Views,
+    surface: SurfaceOfRevolution,
+    options: RevolutionOptions = DEFAULTS,
+    *,
+    max_bounces: int = 1,
+    occlusion_test: bool = True,
+) -> Footprints:
+    """Footprints of all pixels of evenly chosen views that are reflected up to `max_bounces` times."""
+    stride = -(-sum(len(view.solid) for view in views.train) // options.map.pixels)
+    chosen, batch = views.train[:: max(stride, 1)], options.map.batch_views
     found, others = [], []
     for view in chosen:
         places = view.solid.cpu().numpy()
-        at, smooth = smooth_pixels(surface, view.camera, places, most)
+        bend = options.rendering.largest_bend
+        at, smooth = smooth_pixels(
+            surface, view.camera, places, bend, max_bounces=max_bounces, occlusion_test=occlusion_test
+        )
         pixels = view.solid[torch.from_numpy(smooth).to(view.solid.device)]
         directions = torch.stack(list(at.within(OFFSETS)), 1).to(view.radiance.device)
         found.append(PixelFootprints(directions, view.radiance.flatten(1)[:, pixels].T.contiguous()))
         others.append(places[~smooth])
-    joined = [_joined(found[first : first + BATCH_VIEWS]) for first in range(0, len(found), BATCH_VIEWS)]
-    return Footprints([batch for batch in joined if len(batch.radiance)], lambda: _traced(chosen, surface, others))
+    joined = [_joined(found[first : first + batch]) for first in range(0, len(found), batch)]
+    smooth_batches = [areas for areas in joined if len(areas.radiance)]
+    return Footprints(smooth_batches, lambda: _trace(chosen, surface, others, options))
 
 
-def _traced(
-    views: Sequence[TrainView], surface: SurfaceOfRevolution, pixels: Sequence[Int[np.ndarray, "_"]]
+def _trace(
+    views: Sequence[TrainView],
+    surface: SurfaceOfRevolution,
+    pixels: Sequence[Int[np.ndarray, "_"]],
+    options: RevolutionOptions,
 ) -> PixelFootprints:
-    """About `MOST_TRACED` of the pixels, as far as all of their rays leave, however often they are reflected."""
-    stride = max(1, -(-sum(map(len, pixels)) // MOST_TRACED))
+    """About `options.map.traced` of the pixels, as far as all of their rays leave."""
+    stride = max(1, -(-sum(map(len, pixels)) // options.map.traced))
     chosen = [each[index % stride :: stride] for index, each in enumerate(pixels)]
-    found, device = trace_footprints(views, surface, chosen), views[0].radiance.device
-    directions = torch.from_numpy(found.outgoing.reshape(-1, len(SUBRAYS), 3)).float().to(device)
-    return PixelFootprints(directions, torch.from_numpy(found.radiance).float().to(device))
+    bundles = PixelBundles.of(zip(views, chosen, strict=True))
+    paths, device = bundles.trace(surface, options.max_bounces), views[0].radiance.device
+    whole = (paths.bounces > 0).reshape(-1, bundles.rays_per_pixel).all(1)
+    directions = paths.directions.reshape(-1, bundles.rays_per_pixel, 3)[whole]
+    radiance = torch.from_numpy(bundles.radiance[whole])
+    return PixelFootprints(torch.from_numpy(directions).float().to(device), radiance.float().to(device))
 
 
 def _joined(areas: Sequence[PixelFootprints]) -> PixelFootprints:

@@ -1,25 +1,28 @@
-"""A surface of revolution from photographs: outside by outlines, inside by search, then all by what it mirrors."""
+"""A surface of revolution from photographs: outside by silhouettes, then all by what it mirrors.
 
-from collections.abc import Sequence
+Every profile goes through the same steps. Which end is open and what is inside, and then each refinement, is decided by
+held-out views: every fifth view takes no part in what it judges.
+"""
+
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
-from panoless.capture.rays import pixel_rays
-from panoless.capture.views import Views, every_kth_pixel
-from panoless.geometry.revolution.floor import fit_floor
-from panoless.geometry.revolution.footprints import refine_by_footprints
-from panoless.geometry.revolution.interior import search_interior
-from panoless.geometry.revolution.lip import clear_of_lip, open_at_lip, with_lip
-from panoless.geometry.revolution.lip_refinement import refine_lip
-from panoless.geometry.revolution.model import MAX_BOUNCES, SurfaceOfRevolution, revolution_buffers, revolution_rays
-from panoless.geometry.revolution.photometric import Round, photometric_step, select_observations, solve_map
+from panoless.capture.views import TrainView, Views, split_held_out
+from panoless.geometry.revolution.floor import fit_floor, floor_pixels
+from panoless.geometry.revolution.footprints import informative_pixels, refine_by_footprints
+from panoless.geometry.revolution.interior import end_pixels, search_interior
+from panoless.geometry.revolution.lip import clear_of_lip, lip_pixels, open_at_lip, place_lip, refine_lip
+from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_buffers
+from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions, Round
+from panoless.geometry.revolution.photometric import refine_round, solve_map
+from panoless.geometry.revolution.pixels import CENTER, PixelBundles, evenly
 from panoless.geometry.revolution.profile import resample_profile
 from panoless.geometry.revolution.silhouette import (
-    ContourRays,
     axis_starts,
     contour_cost,
     contour_rays,
@@ -27,151 +30,199 @@ from panoless.geometry.revolution.silhouette import (
     refine_outer,
     silhouette_residuals,
 )
-from panoless.kernels.cubemap import sample_cubemap
+from panoless.numeric.gauss_newton import keep_if_better
 from shinypartial.io.progress import Progress
-
-LARGEST_START_COST = 0.6
-"""Mean of e²/(e² + s²), s = 2 px, over a coarse fit: above, no axis is near."""
-SCORED_VIEWS = 16
-LEAST_VIEWS = 6
-COARSE_ROUNDS = (Round(64, 0.3, 3.0), Round(128, 0.3, 2.0))
-FINE_ROUNDS = (
-    Round(128, 0.2, 1.5),
-    Round(256, 0.2, 1.5),
-    Round(256, 0.1, 1.0),
-    Round(256, 0.1, 1.0),
-)
-MAP_RAYS = 600_000
-SEARCHED_RESOLUTION = 128
-STEP_PIXELS = 120_000
-CONTOUR_POINTS = 20_000
-BENDING = 1e-4
-JUDGED_SCALE = 0.1
 
 
 @dataclass(frozen=True)
 class RevolutionProposal:
-    """A surface of revolution closed by a flat lid, and how well it explains the silhouettes. Arrays hold one value a
-    view.
+    """A surface of revolution closed flat at both ends, and how well it explains the silhouettes. Arrays hold one value
+    a view.
     """
 
     surface: SurfaceOfRevolution
+    """Its lid is the end that more pixels see."""
     median_px: Float[np.ndarray, "V"]
     """Median distance of the mask's contour from that of the surface."""
     iou: Float[np.ndarray, "V"]
     """Σ min(alpha, mask) / Σ max(alpha, mask), for some of the views."""
 
 
-def propose_revolution(views: Views) -> RevolutionProposal | None:
+def propose_revolution(views: Views, options: RevolutionOptions = DEFAULTS) -> RevolutionProposal | None:
     """Axis and outer profile that explain the masks best; None when none comes near."""
-    rays = contour_rays(views)
-    if len(np.unique(rays.view)) < LEAST_VIEWS:
+    own = options.silhouette
+    rays = contour_rays(views, own)
+    if len(np.unique(rays.view)) < own.least_views:
         return None
-    pixel = float(np.median(rays.pixel))
-    start = fit_outer(rays, axis_starts(views))
-    if start is None or contour_cost(rays.every(max(1, len(rays.view) // 2000)), start, pixel) > LARGEST_START_COST:
+    start = fit_outer(rays, axis_starts(views, own))
+    if start is None:
         return None
-    surface = refine_outer(rays, start)
+    if (
+        contour_cost(silhouette_residuals(rays.at_most(own.start_points), start, rays.pixel), 2.0)
+        > own.largest_start_cost
+    ):
+        return None
+    base, lid = (_count(end) for end in end_pixels(views, start, options.mouth.pixels))
+    surface = refine_outer(rays, start if lid >= base else start.turned_over())
     if surface is None:
         return None
-    found = silhouette_residuals(rays, surface, pixel)
+    found = silhouette_residuals(rays, surface, rays.pixel)
     distance = np.where(found.side >= 0, np.abs(found.pixels), np.inf)
-    views_seen = np.unique(rays.view)
-    medians = np.array([np.median(distance[rays.view == view]) for view in views_seen])
+    medians = np.array([np.median(distance[rays.view == view]) for view in np.unique(rays.view)])
     overlaps = []
-    for view in views.train[:: max(1, len(views.train) // SCORED_VIEWS)]:
+    for view in views.train[:: max(1, len(views.train) // own.scored_views)]:
         alpha = revolution_buffers(surface, view.camera).alpha
         overlaps.append(float(alpha.minimum(view.mask).sum() / alpha.maximum(view.mask).sum().clamp(min=1e-9)))
     return RevolutionProposal(surface, medians, np.array(overlaps))
 
 
-def refine_revolution(views: Views, start: SurfaceOfRevolution) -> SurfaceOfRevolution:
-    """Profile and axis by what is mirrored, from the closed surface of the outlines.
-
-    The outside gives a map; of the insides that are worth trying, the one that explains most under it is refined on. An
-    open wall gets its bottom last, others their grooves and edges, and an inside searched anew between them.
-    """
-    rays = contour_rays(views)
-    pixel = float(np.median(rays.pixel))
-    contours = rays.every(max(1, len(rays.view) // CONTOUR_POINTS))
-    progress = Progress("fitting a surface of revolution", len(COARSE_ROUNDS) + len(FINE_ROUNDS) + 1)
-    surface, environment = start, None
-    for each in COARSE_ROUNDS:
-        surface, environment = _round(views, contours, surface, each, None, pixel)
-        progress.advance()
-    assert environment is not None
-    thin = open_at_lip(contours, surface, pixel)
-    searched = search_interior(views, surface, environment, pixel)
-    candidates = [surface, searched] if thin is None else [surface, thin, searched]
-    surface = best_interior(views, surface, environment, candidates)
-    for each in FINE_ROUNDS:
-        surface, environment = _round(views, contours, surface, each, environment, pixel)
-        progress.advance()
-    if surface.is_open:
-        with torch.no_grad():
-            surface = refine_lip(views, fit_floor(views, surface, environment), environment, pixel)
-    else:
-        surface = refine_by_footprints(views, contours, surface, pixel)
-        inside = with_searched_interior(views, surface, pixel)
-        if inside is not surface:
-            surface = refine_by_footprints(views, contours, inside, pixel, otherwise=surface)
-    progress.advance()
-    return surface
+def _count(chosen: list[tuple[TrainView, Int[np.ndarray, "_"]]]) -> int:
+    return sum(len(pixels) for _, pixels in chosen)
 
 
-def _round(
-    views: Views,
-    contours: ContourRays,
-    surface: SurfaceOfRevolution,
-    each: Round,
-    environment: Tensor | None,
-    pixel: float,
-) -> tuple[SurfaceOfRevolution, Tensor]:
-    views = clear_of_lip(views, surface)
-    with torch.no_grad():
-        environment = solve_map(views, surface, MAP_RAYS, each.resolution, environment)
-        for _ in range(each.steps):
-            seen = select_observations(views, surface, STEP_PIXELS)
-            surface = with_lip(contours, photometric_step(seen, contours, surface, environment, each, BENDING), pixel)
-            surface = resample_profile(surface, pixel)
-    return surface, environment
-
-
-def with_searched_interior(views: Views, surface: SurfaceOfRevolution, pixel: float) -> SurfaceOfRevolution:
-    """The surface with an inside searched anew under its own map, unless it explains no more than the present one."""
-    with torch.no_grad():
-        environment = solve_map(views, surface, MAP_RAYS, SEARCHED_RESOLUTION)
-        lid = [[0.0, surface.profile[surface.lip, 1]]]
-        closed = replace(surface, profile=np.concatenate([surface.profile[: surface.lip + 1], lid]))
-        found = search_interior(views, closed, environment, pixel)
-        # The search samples the outside anew, too, which would blunt its edges.
-        inner = found.profile[found.lip + 1 :]
-        candidate = replace(surface, profile=np.concatenate([surface.profile[: surface.lip + 1], inner]))
-        return min((surface, candidate), key=lambda each: interior_error(views, closed, environment, each))
-
-
-def best_interior(
-    views: Views, surface: SurfaceOfRevolution, environment: Tensor, candidates: Sequence[SurfaceOfRevolution]
+def refine_revolution(
+    views: Views, start: SurfaceOfRevolution, options: RevolutionOptions = DEFAULTS
 ) -> SurfaceOfRevolution:
-    """The candidate that explains best what is seen on the lid of the closed surface, many reflections deep."""
-    if len(candidates) == 1:
-        return candidates[0]
-    return min(candidates, key=lambda each: interior_error(views, surface, environment, each))
+    """Profile and axis by what is mirrored, from the closed surface of the silhouettes.
 
-
-def interior_error(
-    views: Views, closed: SurfaceOfRevolution, environment: Tensor, candidate: SurfaceOfRevolution
-) -> float:
-    """Mean of ‖e‖²/(‖e‖² + s²), 1 for rays that never leave, over pixels that see the lid of `closed`."""
-    summed, count = 0.0, 0
+    The outside gives a map, under which the mouth is opened. Rounds on single rays follow, and after them the
+    refinements for which pixels are found: areas of pixels, the interior anew, the floor and the lip.
+    """
     with torch.no_grad():
-        for view, pixels in every_kth_pixel(views, MAP_RAYS):
-            origin_hits = closed.hits(*pixel_rays(view.camera, pixels.cpu().numpy()))
-            lid = pixels[torch.from_numpy(origin_hits.side >= closed.lip).to(pixels.device)]
-            if not len(lid):
-                continue
-            rays, _ = revolution_rays(candidate, view, lid, MAX_BOUNCES)
-            error = (sample_cubemap(environment, rays.directions) - rays.radiance).square().sum(1)
-            summed += float((error / (error + JUDGED_SCALE**2)).sum()) + len(lid) - len(error)
-            count += len(lid)
-    return summed / max(count, 1)
+        return _Refinement(views, start, options).run()
+
+
+class _Refinement:
+    """The data of a fit, and its steps."""
+
+    def __init__(self, views: Views, start: SurfaceOfRevolution, options: RevolutionOptions) -> None:
+        self.views, self.start, self.options = views, start, options
+        kept, held_out = split_held_out(views.train)
+        self.kept, self.held_out = (replace(views, train=tuple(part)) for part in (kept, held_out))
+        self.contours = contour_rays(views, options.silhouette).at_most(options.photometric.contour_points)
+        self.pixel = self.contours.pixel
+
+    def run(self) -> SurfaceOfRevolution:
+        """All of them, in order."""
+        fine = self.options.photometric.fine
+        progress = Progress("fitting a surface of revolution", 5 + len(fine))
+        surface, environment = self.open_mouth()
+        progress.advance()
+        for each in fine:
+            surface, environment = self.refine_by_centers(surface, each, environment)
+            progress.advance()
+        mapped = None
+        for refine in (self.refine_areas, self.refine_interior, self.refine_floor, self.refine_lip):
+            if surface is not mapped:
+                environment, mapped = self.solve_finest_map(surface, environment), surface
+            surface = refine(surface, environment)
+            progress.advance()
+        return surface
+
+    def keep_if_better(
+        self,
+        surface: SurfaceOfRevolution,
+        candidate: SurfaceOfRevolution,
+        held_out: PixelBundles,
+        environment: Float[Tensor, "6 3 L L"],
+    ) -> SurfaceOfRevolution:
+        """The candidate, if it explains pixels of held-out views better than the surface does."""
+        limits = self.options.rendering.max_bounces, self.options.judged_scale
+        return keep_if_better(
+            (surface, candidate), lambda each: held_out.error(each, environment, *limits), self.options.least_gain
+        )
+
+    def open_mouth(self) -> tuple[SurfaceOfRevolution, Tensor]:
+        """The outside after coarse rounds with what is inside its lid, or inside its base if that is unclear; a map."""
+        own = self.options.mouth
+        base, lid = (_count(end) for end in end_pixels(self.views, self.start, own.pixels))
+        starts = [self.start, self.start.turned_over()] if base > own.unclear_share * lid else [self.start]
+        seen = self._held_out_ends(self.start)
+        opened = []
+        for surface in starts:
+            environment = None
+            for each in self.options.photometric.coarse:
+                surface, environment = self.refine_by_centers(surface, each, environment)
+            assert environment is not None
+            thin = open_at_lip(self.contours, surface, self.options.lip) if own.thin_walls else None
+            for candidate in (thin, search_interior(self.kept, surface, environment, self.pixel, own)):
+                if candidate is not None:
+                    surface = self.keep_if_better(surface, candidate, seen, environment)
+            error = seen.error(surface, environment, self.options.rendering.max_bounces, self.options.judged_scale)
+            opened.append((error, surface, environment))
+        return min(opened, key=lambda each: each[0])[1:]
+
+    def _held_out_ends(self, closed: SurfaceOfRevolution) -> PixelBundles:
+        base, lid = end_pixels(self.held_out, closed, self.options.mouth.judged_pixels)
+        return PixelBundles.of([*base, *lid], CENTER)
+
+    def refine_by_centers(
+        self, surface: SurfaceOfRevolution, each: Round, environment: Tensor | None
+    ) -> tuple[SurfaceOfRevolution, Tensor]:
+        """The surface after one round on single rays, and the map before it."""
+        own, lip = self.options.photometric, self.options.lip
+        views = clear_of_lip(self.views, surface, lip)
+        environment = solve_map(views, surface, own.map_rays, each.resolution, environment)
+        surface = refine_round(
+            PixelBundles.of(evenly(views, own.pixels), CENTER),
+            self.contours,
+            surface,
+            environment,
+            each,
+            lambda moved: resample_profile(place_lip(self.contours, moved, self.pixel, lip), self.pixel),
+            own,
+        )
+        return surface, environment
+
+    def solve_finest_map(self, surface: SurfaceOfRevolution, environment: Tensor) -> Float[Tensor, "6 3 L L"]:
+        """The map of many rays in the resolution of the last round on areas."""
+        own = self.options.footprints
+        views = clear_of_lip(self.views, surface, self.options.lip)
+        return solve_map(views, surface, own.map_rays, own.rounds[-1].resolution, environment)
+
+    def refine_areas(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
+        """Grooves and edges, by pixels as areas."""
+        return self._keep_areas(surface, surface, environment)
+
+    def _keep_areas(
+        self, surface: SurfaceOfRevolution, start: SurfaceOfRevolution, environment: Tensor
+    ) -> SurfaceOfRevolution:
+        views = clear_of_lip(self.kept, start, self.options.lip).train
+        candidate = refine_by_footprints(views, self.contours, start, environment, self.options)
+        own = self.options.footprints
+        held_out = informative_pixels(self.held_out.train, start, own.pixels // 4, self.pixel, own)
+        return self.keep_if_better(surface, candidate, PixelBundles.of(held_out), environment)
+
+    def refine_interior(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
+        """An interior searched anew under a better map, and then its grooves and edges."""
+        own = self.options.mouth
+        blurred = avg_pool2d(environment, max(environment.shape[-1] // own.searched_resolution, 1))
+        outer = surface.profile[: surface.lip + 1]
+        closed = replace(surface, profile=np.concatenate([outer, [[0.0, outer[-1, 1]]]]))
+        found = search_interior(self.kept, closed, blurred, self.pixel, own)
+        # The search samples the outside anew, too, which would blunt its edges.
+        candidate = replace(surface, profile=np.concatenate([outer, found.profile[found.lip + 1 :]]))
+        seen = self._held_out_ends(closed)
+        if self.keep_if_better(surface, candidate, seen, blurred) is surface:
+            return surface
+        return self._keep_areas(surface, candidate, environment)
+
+    def refine_floor(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
+        """The floor, where enough pixels see it by way of the walls or from below."""
+        seen, judging = (floor_pixels(part, surface, self.options) for part in (self.kept, self.held_out))
+        if len(seen.radiance) < self.options.floor.least_pixels or not len(judging.radiance):
+            return surface
+        candidate = fit_floor(seen, surface, environment, self.pixel, self.options)
+        return self.keep_if_better(surface, candidate, judging, environment)
+
+    def refine_lip(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
+        """The lip, where the wall is long enough and pixels mix it with what lies around it."""
+        own = self.options.lip
+        if surface.arc_lengths[surface.lip] < 2 * own.length_px * self.pixel:
+            return surface
+        parts = ((self.kept, own.pixels), (self.held_out, own.pixels // 2))
+        seen, judging = (lip_pixels(part.train, surface, count, self.options) for part, count in parts)
+        if min(len(seen.radiance), len(judging.radiance)) < own.least_pixels:
+            return surface
+        candidate = refine_lip(seen, surface, environment, self.pixel, self.options)
+        return self.keep_if_better(surface, candidate, judging, environment)

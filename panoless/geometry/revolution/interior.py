@@ -1,9 +1,9 @@
-"""The inside of a mouth or a lid, which no outline tells: a shortest path through what photographs say of every slope.
+"""The interior of a mouth or a lid, which no silhouette tells: a shortest path through what photographs say of slopes.
 
 In the half-plane of radius and height, the ray of a pixel that looks onto the lid of a closed surface passes through
 cells below it. If the surface were there, with the profile's direction θ, the pixel would show the environment in a
 known direction. The mean disagreement over all such pixels and azimuths is the cost of going through that cell in that
-direction, and the inside is the cheapest way from the lip to the axis.
+direction, and the interior is the cheapest path from the lip to the axis.
 """
 
 from dataclasses import dataclass, replace
@@ -13,24 +13,24 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.rays import pixel_rays
-from panoless.capture.views import Views
+from panoless.capture.views import TrainView, Views
 from panoless.geometry.revolution.model import SurfaceOfRevolution
+from panoless.geometry.revolution.options import DEFAULTS, MouthOptions
+from panoless.geometry.revolution.pixels import evenly
 from panoless.geometry.revolution.profile import resample_profile
-from panoless.kernels.cpu.interior import slope_votes
+from panoless.kernels.revolution import slope_votes
 
-SLOPES = 48
-CELL_PX = 0.75
-MOST_CELLS = 128
-"""Along the radius; wider mouths have larger cells."""
-DEPTH = 0.8
-"""Of the mouth's radius."""
-ROWS_ABOVE = 3
-MOST_PIXELS = 60_000
-ERROR_SCALE = 0.15
-FEW_PIXELS = 4.0
-UNSEEN_COST = 0.7
-"""Of a cell and slope that no pixel speaks about: worse than a fair one, better than a wrong one."""
-REACH = 3
+
+def end_pixels(
+    views: Views, closed: SurfaceOfRevolution, count: int
+) -> tuple[list[tuple[TrainView, Int[np.ndarray, "_"]]], list[tuple[TrainView, Int[np.ndarray, "_"]]]]:
+    """Those of about `count` pixels that see the base of a closed surface first, and those that see its lid."""
+    base, lid = [], []
+    for view, pixels in evenly(views, count):
+        side = closed.hits(*pixel_rays(view.camera, pixels)).side
+        base.append((view, pixels[side == 0]))
+        lid.append((view, pixels[side >= closed.lip]))
+    return base, lid
 
 
 @dataclass(frozen=True)
@@ -46,15 +46,20 @@ class Grid:
 
 
 def search_interior(
-    views: Views, closed: SurfaceOfRevolution, environment: Float[Tensor, "6 3 L L"], pixel: float
+    views: Views,
+    closed: SurfaceOfRevolution,
+    environment: Float[Tensor, "6 3 L L"],
+    pixel: float,
+    options: MouthOptions = DEFAULTS.mouth,
 ) -> SurfaceOfRevolution:
-    """The closed surface with the cheapest inside in place of its lid."""
+    """The closed surface with the cheapest interior in place of its lid."""
     radius = float(closed.profile[closed.lip, 0])
-    cell = max(CELL_PX * pixel, radius / MOST_CELLS)
+    cell = max(options.cell_px * pixel, radius / options.cells)
     columns = max(int(np.ceil(radius / cell)), 2)
-    top = float(closed.profile[closed.lip, 1]) + ROWS_ABOVE * cell
-    grid = Grid(cell, top, columns, max(int(DEPTH * columns), 2) + ROWS_ABOVE, ROWS_ABOVE)
-    path = _cheapest(slope_costs(views, closed, environment, grid), grid)
+    above = options.rows_above
+    top = float(closed.profile[closed.lip, 1]) + above * cell
+    grid = Grid(cell, top, columns, max(int(options.depth * columns), 2) + above, above)
+    path = _cheapest(slope_costs(views, closed, environment, grid, options), grid, options.reach)
     inner = np.stack([(path[:, 1] + 0.5) * cell, grid.top - (path[:, 0] + 0.5) * cell], 1)
     inner = _smoothed(np.concatenate([closed.profile[closed.lip, None], inner, [[0.0, inner[-1, 1]]]]))
     return resample_profile(replace(closed, profile=np.concatenate([closed.profile[: closed.lip], inner])), pixel)
@@ -66,30 +71,33 @@ def _smoothed(points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
 
 
 def slope_costs(
-    views: Views, closed: SurfaceOfRevolution, environment: Float[Tensor, "6 3 L L"], grid: Grid
+    views: Views,
+    closed: SurfaceOfRevolution,
+    environment: Float[Tensor, "6 3 L L"],
+    grid: Grid,
+    options: MouthOptions,
 ) -> Float[np.ndarray, "rows columns slopes"]:
     """Mean of ‖e‖²/(‖e‖² + s²) for each cell and direction of the profile, 2π k/slopes from outward level.
 
     Only rays count that leave through the mouth again, which alone is known to be open, or above it.
     """
-    origins, rays, radiance = _lid_pixels(views, closed)
-    votes = slope_votes(
+    origins, rays, radiance = _lid_pixels(views, closed, options.searched_pixels)
+    summed, count = slope_votes(
         (origins - closed.origin) @ closed.frame.T,
         rays @ closed.frame.T,
         radiance,
         environment.permute(0, 2, 3, 1).cpu().numpy().astype(np.float64),
         closed.frame,
         np.array([grid.cell, grid.top, grid.columns, grid.rows, closed.profile[closed.lip, 1]]),
-        2 * np.pi * np.arange(SLOPES) / SLOPES,
-        ERROR_SCALE,
+        2 * np.pi * np.arange(options.slopes) / options.slopes,
+        options.error_scale,
     )
-    summed, count = votes
-    mean = (summed + UNSEEN_COST * FEW_PIXELS) / (count + FEW_PIXELS)
-    return mean.reshape(grid.rows, grid.columns, SLOPES)
+    mean = (summed + options.unseen_cost * options.few_pixels) / (count + options.few_pixels)
+    return mean.reshape(grid.rows, grid.columns, options.slopes)
 
 
 def _lid_pixels(
-    views: Views, closed: SurfaceOfRevolution
+    views: Views, closed: SurfaceOfRevolution, count: int
 ) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]]:
     """Unit rays that meet the lid first, and what they see."""
     parts = []
@@ -99,11 +107,11 @@ def _lid_pixels(
         radiance = view.radiance.flatten(1)[:, view.solid].T.cpu().numpy()
         parts.append((origins[lid], rays[lid] / np.linalg.norm(rays[lid], axis=1, keepdims=True), radiance[lid]))
     origins, rays, radiance = (np.concatenate([part[k] for part in parts]) for k in range(3))
-    stride = max(1, len(rays) // MOST_PIXELS)
+    stride = max(1, len(rays) // count)
     return origins[::stride], rays[::stride], radiance[::stride].astype(np.float64)
 
 
-def _cheapest(costs: Float[np.ndarray, "rows columns slopes"], grid: Grid) -> Int[np.ndarray, "M 2"]:
+def _cheapest(costs: Float[np.ndarray, "rows columns slopes"], grid: Grid, reach: int) -> Int[np.ndarray, "M 2"]:
     """Cells (row, column) from the lip to the axis that minimize ∫ cost ds, the slope that of the way."""
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import dijkstra
@@ -111,13 +119,13 @@ def _cheapest(costs: Float[np.ndarray, "rows columns slopes"], grid: Grid) -> In
     count = grid.rows * grid.columns
     row, column = np.divmod(np.arange(count), grid.columns)
     heads, tails, weights = [], [], []
-    spacing = 2 * np.pi / SLOPES
-    for down in range(-REACH, REACH + 1):
-        for left in range(REACH + 1):
+    spacing = 2 * np.pi / costs.shape[2]
+    for down in range(-reach, reach + 1):
+        for left in range(reach + 1):
             if np.gcd(down, left) != 1:
                 continue
             angle, length = np.arctan2(-down, -left), np.hypot(down, left)
-            slopes = np.round(angle / spacing + np.arange(-1, 2)).astype(np.int64) % SLOPES
+            slopes = np.round(angle / spacing + np.arange(-1, 2)).astype(np.int64) % costs.shape[2]
             own = costs[:, :, slopes].min(2).ravel()
             to_row, to_column = row + down, column - left
             valid = (to_row >= 0) & (to_row < grid.rows) & (to_column >= 0)

@@ -1,7 +1,7 @@
 """The surface of revolution as a kind of geometry."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -13,17 +13,19 @@ from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints
 from panoless.environment.rays import Rays
-from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers
+from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, to_plain
 from panoless.geometry.exact import ExactFamily, ExactGeometry
 from panoless.geometry.revolution.deblurred_map import pixel_footprints
 from panoless.geometry.revolution.fit import propose_revolution, refine_revolution
-from panoless.geometry.revolution.lip import CLEARANCE_PX, beside_lip
+from panoless.geometry.revolution.lip import beside_lip
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_buffers, revolution_rays
+from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
 from panoless.geometry.revolution.placement import surfels_on_revolution
 from panoless.geometry.revolution.render import mean_light
 from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.kernels.rasterize import RasterCamera
 from shinypartial.core.errors import InputError
+from shinypartial.io.records import read_record, write_record
 
 MERIDIANS = 128
 
@@ -36,6 +38,7 @@ class RevolutionMirror(ExactGeometry):
     surface: SurfaceOfRevolution
     occlusion_test: bool = True
     """Whether pixels that see the object again are left out."""
+    options: RevolutionOptions = DEFAULTS
 
     @property
     def num_parameters(self) -> int:
@@ -46,21 +49,27 @@ class RevolutionMirror(ExactGeometry):
         """Solid pixels, but for those beside the lip of an open wall, which mix two surfaces."""
         if not self.surface.is_open:
             return view.solid
-        mixed = torch.from_numpy(beside_lip(view.camera, self.surface, CLEARANCE_PX).ravel())
+        mixed = torch.from_numpy(beside_lip(view.camera, self.surface, self.options.lip.clearance_px).ravel())
         return view.solid[~mixed.to(view.solid.device)[view.solid]]
 
     def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
         """The rays of the pixels; where all solid ones are taken, trusted by the solid angle of each."""
-        weighted = len(pixels) == len(view.solid)
-        return revolution_rays(self.surface, view, pixels, int(self.occlusion_test), weighted=weighted)[0]
+        return revolution_rays(
+            self.surface,
+            view,
+            pixels,
+            occlusion_test=self.occlusion_test,
+            weighted=len(pixels) == len(view.solid),
+            options=self.options.map,
+        )[0]
 
     def footprints(self, views: Views) -> Footprints:
         """Of all pixels that see the environment at once, and of a sample of the others."""
-        return pixel_footprints(views, self.surface, int(self.occlusion_test))
+        return pixel_footprints(views, self.surface, self.options, occlusion_test=self.occlusion_test)
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
         """By intersection; alpha by 4×4 rays where neighbors disagree."""
-        return revolution_buffers(self.surface, camera)
+        return revolution_buffers(self.surface, camera, self.options.rendering.samples)
 
     def shade(
         self,
@@ -70,11 +79,22 @@ class RevolutionMirror(ExactGeometry):
         normals_camera: Float[Tensor, "3 P"],
     ) -> Float[Tensor, "P 3"]:
         """Mean over the pixels' areas, followed through all their reflections."""
-        return mean_light(self.surface, environment, camera, pixels)
+        return mean_light(self.surface, environment, camera, pixels, self.options.rendering)
 
     def to_surfels(self, config: FitConfig) -> SurfelMirror:
         """Rings of surfels, curved as the surface is."""
         return SurfelMirror.of(surfels_on_revolution(self.surface, config.surfels.count), config)
+
+    def state_dict(self) -> dict[str, Any]:
+        """All numbers as lists and plain values."""
+        surface, options = to_plain(self.surface), write_record(self.options)
+        return {"surface": surface, "occlusion_test": self.occlusion_test, "options": options}
+
+    @classmethod
+    def from_state_dict(cls, content: dict[str, Any]) -> "RevolutionMirror":
+        """The geometry that `state_dict` was taken from."""
+        options = read_record(RevolutionOptions, content["options"], "the options of a surface of revolution")
+        return cls(from_plain(SurfaceOfRevolution, content["surface"]), content["occlusion_test"], options)
 
     def mesh(self, frame: ObjectFrame) -> Mesh:
         """Quadrilaterals between 128 meridians."""
@@ -95,7 +115,7 @@ class RevolutionFamily(ExactFamily):
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """Axis and outer profile by silhouettes."""
-        found = propose_revolution(views)
+        found = propose_revolution(views, config.revolution)
         if found is not None:
             return Proposal(found.surface, float(np.median(found.median_px)), float(np.median(found.iou)))
         if asked:
@@ -108,4 +128,5 @@ class RevolutionFamily(ExactFamily):
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """Profile and axis by what is reflected."""
-        return RevolutionMirror(refine_revolution(views, proposal.shape), config.environment.trace)
+        surface = refine_revolution(views, proposal.shape, config.revolution)
+        return RevolutionMirror(surface, config.environment.trace, config.revolution)

@@ -1,140 +1,260 @@
-"""The end of a wall without thickness, which is a circle: where outlines put it, and how the profile gets there.
+"""The lip of a vessel: where silhouettes put it, how the profile gets there, and what photographs add.
 
-A contour ray that passes over the lip touches that circle alone. In the half-plane of radius ρ and height h it is a
-hyperbola through the tip q of the profile, with unit normal m where it comes nearest, so m·q is known; rays of several
-elevations and both sides of the lip have different m, and q is their common point.
+A contour ray that passes over the lip of a wall without thickness touches that circle alone. In the half-plane of
+radius ρ and height h it is a hyperbola through the tip q of the profile, with unit normal m where it comes nearest, so
+m·q is known; rays of several elevations and both sides of the lip have different m, and q is their common point.
+
+Silhouettes place the lip to a twentieth of a pixel, but over the last pixels of the wall that is a degree, and rays
+that leave a vessel pass them twice or more. So pixels that mix the lip with what lies around it refine it: each is the
+mean of some rays, followed as deep as they go. How that changes with a few numbers, shifts of the profile near the lip
+along its normals and an extension of a thin wall, is found by differences. Pixels that are very sensitive to these
+numbers count less, because they are as sensitive to what is not fitted:
+
+w = (1 + ‖e‖²/9v)⁻²/v, v = σ² + τ² mean_c ‖∂c/∂θ‖².
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from torch import Tensor
 
-from panoless.capture.rays import pose_of, project
+from panoless.capture.rays import pixel_rays, pose_of, project
 from panoless.capture.views import TrainView, Views
-from panoless.geometry.revolution.model import SurfaceOfRevolution
+from panoless.geometry.revolution.model import SurfaceOfRevolution, trace_reflections
+from panoless.geometry.revolution.options import DEFAULTS, LipOptions, RevolutionOptions
+from panoless.geometry.revolution.pixels import PixelBundles
 from panoless.geometry.revolution.profile import resample_profile
-from panoless.geometry.revolution.silhouette import ContourRays, in_axis_frame, robust_scale, silhouette_residuals
+from panoless.geometry.revolution.silhouette import ContourRays, adapted_scale, in_axis_frame, silhouette_residuals
 from panoless.kernels.rasterize import RasterCamera
+from panoless.numeric.gauss_newton import accept_step, damped_step
+from panoless.numeric.robust import robust_weight
 
-FEWEST_RAYS = 20
-STEPS = 6
-FARTHEST_PX = 6.0
-"""Rays whose nearest point lies farther from the tip than this touch something else."""
-SPOILED_PX = 7
-"""So much of a closed surface's outside, before its lid, is bent by the corner that it was given there."""
-FITTED_PX = 16
-"""The part before that, from which the profile goes on to the tip."""
-TIP_WEIGHT = 4.0
-END_PX = 4
-"""So much of an open wall before its lip has no pixels that see it alone."""
-CLEARANCE_PX = 2
-"""Pixels nearer than this to the lip's image may show what lies before and behind it."""
-AROUND = 2000
+RING_POINTS = 2000
+"""Around the lip's image: more than its pixels."""
+TIP_DAMPING = 2e-3
 
 
-def tip_shift(contours: ContourRays, surface: SurfaceOfRevolution, scale_px: float) -> Float[np.ndarray, "2"]:
+def tip_shift(
+    contours: ContourRays, surface: SurfaceOfRevolution, scale_px: float, options: LipOptions = DEFAULTS.lip
+) -> Float[np.ndarray, "2"]:
     """How (ρ, h) of the lip has to move for the outlines: one robust Gauss–Newton step; zero when hardly any see it."""
-    pixel = float(np.median(contours.pixel))
-    found = silhouette_residuals(contours, surface, pixel)
+    found = silhouette_residuals(contours, surface, contours.pixel)
     tip = surface.profile[surface.lip]
     radius = np.maximum(np.hypot(found.points[:, 0], found.points[:, 1]), 1e-9)
-    excluded = np.stack([radius, found.points[:, 2]], 1) - tip
-    over = (found.side >= 0) & ~found.valid & (np.linalg.norm(excluded, axis=1) < FARTHEST_PX * pixel)
-    if int(over.sum()) < FEWEST_RAYS:
+    away = np.stack([radius, found.points[:, 2]], 1) - tip
+    near = np.linalg.norm(away, axis=1) < options.farthest_px * contours.pixel
+    over = (found.side >= 0) & ~found.valid & near
+    if int(over.sum()) < options.least_rays:
         return np.zeros(2)
     directions = in_axis_frame(contours, surface)[1][over]
     outward = (found.points[over, :2] * directions[:, :2]).sum(1) / radius[over]
     normals = np.stack([directions[:, 2], -outward], 1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-    distance = (normals * excluded[over]).sum(1)
-    in_pixels = distance / contours.pixel[over]
-    weights = (1 + (in_pixels / robust_scale(in_pixels, scale_px)) ** 2) ** -2
-    matrix = (normals * weights[:, None]).T @ normals
-    return np.linalg.solve(matrix + 1e-3 * np.trace(matrix) * np.eye(2), normals.T @ (weights * distance))
+    distance = (normals * away[over]).sum(1)
+    in_pixels = distance / contours.pixel_lengths[over]
+    weights = robust_weight(in_pixels, adapted_scale(contours, in_pixels, scale_px))
+    weighted = normals * weights[:, None]
+    return damped_step(-weighted.T @ distance, weighted.T @ normals, TIP_DAMPING)
 
 
-def open_at_lip(contours: ContourRays, closed: SurfaceOfRevolution, pixel: float) -> SurfaceOfRevolution | None:
+def open_at_lip(
+    contours: ContourRays, closed: SurfaceOfRevolution, options: LipOptions = DEFAULTS.lip
+) -> SurfaceOfRevolution | None:
     """The outside of a closed surface as a wall without thickness that ends where outlines put its lip.
 
     Up to there the profile goes on as a cubic through its last good vertex, fitted to those before it and to the lip.
     None where the outside is no longer than what is fitted, or doesn't rise to its lip.
     """
-    kept = closed.lip - SPOILED_PX
-    first = kept - FITTED_PX
+    pixel = contours.pixel
+    kept = _vertex_below_lip(closed, options.spoiled_px * pixel)
+    first = _vertex_below_lip(closed, (options.spoiled_px + options.fitted_px) * pixel)
     if first < 1:
         return None
     last = closed.profile[kept]
     rise = last - closed.profile[first]
     if rise[1] < 0.1 * np.linalg.norm(rise):
         return None
-    ended = _ended(closed, kept, last + rise * max((closed.profile[closed.lip, 1] - last[1]) / rise[1], 0.0), pixel)
-    for step in range(STEPS):
-        shift = tip_shift(contours, ended, max(4.0 / 2**step, 0.5))
-        ended = _ended(closed, kept, ended.profile[-1] + shift, pixel)
+    tip = last + rise * max((closed.profile[closed.lip, 1] - last[1]) / rise[1], 0.0)
+    ended = _end_at(closed, kept, tip, pixel, pixel, options)
+    for step in range(options.steps):
+        shift = tip_shift(contours, ended, max(4.0 / 2**step, 0.5), options)
+        ended = _end_at(closed, kept, ended.profile[-1] + shift, pixel, pixel, options)
     return ended
 
 
-def _ended(closed: SurfaceOfRevolution, kept: int, tip: Float[np.ndarray, "2"], pixel: float) -> SurfaceOfRevolution:
+def _vertex_below_lip(surface: SurfaceOfRevolution, distance: float) -> int:
+    """The last vertex of the outside that is that far from the lip along the profile; 0 for none."""
+    below = surface.arc_lengths[surface.lip] - surface.arc_lengths[1 : surface.lip + 1]
+    return int((below > distance - 0.5 * np.median(-np.diff(below))).sum())
+
+
+def _end_at(
+    surface: SurfaceOfRevolution,
+    kept: int,
+    tip: Float[np.ndarray, "2"],
+    pixel: float,
+    spacing: float,
+    options: LipOptions,
+) -> SurfaceOfRevolution:
     """The outside up to the vertex `kept`, and a cubic from there to the tip."""
-    start, points = closed.profile[kept], closed.profile[kept - FITTED_PX : kept]
+    below = surface.arc_lengths[kept] - surface.arc_lengths[1:kept]
+    start, points = surface.profile[kept], surface.profile[1:kept][below < (options.fitted_px + 0.5) * pixel]
     way = tip - start
     length = float(np.linalg.norm(way))
     if length < pixel:
-        profile = np.concatenate([closed.profile[: kept + 1], tip[None]])
-        return replace(closed, profile=profile, lip=len(profile) - 1)
+        profile = np.concatenate([surface.profile[: kept + 1], tip[None]])
+        return replace(surface, profile=profile, lip=len(profile) - 1)
     along, across = way / length, np.array([-way[1], way[0]]) / length
     x = np.append((points - start) @ along, length)
     y = np.append((points - start) @ across, 0.0)
-    weights = np.append(np.ones(len(points)), TIP_WEIGHT)
+    weights = np.append(np.full(len(points), (spacing / pixel) ** 0.5), options.tip_weight)
     powers = np.stack([x, x**2, x**3], 1) / length ** np.arange(1, 4)
     coefficients = np.linalg.lstsq(powers * weights[:, None], y * weights, rcond=None)[0]
-    t = np.arange(1, max(int(np.ceil(length / pixel)), 1) + 1) / max(int(np.ceil(length / pixel)), 1)
+    t = np.arange(1, max(int(np.ceil(length / spacing)), 1) + 1) / max(int(np.ceil(length / spacing)), 1)
     # What the fit misses the tip by is made up for along the way.
     bend = np.stack([t, t**2, t**3], 1) @ coefficients - t**2 * coefficients.sum()
     new = start + t[:, None] * way + bend[:, None] * across
-    profile = np.concatenate([closed.profile[: kept + 1], new])
-    return resample_profile(replace(closed, profile=profile, lip=len(profile) - 1), pixel)
+    profile = np.concatenate([surface.profile[: kept + 1], new])
+    return resample_profile(replace(surface, profile=profile, lip=len(profile) - 1), spacing)
 
 
-def clear_of_lip(views: Views, surface: SurfaceOfRevolution) -> Views:
+def place_lip(
+    contours: ContourRays, surface: SurfaceOfRevolution, spacing: float, options: LipOptions = DEFAULTS.lip
+) -> SurfaceOfRevolution:
+    """A thin wall with its lip where outlines put it, and its last pixels led there as the wall before them goes.
+
+    Others are returned as they are, and so is a wall that is no longer than what the end is fitted to.
+    """
+    pixel = contours.pixel
+    if not surface.is_open or _vertex_below_lip(surface, (options.end_px + options.fitted_px) * pixel) < 1:
+        return surface
+    kept = _vertex_below_lip(surface, options.end_px * pixel)
+    shift = tip_shift(contours, surface, 1.0, options)
+    shift *= min(1.0, pixel / max(float(np.linalg.norm(shift)), 1e-12))
+    return _end_at(surface, kept, surface.profile[-1] + shift, pixel, spacing, options)
+
+
+def clear_of_lip(views: Views, surface: SurfaceOfRevolution, options: LipOptions = DEFAULTS.lip) -> Views:
     """The views without the pixels beside the lip of an open surface, which mix two surfaces: a lid's doesn't
     matter.
     """
-    return replace(views, train=tuple(_clear(view, surface) for view in views.train)) if surface.is_open else views
+    if not surface.is_open:
+        return views
+    return replace(views, train=tuple(_clear(view, surface, options.clearance_px) for view in views.train))
 
 
-def _clear(view: TrainView, surface: SurfaceOfRevolution) -> TrainView:
-    mixed = beside_lip(view.camera, surface, CLEARANCE_PX).ravel()
+def _clear(view: TrainView, surface: SurfaceOfRevolution, clearance_px: int) -> TrainView:
+    mixed = beside_lip(view.camera, surface, clearance_px).ravel()
     return replace(view, solid=view.solid[torch.from_numpy(~mixed).to(view.solid.device)[view.solid]])
 
 
 def beside_lip(camera: RasterCamera, surface: SurfaceOfRevolution, reach_px: int) -> Bool[np.ndarray, "H W"]:
     """Pixels whose center is nearer than that to the image of the lip."""
-    turn = 2 * np.pi * np.arange(AROUND) / AROUND
+    turn = 2 * np.pi * np.arange(RING_POINTS) / RING_POINTS
     radius, height = surface.profile[surface.lip]
-    ring = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(AROUND, height)], 1) @ surface.frame
+    ring = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(RING_POINTS, height)], 1) @ surface.frame
     rotation, center = pose_of(camera)
     seen = (ring + surface.origin - center) @ rotation.T
     x, y = project(camera, seen)
     reach = np.arange(-reach_px, reach_px + 1)
     column, row = np.floor(x)[:, None, None] + reach, np.floor(y)[:, None, None] + reach[:, None]
-    excluded = np.hypot(column + 0.5 - x[:, None, None], row + 0.5 - y[:, None, None])
-    near = (excluded < reach_px) & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
+    distance = np.hypot(column + 0.5 - x[:, None, None], row + 0.5 - y[:, None, None])
+    near = (distance < reach_px) & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
     beside = np.zeros(camera.height * camera.width, bool)
     beside[(row * camera.width + column)[near].astype(np.int64)] = True
     return beside.reshape(camera.height, camera.width)
 
 
-def with_lip(contours: ContourRays, surface: SurfaceOfRevolution, pixel: float) -> SurfaceOfRevolution:
-    """An open surface with its lip where outlines put it, and its last pixels led there as the wall before them goes.
+def refine_lip(
+    pixels: PixelBundles,
+    surface: SurfaceOfRevolution,
+    environment: Float[Tensor, "6 3 L L"],
+    pixel: float,
+    options: RevolutionOptions = DEFAULTS,
+) -> SurfaceOfRevolution:
+    """The surface with its profile near the lip where `lip_pixels` put it under a map, by Gauss–Newton."""
+    for _ in range(options.lip.refined_steps):
+        moved = _lip_step(pixels, surface, environment, pixel, options)
+        if moved is surface:
+            break
+        surface = moved
+    return surface
 
-    Others are returned as they are, and so is a wall that is no longer than what the end is fitted to.
+
+def _lip_step(
+    pixels: PixelBundles,
+    surface: SurfaceOfRevolution,
+    environment: Float[Tensor, "6 3 L L"],
+    pixel: float,
+    options: RevolutionOptions,
+) -> SurfaceOfRevolution:
+    own, max_bounces = options.lip, options.rendering.max_bounces
+    shifts = _shifts(surface, pixel, own)
+
+    def shown(shift: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "P 3"]:
+        return pixels.shown(_shifted(surface, shift), environment, max_bounces)
+
+    residual = shown(np.zeros_like(surface.profile)) - pixels.radiance
+    small = own.difference_px * pixel * shifts
+    jacobian = np.stack([shown(shift) - shown(-shift) for shift in small], -1) / (2 * own.difference_px)
+    variance = options.photometric.radiance_sigma**2
+    variance = variance + own.parameter_sigma_px**2 * (jacobian**2).sum(-1).mean(1)
+    weighted = jacobian * (robust_weight(residual, 3 * variance**0.5) / variance)[:, None, None]
+    matrix = np.tensordot(weighted, jacobian, ((0, 1), (0, 1)))
+    gradient = np.tensordot(weighted, residual, ((0, 1), (0, 1)))
+    return accept_step(
+        surface,
+        damped_step(gradient, matrix, own.damping, own.largest_step_px),
+        lambda each, step: _shifted(each, pixel * np.tensordot(step, shifts, 1)),
+        lambda each: pixels.error(each, environment, max_bounces, options.judged_scale),
+        own.lengths,
+    )
+
+
+def _shifts(surface: SurfaceOfRevolution, pixel: float, options: LipOptions) -> Float[np.ndarray, "D N 2"]:
+    """Unit shifts of the profile's vertices: cubic B-splines along the normals on both sides of the lip, and an
+    extension along a thin wall.
     """
-    kept = surface.lip - END_PX
-    if not surface.is_open or kept - FITTED_PX < 1:
-        return surface
-    shift = tip_shift(contours, surface, 1.0)
-    shift *= min(1.0, pixel / max(float(np.linalg.norm(shift)), 1e-12))
-    return _ended(surface, kept, surface.profile[-1] + shift, pixel)
+    place = (surface.arc_lengths - surface.arc_lengths[surface.lip]) / pixel
+    last = min(float(place[-1]), options.length_px)
+    places = place - np.arange(-options.length_px, last + options.knot_px + 1, options.knot_px)[:, None]
+    splines = np.abs(places) / options.knot_px
+    splines = np.where(splines < 1, 2 / 3 - splines**2 + splines**3 / 2, np.clip(2 - splines, 0, None) ** 3 / 6)
+    along = np.gradient(surface.profile, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    shifts = splines[..., None] * np.stack([along[:, 1], -along[:, 0]], 1)
+    if surface.is_open:
+        extension = np.clip(1 + place / options.length_px, 0, 1)[:, None] ** 2 * along
+        shifts = np.concatenate([shifts, extension[None]])
+    # The ends stay on the axis.
+    shifts[:, surface.profile[:, 0] < 1e-9] = 0
+    return shifts
+
+
+def _shifted(surface: SurfaceOfRevolution, shift: Float[np.ndarray, "N 2"]) -> SurfaceOfRevolution:
+    return replace(surface, profile=surface.profile + shift)
+
+
+def lip_pixels(
+    views: Sequence[TrainView],
+    surface: SurfaceOfRevolution,
+    count: int,
+    options: RevolutionOptions = DEFAULTS,
+) -> PixelBundles:
+    """About `count` pixels: half of them near the lip, half mirrored more than once."""
+    generator = np.random.default_rng(0)
+    near = [np.flatnonzero(beside_lip(view.camera, surface, options.lip.reach_px)) for view in views]
+    deep = []
+    for view in views:
+        pixels, limit = view.solid.cpu().numpy(), options.rendering.max_bounces
+        paths = trace_reflections(surface, *pixel_rays(view.camera, pixels), max_bounces=limit)
+        deep.append(pixels[paths.bounces != 1])
+    shares = [count / 2 / max(sum(map(len, group)), 1) for group in (near, deep)]
+    chosen = []
+    for view, *groups in zip(views, near, deep, strict=True):
+        drawn = [group[generator.random(len(group)) < share] for group, share in zip(groups, shares, strict=True)]
+        chosen.append((view, np.unique(np.concatenate(drawn))))
+    return PixelBundles.of(chosen)

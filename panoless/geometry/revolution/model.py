@@ -1,6 +1,6 @@
 """A surface of revolution: an axis and a profile, what a camera sees of it, and the same as surfels.
 
-Like `plane`, it needs no blending: rays are intersected with the surface itself, and may be followed on from there.
+Like a plane, it needs no blending: rays are intersected with the surface itself, and may be followed on from there.
 """
 
 import math
@@ -15,18 +15,15 @@ from torch import Tensor
 from panoless.capture.rays import pixel_rays, pose_of, project, reflect
 from panoless.capture.views import TrainView
 from panoless.environment.rays import Rays
-from panoless.geometry.base import SurfaceBuffers
-from panoless.kernels.cpu.revolution import first_hits, follow
+from panoless.geometry.base import SurfaceBuffers, buffers_from_arrays
+from panoless.geometry.revolution.options import DEFAULTS, MapOptions
 from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.revolution import first_hits, follow
 from shinypartial.core.sphere import pixel_footprint_sr
 
 CREASE_RAD = math.radians(35.0)
 """A turn of the profile above this is an edge: normals are not interpolated across it."""
-SUBPIXELS = 4
-MAX_BOUNCES = 6
-"""What is mirrored more often is not followed in a fit."""
 BOX_AROUND = 64
-FOOTPRINT_TEXEL_SR = (math.pi / 2 / 128) ** 2
 RAY_EPSILON = 1e-4
 """A mirrored ray starts this far from the surface, in scene units."""
 
@@ -47,6 +44,10 @@ class Hits:
     def met(self) -> Bool[np.ndarray, "P"]:
         """Which rays meet the surface."""
         return self.side >= 0
+
+    def of(self, chosen: Int[np.ndarray, "Q"] | Bool[np.ndarray, "P"]) -> "Hits":
+        """Those of the chosen rays."""
+        return Hits(**{name: values[chosen] for name, values in vars(self).items()})
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,12 @@ class SurfaceOfRevolution:
                 ends[index] = level
         return ends
 
+    def turned_over(self) -> "SurfaceOfRevolution":
+        """The same outside with the axis the other way round, closed flat at both ends."""
+        outer = self.profile[1 : self.lip + 1][::-1] * [1.0, -1.0]
+        profile = np.concatenate([[[0.0, outer[0, 1]]], outer, [[0.0, outer[-1, 1]]]])
+        return SurfaceOfRevolution(self.origin, -self.axis, profile, len(outer))
+
     @cached_property
     def arc_lengths(self) -> Float[np.ndarray, "N"]:
         """Length of the profile up to each vertex."""
@@ -101,6 +108,11 @@ class SurfaceOfRevolution:
     def is_open(self) -> bool:
         """Whether it is a wall without thickness, which ends at the lip."""
         return self.lip == len(self.profile) - 1
+
+    @property
+    def is_drum(self) -> bool:
+        """Whether nothing is known of its inside: flat lids close both ends."""
+        return self.lip == len(self.profile) - 2
 
     @property
     def num_parameters(self) -> int:
@@ -136,9 +148,10 @@ class SurfaceOfRevolution:
         )
 
 
-def revolution_buffers(surface: SurfaceOfRevolution, camera: RasterCamera) -> SurfaceBuffers:
-    """The surface as surfels would be seen: depth and normal of the rays through pixel centers, alpha by 4×4 rays where
-    neighbors disagree. Where only the center misses, depth and normal are those of a neighbor.
+def revolution_buffers(surface: SurfaceOfRevolution, camera: RasterCamera, samples: int = 4) -> SurfaceBuffers:
+    """The surface as surfels would be seen: depth and normal of the rays through pixel centers, alpha by `samples`²
+    rays where neighbors disagree. Where only the center misses, depth and normal are those of a neighbor. The three
+    depths agree.
     """
     shape, everything = (camera.height, camera.width), np.arange(camera.height * camera.width)
     hits = _hits_within(surface, camera, everything)
@@ -149,25 +162,22 @@ def revolution_buffers(surface: SurfaceOfRevolution, camera: RasterCamera) -> Su
     around = sum(padded[1 + i : 1 + i + shape[0], 1 + j : 1 + j + shape[1]].astype(int) for i, j in _NEIGHBORS)
     mixed = np.flatnonzero((around > 0) & (around < len(_NEIGHBORS)))
     share, normal, depth = np.zeros(len(mixed)), np.zeros((len(mixed), 3)), np.zeros(len(mixed))
-    for i in range(SUBPIXELS):
-        for j in range(SUBPIXELS):
-            fine = surface.hits(*pixel_rays(camera, mixed, ((i + 0.5) / SUBPIXELS, (j + 0.5) / SUBPIXELS)))
+    for i in range(samples):
+        for j in range(samples):
+            fine = surface.hits(*pixel_rays(camera, mixed, ((i + 0.5) / samples, (j + 0.5) / samples)))
             facing = _facing(fine.normals, rays[mixed])
             share, normal = share + fine.met, normal + facing
             depth += np.where(fine.met, fine.distance, 0.0)
-    alpha.ravel()[mixed] = share / SUBPIXELS**2
+    alpha.ravel()[mixed] = share / samples**2
     z = np.where(hits.met, hits.distance, 0.0)
     normals = _facing(hits.normals, rays)
     missed = ~hits.met[mixed] & (share > 0)
     z[mixed[missed]] = (depth / np.maximum(share, 1))[missed]
     normals[mixed[missed]] = (normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12))[missed]
     rotation, _ = pose_of(camera)
-    device = camera.world_to_camera.device
-    covered, distance = (
-        torch.from_numpy(image.reshape(shape)).float().to(device) for image in (alpha, z * (alpha.ravel() > 0))
+    return buffers_from_arrays(
+        alpha, (z * (alpha.ravel() > 0)).reshape(shape), (normals @ rotation.T).T.reshape(3, *shape), camera
     )
-    normals_camera = torch.from_numpy((normals @ rotation.T).T.reshape(3, *shape)).float().to(device) * covered
-    return SurfaceBuffers(covered, normals_camera, distance, covered.new_zeros(3, *covered.shape))
 
 
 def _hits_within(surface: SurfaceOfRevolution, camera: RasterCamera, pixels: Int[np.ndarray, "P"]) -> Hits:
@@ -208,46 +218,67 @@ class ReflectionPaths:
 
 
 def trace_reflections(
-    surface: SurfaceOfRevolution, origins: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"], most: int = 1
+    surface: SurfaceOfRevolution,
+    origins: Float[np.ndarray, "P 3"],
+    directions: Float[np.ndarray, "P 3"],
+    *,
+    max_bounces: int = 1,
+    occlusion_test: bool = True,
 ) -> ReflectionPaths:
-    """Mirror rays at the surface up to `most` times; once, whatever they meet then, if that is 0."""
+    """Mirror rays at the surface up to `max_bounces` times.
+
+    A ray that meets the surface once more after the last reflection never leaves; without `occlusion_test` that is not
+    looked for, and such a ray leaves as it was mirrored last.
+    """
     first = surface.hits(origins, directions)
-    if most == 0:
-        once = reflect(directions, first.normals)
-        once *= (first.met / np.linalg.norm(once, axis=1))[:, None]
-        return ReflectionPaths(once, first.met.astype(np.int64), first)
     met = np.flatnonzero(first.met)
-    points = (first.points[met] - surface.origin) @ surface.frame.T
-    places = first.side[met], first.along[met]
-    directions_local, times = follow(
-        points, directions[met] @ surface.frame.T, places, surface.profile, surface.angles, RAY_EPSILON, most
-    )
     final, bounces = np.zeros((len(origins), 3)), np.zeros(len(origins), dtype=np.int64)
-    final[met], bounces[met] = directions_local @ surface.frame, times
+    if occlusion_test:
+        points = (first.points[met] - surface.origin) @ surface.frame.T
+        places = first.side[met], first.along[met]
+        leaving, times = follow(
+            points, directions[met] @ surface.frame.T, places, surface.profile, surface.angles, RAY_EPSILON, max_bounces
+        )
+        final[met], bounces[met] = leaving @ surface.frame, times
+        return ReflectionPaths(final, bounces, first)
+    hits, incoming = first.of(met), directions[met]
+    for _ in range(max_bounces):
+        outgoing = reflect(incoming, hits.normals)
+        outgoing /= np.linalg.norm(outgoing, axis=1, keepdims=True)
+        final[met] = outgoing
+        bounces[met] += 1
+        hits = surface.hits(hits.points + RAY_EPSILON * outgoing, outgoing)
+        met, incoming, hits = met[hits.met], outgoing[hits.met], hits.of(hits.met)
     return ReflectionPaths(final, bounces, first)
 
 
 def revolution_rays(
-    surface: SurfaceOfRevolution, view: TrainView, pixels: Tensor, most: int = 1, *, weighted: bool = False
+    surface: SurfaceOfRevolution,
+    view: TrainView,
+    pixels: Tensor,
+    *,
+    max_bounces: int = 1,
+    occlusion_test: bool = True,
+    weighted: bool = False,
+    options: MapOptions = DEFAULTS.map,
 ) -> tuple[Rays, Hits]:
-    """What pixels (flat indices) of a view observed of the environment by at most that many reflections (see
-    `trace_reflections`), and where they met the surface.
+    """What pixels (flat indices) of a view observed of the environment (see `trace_reflections`), and where they met
+    the surface.
 
-    If `weighted`, rays have the trust 1/(1 + a/t): a is the square of the larger angle to the next of the given pixels
-    by row and by column, t the solid angle of a texel of 0.7°. A pixel near the lip sees a long strip, which says
-    little about any texel of it. Pixels are in ascending order then.
+    If `weighted`, rays have the confidence 1/(1 + a/t): a is the square of the larger angle to the next of the given
+    pixels by row and by column, t that of a texel. A pixel near the lip sees a long strip, which says little about any
+    texel of it. Pixels are in ascending order then.
     """
     origins, directions = pixel_rays(view.camera, pixels.cpu().numpy())
-    escapes = trace_reflections(surface, origins, directions, most)
-    seen = escapes.bounces > 0
-    kept = pixels[torch.from_numpy(seen).to(pixels.device)]
-    outgoing = torch.from_numpy(escapes.directions[seen]).float().to(view.radiance.device)
-    hits = Hits(**{name: values[seen] for name, values in vars(escapes.first).items()})
+    paths = trace_reflections(surface, origins, directions, max_bounces=max_bounces, occlusion_test=occlusion_test)
+    left = paths.bounces > 0
+    kept = pixels[torch.from_numpy(left).to(pixels.device)]
+    outgoing = torch.from_numpy(paths.directions[left]).float().to(view.radiance.device)
     trust = None
     if weighted:
         image, mask = np.zeros((*view.mask.shape, 3)), np.zeros(view.mask.shape, dtype=bool)
         places = kept.cpu().numpy()
-        image.reshape(-1, 3)[places], mask.ravel()[places] = escapes.directions[seen], True
+        image.reshape(-1, 3)[places], mask.ravel()[places] = paths.directions[left], True
         footprint_sr = pixel_footprint_sr(image, mask)[mask]
-        trust = torch.from_numpy(1 / (1 + footprint_sr / FOOTPRINT_TEXEL_SR)).to(outgoing)
-    return Rays(outgoing, view.radiance.flatten(1)[:, kept].T.contiguous(), trust), hits
+        trust = torch.from_numpy(1 / (1 + footprint_sr / options.confidence_texel_rad**2)).to(outgoing)
+    return Rays(outgoing, view.radiance.flatten(1)[:, kept].T.contiguous(), trust), paths.first.of(left)

@@ -7,95 +7,105 @@ turns the normal by −δ' τ, and by as much as it turns along the part of that
 dn = −δ' τ + δ/(n·d) (κ (d·τ) τ + (n_ρ/ρ) (d·e_φ) e_φ),
 
 with τ the direction of the profile, κ its curvature and e_φ the direction of azimuth. A motion u = w × x + t of the
-whole body does the same with δ = n·u, and turns the normal by w × n less what u slides along the surface.
+whole body does the same with δ = n·u, and turns the normal by w × n less what u slides along the surface. A pixel's
+prediction is the mean over its rays, and so are its derivatives.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from panoless.capture.rays import reflect
-from panoless.capture.views import Views, concatenated, every_kth_pixel
+from panoless.capture.views import Views, every_kth_pixel
 from panoless.environment.solve import solve_environment
-from panoless.geometry.revolution.model import Hits, SurfaceOfRevolution, revolution_rays
+from panoless.geometry.revolution.model import Hits, ReflectionPaths, SurfaceOfRevolution, revolution_rays
+from panoless.geometry.revolution.options import DEFAULTS, PhotometricOptions, Round
+from panoless.geometry.revolution.pixels import PixelBundles, look_up
 from panoless.geometry.revolution.profile import ProfileSplines, apply_step
 from panoless.geometry.revolution.silhouette import (
     ContourRays,
-    accumulate_equations,
+    SilhouetteResiduals,
+    adapted_scale,
     axis_motion,
+    contour_cost,
     contour_equations,
-    solved,
+    parameter_columns,
+    silhouette_residuals,
 )
-from panoless.kernels.cubemap import sample_cubemap
-
-LEAST_COSINE = 0.05
-"""Rays that graze the surface more than this say little and amplify every error."""
-CONTOUR_SIGMA_PX = 0.15
-RADIANCE_SIGMA = 0.05
-LEAST_RADIUS_PX = 1.0
-
-
-@dataclass(frozen=True)
-class Round:
-    """One alternation: a map of that resolution, then steps with that robust scale and spacing of the splines."""
-
-    resolution: int
-    robust: float
-    knot_px: float
-    steps: int = 2
-
-
-@dataclass(frozen=True)
-class Observations:
-    """Pixels that see the environment by way of a surface of revolution at once: rays that meet it, with where and
-    what they saw.
-    """
-
-    directions: Float[np.ndarray, "P 3"]
-    radiance: Float[Tensor, "P 3"]
-    hits: Hits
-
-
-def select_observations(views: Views, surface: SurfaceOfRevolution, most: int) -> Observations:
-    """About `most` pixels of all views, evenly."""
-    parts = []
-    for view, pixels in every_kth_pixel(views, most):
-        rays, hits = revolution_rays(surface, view, pixels)
-        way = hits.points - view.position
-        parts.append((way / hits.distance[:, None], rays.radiance, hits))
-    directions_local, radiance, met = zip(*parts, strict=True)
-    return Observations(np.concatenate(directions_local), torch.cat(radiance), concatenated(met))
+from panoless.numeric.gauss_newton import accept_step, damped_step, jacobian_of_rows, normal_equations
+from panoless.numeric.robust import bounded_error, robust_weight
 
 
 def solve_map(
-    views: Views, surface: SurfaceOfRevolution, most: int, resolution: int, start: Tensor | None = None
+    views: Views, surface: SurfaceOfRevolution, rays: int, resolution: int, start: Tensor | None = None
 ) -> Float[Tensor, "6 3 L L"]:
-    """The closed-form map for a surface of revolution."""
-    rays = [revolution_rays(surface, *chosen)[0] for chosen in every_kth_pixel(views, most)]
-    return solve_environment(rays, resolution, start)
+    """The closed-form map for a surface of revolution, from about that many rays."""
+    chosen = every_kth_pixel(views, rays)
+    return solve_environment([revolution_rays(surface, *each)[0] for each in chosen], resolution, start)
+
+
+@dataclass(frozen=True)
+class Photometry:
+    """How pixels disagree with what a surface shows of a map."""
+
+    paths: ReflectionPaths
+    residual: Float[np.ndarray, "P 3"]
+    """Prediction less photograph; zero for pixels that are not whole."""
+    whole: Bool[np.ndarray, "P"]
+    """Whether all rays of a pixel leave."""
+
+    @classmethod
+    def of(
+        cls,
+        pixels: PixelBundles,
+        surface: SurfaceOfRevolution,
+        environment: Float[Tensor, "6 3 L L"],
+        max_bounces: int = 1,
+    ) -> "Photometry":
+        """Pixels under a map in a surface."""
+        paths = pixels.trace(surface, max_bounces)
+        whole = (paths.bounces > 0).reshape(-1, pixels.rays_per_pixel).all(1)
+        residual = pixels.mean_light(paths, environment) - pixels.radiance
+        return cls(paths, np.where(whole[:, None], residual, 0.0), whole)
+
+    def cost(self, scale: float) -> float:
+        """Σ ‖e‖²/(‖e‖² + s²), 1 for pixels that are not whole."""
+        return float(np.where(self.whole, bounded_error(self.residual, scale), 1.0).sum())
 
 
 def photometric_equations(
-    seen: Observations,
+    pixels: PixelBundles,
+    found: Photometry,
     surface: SurfaceOfRevolution,
     splines: ProfileSplines,
     environment: Float[Tensor, "6 3 L L"],
     robust: float,
     pixel: float,
+    options: PhotometricOptions = DEFAULTS.photometric,
 ) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
-    """Gradient and matrix over the axis' four numbers and the splines, in units of the radiance's deviation."""
-    motion = normal_motion(seen.directions, seen.hits, surface, splines, pixel)
-    radiance = seen.radiance[torch.from_numpy(motion.kept)].cpu().numpy()
-    residual = motion.look_up(environment, surface) - radiance
-    weights = (1 + (residual**2).sum(1) / robust**2) ** -2 / RADIANCE_SIGMA**2
+    """Gradient and matrix over the axis' four numbers and the splines, in units of the radiance's deviation.
+
+    Every row is the mean of those of a pixel's rays. Rays that are mirrored more than once have no derivative.
+    """
+    from scipy.sparse import csr_matrix
+
+    count, each = len(pixels.radiance), pixels.rays_per_pixel
+    once = np.flatnonzero((found.paths.bounces == 1) & np.repeat(found.whole, each))
+    motion = normal_motion(pixels.directions[once], found.paths.first.of(once), surface, splines, pixel, options)
+    rows, ray, columns = (
+        motion.radiance_by_parameters(environment, surface),
+        once[motion.kept],
+        parameter_columns(motion.index),
+    )
+    mean = csr_matrix((np.full(len(ray), 1 / each), (ray // each, np.arange(len(ray)))), (count, len(ray)))
+    weights = robust_weight(found.residual, robust) / options.radiance_sigma**2
     gradient, matrix = np.zeros(4 + splines.count), np.zeros((4 + splines.count, 4 + splines.count))
-    rows = motion.radiance_by_parameters(environment, surface)
     for channel in range(3):
-        by_axis, by_spline = rows[:, channel, :4], rows[:, channel, 4:]
-        g, m = accumulate_equations(by_axis, by_spline, motion.index, residual[:, channel], weights, splines.count)
+        jacobian = mean @ jacobian_of_rows(rows[:, channel], columns, 4 + splines.count)
+        g, m = normal_equations(jacobian, found.residual[:, channel], weights)
         gradient, matrix = gradient + g, matrix + m
     return gradient, matrix
 
@@ -121,12 +131,11 @@ class NormalMotion:
         self,
         environment: Float[Tensor, "6 3 L L"],
         surface: SurfaceOfRevolution,
-        turned: Float[np.ndarray, "Q 3"] | None = None,
+        normals: Float[np.ndarray, "Q 3"],
     ) -> Float[np.ndarray, "Q 3"]:
-        """What rays see of a map by the normals, or by others that need not be unit."""
-        normals = self.normals if turned is None else turned / np.linalg.norm(turned, axis=1, keepdims=True)
-        directions = torch.from_numpy(reflect(self.rays, normals) @ surface.frame).float().to(environment.device)
-        return sample_cubemap(environment, directions).cpu().numpy().astype(np.float64)
+        """What rays see of a map by other normals, which need not be unit."""
+        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        return look_up(environment, reflect(self.rays, normals) @ surface.frame)
 
     def radiance_by_parameters(
         self, environment: Float[Tensor, "6 3 L L"], surface: SurfaceOfRevolution
@@ -148,6 +157,7 @@ def normal_motion(
     surface: SurfaceOfRevolution,
     splines: ProfileSplines,
     pixel: float,
+    options: PhotometricOptions,
 ) -> NormalMotion:
     """The turns of the module's equation for rays in the normalized frame and where they meet a surface of
     revolution.
@@ -157,7 +167,7 @@ def normal_motion(
     points, normals = (hits.points - surface.origin) @ surface.frame.T, hits.normals @ surface.frame.T
     rho = np.hypot(points[:, 0], points[:, 1])
     facing = (rays * normals).sum(1)
-    kept = (np.abs(facing) > LEAST_COSINE) & (rho > LEAST_RADIUS_PX * pixel)
+    kept = (np.abs(facing) > options.least_cosine) & (rho > options.least_radius_px * pixel)
     rays, points, normals, rho, facing = (each[kept] for each in (rays, points, normals, rho, facing))
     side, along = hits.side[kept], hits.along[kept]
     azimuth = np.stack([-points[:, 1], points[:, 0], np.zeros_like(rho)], 1) / rho[:, None]
@@ -200,33 +210,73 @@ def _axis_turns(points, normals, profile_direction, azimuth, rays, facing, bend,
     return turn_profile + bend[:, None] * slide_profile, turn_azimuth + around[:, None] * slide_azimuth
 
 
-def photometric_step(
-    seen: Observations,
+@dataclass(frozen=True)
+class _Evaluation:
+    """A surface under a map: photometry, contours and the cost of both."""
+
+    surface: SurfaceOfRevolution
+    photometry: Photometry
+    contours: SilhouetteResiduals
+    cost: float
+
+
+def refine_round(
+    pixels: PixelBundles,
     contours: ContourRays,
     surface: SurfaceOfRevolution,
     environment: Float[Tensor, "6 3 L L"],
     each: Round,
-    bending: float,
+    settle: Callable[[SurfaceOfRevolution], SurfaceOfRevolution],
+    options: PhotometricOptions,
+    max_bounces: int = 1,
 ) -> SurfaceOfRevolution:
-    """One Gauss–Newton step on photographs and contours together."""
-    pixel = float(np.median(contours.pixel))
-    splines = ProfileSplines.of(surface, each.knot_px * pixel)
-    equations = photometric_equations(seen, surface, splines, environment, each.robust, pixel)
-    return step_on_equations(equations, contours, surface, splines, bending)
+    """Gauss–Newton steps on photographs and contours together; each is taken if it lowers the cost of both.
 
+    The cost is Σ s²ρ(e/s)/2σ² over pixels and contour rays, ρ the bounded error. `settle` follows every step: it
+    samples the profile evenly and keeps a thin wall's lip where contours have it.
+    """
+    cell = contours.pixel
+    touched = silhouette_residuals(contours, surface, cell)
+    scale = adapted_scale(contours, touched.pixels[touched.valid], options.contour_scale_px)
+    of_contours, of_pixels = (
+        (scale / options.contour_sigma_px) ** 2 / 2,
+        (each.robust / options.radiance_sigma) ** 2 / 2,
+    )
 
-def step_on_equations(
-    equations: tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]],
-    contours: ContourRays,
-    surface: SurfaceOfRevolution,
-    splines: ProfileSplines,
-    bending: float,
-) -> SurfaceOfRevolution:
-    """The step of gradient and matrix of the photographs, with the contours and a share of their stiffness."""
-    gradient, matrix = equations
-    pixel = float(np.median(contours.pixel))
-    by_contour, of_contours = contour_equations(contours, surface, splines, pixel, 1.0)
-    gradient = gradient + by_contour / CONTOUR_SIGMA_PX**2
-    matrix = matrix + of_contours / CONTOUR_SIGMA_PX**2
-    matrix[4:, 4:] += splines.bending(bending * np.trace(matrix[4:, 4:]) / splines.count)
-    return apply_step(surface, splines, solved(gradient, matrix))
+    def evaluate(tried: SurfaceOfRevolution) -> _Evaluation:
+        photometry = Photometry.of(pixels, tried, environment, max_bounces)
+        found = silhouette_residuals(contours, tried, cell)
+        cost = of_pixels * photometry.cost(each.robust)
+        return _Evaluation(
+            tried, photometry, found, cost + of_contours * len(found.pixels) * contour_cost(found, scale)
+        )
+
+    def advance(here: _Evaluation) -> _Evaluation:
+        splines, limits, evaluations = ProfileSplines.of(here.surface, each.knot_px * cell), contours.options, [here]
+        gradient, matrix = photometric_equations(
+            pixels, here.photometry, here.surface, splines, environment, each.robust, cell, options
+        )
+        by_contour, contour_matrix = contour_equations(contours, here.contours, splines, scale)
+        gradient = gradient + by_contour / options.contour_sigma_px**2
+        matrix = matrix + contour_matrix / options.contour_sigma_px**2
+        matrix[4:, 4:] += splines.bending(each.bending * np.trace(matrix[4:, 4:]) / splines.count)
+
+        def cost(tried: SurfaceOfRevolution) -> float:
+            if tried is not evaluations[-1].surface:
+                evaluations.append(evaluate(tried))
+            return evaluations[-1].cost
+
+        moved = accept_step(
+            here.surface,
+            damped_step(gradient, matrix, limits.damping, limits.largest_turn_rad, slice(4)),
+            lambda surface, step: settle(apply_step(surface, splines, step)),
+            cost,
+        )
+        return here if moved is here.surface else evaluations[-1]
+
+    here = evaluate(surface)
+    for _ in range(each.steps):
+        before, here = here, advance(here)
+        if here.cost > (1 - options.least_fall) * before.cost:
+            break
+    return here.surface

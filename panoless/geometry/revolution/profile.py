@@ -6,10 +6,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from panoless.geometry.revolution.model import SurfaceOfRevolution
+from panoless.numeric.bspline import cubic_bsplines_at
 
-LEAST_ANGLE_SINE = 0.5
-LARGEST_SHIFT_STEPS = 1.5
-"""A vertex moves by at most this many times the spacing of the profile."""
+LEAST_CORNER_SINE = 0.5
+"""A vertex whose sides turn by more than half a right angle or so is a corner: it moves to where both sides move."""
+LARGEST_SHIFT_SIDES = 1.5
+"""A vertex moves by at most this many lengths of a side in one step, or the profile could fold."""
 
 
 def resample_profile(surface: SurfaceOfRevolution, spacing: float) -> SurfaceOfRevolution:
@@ -73,9 +75,8 @@ class ProfileSplines:
         inner = (side >= self.surface.lip).astype(np.int64)
         start, knot = np.array(self.starts)[inner], np.array(self.knots)[inner]
         pieces = np.array(self.counts)[inner] - 3
-        x = np.clip((place - start) / knot, 0, pieces)
-        first = np.minimum(np.floor(x).astype(np.int64), np.maximum(pieces - 1, 0))
-        values = _cubic_derivative(x - first) / knot[:, None] if derivative else _cubic(x - first)
+        first, basis = cubic_bsplines_at(np.clip((place - start) / knot, 0, pieces), pieces + 3, 1)
+        values = basis[1] / knot[:, None] if derivative else basis[0]
         values = np.where((side == 0)[:, None], 0.0, values)
         return values, np.where((side == 0)[:, None], 0, (first + inner * self.counts[0])[:, None]) + np.arange(4)
 
@@ -91,14 +92,6 @@ class ProfileSplines:
         return matrix
 
 
-def _cubic(u: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P 4"]:
-    return np.stack([(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3], 1) / 6
-
-
-def _cubic_derivative(u: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P 4"]:
-    return np.stack([-((1 - u) ** 2), 3 * u**2 - 4 * u, -3 * u**2 + 2 * u + 1, u**2], 1) / 2
-
-
 def apply_step(
     surface: SurfaceOfRevolution, splines: ProfileSplines, step: Float[np.ndarray, "D"]
 ) -> SurfaceOfRevolution:
@@ -107,7 +100,7 @@ def apply_step(
     axis = surface.axis + np.cross(turn, surface.axis)
     profile, last = surface.profile.copy(), len(surface.profile) - 1
     spacing = float(np.median(np.linalg.norm(np.diff(profile[1:], axis=0), axis=1)))
-    limit = LARGEST_SHIFT_STEPS * spacing
+    limit = LARGEST_SHIFT_SIDES * spacing
     sides = np.arange(last)
     normal = np.stack([np.sin(surface.angles), -np.cos(surface.angles)], 2)
     shifts = []
@@ -117,7 +110,7 @@ def apply_step(
     # A vertex between two sides takes the mean; over an edge, the corner of both shifted sides.
     before, after = normal[:-1, 1], normal[1:, 0]
     sine = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
-    corner = np.abs(sine) > LEAST_ANGLE_SINE
+    corner = np.abs(sine) > LEAST_CORNER_SINE
     a, b, divisor = shifts[1][:-1], shifts[0][1:], np.where(corner, sine, 1.0)
     exact = np.stack([a * after[:, 1] - b * before[:, 1], b * before[:, 0] - a * after[:, 0]], 1) / divisor[:, None]
     mean = (before * a[:, None] + after * b[:, None]) / 2

@@ -6,6 +6,7 @@ of all views and both sides have one envelope, which is the profile, if the axis
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -14,29 +15,16 @@ from panoless.capture.rays import camera_rays, pose_of
 from panoless.capture.silhouettes import MaskContours, mask_contours
 from panoless.capture.views import Views
 from panoless.geometry.revolution.model import SurfaceOfRevolution
+from panoless.geometry.revolution.options import DEFAULTS, SilhouetteOptions
 from panoless.geometry.revolution.profile import ProfileSplines, apply_step, resample_profile
-from panoless.kernels.cpu.profile import closest_approach, distance_grid, envelope
+from panoless.kernels.revolution import closest_approach, distance_grid, envelope
+from panoless.numeric.gauss_newton import accept_step, damped_step, jacobian_of_rows, normal_equations
+from panoless.numeric.robust import bounded_error, robust_scale, robust_weight
 from shinypartial.core.conventions import PIXEL_CENTER
 
 REACH = 1.5
 TALLEST = 1.05
 """The normalized object lies in the unit ball; rays are followed a little beyond."""
-START_VIEWS = 24
-START_POINTS = 1500
-START_CELL_PX = 3.0
-START_STEPS = 4
-MOST_POINTS = 30_000
-RANK_SHARE = 0.02
-"""Of the rays that could touch a height, this share may be wrong by noise."""
-TIP_CELLS, BLUNT_CELLS = 1.5, 4.0
-WIDEST_WITHIN = 0.6
-LEAST_CELLS = 5
-GRAZING_RAD = np.radians(10.0)
-"""Silhouettes don't tell slopes within this of those under which the lowest camera looks over the lip."""
-NOISE_SCALE = 3.0
-BENDING = 1e-3
-FINAL_SCALES_PX = (4.0, 2.0, 1.0, 1.0, 0.5, 0.5)
-LARGEST_TURN_RAD = 0.1
 
 
 @dataclass(frozen=True)
@@ -46,15 +34,19 @@ class ContourRays:
     view: Int[np.ndarray, "P"]
     origins: Float[np.ndarray, "P 3"]
     directions: Float[np.ndarray, "P 3"]
-    pixel: Float[np.ndarray, "P"]
+    pixel_lengths: Float[np.ndarray, "P"]
+    options: SilhouetteOptions = DEFAULTS.silhouette
 
-    def every(self, stride: int) -> "ContourRays":
-        """Every stride-th."""
-        return ContourRays(*(values[::stride] for values in vars(self).values()))
+    @cached_property
+    def pixel(self) -> float:
+        """The median length of a pixel at the object."""
+        return float(np.median(self.pixel_lengths))
 
-    def of(self, chosen: Bool[np.ndarray, "P"]) -> "ContourRays":
-        """The chosen ones."""
-        return ContourRays(*(values[chosen] for values in vars(self).values()))
+    def at_most(self, count: int) -> "ContourRays":
+        """Every k-th, so that about `count` remain."""
+        k = max(1, len(self.view) // count)
+        rays = (self.view[::k], self.origins[::k], self.directions[::k], self.pixel_lengths[::k])
+        return ContourRays(*rays, self.options)
 
 
 @dataclass(frozen=True)
@@ -71,21 +63,21 @@ class SilhouetteResiduals:
     normals: Float[np.ndarray, "P 3"]
 
 
-def contour_rays(views: Views) -> ContourRays:
+def contour_rays(views: Views, options: SilhouetteOptions = DEFAULTS.silhouette) -> ContourRays:
     """The contours of all masks as unit rays."""
     contours: MaskContours = mask_contours(views)
     length = np.linalg.norm(contours.rays, axis=1)
     focal = np.array([view.camera.fx for view in views.train])
     distance = np.linalg.norm(contours.centers, axis=1)
     pixel = distance / (focal[contours.view] * length) if len(length) else length
-    return ContourRays(contours.view, contours.centers, contours.rays / length[:, None], pixel)
+    return ContourRays(contours.view, contours.centers, contours.rays / length[:, None], pixel, options)
 
 
-def axis_starts(views: Views) -> list[SurfaceOfRevolution]:
+def axis_starts(views: Views, options: SilhouetteOptions = DEFAULTS.silhouette) -> list[SurfaceOfRevolution]:
     """Axes worth trying, without profiles: the planes through either principal axis of the masks meet in a line near
-    the axis; and the world's axes through the middle.
+    the axis; and the principal axes of the cameras' positions through the middle.
     """
-    chosen = views.train[:: max(1, len(views.train) // START_VIEWS)]
+    chosen = views.train[:: max(1, len(views.train) // options.start_views)]
     normals: list[list[np.ndarray]] = [[], []]
     centers = []
     for view in chosen:
@@ -105,7 +97,8 @@ def axis_starts(views: Views) -> list[SurfaceOfRevolution]:
         right = (planes * np.array(centers)).sum(1)
         origin = np.linalg.solve(planes.T @ planes + 1e-2 * len(planes) * np.eye(3), planes.T @ right)
         starts.append(_bare(origin, vectors[:, 0]))
-    return starts + [_bare(np.zeros(3), axis) for axis in np.eye(3)[[2, 1, 0]]]
+    _, principal = np.linalg.eigh(np.cov(np.array(centers).T))
+    return starts + [_bare(np.zeros(3), axis) for axis in principal.T]
 
 
 def _bare(origin: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"]) -> SurfaceOfRevolution:
@@ -116,12 +109,12 @@ def outer_surface(rays: ContourRays, start: SurfaceOfRevolution, cell: float) ->
     """The envelope around an axis, closed flat at both ends; None when there is none."""
     origins, directions = in_axis_frame(rays, start)
     cells = int(2 * TALLEST / cell)
-    rank = int(RANK_SHARE * len(rays.view) / (2 * TALLEST / cell)) + 1
+    rank = int(rays.options.rank_share * len(rays.view) / (2 * TALLEST / cell)) + 1
     smallest = envelope(origins, directions, -TALLEST, cell, cells, rank + 1, REACH)[:, rank]
     radius = np.where(np.isfinite(smallest), smallest, 0.0)
     heights = -TALLEST + (np.arange(cells) + 0.5) * cell
-    lowest, highest = _ends(origins, heights, radius, cell)
-    if highest - lowest < LEAST_CELLS:
+    lowest, highest = _ends(origins, heights, radius, cell, rays.options)
+    if highest - lowest < rays.options.least_cells:
         return None
     outer = np.stack([radius, heights], 1)[lowest : highest + 1]
     profile = np.concatenate([[[0.0, outer[0, 1]]], outer, [[0.0, outer[-1, 1]]]])
@@ -129,28 +122,35 @@ def outer_surface(rays: ContourRays, start: SurfaceOfRevolution, cell: float) ->
 
 
 def _ends(
-    origins: Float[np.ndarray, "P 3"], heights: Float[np.ndarray, "C"], radius: Float[np.ndarray, "C"], cell: float
+    origins: Float[np.ndarray, "P 3"],
+    heights: Float[np.ndarray, "C"],
+    radius: Float[np.ndarray, "C"],
+    cell: float,
+    options: SilhouetteOptions,
 ) -> tuple[int, int]:
     """Cells between which silhouettes tell the profile: beyond, it closes as fast as the most level view allows.
 
-    The widest cell belongs to the object, unless few rays pass the heights beyond its ends.
+    The widest cell belongs to the object, unless few rays pass the heights beyond its ends. The last cell outward is
+    blunt and less steep than that, and no cell inward falls to it as steeply.
     """
-    middle = np.abs(heights) < WIDEST_WITHIN
+    middle = np.abs(heights) < options.widest_within
     widest = int(np.argmax(np.where(middle, radius, 0.0)))
     across = np.hypot(origins[:, 0], origins[:, 1]) + float(radius[widest])
     ends = []
     for outward in (-1, 1):
         elevation = np.arctan2(outward * (origins[:, 2] - heights[widest]), across).min()
-        steepest = 1 / np.tan(max(elevation, 0.0) + GRAZING_RAD)
+        steepest = 1 / np.tan(max(elevation, 0.0) + options.grazing_rad)
         index = widest
-        while 0 < index < len(radius) - 1 and radius[index] > TIP_CELLS * cell:
+        while 0 < index < len(radius) - 1 and radius[index] > options.tip_cells * cell:
             index += outward
         while abs(index - widest) > 2:
             rise = (radius[index - 2 * outward] - radius[index]) / (2 * cell)
-            if radius[index] > BLUNT_CELLS * cell and rise < steepest:
+            if radius[index] > options.blunt_cells * cell and rise < steepest:
                 break
             index -= outward
-        ends.append(index)
+        inward = np.arange(widest, index, outward)
+        steep = radius[inward] - radius[index] > steepest * cell * np.abs(inward - index)
+        ends.append(int(inward[np.argmax(steep)]) if steep.any() else index)
     return ends[0], ends[1]
 
 
@@ -187,29 +187,32 @@ def silhouette_residuals(rays: ContourRays, surface: SurfaceOfRevolution, cell: 
     if surface.is_open:
         # Beyond the end of a wall without thickness the lip alone is touched: no shift along normals mends that.
         valid &= (side < surface.lip - 1) | (along < 1)
-    return SilhouetteResiduals(signed / rays.pixel, valid, side, along, points, normals)
-
-
-def robust_scale(pixels: Float[np.ndarray, "P"], scale_px: float) -> float:
-    """The scale, or a multiple of the median distance if that is larger, so that all views keep a say."""
-    return max(scale_px, NOISE_SCALE * float(np.median(np.abs(pixels)))) if len(pixels) else scale_px
+    return SilhouetteResiduals(signed / rays.pixel_lengths, valid, side, along, points, normals)
 
 
 def contour_equations(
-    rays: ContourRays, surface: SurfaceOfRevolution, splines: ProfileSplines, cell: float, scale_px: float
+    rays: ContourRays, found: SilhouetteResiduals, splines: ProfileSplines, scale_px: float
 ) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
     """Gradient Jᵀ W e and matrix Jᵀ W J of the distances in pixels: four numbers of the axis, then the splines'.
 
     A shift δ of the profile along its normal takes δ from the distance, a motion u = w × x + t of the body n·u.
     """
-    found = silhouette_residuals(rays, surface, cell)
     kept = found.valid
-    scale = robust_scale(found.pixels[kept], scale_px)
-    weights = (1 + (found.pixels[kept] / scale) ** 2) ** -2
-    inverse = 1 / rays.pixel[kept]
-    by_axis = -axis_motion(found.points[kept], found.normals[kept]) * inverse[:, None]
+    inverse = 1 / rays.pixel_lengths[kept, None]
     values, index = splines.values(found.side[kept], found.along[kept])
-    return accumulate_equations(by_axis, -values * inverse[:, None], index, found.pixels[kept], weights, splines.count)
+    rows = np.concatenate([-axis_motion(found.points[kept], found.normals[kept]), -values], 1) * inverse
+    jacobian = jacobian_of_rows(rows, parameter_columns(index), 4 + splines.count)
+    return normal_equations(jacobian, found.pixels[kept], robust_weight(found.pixels[kept], scale_px))
+
+
+def adapted_scale(rays: ContourRays, pixels: Float[np.ndarray, "P"], scale_px: float) -> float:
+    """The scale, or a multiple of the median distance if that is larger, so that all views keep a say."""
+    return robust_scale(pixels, scale_px, rays.options.noise_multiple)
+
+
+def parameter_columns(index: Int[np.ndarray, "P 4"]) -> Int[np.ndarray, "P 8"]:
+    """Columns of the axis' four numbers and of the four splines of each row."""
+    return np.concatenate([np.broadcast_to(np.arange(4), (len(index), 4)), 4 + index], 1)
 
 
 def axis_motion(points: Float[np.ndarray, "P 3"], normals: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 4"]:
@@ -219,78 +222,58 @@ def axis_motion(points: Float[np.ndarray, "P 3"], normals: Float[np.ndarray, "P 
     return np.stack([y * c - z * b, z * a - x * c, a, b], 1)
 
 
-def accumulate_equations(
-    by_axis: Float[np.ndarray, "P 4"],
-    by_spline: Float[np.ndarray, "P 4"],
-    index: Int[np.ndarray, "P 4"],
-    residual: Float[np.ndarray, "P"],
-    weights: Float[np.ndarray, "P"],
-    count: int,
-) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
-    """Jᵀ W e and Jᵀ W J of rows with eight entries."""
-    from scipy import sparse
-
-    rows = len(residual)
-    columns = np.concatenate([np.broadcast_to(np.arange(4), (rows, 4)), 4 + index], 1)
-    jacobian = sparse.csr_matrix(
-        (np.concatenate([by_axis, by_spline], 1).ravel(), columns.ravel(), np.arange(rows + 1) * 8),
-        shape=(rows, 4 + count),
-    )
-    weighted = jacobian.multiply(weights[:, None]).tocsr()
-    return weighted.T @ residual, (weighted.T @ jacobian).toarray()
+def contour_cost(found: SilhouetteResiduals, scale_px: float) -> float:
+    """Mean of e²/(e² + s²) over contour rays, e the distance (px); 1 for those that pass far away."""
+    return float(np.where(found.side >= 0, bounded_error(found.pixels, scale_px), 1.0).mean())
 
 
 def contour_step(
     rays: ContourRays, surface: SurfaceOfRevolution, cell: float, scale_px: float, knot: float
 ) -> SurfaceOfRevolution:
-    """One robust Gauss–Newton step of axis and profile together."""
-    splines = ProfileSplines.of(surface, knot)
-    gradient, matrix = contour_equations(rays, surface, splines, cell, scale_px)
-    matrix[4:, 4:] += splines.bending(BENDING * np.trace(matrix[4:, 4:]) / splines.count)
-    return apply_step(surface, splines, solved(gradient, matrix))
-
-
-def solved(gradient: Float[np.ndarray, "D"], matrix: Float[np.ndarray, "D D"]) -> Float[np.ndarray, "D"]:
-    """−(M + ε)⁻¹ g, cut where the axis would turn by more than a tenth."""
-    damped = matrix + np.diag(1e-6 * np.diag(matrix) + 1e-9 * np.trace(matrix) / len(matrix) + 1e-12)
-    step = -np.linalg.solve(damped, gradient)
-    return step * min(1.0, LARGEST_TURN_RAD / max(float(np.abs(step[:4]).max()), 1e-12))
-
-
-def contour_cost(rays: ContourRays, surface: SurfaceOfRevolution, cell: float, scale_px: float = 2.0) -> float:
-    """Mean of e²/(e² + s²)."""
+    """One robust Gauss–Newton step of axis and profile together; the surface as it is where its cost does not fall."""
+    splines, options = ProfileSplines.of(surface, knot), rays.options
     found = silhouette_residuals(rays, surface, cell)
-    squared = (found.pixels / scale_px) ** 2
-    return float(np.where(found.side >= 0, squared / (1 + squared), 1.0).mean())
+    scale = adapted_scale(rays, found.pixels[found.valid], scale_px)
+    gradient, matrix = contour_equations(rays, found, splines, scale)
+    matrix[4:, 4:] += splines.bending(options.bending * np.trace(matrix[4:, 4:]) / splines.count)
+
+    def cost(each: SurfaceOfRevolution) -> float:
+        return contour_cost(found if each is surface else silhouette_residuals(rays, each, cell), scale)
+
+    return accept_step(
+        surface,
+        damped_step(gradient, matrix, options.damping, options.largest_turn_rad, slice(4)),
+        lambda each, step: resample_profile(apply_step(each, splines, step), cell),
+        cost,
+    )
 
 
 def fit_outer(rays: ContourRays, starts: Sequence[SurfaceOfRevolution]) -> SurfaceOfRevolution | None:
     """Axis and outer profile of the best of several starts, coarse to fine; None when no start has an envelope."""
-    pixel = float(np.median(rays.pixel))
-    sparse = rays.every(max(1, len(rays.view) // START_POINTS))
-    cell = START_CELL_PX * pixel
+    options = rays.options
+    sparse = rays.at_most(options.start_points)
+    cell = options.start_cell_px * rays.pixel
     best, least = None, np.inf
     for start in starts:
-        surface = _refined(sparse, start, cell, (16.0,) * START_STEPS)
-        cost = np.inf if surface is None else contour_cost(sparse, surface, cell)
-        if surface is not None and cost < least:
-            best, least = surface, cost
+        surface = _refine(sparse, start, cell, options.start_scales_px)
+        if surface is not None:
+            cost = contour_cost(silhouette_residuals(sparse, surface, cell), 2.0)
+            if cost < least:
+                best, least = surface, cost
     return best
 
 
 def refine_outer(rays: ContourRays, start: SurfaceOfRevolution) -> SurfaceOfRevolution | None:
     """Axis and profile at a pixel's spacing."""
-    pixel = float(np.median(rays.pixel))
-    dense = rays.every(max(1, len(rays.view) // MOST_POINTS))
-    return _refined(dense, start, pixel, FINAL_SCALES_PX)
+    return _refine(rays.at_most(rays.options.points), start, rays.pixel, rays.options.scales_px)
 
 
-def _refined(
+def _refine(
     rays: ContourRays, start: SurfaceOfRevolution, cell: float, scales_px: Sequence[float]
 ) -> SurfaceOfRevolution | None:
     surface = outer_surface(rays, start, cell)
     if surface is None:
         return None
     for scale in scales_px:
-        surface = resample_profile(contour_step(rays, surface, cell, scale, 2 * cell), cell)
+        surface = contour_step(rays, surface, cell, scale, 2 * cell)
     return surface

@@ -139,5 +139,5 @@ def test_without_saturated_pixels_saturation_is_nothing(photographs) -> None:
 def test_a_saturated_pixel_is_a_lower_bound() -> None:
     """It has a vote where a map is darker than it, none where one is brighter; any other pixel has one either way."""
     areas = PixelFootprints(torch.zeros(2, 1, 3), torch.tensor([[1.0, 1.0, 1.0], [0.5, 0.5, 0.5]]))
-    votes = areas.weights(torch.tensor([[2.0, 1.0, 0.9], [0.6, 0.5, 0.4]]), ONE, 0.1) > 0
+    votes = areas.weights(torch.tensor([[2.0, 1.0, 0.9], [0.6, 0.5, 0.4]]), ONE, 0.1, 0.998) > 0
     assert votes.tolist() == [[False, False, True], [True, True, True]]

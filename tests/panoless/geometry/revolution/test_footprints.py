@@ -8,17 +8,13 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from panoless.capture.views import Views
-from panoless.geometry.revolution import footprints
-from panoless.geometry.revolution.footprints import (
-    footprint_equations,
-    informative_pixels,
-    refine_by_footprints,
-    trace_footprints,
-)
+from panoless.geometry.revolution.fit import _Refinement
+from panoless.geometry.revolution.footprints import informative_pixels
 from panoless.geometry.revolution.model import SurfaceOfRevolution
-from panoless.geometry.revolution.photometric import RADIANCE_SIGMA
+from panoless.geometry.revolution.options import DEFAULTS
+from panoless.geometry.revolution.photometric import Photometry, photometric_equations, solve_map
+from panoless.geometry.revolution.pixels import PixelBundles
 from panoless.geometry.revolution.profile import ProfileSplines, apply_step, resample_profile
-from panoless.geometry.revolution.silhouette import contour_rays
 from panoless.kernels.cubemap import cubemap_directions
 from tests.support.mirror_revolution import around, goblet, rays_of, revolution_views
 from tests.support.synthetic_dataset import environment_radiance
@@ -64,13 +60,18 @@ def error_deg(surface: SurfaceOfRevolution, truth: SurfaceOfRevolution, size: in
     return float(np.degrees(np.arccos(cosine)).mean())
 
 
-@pytest.fixture
-def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The two coarse rounds, which take a tenth of the time."""
-    monkeypatch.setattr(footprints, "MAP_RESOLUTION", 64)
-    monkeypatch.setattr(footprints, "ROUNDS", footprints.ROUNDS[:2])
-    monkeypatch.setattr(footprints, "BENDING", footprints.BENDING[:2])
-    monkeypatch.setattr(footprints, "PIXELS", 12_000)
+COARSE = replace(
+    DEFAULTS,
+    footprints=replace(DEFAULTS.footprints, rounds=DEFAULTS.footprints.rounds[:2], pixels=12_000),
+)
+"""The two coarse rounds, which take a tenth of the time."""
+
+
+def refine_areas(views: Views, start: SurfaceOfRevolution) -> SurfaceOfRevolution:
+    """What held-out views leave of the refinement by areas."""
+    with torch.no_grad():
+        fit = _Refinement(views, start, COARSE)
+        return fit.refine_areas(start, solve_map(views, start, 1_000_000, 64))
 
 
 @pytest.fixture(scope="module")
@@ -89,12 +90,14 @@ def test_equations_are_the_derivatives_of_the_mean_of_rays() -> None:
         hits = surface.hits(*rays_of(view.camera))
         facing = np.abs((hits.normals * rays_of(view.camera)[1]).sum(1))
         height = (hits.points - surface.origin) @ surface.axis
-        pixels.append(np.flatnonzero(hits.met & (facing > 0.4) & (np.abs(height + 0.05) < 0.45)))
-    gradient, _ = footprint_equations(trace_footprints(views.train, surface, pixels), surface, splines, scene, 1e6, 0.0)
+        pixels.append((view, np.flatnonzero(hits.met & (facing > 0.4) & (np.abs(height + 0.05) < 0.45))))
+    areas = PixelBundles.of(pixels)
+    found = Photometry.of(areas, surface, scene, 6)
+    gradient, _ = photometric_equations(areas, found, surface, splines, scene, 1e6, 0.0)
 
     def cost(changed: SurfaceOfRevolution) -> float:
-        areas = trace_footprints(views.train, changed, pixels)
-        return float(((areas.shown(scene) - areas.radiance) ** 2).sum()) / 2 / RADIANCE_SIGMA**2
+        residual = Photometry.of(areas, changed, scene, 6).residual
+        return float((residual**2).sum()) / 2 / DEFAULTS.photometric.radiance_sigma**2
 
     generator = np.random.default_rng(1)
     for _ in range(3):
@@ -107,15 +110,13 @@ def test_equations_are_the_derivatives_of_the_mean_of_rays() -> None:
         assert change / 2e-4 == pytest.approx(float(gradient @ direction), rel=0.15)
 
 
-@pytest.mark.usefixtures("coarse")
 def test_a_groove_of_some_pixels_is_found(grooved_views: Views) -> None:
     """From the body without its groove: the normals there, wrong by tens of degrees, become right to half of that."""
     start = resample_profile(goblet(), PIXEL)
-    found = refine_by_footprints(grooved_views, contour_rays(grooved_views), start, PIXEL)
+    found = refine_areas(grooved_views, start)
     assert error_deg(found, grooved()) < error_deg(start, grooved()) / 2
 
 
-@pytest.mark.usefixtures("coarse")
 def test_what_held_out_views_do_not_show_is_not_kept(grooved_views: Views) -> None:
     """Every fifth view shows a body without the groove that the others show: the start is returned."""
     plain = averaged_views(goblet(), 10)
@@ -124,16 +125,16 @@ def test_what_held_out_views_do_not_show_is_not_kept(grooved_views: Views) -> No
         for index, (without, with_groove) in enumerate(zip(plain.train, grooved_views.train, strict=True))
     )
     views, start = replace(plain, train=mixed), resample_profile(goblet(), PIXEL)
-    assert refine_by_footprints(views, contour_rays(views), start, PIXEL) is start
+    assert refine_areas(views, start) is start
 
 
 def test_pixels_are_taken_where_the_profile_turns() -> None:
     """Three quarters of them see the groove or another bend, which are a smaller part of what all see."""
     views, surface = averaged_views(grooved(), 5), resample_profile(grooved(), PIXEL / 3)
     chosen = informative_pixels(views.train, surface, 1000, PIXEL)
-    assert 800 < sum(map(len, chosen)) < 1200
+    assert 800 < sum(len(pixels) for _, pixels in chosen) < 1200
     shares = []
-    for pixels_of in (lambda i: chosen[i], lambda i: views.train[i].solid.numpy()):
+    for pixels_of in (lambda i: chosen[i][1], lambda i: views.train[i].solid.numpy()):
         points = [
             surface.hits(*(each[pixels_of(i)] for each in rays_of(view.camera))).points
             for i, view in enumerate(views.train)

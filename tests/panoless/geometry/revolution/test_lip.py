@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from panoless.geometry.revolution.lip import open_at_lip, tip_shift, with_lip
+from panoless.geometry.revolution.lip import open_at_lip, place_lip, tip_shift
 from panoless.geometry.revolution.model import SurfaceOfRevolution
 from panoless.geometry.revolution.profile import resample_profile
 from panoless.geometry.revolution.silhouette import contour_rays, silhouette_residuals
@@ -38,7 +38,7 @@ def test_a_wall_that_ends_too_early_grows_to_its_rim(contours) -> None:
     kept = len(truth.profile) - round(2 * PIXEL / spacing)
     surface = SurfaceOfRevolution(truth.origin, truth.axis, truth.profile[:kept], kept - 1)
     for _ in range(8):
-        surface = with_lip(contours, surface, PIXEL)
+        surface = place_lip(contours, surface, PIXEL)
     assert np.linalg.norm(surface.profile[-1] - truth.profile[-1]) < 0.1 * PIXEL
 
 
@@ -48,7 +48,7 @@ def test_a_closed_surface_opens_where_it_should(contours) -> None:
     corner = truth.profile[truth.lip - 5] + np.array([[1.5, 0.2], [2.5, 0.3]]) * PIXEL
     profile = np.concatenate([truth.profile[: truth.lip - 4], corner, [[0.0, corner[-1, 1]]]])
     closed = SurfaceOfRevolution(truth.origin, truth.axis, profile, truth.lip - 3)
-    found = open_at_lip(contours, closed, PIXEL)
+    found = open_at_lip(contours, closed)
     assert found is not None
     assert found.is_open
     assert np.linalg.norm(found.profile[-1] - truth.profile[-1]) < 0.1 * PIXEL

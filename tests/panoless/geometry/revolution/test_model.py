@@ -11,7 +11,9 @@ from panoless.capture.silhouettes import mask_contours
 from panoless.geometry.revolution.fit import propose_revolution
 from panoless.geometry.revolution.interior import search_interior
 from panoless.geometry.revolution.model import RAY_EPSILON, SurfaceOfRevolution, revolution_buffers, trace_reflections
-from panoless.geometry.revolution.photometric import photometric_equations, select_observations
+from panoless.geometry.revolution.options import DEFAULTS
+from panoless.geometry.revolution.photometric import Photometry, photometric_equations
+from panoless.geometry.revolution.pixels import CENTER, PixelBundles, evenly
 from panoless.geometry.revolution.placement import surfels_on_revolution
 from panoless.geometry.revolution.profile import ProfileSplines, apply_step, resample_profile
 from panoless.geometry.revolution.silhouette import contour_rays, silhouette_residuals
@@ -52,7 +54,7 @@ def test_two_mirrors_pass_a_ray_on() -> None:
     """Inside a right-angled cone a ray along the axis is mirrored twice and comes back the way it came."""
     cone = SurfaceOfRevolution(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([[0.0, 0.0], [1.0, 1.0]]), 1)
     escapes = trace_reflections(
-        cone, np.array([[0.5, 0.1, 3.0], [2.0, 0.0, 3.0]]), np.tile([[0.0, 0.0, -1.0]], (2, 1)), 6
+        cone, np.array([[0.5, 0.1, 3.0], [2.0, 0.0, 3.0]]), np.tile([[0.0, 0.0, -1.0]], (2, 1)), max_bounces=6
     )
     np.testing.assert_array_equal(escapes.bounces, [2, 0])
     np.testing.assert_allclose(escapes.directions[0], [0, 0, 1], atol=1e-6)
@@ -63,7 +65,7 @@ def test_a_ray_is_followed_as_if_hit_and_mirrored_one_by_one() -> None:
     """In a funnel, until it leaves or six reflections have been."""
     surface = funnel()
     origins, directions = rays_of(around(4, 60)[3])
-    escapes = trace_reflections(surface, origins, directions, 6)
+    escapes = trace_reflections(surface, origins, directions, max_bounces=6)
     assert (escapes.bounces == 1).sum() > 50
     assert (escapes.bounces > 1).sum() > 50
     for ray in np.flatnonzero(escapes.first.met):
@@ -79,6 +81,34 @@ def test_a_ray_is_followed_as_if_hit_and_mirrored_one_by_one() -> None:
         else:
             assert times == 7
             assert not escapes.directions[ray].any()
+
+
+def test_without_an_occlusion_test_the_last_direction_stands() -> None:
+    """After one and after two reflections, whatever is met then; where nothing is met, as with the test."""
+    surface = funnel()
+    origins, directions = rays_of(around(4, 60)[3])
+    for count in (1, 2):
+        tested = trace_reflections(surface, origins, directions, max_bounces=count)
+        free = trace_reflections(surface, origins, directions, max_bounces=count, occlusion_test=False)
+        left = tested.bounces > 0
+        np.testing.assert_array_equal(free.bounces[left], tested.bounces[left])
+        np.testing.assert_allclose(free.directions[left], tested.directions[left], atol=1e-9)
+        again = free.first.met & ~left
+        assert again.sum() > 50
+        np.testing.assert_array_equal(free.bounces[again], count)
+        np.testing.assert_allclose(np.linalg.norm(free.directions[again], axis=1), 1)
+
+
+def test_a_body_turned_over_is_where_it_was() -> None:
+    """Its silhouette is the same, its lid the former base, and turned over again it is the body."""
+    body = goblet()
+    over = body.turned_over()
+    np.testing.assert_allclose(over.axis, -body.axis)
+    camera = around(3, 48)[1]
+    first, second = (each.hits(*rays_of(camera)) for each in (body, over))
+    np.testing.assert_array_equal(first.met, second.met)
+    np.testing.assert_allclose(first.points, second.points, atol=1e-9)
+    np.testing.assert_allclose(over.turned_over().profile, body.profile, atol=1e-12)
 
 
 def test_surfels_of_a_ball_have_its_normals_and_curvature() -> None:
@@ -114,16 +144,17 @@ def goblet_fit():
 
 
 def test_outlines_give_axis_and_profile(goblet_fit) -> None:
-    """A tilted axis to a tenth of a degree and the outside to a tenth of a pixel (0.02 units), from masks alone."""
+    """A tilted axis to a tenth of a degree, toward the end that cameras look into, and the outside to a tenth of a
+    pixel (0.02 units), from masks alone.
+    """
     surface, truth = goblet_fit.surface, goblet()
-    assert np.degrees(np.arccos(min(abs(surface.axis @ truth.axis), 1.0))) < 0.1
+    assert np.degrees(np.arccos(min(surface.axis @ truth.axis, 1.0))) < 0.1
     away = surface.origin - truth.origin
     assert np.linalg.norm(away - (away @ truth.axis) * truth.axis) < 0.002
     assert float(np.median(goblet_fit.median_px)) < 0.1
     assert float(np.median(goblet_fit.iou)) > 0.99
     shift = (surface.origin - truth.origin) @ truth.axis
-    sign = np.sign(surface.axis @ truth.axis)
-    heights = sign * surface.profile[1 : surface.lip + 1, 1] + shift
+    heights = surface.profile[1 : surface.lip + 1, 1] + shift
     inner = (heights > -0.6) & (heights < 0.5)
     expected = 0.5 + 0.12 * np.cos(4 * heights)
     assert float(np.median(np.abs(surface.profile[1 : surface.lip + 1, 0] - expected)[inner])) < 0.002
@@ -155,32 +186,25 @@ def test_equations_are_the_derivatives_of_the_residuals() -> None:
     """Jᵀ r predicts the change of Σ e²/2 under small moves of axis and profile, found by tracing the moved surface."""
     views = revolution_views(goblet(), around(6, 64))
     surface = resample_profile(replace(goblet(), origin=goblet().origin + 0.01), 0.02)
-    splines, seen, scene = (
-        ProfileSplines.of(surface, 0.1),
-        select_observations(views, surface, 20_000),
-        environment(256),
-    )
-    gradient, _ = photometric_equations(seen, surface, splines, scene, 1e6, 0.0)
+    splines, scene = ProfileSplines.of(surface, 0.1), environment(256)
+    seen = PixelBundles.of(evenly(views, 20_000), CENTER)
+    found = Photometry.of(seen, surface, scene)
+    gradient, _ = photometric_equations(seen, found, surface, splines, scene, 1e6, 0.0)
     generator = np.random.default_rng(1)
     for _ in range(3):
         direction = np.concatenate([generator.normal(size=4), generator.normal(size=splines.count) * 0.3])
         direction[4 + splines.counts[0] :] = 0
         direction[4 : 4 + 3] = direction[4 + splines.counts[0] - 3 : 4 + splines.counts[0]] = 0
-        costs = [_cost(seen, apply_step(surface, splines, sign * 1e-4 * direction), scene) for sign in (-1, 1)]
+        costs = [_cost(seen, found, apply_step(surface, splines, sign * 1e-4 * direction), scene) for sign in (-1, 1)]
         assert (costs[1] - costs[0]) / 2e-4 == pytest.approx(float(gradient @ direction), rel=0.1)
 
 
-def _cost(seen, surface, scene) -> float:
-    from panoless.capture.rays import reflect
-    from panoless.geometry.revolution.photometric import RADIANCE_SIGMA
-    from panoless.kernels.cubemap import sample_cubemap
-
-    origins = seen.hits.points - 3 * seen.directions
-    hits = surface.hits(origins, seen.directions)
+def _cost(seen: PixelBundles, found: Photometry, surface: SurfaceOfRevolution, scene: torch.Tensor) -> float:
+    """Over pixels that count in the equations."""
     unit = seen.directions / np.linalg.norm(seen.directions, axis=1, keepdims=True)
-    error = sample_cubemap(scene, torch.from_numpy(reflect(unit, hits.normals)).float()) - seen.radiance
-    cosine = np.abs((unit * seen.hits.normals).sum(1)) > 0.05
-    return float(error[torch.from_numpy(cosine & hits.met)].double().square().sum()) / 2 / RADIANCE_SIGMA**2
+    counted = found.whole & (np.abs((unit * found.paths.first.normals).sum(1)) > 0.05)
+    residual = Photometry.of(seen, surface, scene).residual[counted]
+    return float((residual**2).sum()) / 2 / DEFAULTS.photometric.radiance_sigma**2
 
 
 def test_a_search_finds_the_funnel_inside() -> None:

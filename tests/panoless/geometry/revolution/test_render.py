@@ -6,9 +6,9 @@ import numpy as np
 import torch
 
 from panoless.capture.rays import pixel_rays
-from panoless.geometry.revolution import render as revolution_render
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_buffers, trace_reflections
-from panoless.geometry.revolution.render import MAX_RENDER_BOUNCES, mean_light
+from panoless.geometry.revolution.options import RenderingOptions
+from panoless.geometry.revolution.render import mean_light
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.kernels.rasterize import RasterCamera
 from tests.support.mirror_revolution import TILTED, around, bowl
@@ -56,13 +56,12 @@ def _sphere_light(surface, radius, scene, camera, pixels, shift):
     return sample_cubemap(scene, torch.from_numpy(directions_local).float())
 
 
-def test_interpolated_directions_are_those_of_traced_rays(monkeypatch) -> None:
+def test_interpolated_directions_are_those_of_traced_rays() -> None:
     """With no interpolation at all, the smooth pixels of a bowl change by less than a thousandth."""
     surface, scene, camera = bowl(), environment(), around(3, 64)[2]
     pixels = covered(surface, camera)
     quick = mean_light(surface, scene, camera, pixels)
-    monkeypatch.setattr(revolution_render, "LARGEST_BEND", 0.0)
-    slow = mean_light(surface, scene, camera, pixels)
+    slow = mean_light(surface, scene, camera, pixels, RenderingOptions(largest_bend=0.0))
     assert float((quick - slow).abs().mean()) < 1e-3
     assert 0 < int(((quick - slow).abs().amax(1) > 0).sum()) < len(pixels)
 
@@ -73,7 +72,7 @@ def test_a_white_world_makes_a_white_mirror() -> None:
     pixels = covered(surface, camera)
     light = mean_light(surface, torch.ones(6, 3, 8, 8), camera, pixels)
     assert float(light.max()) <= 1 + 1e-5
-    once = trace_reflections(surface, *pixel_rays(camera, pixels.numpy()), MAX_RENDER_BOUNCES).bounces == 1
+    once = trace_reflections(surface, *pixel_rays(camera, pixels.numpy()), max_bounces=16).bounces == 1
     assert float(light[torch.from_numpy(once)].median()) == 1
     assert float((light > 1 - 1e-5).float().mean()) > 0.9
 
