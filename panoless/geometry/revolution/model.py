@@ -110,11 +110,6 @@ class SurfaceOfRevolution:
         return self.lip == len(self.profile) - 1
 
     @property
-    def is_drum(self) -> bool:
-        """Whether nothing is known of its inside: flat lids close both ends."""
-        return self.lip == len(self.profile) - 2
-
-    @property
     def num_parameters(self) -> int:
         """How many numbers it is made of: axis and origin across it, height of the frame, and the profile."""
         return 5 + self.profile.size

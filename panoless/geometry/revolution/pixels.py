@@ -54,10 +54,10 @@ class PixelBundles:
     def at_most(self, count: int) -> "PixelBundles":
         """Every k-th pixel, so that about `count` remain."""
         stride, rays = max(1, len(self.radiance) // count), self.rays_per_pixel
-        return PixelBundles(
-            *(each.reshape(-1, rays, 3)[::stride].reshape(-1, 3) for each in (self.origins, self.directions)),
-            self.radiance[::stride],
+        origins, directions = (
+            each.reshape(-1, rays, 3)[::stride].reshape(-1, 3) for each in (self.origins, self.directions)
         )
+        return PixelBundles(origins, directions, self.radiance[::stride])
 
     def trace(self, surface: SurfaceOfRevolution, max_bounces: int) -> ReflectionPaths:
         """Where all rays go."""
