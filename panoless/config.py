@@ -54,7 +54,7 @@ class EnvironmentConfig:
     activation: Literal["clamp", "sigmoid"] = "clamp"
     """`sigmoid`: Eq. 7 of the paper, started at random logits; `clamp`: radiance itself, kept in [0, 1]."""
     range: Literal["ldr", "hdr"] = "ldr"
-    """`ldr`: views are clipped to [0, 1], as photographs are; `hdr`: radiance above 1 is fitted, too (needs EXR)."""
+    """`ldr`: views are clipped to [0, 1], as photographs are; `hdr`: radiance above 1 is fitted, too (EXR, HDR)."""
     warmup: Share = 0.06
     """Share of the iterations in which only the environment learns, before the geometry moves."""
     solve: bool = True

@@ -1,5 +1,7 @@
 """Polygons, as vertices in order: exact coverage of pixels, nearest sides, signed distance, clipping."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -72,11 +74,8 @@ def nearest_side(
 
     Side i leads from vertex i to the next; infinite distances from a boundary without vertices.
     """
-    x, y = np.ascontiguousarray(points.T)
     least, side, along = np.full(len(points), np.inf), np.zeros(len(points), dtype=np.int64), np.zeros(len(points))
-    for index, ((x0, y0), (dx, dy)) in enumerate(zip(boundary, _sides(boundary), strict=True)):
-        share = (((x - x0) * dx + (y - y0) * dy) / max(dx * dx + dy * dy, 1e-18)).clip(0, 1)
-        squared = (x - x0 - share * dx) ** 2 + (y - y0 - share * dy) ** 2
+    for index, (share, squared) in enumerate(_feet(points, boundary)):
         nearer = squared < least
         least[nearer], along[nearer], side[nearer] = squared[nearer], share[nearer], index
     return side, along, np.sqrt(least)
@@ -94,7 +93,20 @@ def contains(boundary: Float[np.ndarray, "N 2"], points: Float[np.ndarray, "P 2"
 
 def depth_inside(points: Float[np.ndarray, "P 2"], boundary: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "P"]:
     """Distance of points from a boundary, negative outside of it."""
-    return np.where(contains(boundary, points), 1.0, -1.0) * nearest_side(points, boundary)[2]
+    least = np.full(len(points), np.inf)
+    for _, squared in _feet(points, boundary):
+        np.minimum(least, squared, out=least)
+    return np.where(contains(boundary, points), 1.0, -1.0) * np.sqrt(least)
+
+
+def _feet(
+    points: Float[np.ndarray, "P 2"], boundary: Float[np.ndarray, "N 2"]
+) -> Iterator[tuple[Float[np.ndarray, "P"], Float[np.ndarray, "P"]]]:
+    """For each side, where on it the point nearest to each of the others is, and its squared distance."""
+    x, y = np.ascontiguousarray(points.T)
+    for (x0, y0), (dx, dy) in zip(boundary, _sides(boundary), strict=True):
+        share = (((x - x0) * dx + (y - y0) * dy) / max(dx * dx + dy * dy, 1e-18)).clip(0, 1)
+        yield share, (x - x0 - share * dx) ** 2 + (y - y0 - share * dy) ** 2
 
 
 def _sides(boundary: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:

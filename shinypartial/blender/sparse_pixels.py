@@ -55,16 +55,14 @@ def render_sparse(
     scene.objects[PORTAL].scale = (PLANE_SHARE * depth,) * 3
     places = np.zeros((height * width, 4), np.float32)
     places[: len(rows), 0], places[: len(rows), 1] = columns, rows
-    image = _upload(bpy, places.reshape(height, width, 4))
     nodes = bpy.data.materials[PORTAL].node_tree.nodes
-    nodes["places"].image = image
+    # Cycles knows images by their address: the one before may go only when this one has another.
+    before, nodes["places"].image = nodes["places"].image, _upload(bpy, places.reshape(height, width, 4))
+    if before:
+        bpy.data.images.remove(before)
     nodes["size"].inputs[1].default_value = (width, height, 0)
     scene.render.filepath = str(path)
-    try:
-        bpy.ops.render.render(write_still=True, scene=SPARSE)
-    finally:
-        nodes["places"].image = None
-        bpy.data.images.remove(image)
+    bpy.ops.render.render(write_still=True, scene=SPARSE)
     return {name: channel.ravel()[: len(rows)] for name, channel in read_passes(path, PASSES).items()}
 
 

@@ -1,7 +1,7 @@
-"""What a plain folder promises: the layout of Shiny Blender and NeRF-synthetic, which holds 8-bit pictures and cameras.
+"""Rules of a plain folder: the layout of Shiny Blender and NeRF-synthetic, which holds pictures and cameras.
 
-Original folders have no manifest; a subset of one has a manifest that says so. What isn't there is no break of the
-format, but can't be scored either.
+Original folders have no manifest; a subset of one has a manifest that says so. What isn't there violates no rule,
+but can't be scored either.
 """
 
 from collections.abc import Iterator, Sequence
@@ -50,7 +50,7 @@ def read_plain_frames(root: Path, split: str) -> tuple[list[Frame], int, list[Vi
 
 
 def check_plain_frame(root: Path, frame: Frame) -> Iterator[Violation]:
-    """Every broken promise of a frame without an EXR."""
+    """Every violation in a frame without an EXR."""
     photograph = frame.photograph
     name = _name(root, photograph)
     if not photograph.is_file():

@@ -1,4 +1,4 @@
-"""Check every promise of the dataset format and name each one that a folder breaks."""
+"""Check every rule of the dataset format and name each violation."""
 
 import math
 from collections.abc import Iterator
@@ -49,9 +49,9 @@ RADIANCE_TOLERANCE = 2e-3
 
 
 def validate(root: Path, progress: bool = False) -> list[Violation]:
-    """Every promise that the folder breaks, warnings last; empty when it keeps them all.
+    """Every violation of the format, warnings last; empty when there is none.
 
-    A folder in the plain layout (`plain.is_plain`) promises less: `unscored` says what it lacks. Raises InputError when
+    Fewer rules hold for a plain folder (`plain.is_plain`): `unscored` says what it lacks. Raises InputError when
     there is no such folder.
     """
     if not root.is_dir():
@@ -212,7 +212,7 @@ def _hemisphere_problems(frames: list[Frame], manifest: dict[str, Any]) -> Itera
     axis = _vector(recipe.get("hemisphere_axis", offsets.mean(0)))
     for frame, height in zip(frames, offsets @ axis, strict=True):
         if not height > 0:
-            yield f"the camera of {frame.name} lies outside the hemisphere that the recipe promises"
+            yield f"the camera of {frame.name} lies outside the hemisphere that the recipe names"
 
 
 def _vector(values: Any) -> Float[np.ndarray, "3"]:

@@ -1,4 +1,4 @@
-"""What one frame promises: files of the right kind, physical values, and companions that agree with the EXR."""
+"""Rules of one frame: files of the right kind, physical values, and companions that agree with the EXR."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,7 +31,7 @@ COMPARED_ALPHA = 1 / 64
 
 
 def check_frame(root: Path, frame: Frame, self_reflection: bool = False) -> Iterator[Violation]:
-    """Every broken promise of a frame's files; without `self_reflection` it may have that or not."""
+    """Every violation in a frame's files; without `self_reflection` it may have that or not."""
     expected = (*frame.files, frame.self_png) if self_reflection else frame.files
     missing = [path for path in expected if not path.is_file()]
     yield from (Violation(_name(root, path), "the file is missing", REMAKE) for path in missing)

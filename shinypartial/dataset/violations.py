@@ -1,4 +1,4 @@
-"""A broken promise of the format: which file, what is wrong with it and what to do."""
+"""Violations of the format: which file, what is wrong with it and what to do."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ REMAKE = "Delete the file and run the `shinypartial generate` that made the fold
 
 @dataclass(frozen=True)
 class Violation:
-    """A promise of the format that a folder breaks; a warning is lawful but worth a look."""
+    """A rule of the format that a folder violates; a warning violates none, but is worth a look."""
 
     file: str
     problem: str
@@ -18,5 +18,5 @@ class Violation:
 
 
 def violation_of(file: str, error: InputError, remedy: str = REMAKE) -> Violation:
-    """The break that a failed reading of `file` amounts to."""
+    """The violation that a failed reading of `file` is."""
     return Violation(file, f"expected {error.expected}, found {error.found}", remedy)

@@ -115,6 +115,7 @@ def write_png(path: Path, image: UInt8[np.ndarray, "H W *C"]) -> None:
     spec.attribute("oiio:UnassociatedAlpha", 1)
     with atomic_write(path) as temporary:
         file = oiio.ImageOutput.create("png")
+        assert file is not None
         if not (file.open(str(temporary), spec) and file.write_image(pixels) and file.close()):
             raise OSError(errno.ENOSPC, f"could not write the PNG ({file.geterror()})", str(path))
         _require_complete_write(temporary, path)

@@ -90,8 +90,8 @@ def solve_latlong(rays: Rays, height: int, after_round: Callable[[], None] = lam
             weights = weights * (1 + _squared_residuals(cells, solution, clipped) / np.float32(scale**2)) ** -2
         evidence, right_side = _splat(cells, weights, clipped)
         mean = right_side / np.maximum(evidence, 1e-9)[:, None]
-        averaged = _filled(mean, evidence, height) if averaged is None else averaged
-        start = _filled(mean if solution is None else solution, evidence, height)
+        averaged = _fill(mean, evidence, height) if averaged is None else averaged
+        start = _fill(mean if solution is None else solution, evidence, height)
         solution = _conjugate_gradients(_normal_matrix(cells, weights) + laplacian, right_side, start)
         after_round()
     assert solution is not None
@@ -206,9 +206,7 @@ def _conjugate_gradients(
     return solution
 
 
-def _filled(
-    texels: Float[np.ndarray, "T 3"], evidence: Float[np.ndarray, "T"], height: int
-) -> Float[np.ndarray, "T 3"]:
+def _fill(texels: Float[np.ndarray, "T 3"], evidence: Float[np.ndarray, "T"], height: int) -> Float[np.ndarray, "T 3"]:
     shape = (height, 2 * height)
     return fill_gaps(texels.reshape(*shape, 3), evidence.reshape(shape)).reshape(-1, 3)
 

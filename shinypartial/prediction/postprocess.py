@@ -112,11 +112,11 @@ def postprocess(prediction: Path, output: Path, options: BlurOptions = BlurOptio
             if path.is_file() and str(place) not in NOT_TAKEN_OVER and place.parts[0] not in FOLDERS_NOT_TAKEN_OVER:
                 _take_over(path, output / place)
         write_environment_map(output, blurred.radiance)
-        write_info(output, _described(info, prediction, blurred, options, time.monotonic() - start))
+        write_info(output, _describe(info, prediction, blurred, options, time.monotonic() - start))
     return blurred
 
 
-def _described(
+def _describe(
     info: PredictionInfo, source: Path, blurred: Blurred, options: BlurOptions, seconds: float
 ) -> PredictionInfo:
     """What differs from one seed to the next stands in `model`, so that charts still see one configuration."""

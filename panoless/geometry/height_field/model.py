@@ -70,19 +70,24 @@ class HeightField:
         """Rows t_u, t_v, n: rotates the normalized frame into the axes of the plane."""
         return np.stack([self.plane.tangent_u, self.plane.tangent_v, self.plane.normal])
 
-    def basis(self, places: Float[np.ndarray, "P 2"]) -> tuple[Int[np.ndarray, "P 16"], Float[np.ndarray, "6 P 16"]]:
-        """Which coefficients act at plane coordinates, and by how much on h, h_u, h_v, h_uu, h_uv and h_vv there."""
+    def basis(
+        self, places: Float[np.ndarray, "P 2"], derivatives: int = 2
+    ) -> tuple[Int[np.ndarray, "P 16"], Float[np.ndarray, "K P 16"]]:
+        """Which coefficients act at plane coordinates, and by how much on h, h_u, h_v, h_uu, h_uv and h_vv there, or on
+        those of them that are derivatives of at most that order.
+        """
         rows, columns = self.coefficients.shape
         u, v = ((places - self.low) / self.spacing).T
-        row, along_u = cubic_bsplines_at(u, rows, derivatives=2)
-        column, along_v = cubic_bsplines_at(v, columns, derivatives=2)
+        row, along_u = cubic_bsplines_at(u, rows, derivatives)
+        column, along_v = cubic_bsplines_at(v, columns, derivatives)
         index = (row[:, None, None] + np.arange(4)[:, None]) * columns + column[:, None, None] + np.arange(4)
-        weights = [(along_u[i][:, :, None] * along_v[j][:, None]) / self.spacing ** (i + j) for i, j in ORDERS]
-        return index.reshape(-1, 16), np.stack(weights).reshape(6, -1, 16)
+        orders = [(i, j) for i, j in ORDERS if i + j <= derivatives]
+        weights = [(along_u[i][:, :, None] * along_v[j][:, None]) / self.spacing ** (i + j) for i, j in orders]
+        return index.reshape(-1, 16), np.stack(weights).reshape(len(orders), -1, 16)
 
-    def heights(self, places: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "6 P"]:
-        """h, h_u, h_v, h_uu, h_uv and h_vv at plane coordinates."""
-        index, weights = self.basis(places)
+    def heights(self, places: Float[np.ndarray, "P 2"], derivatives: int = 2) -> Float[np.ndarray, "K P"]:
+        """h, h_u, h_v, h_uu, h_uv and h_vv at plane coordinates, or h and the slopes, or h alone."""
+        index, weights = self.basis(places, derivatives)
         return (weights * self.coefficients.ravel()[index]).sum(2)
 
     def quadrilaterals(self) -> tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, "F 4"]]:
@@ -94,7 +99,7 @@ class HeightField:
         index = np.arange(len(places)).reshape(steps + 1)
         faces = np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]], -1).reshape(-1, 4)
         within = depth_inside(places[faces].mean(1), self.plane.boundary) > 0
-        return self.plane.points(places) + self.heights(places)[0][:, None] * self.plane.normal, faces[within]
+        return self.plane.points(places) + self.heights(places, 0)[0][:, None] * self.plane.normal, faces[within]
 
     def bending(self) -> Float[np.ndarray, "D D"]:
         """B with cᵀ B c the sum of squared second differences of the coefficients c: Σ c_uu² + 2 c_uv² + c_vv²."""
@@ -203,4 +208,4 @@ def edge_points(height_field: HeightField) -> Float[np.ndarray, "E 3"]:
         pieces = int(np.ceil(STEPS_A_CELL * np.linalg.norm(end - start) / height_field.spacing)) or 1
         parts.append(start + np.arange(pieces)[:, None] / pieces * (end - start))
     places = np.concatenate(parts)
-    return height_field.plane.points(places) + height_field.heights(places)[0][:, None] * height_field.plane.normal
+    return height_field.plane.points(places) + height_field.heights(places, 0)[0][:, None] * height_field.plane.normal

@@ -7,6 +7,7 @@ the mirror (variable projection, Golub and Pereyra 1973).
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -102,7 +103,7 @@ class Photographs:
         slide = np.stack([h_uu, h_uv, h_uv, h_vv]).reshape(2, 2, -1)
         slide = np.einsum("abp,pb->ap", slide, directions[:, :2]) / rate
         slopes = basis[1:3] + slide[:, :, None] * basis[0]
-        by_slope, gather = self._radiance_by_slope(), self._gather()
+        by_slope, gather = self._radiance_by_slope(), self.gather
         for channel, residual in enumerate(self.residual.T):
             values = by_slope[0, :, channel, None] * slopes[0] + by_slope[1, :, channel, None] * slopes[1]
             jacobian = jacobian_of_rows(values, index, count)
@@ -114,13 +115,16 @@ class Photographs:
 
     def cost(self, candidate: HeightField) -> float:
         """The cost of another height field near to this one; a ray that misses it has a residual of 1."""
-        hits = candidate.hits(self.observed.origins, self.observed.directions)
-        shown = _look_up(self.environment, candidate, self.observed.directions, hits)
-        residual = np.where(hits.met[:, None], shown - self.observed.rays.radiance.cpu().numpy(), 1.0)
-        explained = self._gather() @ residual
+        residual = self.residual
+        if candidate is not self.height_field:
+            hits = candidate.hits(self.observed.origins, self.observed.directions)
+            shown = _look_up(self.environment, candidate, self.observed.directions, hits)
+            residual = np.where(hits.met[:, None], shown - self.observed.rays.radiance.cpu().numpy(), 1.0)
+        explained = self.gather @ residual
         return float((self.weights @ residual**2).sum() - (explained**2).sum()) / 2
 
-    def _gather(self) -> "csr_matrix":
+    @cached_property
+    def gather(self) -> "csr_matrix":
         """G with ‖G x‖² = Σ_texels (Σ w x)²/Σ w."""
         from scipy import sparse
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def edge_residuals(contours: MaskContours, height_field: HeightField, options: HeightFieldOptions) -> BoundaryResiduals:
     """Distances of the contours from the mirror's edge or its frame, whichever hides the other."""
     return boundary_residuals(
-        contours, height_field.plane, options.contours, lambda places: height_field.heights(places)[0]
+        contours, height_field.plane, options.contours, lambda places: height_field.heights(places, 0)[0]
     )
 
 
@@ -35,7 +35,7 @@ def edge_jacobian(residuals: BoundaryResiduals, height_field: HeightField) -> "c
 
     boundary, framed = height_field.plane.boundary, height_field.plane.frame_height > 0
     start, end = boundary[residuals.side], np.roll(boundary, -1, 0)[residuals.side]
-    index, basis = height_field.basis(start + residuals.along[:, None] * (end - start))
+    index, basis = height_field.basis(start + residuals.along[:, None] * (end - start), 0)
     by_height = jacobian_of_rows(residuals.by_height[:, None] * basis[0], index, height_field.coefficients.size)
     known = sparse.diags(np.append([framed, framed, 0.0, framed], np.ones(boundary.size)))
     return sparse.hstack([boundary_jacobian(residuals, len(boundary)) @ known, by_height]).tocsr()

@@ -1,4 +1,4 @@
-"""The light of a fit: an encoding with an inverse, the usual one the identity, and a tint that leaves no trace."""
+"""The encoding of a fit has an inverse, the usual one the identity, and a tint that leaves no trace."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -40,11 +40,11 @@ HDR = RadianceEncoding(high_dynamic_range=True)
 
 @given(st.floats(0, 65504, width=32), st.sampled_from([(1.0, 1.0, 1.0), TINT]))
 def test_decoding_inverts_encoding(radiance: float, tint: tuple[float, float, float]) -> None:
-    light = RadianceEncoding(True, tint)
+    encoding = RadianceEncoding(True, tint)
     color = np.full((1, 1, 3), radiance, np.float32) * np.array(tint, np.float32)
-    encoded = torch.from_numpy(light.encoded(color)).permute(2, 0, 1)[None].expand(6, 3, 1, 1)
+    encoded = torch.from_numpy(encoding.encoded(color)).permute(2, 0, 1)[None].expand(6, 3, 1, 1)
     # ln of the largest half is 11, of which single precision keeps 1e-6.
-    torch.testing.assert_close(light.decoded(encoded), torch.full((6, 3, 1, 1), radiance), rtol=2e-5, atol=1e-7)
+    torch.testing.assert_close(encoding.decoded(encoded), torch.full((6, 3, 1, 1), radiance), rtol=2e-5, atol=1e-7)
 
 
 def test_the_encoding_is_smooth_increasing_and_the_identity_up_to_one() -> None:
@@ -59,15 +59,15 @@ def test_the_encoding_is_smooth_increasing_and_the_identity_up_to_one() -> None:
 def test_no_view_is_brighter_than_saturation(tmp_path: Path) -> None:
     """Encoded radiance ends at 1/F of each channel with a low dynamic range, and nowhere with a high one."""
     dataset = make_sphere_dataset(tmp_path)
-    for light in (LDR, RadianceEncoding(tint=TINT), HDR):
+    for encoding in (LDR, RadianceEncoding(tint=TINT), HDR):
         frame = dataset.train[0]
         view = read_view(frame)
         bright = replace(view, radiance=4 * np.ones_like(view.radiance))
-        encoded = torch.from_numpy(light.encoded(light.clipped(frame, bright))).float()
-        if light.high_dynamic_range:
-            assert bool(light.saturation.isinf().all())
+        encoded = torch.from_numpy(encoding.encoded(encoding.clipped(frame, bright))).float()
+        if encoding.high_dynamic_range:
+            assert bool(encoding.saturation.isinf().all())
         else:
-            torch.testing.assert_close(encoded.amax((0, 1)), light.saturation)
+            torch.testing.assert_close(encoded.amax((0, 1)), encoding.saturation)
 
 
 def test_the_usual_light_changes_nothing() -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jaxtyping import Float
 
+from shinypartial.blender import render as render_module
 from shinypartial.blender.directions import GRID, LOST, MARKED, MISSED, MirrorPaths, render_directions
 from shinypartial.blender.footprint import FarWorld, smooth_light
 from shinypartial.blender.passes import PASSES
@@ -238,3 +240,32 @@ def test_a_camera_beside_a_prop_gets_a_path_traced_view(lit: SceneSpec) -> None:
     near.camera_to_world[:3, 3] = 0.0
     with open_renderer(spec) as renderer:
         assert renderer.render(near).alpha.shape == (RESOLUTION, RESOLUTION)
+
+
+def test_a_pixel_that_got_the_sample_of_another_place_is_traced_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = tiny_scene(tmp_path, resolution=32, samples=64)
+    camera = plan_cameras(spec.camera, spec.render.resolution).train[0]
+    traced: list[int] = []
+
+    def mixed_up_at_first(bpy, path, chosen, depth):
+        passes = render_sparse(bpy, path, chosen, depth)
+        traced.append(int(chosen.sum()))
+        if len(traced) == 1:  # The pixel of least alpha gets one sample of a normal that can't be seen there.
+            number = np.argmin(passes["Combined.A"])
+            away = ray_directions_world(camera)[chosen][number] / spec.render.samples
+            for channel, value in zip("XYZ", away, strict=True):
+                passes[f"Normal.{channel}"][number] = value
+            passes["Combined.A"][number] = 1 / spec.render.samples
+        return passes
+
+    with open_renderer(spec) as renderer:
+        expected = renderer.render(camera)
+        monkeypatch.setattr(render_module, "render_sparse", mixed_up_at_first)
+        view = renderer.render(camera)
+    assert traced[0] > 10
+    assert traced[1:] == [1]
+    # Its samples lie elsewhere in the pixel than before; measured one of 64.
+    np.testing.assert_allclose(view.alpha, expected.alpha, atol=0.1)
+    assert np.sum(view.normals_world * ray_directions_world(camera), -1).max() < 0.02

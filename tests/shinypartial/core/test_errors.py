@@ -1,6 +1,9 @@
 """What the user causes becomes one message and exit code 2; our own mistakes stay loud."""
 
 import errno
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -80,3 +83,18 @@ def test_the_command_line_ends_with_code_2_and_no_traceback(
 def test_our_own_mistakes_are_not_hidden() -> None:
     with pytest.raises(ZeroDivisionError):
         run_command(raising(ZeroDivisionError()))
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["shinypartial.cli --help", "shinypartial.cli report --help", "panoless.cli --help", "panoless.cli fit --help"],
+)
+def test_help_that_is_cut_off_by_a_pipe_is_no_error(command: str) -> None:
+    """As in `panoless fit --help | head -1`: nobody reads the pipe by the time that help is written, or flushed."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "wb") as closed:
+        done = subprocess.run(
+            [sys.executable, "-m", *command.split()], stdout=closed, stderr=subprocess.PIPE, text=True
+        )
+    assert (done.returncode, done.stderr) == (0, "")

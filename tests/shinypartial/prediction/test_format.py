@@ -61,7 +61,10 @@ def candidate(**entries: Any) -> dict[str, Any]:
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "overlap above one": (candidate(overlap=1.2), r"candidates\.0\.overlap.*from 0 to 1.*found 1\.2"),
     "negative distance": (candidate(silhouette_px=-1), r"candidates\.0\.silhouette_px.*at least 0"),
-    "text for a number": (candidate(held_out_error="small"), r"candidates\.0\.held_out_error.*a number or none"),
+    "text for a number": (
+        candidate(held_out_error="small"),
+        r"candidates\.0\.held_out_error.*a number of at least 0 or none",
+    ),
     "unknown key": (candidate(iou=0.9), r"candidates\.0\.iou.*unknown key"),
     "no verdict": (candidate(verdict=" "), r"candidates\.0\.verdict.*not empty"),
     "another one chosen": (candidate(kind="surfels"), r"model_selection\.chosen.*found 'plane'"),

@@ -156,6 +156,25 @@ def test_the_summary_names_numbers_and_what_was_left_out(evaluated: Path) -> Non
     assert "warning" not in lines
 
 
+def test_lpips_is_shown_wherever_its_weights_lie(
+    tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With weights in one of their places nothing is asked for: `evaluate` scores, summary and report show."""
+    monkeypatch.setattr(perceptual, "find_weights", lambda network, folder: tmp_path / network)
+    monkeypatch.setattr(perceptual, "has_torch", lambda: True)
+    monkeypatch.setattr(perceptual, "load_lpips", lambda network, _: lambda *_: {"alex": 0.125, "vgg": 0.25}[network])
+    prediction = write_truth_prediction(tmp_path / "truth", sphere_dataset)
+    evaluate(prediction)
+    lines = "\n".join(summary_lines(prediction))
+    assert "perceptual  lpips_alex 0.1250 ↓" in lines
+    assert re.search(r"renders .* lpips_alex 0\.1250 ↓", lines)
+    assert "LPIPS weights" not in lines
+    page = write_report(prediction).read_text(encoding="utf-8")
+    assert "<b>0.1250 ↓</b><span>Environment LPIPS</span>" in page
+    assert "0.2500" in page
+    assert "LPIPS weights" not in page
+
+
 def test_a_dataset_of_another_version_is_a_warning(tmp_path: Path, sphere_dataset: Dataset) -> None:
     prediction = write_truth_prediction(tmp_path / "old", sphere_dataset)
     write_info(prediction, replace(read_info(prediction), dataset_hash="0" * 64, curves={}))
