@@ -23,7 +23,7 @@ from shinypartial.blender.passes import ALPHA_CHANNEL, COLOR_CHANNELS, PASSES, r
 from shinypartial.blender.region import Region, image_region, set_border
 from shinypartial.blender.render import RenderedView, Renderer, open_renderer
 from shinypartial.blender.runtime import quiet
-from shinypartial.blender.sparse_pixels import PICKED
+from shinypartial.blender.sparse_pixels import SPARSE
 from shinypartial.blender.worker_pool import PoolPlan, open_pool
 from shinypartial.core.camera import Camera, opencv_to_opengl
 from shinypartial.core.trajectory import plan_cameras
@@ -130,7 +130,7 @@ def render_ours(renderer: Renderer, camera: Camera, samples: int, seed: int = 0)
     """Seconds from the camera to the view as a dataset's frames are made, and the view."""
     apply(renderer, camera, Settings(samples, False, seed))
     if renderer.mirror:
-        cycles = renderer.bpy.data.scenes[PICKED].cycles
+        cycles = renderer.bpy.data.scenes[SPARSE].cycles
         cycles.samples, cycles.seed = samples, seed
     begin = time.perf_counter()
     view = renderer.render(camera)

@@ -1,4 +1,4 @@
-"""Programs in docs/examples: each can be started, and the tables of results are written from finished folders only."""
+"""Examples and benchmarks can be imported, and the tables of results are written from finished folders only."""
 
 import importlib.util
 import json
@@ -12,11 +12,11 @@ import pytest
 from shinypartial.scene import scene_names
 
 ROOT = Path(__file__).resolve().parents[2]
-EXAMPLES = sorted((ROOT / "docs" / "examples").glob("*.py"))
+PROGRAMS = sorted(path for folder in ("docs/examples", "tests/benchmarks") for path in (ROOT / folder).glob("*.py"))
 
 
 def load(path: Path) -> ModuleType:
-    """An example as a module."""
+    """A program as a module."""
     specification = importlib.util.spec_from_file_location(path.stem, path)
     assert specification
     assert specification.loader
@@ -26,8 +26,9 @@ def load(path: Path) -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_an_example_can_be_imported(path: Path) -> None:
+@pytest.mark.parametrize("path", PROGRAMS, ids=lambda path: path.stem)
+def test_a_program_can_be_imported(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(path.parent)
     assert load(path).__doc__
 
 
