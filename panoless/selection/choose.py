@@ -65,7 +65,8 @@ def _examine(
         return Candidate(family.kind, verdict, "misses the silhouettes", *evidence), None
     geometry = family.fit(views, proposal, config)
     own, free = held_out_errors(usable_views(views, geometry), config, geometry, trial)
-    unexplained = float(own.mean()) > options.largest_error
+    refinable = family.kind in {other.refines for other in FAMILIES.values()}
+    unexplained = refinable and float(own.mean()) > options.largest_error
     better = is_clearly_lower(free, own, options)
     verdict = Verdict.REFUSED_BY_HELD_OUT_VIEWS if unexplained or better else Verdict.CHOSEN
     reason = "surfels are clearly better" if better else "surfels are no better"

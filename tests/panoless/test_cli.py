@@ -8,11 +8,15 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from panoless.cli import _announce_compilation, main
-from panoless.config import FitConfig
+from panoless.api import announce_compilation
+from panoless.cli import main
+from panoless.config import FitConfig, with_overrides
 from panoless.presets import PRESETS
+from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
+from shinypartial.io.records import write_record
 
+TUNED = ("first_surface", "plane", "height_field", "revolution", "footprint_map", "selection")
 TINY = ["--config.iterations", "4", "--config.surfels.count", "40", "--config.surfels.hull-resolution", "24"]
 MODELS = get_args(get_args(get_type_hints(FitConfig, include_extras=True)["model"])[0])
 
@@ -33,11 +37,32 @@ def help_text(arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypa
 
 
 def test_help_lists_every_option(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """But for the tuned numbers of the stages, each of which `--set` changes."""
     text = help_text(["fit"], capsys, monkeypatch)
+    tuned = tuple(f"--config.{name.replace('_', '-')}." for name in TUNED)
     for name in option_names(FitConfig()):
         # The model is an option of the command itself.
-        assert name.replace("--config.model", "--model") in text, name
+        assert (name.replace("--config.model", "--model") in text) != name.startswith(tuned), name
     assert "Eq. 12" in text
+    assert "--set" in text
+
+
+@pytest.mark.parametrize("section", TUNED)
+def test_every_tuned_number_can_be_set(section: str) -> None:
+    """To its own value, which changes nothing, and by a wrong word, which is refused."""
+    config = FitConfig()
+    values = write_record(config)[section]
+    overrides = [f"{section}.{name}={json.dumps(value)}" for name, value in values.items()]
+    assert with_overrides(config, overrides) == config
+    for override in (f"{section}.of_the_future=1", f"{overrides[0].partition('=')[0]}=word", section):
+        with pytest.raises(InputError):
+            with_overrides(config, [override])
+
+
+def test_a_tuned_number_deep_inside_can_be_set() -> None:
+    config = with_overrides(FitConfig(), ["revolution.lip.clearance-px=3", "selection.least_gain=0.1"])
+    assert config.revolution.lip.clearance_px == 3
+    assert config.selection.least_gain == 0.1
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -100,7 +125,7 @@ def test_a_model_that_is_asked_for_is_taken_and_saved(
 ) -> None:
     """Even a plane for a sphere, which is a surface of revolution; the run says so, and so does the prediction."""
     monkeypatch.chdir(tmp_path)
-    tables = {"plane": "plane.ply", "revolution": "surface.ply", "surfels": "surfels.ply"}
+    tables = {"plane": "plane.ply", "revolution": "revolution.ply", "surfels": "surfels.ply"}
     coarse = ["--config.environment.resolution", "16", "--config.environment.solve-resolution", "16"]
     for model in tables:
         assert main(["fit", str(many_views_dataset.root), *TINY, *coarse, "--model", model, "--output", model]) == 0
@@ -160,7 +185,7 @@ def test_compilation_is_announced_once_and_only_when_it_happens(
     from numba.core import event
 
     monkeypatch.setattr(event, "_registered", defaultdict(list))
-    _announce_compilation()
+    announce_compilation()
     assert capsys.readouterr().err == ""
     for value in (1, 1.0):
         assert njit(lambda x: x + 1)(value) == value + 1

@@ -79,7 +79,7 @@ def test_bad_usage_exits_with_2(arguments: list[str], capsys: pytest.CaptureFixt
 
 
 BAD_INPUT = {
-    "unknown scene": (["generate", "--scene", "kettle"], "vase"),
+    "unknown scene": (["generate", "--scene", "no-such-scene"], "vase"),
     "too small": (["generate", "--scene", "vase", "--resolution", "0"], "render.resolution"),
     "no views": (["generate", "--scene", "vase", "--train", "0"], "camera.train"),
     "no recipe": (["generate", "--scene", "none/scene.toml"], "Check the path"),

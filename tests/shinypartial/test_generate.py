@@ -274,7 +274,7 @@ def test_an_output_that_can_not_be_a_folder_is_refused(tmp_path: Path) -> None:
 
 
 def test_an_unknown_scene_is_refused_with_what_exists() -> None:
-    result = run("generate", "--scene", "kettle")
+    result = run("generate", "--scene", "no-such-scene")
     assert result.returncode == 2
     assert "vase" in result.stderr
 
