@@ -14,7 +14,7 @@ class SelectionOptions:
     least_overlap: Share = 0.98
     """Its silhouette and the masks share at least this part of their union: median over views."""
     largest_error: NonNegative = 0.3
-    """A candidate that another kind takes on (a plane) and that leaves more of the held-out views unexplained is refused,
+    """A candidate that another kind takes on (a plane) is refused if it leaves more of the held-out views unexplained,
     even if surfels do no better. Right ones leave a twentieth."""
     least_gain: Share = 0.05
     """Surfels have to lower the held-out error by this share to be preferred."""
