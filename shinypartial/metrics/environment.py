@@ -4,7 +4,9 @@ Both maps are clipped to [0, 1] in linear light and brought to one size: by area
 lookup when smaller. Texels are weighted by solid angle, over all directions and over those that training views see.
 """
 
+import functools
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -12,6 +14,9 @@ from jaxtyping import Bool, Float
 from shinypartial.core.color import linear_to_srgb
 from shinypartial.core.sphere import latlong_directions, latlong_solid_angles, sample_latlong
 from shinypartial.metrics.image import SSIM_RADIUS, l1, psnr, ssim, ssim_map, weighted_mean
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 PROTOCOL_HEIGHT = 256
 #: Added to radiance before the logarithm, so that black texels do not decide the HDR error.
@@ -71,17 +76,23 @@ def to_protocol_size(latlong: Float[np.ndarray, "H W C"], height: int = PROTOCOL
         return latlong
     if latlong.shape[0] < height:
         return sample_latlong(latlong, latlong_directions(height)).astype(latlong.dtype)
-    rows, columns = _area_weights(latlong.shape[0], height), _area_weights(latlong.shape[1], 2 * height)
-    return np.einsum("hi,iwc,vw->hvc", rows, latlong, columns, optimize=True).astype(latlong.dtype)
+    source_height, source_width, channels = latlong.shape
+    rows = _area_weights(source_height, height) @ latlong.reshape(source_height, -1)
+    across = rows.reshape(height, source_width, channels).swapaxes(0, 1).reshape(source_width, -1)
+    resized = (_area_weights(source_width, 2 * height) @ across).reshape(2 * height, height, channels)
+    return resized.swapaxes(0, 1).astype(latlong.dtype)
 
 
-def _area_weights(source: int, target: int) -> Float[np.ndarray, "t s"]:
-    """Share of every source interval in every target interval; rows sum to one."""
+@functools.lru_cache(maxsize=8)
+def _area_weights(source: int, target: int) -> "csr_matrix":
+    """Share of every source interval in every target interval, (target, source) and sparse; rows sum to one."""
+    from scipy.sparse import csr_matrix
+
     edges = np.arange(target + 1)[:, None] * (source / target)
     lower, upper = edges[:-1], edges[1:]
     start = np.arange(source)[None]
     overlap = np.clip(np.minimum(upper, start + 1) - np.maximum(lower, start), 0, None)
-    return overlap / overlap.sum(1, keepdims=True)
+    return csr_matrix(overlap / overlap.sum(1, keepdims=True))
 
 
 def clipped_map(radiance: Latlong) -> Latlong:
