@@ -8,7 +8,8 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from panoless.cli import _announce_compilation, main
+from panoless.api import announce_compilation
+from panoless.cli import main
 from panoless.config import FitConfig
 from panoless.presets import PRESETS
 from shinypartial.dataset.schema import Dataset
@@ -160,7 +161,8 @@ def test_compilation_is_announced_once_and_only_when_it_happens(
     from numba.core import event
 
     monkeypatch.setattr(event, "_registered", defaultdict(list))
-    _announce_compilation()
+    announce_compilation.cache_clear()
+    announce_compilation()
     assert capsys.readouterr().err == ""
     for value in (1, 1.0):
         assert njit(lambda x: x + 1)(value) == value + 1
