@@ -185,6 +185,7 @@ def test_compilation_is_announced_once_and_only_when_it_happens(
     from numba.core import event
 
     monkeypatch.setattr(event, "_registered", defaultdict(list))
+    announce_compilation.cache_clear()
     announce_compilation()
     assert capsys.readouterr().err == ""
     for value in (1, 1.0):
