@@ -1,4 +1,4 @@
-"""Make docs/results/ablations.md: figures of every scene, one lever less, surfels flat and curved, the paper's method.
+"""Make docs/results/ablations.md: figures of every scene, one part left out, surfels flat and curved, the paper's method.
 
     for S in vase cola mirror deformed-mirror sculpture; do shinypartial generate --scene $S --resolution 400; done
     for S in vase cola mirror deformed-mirror sculpture; do shinypartial oracle datasets/$S-400; done
@@ -114,11 +114,11 @@ LEVERS: tuple[tuple[str, tuple[str, ...]], ...] = (
 TABLES = {
     "figures": Table(
         "Figures",
-        "`panoless fit` as it is, beside the bound of each scene (ground-truth normals, same views).",
+        "`panoless fit` as it is, beside the oracle baseline of each scene.",
         tuple(Row("default", scene) for scene in SCENES),
     ),
     "levers": Table(
-        "One lever less",
+        "Leave one out",
         "The default without one of its parts, on the scene that is fitted with free surfels; and the ladder, "
         "self-reflection and fill on the scenes in which it takes another rung, where they act. Their default is in "
         "*Figures*; what takes part in these models does not depend on the seed.",
@@ -282,17 +282,19 @@ def markdown(table: str, seeds: list[int]) -> Iterator[str]:
     content = TABLES[table]
     columns = content.columns or COLUMNS
     yield from (f"## {content.title}", "", content.text, "")
-    yield "| Scene | | " + " | ".join(name for name, _, _ in columns) + " | Model | Numbers |"
+    yield "| Scene | | " + " | ".join(name for name, _, _ in columns) + " | Model | Parameters |"
     yield "| --- " * (len(columns) + 4) + "|"
     for scene, name, *cells in content.published:
         yield f"| {scene} | {name} | " + " | ".join(cells) + " |" + " – |" * (len(columns) + 2 - len(cells))
     shown = set()
     for row in content.rows:
         figures = found(table, row, seeds)
-        bound = Path("predictions") / f"{row.scene}-400-oracle"
-        if not content.columns and row.scene not in shown and (bound / "scores.json").exists():
-            best = figures_of(bound)
-            yield f"| {row.scene} | bound | {cell([best.observed])} | {cell([best.full])} |" + " – |" * len(columns)
+        oracle = Path("predictions") / f"{row.scene}-400-oracle"
+        if not content.columns and row.scene not in shown and (oracle / "scores.json").exists():
+            best = figures_of(oracle)
+            yield f"| {row.scene} | oracle baseline | {cell([best.observed])} | {cell([best.full])} |" + " – |" * len(
+                columns
+            )
         shown.add(row.scene)
         if not figures:
             continue

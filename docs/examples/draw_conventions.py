@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/conventions.md from the functions that define the conventions.
+"""Draw the pictures of docs/reference/conventions.md from the functions that define the conventions.
 
 Run: python docs/examples/draw_conventions.py [FOLDER]   (default: docs/images)
 """

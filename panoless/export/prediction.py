@@ -197,6 +197,7 @@ def _model_selection(selection: Selection) -> ModelSelection:
             held_out_error=each.held_out_error,
             verdict=str(each.verdict),
             reason=each.reason,
+            alternative_error=each.surfels_error,
         )
         for each in selection.candidates
     )

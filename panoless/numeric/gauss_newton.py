@@ -13,9 +13,7 @@ State = TypeVar("State")
 LEAST_DAMPING = 1e-9
 """As little as keeps a matrix regular where nothing tells a parameter; not tuned."""
 LEAST_GAIN = 0.02
-"""Share of its held-out cost by which a finer model has to be better. Chosen on the development scenes: repeated fits
-of one model differ by a few thousandths.
-"""
+"""Share of its held-out cost by which a finer model has to be better. Chosen on the development scenes."""
 
 
 def jacobian_of_rows(

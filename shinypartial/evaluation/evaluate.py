@@ -1,7 +1,7 @@
 """Folders in, scores out: a prediction is compared with its dataset under named protocols, whatever method wrote it.
 
 Reads only the two folders; writes PREDICTION/scores.json and the pictures in PREDICTION/evaluation. The definitions
-are in docs/metrics.md.
+are in docs/reference/metrics.md.
 """
 
 from collections.abc import Iterator
@@ -303,7 +303,7 @@ def _require_visibility(visibility: Float[np.ndarray, "H W"], path: Path) -> Non
     raise InputError(
         expected=f"finite visibility in [0, 1], twice as wide as high, in {path}",
         found=f"{width}×{height} with values from {bounds[0]:.4g} to {bounds[1]:.4g}",
-        remedy="Export the visibility again: see docs/prediction-format.md.",
+        remedy="Export the visibility again: see docs/reference/prediction-format.md.",
     )
 
 

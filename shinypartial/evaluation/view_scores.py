@@ -42,7 +42,7 @@ class ViewResult:
 def read_prediction(prediction: Path, frame: Frame) -> View:
     """The prediction of a test view; InputError, with the file's name, when it is missing or misshapen."""
     predicted = prediction_frame(prediction, frame)
-    remedy = "Export every test view of the prediction again: see docs/prediction-format.md."
+    remedy = "Export every test view of the prediction again: see docs/reference/prediction-format.md."
     if not predicted.exr.exists() and not predicted.png.exists():
         raise InputError(
             expected=f"the prediction of {frame.name} at {predicted.exr}",

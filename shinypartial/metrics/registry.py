@@ -13,7 +13,7 @@ REINHARD = "Reinhard et al., Photographic tone reproduction, SIGGRAPH 2002, doi:
 ILG = "Ilg et al., Uncertainty estimates for optical flow, ECCV 2018, arXiv:1802.07095"
 HANLEY = "Hanley and McNeil, Radiology 143, 1982, doi:10.1148/radiology.143.1.7063747"
 SPEARMAN = "Spearman, American Journal of Psychology 15, 1904, doi:10.2307/1412159"
-DEFINED_HERE = "docs/metrics.md"
+DEFINED_HERE = "docs/reference/metrics.md"
 
 
 class Direction(Enum):

@@ -42,7 +42,8 @@ class Candidate:
     """A kind of model that was considered, the evidence for it, and what became of it; None: not measured.
 
     `silhouette_px` is its distance from the silhouettes, `overlap` the intersection over union with the masks,
-    `held_out_error` its error on views that were left out of the fit. `verdict` is a word such as "chosen" or
+    `held_out_error` its error on views that were left out of the fit, `alternative_error` that of the
+    freer kind that it was compared with. `verdict` is a word such as "chosen" or
     "rejected", `reason` says why.
     """
 
@@ -52,6 +53,7 @@ class Candidate:
     held_out_error: NonNegative | None
     verdict: Text
     reason: str = ""
+    alternative_error: NonNegative | None = None
 
 
 @dataclass(frozen=True)
@@ -177,13 +179,15 @@ def read_info(root: Path) -> PredictionInfo:
             found="another format",
             remedy="Export the prediction again with this version.",
         )
-    info = read_record(PredictionInfo, content, str(root / DESCRIPTION), remedy="See docs/prediction-format.md.")
+    info = read_record(
+        PredictionInfo, content, str(root / DESCRIPTION), remedy="See docs/reference/prediction-format.md."
+    )
     selection = info.model_selection
     if selection and selection.candidates and selection.chosen not in {one.kind for one in selection.candidates}:
         raise InputError(
             expected=f"`model_selection.chosen` of {root / DESCRIPTION} to be the kind of one of its candidates",
             found=repr(selection.chosen),
-            remedy="See docs/prediction-format.md.",
+            remedy="See docs/reference/prediction-format.md.",
         )
     return info
 

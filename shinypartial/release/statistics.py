@@ -42,7 +42,7 @@ def split_statistics(frames: Sequence[Frame]) -> SplitStatistics:
 
 
 def dataset_statistics(train: Sequence[Frame], test: Sequence[Frame]) -> dict[str, Any]:
-    """The manifest's `statistics`: counts of views, and what docs/dataset-format.md says about the rest."""
+    """The manifest's `statistics`: counts of views, and what docs/reference/dataset-format.md says about the rest."""
     by_split = {"train": split_statistics(train), "test": split_statistics(test)}
     training = by_split["train"].cells
     return {

@@ -64,7 +64,9 @@ def load_scene(scene: str) -> SceneSpec:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(
-            expected=f"{path} to be TOML", found=str(error), remedy="Correct the file; docs/adding-a-scene.md helps."
+            expected=f"{path} to be TOML",
+            found=str(error),
+            remedy="Correct the file; docs/how-to/add-a-scene.md helps.",
         ) from None
     spec = parse_scene(table, str(path))
     remedy = "Correct the path; it is relative to the folder of scene.toml."

@@ -81,4 +81,4 @@ def test_what_is_wrong_is_named_with_its_place(
     with pytest.raises(InputError, match=words) as caught:
         read_info(rewrite(prediction, tmp_path, **entries))
     assert DESCRIPTION in str(caught.value)
-    assert "docs/prediction-format.md" in caught.value.remedy
+    assert "docs/reference/prediction-format.md" in caught.value.remedy
