@@ -219,6 +219,8 @@ def with_overrides(config: FitConfig, overrides: Sequence[str]) -> FitConfig:
 
     Raises InputError for a path that is no option, and for a value out of its range.
     """
+    if not overrides:
+        return config
     content = write_record(config)
     for override in overrides:
         path, equals, text = override.partition("=")

@@ -55,6 +55,8 @@ from shinypartial.prediction.format import (
 
 PICTURES = "pictures"
 SUPERSAMPLING = 2
+FORMER_KINDS = ("sheet", "lathe")
+"""Names of PLY files that an earlier version wrote."""
 EXPORT_THREADS = 2
 
 
@@ -74,7 +76,7 @@ def export_prediction(
     height = 2 * state.environment.shape[-1]
     write_environment_map(folder, cube_to_latlong(state.environment, height))
     write_visibility(folder, cube_to_latlong(state.visibility[:, None], height)[..., 0].clip(0, 1))
-    for kind in FAMILIES:
+    for kind in (*FAMILIES, *FORMER_KINDS):
         (folder / f"{kind}.ply").unlink(missing_ok=True)
     mesh_file = f"{state.geometry.kind}.ply"
     write_ply(folder / mesh_file, state.geometry.mesh(state.frame))

@@ -217,9 +217,12 @@ def test_a_value_out_of_range(options: str, workplace: Path, sphere_dataset: Dat
 
 
 def test_export_of_an_unfinished_run(workplace: Path, sphere_dataset: Dataset, capsys, monkeypatch) -> None:
-    monkeypatch.setattr("panoless.fit.CHECKPOINT_INTERVAL_S", -1.0)
+    def interrupted(*_) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("panoless.reconstruct.recorder.CHECKPOINT_INTERVAL_S", -1.0)
     with monkeypatch.context() as patch:
-        patch.setattr("panoless.fit.Fitter._complete", lambda self: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr("panoless.reconstruct.fit.complete", interrupted)
         assert main(["fit", str(sphere_dataset.root), "--output", "out", *TINY]) == 130
     assert "continue" in capsys.readouterr().err
     assert_refused(capsys, main(["export", "runs/out", "--output", "early"]), "4 of 4 iterations")

@@ -15,9 +15,9 @@ ROOT = Path(__file__).resolve().parents[2]
 ITERATIONS = 400
 PROGRAM = """
 import sys
-import panoless.reconstruct.fit
 from panoless.cli import main
-panoless.fit.CHECKPOINT_INTERVAL_S = 0.05
+from panoless.reconstruct import recorder
+recorder.CHECKPOINT_INTERVAL_S = 0.05
 sys.exit(main(sys.argv[1:]))
 """
 

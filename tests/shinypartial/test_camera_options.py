@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 
 from shinypartial import generate as generate_module
-from shinypartial.cli import CameraOptions, main
+from shinypartial.cli import main
+from shinypartial.cli.scenes import CameraOptions
 from shinypartial.core.errors import InputError
 from shinypartial.core.trajectory import PATHS, PLACEMENTS, SWEPT_PATHS, CameraPath
 from shinypartial.scene import SceneSpec, load_scene, override

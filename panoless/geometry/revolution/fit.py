@@ -62,10 +62,11 @@ def propose_revolution(views: Views, options: RevolutionOptions = DEFAULTS) -> R
         > own.largest_start_cost
     ):
         return None
-    base, lid = (_count(end) for end in end_pixels(views, start, options.mouth.pixels))
-    surface = refine_outer(rays, start if lid >= base else start.turned_over())
+    surface = refine_outer(rays, start)
     if surface is None:
         return None
+    base, lid = (_count(end) for end in end_pixels(views, surface, options.mouth.pixels))
+    surface = surface if lid >= base else surface.turned_over()
     found = silhouette_residuals(rays, surface, rays.pixel)
     distance = np.where(found.side >= 0, np.abs(found.pixels), np.inf)
     medians = np.array([np.median(distance[rays.view == view]) for view in np.unique(rays.view)])

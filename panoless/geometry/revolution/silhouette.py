@@ -24,6 +24,7 @@ from shinypartial.core.conventions import PIXEL_CENTER
 
 REACH = 1.5
 TALLEST = 1.05
+JUDGED_SCALE_PX = 2.0
 """The normalized object lies in the unit ball; rays are followed a little beyond."""
 
 
@@ -105,20 +106,21 @@ def _bare(origin: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"]) -> Surfa
     return SurfaceOfRevolution(origin - (origin @ axis) * axis, axis, np.zeros((0, 2)), 0)
 
 
-def outer_surface(rays: ContourRays, start: SurfaceOfRevolution, cell: float) -> SurfaceOfRevolution | None:
-    """The envelope around an axis, closed flat at both ends; None when there is none."""
+def outer_surfaces(rays: ContourRays, start: SurfaceOfRevolution, cell: float) -> list[SurfaceOfRevolution]:
+    """The envelope around an axis, closed flat at both ends, and without the cones beyond them; none without one."""
     origins, directions = in_axis_frame(rays, start)
     cells = int(2 * TALLEST / cell)
     rank = int(rays.options.rank_share * len(rays.view) / (2 * TALLEST / cell)) + 1
     smallest = envelope(origins, directions, -TALLEST, cell, cells, rank + 1, REACH)[:, rank]
     radius = np.where(np.isfinite(smallest), smallest, 0.0)
     heights = -TALLEST + (np.arange(cells) + 0.5) * cell
-    lowest, highest = _ends(origins, heights, radius, cell, rays.options)
-    if highest - lowest < rays.options.least_cells:
-        return None
-    outer = np.stack([radius, heights], 1)[lowest : highest + 1]
-    profile = np.concatenate([[[0.0, outer[0, 1]]], outer, [[0.0, outer[-1, 1]]]])
-    return resample_profile(replace(start, profile=profile, lip=len(outer)), cell)
+    surfaces = []
+    for lowest, highest in _ends(origins, heights, radius, cell, rays.options):
+        if highest - lowest >= rays.options.least_cells:
+            outer = np.stack([radius, heights], 1)[lowest : highest + 1]
+            profile = np.concatenate([[[0.0, outer[0, 1]]], outer, [[0.0, outer[-1, 1]]]])
+            surfaces.append(resample_profile(replace(start, profile=profile, lip=len(outer)), cell))
+    return surfaces
 
 
 def _ends(
@@ -127,16 +129,17 @@ def _ends(
     radius: Float[np.ndarray, "C"],
     cell: float,
     options: SilhouetteOptions,
-) -> tuple[int, int]:
+) -> list[tuple[int, int]]:
     """Cells between which silhouettes tell the profile: beyond, it closes as fast as the most level view allows.
 
     The widest cell belongs to the object, unless few rays pass the heights beyond its ends. The last cell outward is
-    blunt and less steep than that, and no cell inward falls to it as steeply.
+    blunt and less steep than that. A second pair, where it differs, also leaves out what any cell inward falls to as
+    steeply: a cone that silhouettes leave beyond a lip, or a stem.
     """
     middle = np.abs(heights) < options.widest_within
     widest = int(np.argmax(np.where(middle, radius, 0.0)))
     across = np.hypot(origins[:, 0], origins[:, 1]) + float(radius[widest])
-    ends = []
+    ends, cut = [], []
     for outward in (-1, 1):
         elevation = np.arctan2(outward * (origins[:, 2] - heights[widest]), across).min()
         steepest = 1 / np.tan(max(elevation, 0.0) + options.grazing_rad)
@@ -150,8 +153,9 @@ def _ends(
             index -= outward
         inward = np.arange(widest, index, outward)
         steep = radius[inward] - radius[index] > steepest * cell * np.abs(inward - index)
-        ends.append(int(inward[np.argmax(steep)]) if steep.any() else index)
-    return ends[0], ends[1]
+        ends.append(index)
+        cut.append(int(inward[np.argmax(steep)]) if steep.any() else index)
+    return [(ends[0], ends[1])] if cut == ends else [(ends[0], ends[1]), (cut[0], cut[1])]
 
 
 def in_axis_frame(
@@ -257,7 +261,7 @@ def fit_outer(rays: ContourRays, starts: Sequence[SurfaceOfRevolution]) -> Surfa
     for start in starts:
         surface = _refine(sparse, start, cell, options.start_scales_px)
         if surface is not None:
-            cost = contour_cost(silhouette_residuals(sparse, surface, cell), 2.0)
+            cost = contour_cost(silhouette_residuals(sparse, surface, cell), JUDGED_SCALE_PX)
             if cost < least:
                 best, least = surface, cost
     return best
@@ -271,9 +275,12 @@ def refine_outer(rays: ContourRays, start: SurfaceOfRevolution) -> SurfaceOfRevo
 def _refine(
     rays: ContourRays, start: SurfaceOfRevolution, cell: float, scales_px: Sequence[float]
 ) -> SurfaceOfRevolution | None:
-    surface = outer_surface(rays, start, cell)
-    if surface is None:
-        return None
-    for scale in scales_px:
-        surface = contour_step(rays, surface, cell, scale, 2 * cell)
-    return surface
+    """The envelope of least cost around an axis, after steps at those scales; None when there is none."""
+    best, least = None, np.inf
+    for surface in outer_surfaces(rays, start, cell):
+        for scale in scales_px:
+            surface = contour_step(rays, surface, cell, scale, 2 * cell)
+        cost = contour_cost(silhouette_residuals(rays, surface, cell), JUDGED_SCALE_PX)
+        if cost < least:
+            best, least = surface, cost
+    return best

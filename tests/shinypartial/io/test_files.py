@@ -42,8 +42,8 @@ def test_a_failure_keeps_the_old_file_and_leaves_nothing_else(tmp_path: Path, fa
 def test_a_killed_process_leaves_only_a_partial_file(tmp_path: Path) -> None:
     path = tmp_path / "r_000.exr"
     program = (
-        "import sys, time, pathlib; from shinypartial.files import whole_file\n"
-        f"with whole_file(pathlib.Path({str(path)!r})) as temporary:\n"
+        "import sys, time, pathlib; from shinypartial.io.files import atomic_write\n"
+        f"with atomic_write(pathlib.Path({str(path)!r})) as temporary:\n"
         "    temporary.write_bytes(b'half'); print('written', flush=True); time.sleep(60)\n"
     )
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as process:
@@ -57,9 +57,9 @@ def test_a_killed_process_leaves_only_a_partial_file(tmp_path: Path) -> None:
 
 HOLD = """
 import pathlib, sys, time
-from shinypartial.files import only_writer
+from shinypartial.io.files import folder_lock
 {before}
-with only_writer(pathlib.Path({folder!r})):
+with folder_lock(pathlib.Path({folder!r})):
     print('held', flush=True)
     time.sleep(60)
 """

@@ -86,15 +86,15 @@ def test_a_ray_is_followed_as_if_hit_and_mirrored_one_by_one() -> None:
 def test_without_an_occlusion_test_the_last_direction_stands() -> None:
     """After one and after two reflections, whatever is met then; where nothing is met, as with the test."""
     surface = funnel()
-    origins, directions = rays_of(around(4, 60)[3])
-    for count in (1, 2):
+    for count, camera, least in ((1, around(4, 60)[3], 100), (2, around(4, 60)[2], 10)):
+        origins, directions = rays_of(camera)
         tested = trace_reflections(surface, origins, directions, max_bounces=count)
         free = trace_reflections(surface, origins, directions, max_bounces=count, occlusion_test=False)
         left = tested.bounces > 0
         np.testing.assert_array_equal(free.bounces[left], tested.bounces[left])
         np.testing.assert_allclose(free.directions[left], tested.directions[left], atol=1e-9)
         again = free.first.met & ~left
-        assert again.sum() > 50
+        assert again.sum() > least
         np.testing.assert_array_equal(free.bounces[again], count)
         np.testing.assert_allclose(np.linalg.norm(free.directions[again], axis=1), 1)
 
