@@ -224,7 +224,7 @@ def _shifts(surface: SurfaceOfRevolution, pixel: float, options: LipOptions) -> 
     splines = np.abs(places) / options.knot_px
     splines = np.where(splines < 1, 2 / 3 - splines**2 + splines**3 / 2, np.clip(2 - splines, 0, None) ** 3 / 6)
     along = np.gradient(surface.profile, axis=0)
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
     shifts = splines[..., None] * np.stack([along[:, 1], -along[:, 0]], 1)
     if surface.is_open:
         extension = np.clip(1 + place / options.length_px, 0, 1)[:, None] ** 2 * along
