@@ -62,12 +62,10 @@ def propose_revolution(views: Views, options: RevolutionOptions = DEFAULTS) -> R
         > own.largest_start_cost
     ):
         return None
-    # The same end comes first in every world, because sampling begins there; afterwards it is the base.
-    ends = [_count(end) for end in end_pixels(views, start, options.mouth.pixels)]
-    surface = refine_outer(rays, start if ends[0] > ends[1] else start.turned_over())
+    base, lid = (_count(end) for end in end_pixels(views, start, options.mouth.pixels))
+    surface = refine_outer(rays, start if lid >= base else start.turned_over())
     if surface is None:
         return None
-    surface = surface.turned_over()
     found = silhouette_residuals(rays, surface, rays.pixel)
     distance = np.where(found.side >= 0, np.abs(found.pixels), np.inf)
     medians = np.array([np.median(distance[rays.view == view]) for view in np.unique(rays.view)])
