@@ -232,13 +232,9 @@ def contour_cost(found: SilhouetteResiduals, scale_px: float) -> float:
 
 
 def contour_step(
-    rays: ContourRays, surface: SurfaceOfRevolution, cell: float, scale_px: float, knot: float, *, guarded: bool
+    rays: ContourRays, surface: SurfaceOfRevolution, cell: float, scale_px: float, knot: float
 ) -> SurfaceOfRevolution:
-    """One robust Gauss–Newton step of axis and profile together.
-
-    If `guarded`, the surface stays as it is where its cost does not fall. Near the solution a profile sampled anew may
-    cost more at its corners for a step or two while the axis comes right, so the last rounds go unguarded.
-    """
+    """One robust Gauss–Newton step of axis and profile together; the surface as it is where its cost does not fall."""
     splines, options = ProfileSplines.of(surface, knot), rays.options
     found = silhouette_residuals(rays, surface, cell)
     scale = adapted_scale(rays, found.pixels[found.valid], scale_px)
@@ -248,11 +244,12 @@ def contour_step(
     def cost(each: SurfaceOfRevolution) -> float:
         return contour_cost(found if each is surface else silhouette_residuals(rays, each, cell), scale)
 
-    def apply(each: SurfaceOfRevolution, step: Float[np.ndarray, "D"]) -> SurfaceOfRevolution:
-        return resample_profile(apply_step(each, splines, step), cell)
-
-    step = damped_step(gradient, matrix, options.damping, options.largest_turn_rad, slice(4))
-    return accept_step(surface, step, apply, cost) if guarded else apply(surface, step)
+    return accept_step(
+        surface,
+        damped_step(gradient, matrix, options.damping, options.largest_turn_rad, slice(4)),
+        lambda each, step: resample_profile(apply_step(each, splines, step), cell),
+        cost,
+    )
 
 
 def fit_outer(rays: ContourRays, starts: Sequence[SurfaceOfRevolution]) -> SurfaceOfRevolution | None:
@@ -262,7 +259,7 @@ def fit_outer(rays: ContourRays, starts: Sequence[SurfaceOfRevolution]) -> Surfa
     cell = options.start_cell_px * rays.pixel
     best, least = None, np.inf
     for start in starts:
-        surface = _refine(sparse, start, cell, options.start_scales_px, guarded=True)
+        surface = _refine(sparse, start, cell, options.start_scales_px)
         if surface is not None:
             cost = contour_cost(silhouette_residuals(sparse, surface, cell), JUDGED_SCALE_PX)
             if cost < least:
@@ -272,17 +269,17 @@ def fit_outer(rays: ContourRays, starts: Sequence[SurfaceOfRevolution]) -> Surfa
 
 def refine_outer(rays: ContourRays, start: SurfaceOfRevolution) -> SurfaceOfRevolution | None:
     """Axis and profile at a pixel's spacing."""
-    return _refine(rays.at_most(rays.options.points), start, rays.pixel, rays.options.scales_px, guarded=False)
+    return _refine(rays.at_most(rays.options.points), start, rays.pixel, rays.options.scales_px)
 
 
 def _refine(
-    rays: ContourRays, start: SurfaceOfRevolution, cell: float, scales_px: Sequence[float], *, guarded: bool
+    rays: ContourRays, start: SurfaceOfRevolution, cell: float, scales_px: Sequence[float]
 ) -> SurfaceOfRevolution | None:
     """The envelope of least cost around an axis, after steps at those scales; None when there is none."""
     best, least = None, np.inf
     for surface in outer_surfaces(rays, start, cell):
         for scale in scales_px:
-            surface = contour_step(rays, surface, cell, scale, 2 * cell, guarded=guarded)
+            surface = contour_step(rays, surface, cell, scale, 2 * cell)
         cost = contour_cost(silhouette_residuals(rays, surface, cell), JUDGED_SCALE_PX)
         if cost < least:
             best, least = surface, cost
