@@ -25,6 +25,8 @@ from shinypartial.core.conventions import PIXEL_CENTER
 REACH = 1.5
 TALLEST = 1.05
 JUDGED_SCALE_PX = 2.0
+STEM_GAIN = 0.5
+"""Share of the cost below which a stem is believed. Chosen on a traced bowl and a goblet of the tests."""
 """The normalized object lies in the unit ball; rays are followed a little beyond."""
 
 
@@ -133,7 +135,7 @@ def _ends(
     """Cells between which silhouettes tell the profile: beyond, it closes as fast as the most level view allows.
 
     The widest cell belongs to the object, unless few rays pass the heights beyond its ends. The last cell outward is
-    blunt and less steep than that. A second pair, where it differs, also leaves out what any cell inward falls to as
+    blunt and less steep than that. A pair before it, where it differs, also leaves out what any cell inward falls to as
     steeply: a cone that silhouettes leave beyond a lip, or a stem.
     """
     middle = np.abs(heights) < options.widest_within
@@ -155,7 +157,7 @@ def _ends(
         steep = radius[inward] - radius[index] > steepest * cell * np.abs(inward - index)
         ends.append(index)
         cut.append(int(inward[np.argmax(steep)]) if steep.any() else index)
-    return [(ends[0], ends[1])] if cut == ends else [(ends[0], ends[1]), (cut[0], cut[1])]
+    return [(ends[0], ends[1])] if cut == ends else [(cut[0], cut[1]), (ends[0], ends[1])]
 
 
 def in_axis_frame(
@@ -275,12 +277,14 @@ def refine_outer(rays: ContourRays, start: SurfaceOfRevolution) -> SurfaceOfRevo
 def _refine(
     rays: ContourRays, start: SurfaceOfRevolution, cell: float, scales_px: Sequence[float]
 ) -> SurfaceOfRevolution | None:
-    """The envelope of least cost around an axis, after steps at those scales; None when there is none."""
+    """The envelope around an axis after steps at those scales, with what may be a cone or a stem only where that halves
+    the cost; None when there is none.
+    """
     best, least = None, np.inf
     for surface in outer_surfaces(rays, start, cell):
         for scale in scales_px:
             surface = contour_step(rays, surface, cell, scale, 2 * cell)
         cost = contour_cost(silhouette_residuals(rays, surface, cell), JUDGED_SCALE_PX)
-        if cost < least:
+        if best is None or cost < STEM_GAIN * least:
             best, least = surface, cost
     return best
