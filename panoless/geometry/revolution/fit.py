@@ -23,6 +23,7 @@ from panoless.geometry.revolution.photometric import refine_round, solve_map
 from panoless.geometry.revolution.pixels import CENTER, PixelBundles, evenly
 from panoless.geometry.revolution.profile import resample_profile
 from panoless.geometry.revolution.silhouette import (
+    ContourRays,
     axis_starts,
     contour_cost,
     contour_rays,
@@ -32,6 +33,9 @@ from panoless.geometry.revolution.silhouette import (
 )
 from panoless.numeric.gauss_newton import keep_if_better
 from shinypartial.io.progress import Progress
+
+BELIEVED_OVERLAP = 0.98
+"""Of body and masks, from which no stem is looked for: what model selection asks for."""
 
 
 @dataclass(frozen=True)
@@ -49,21 +53,34 @@ class RevolutionProposal:
 
 
 def propose_revolution(views: Views, options: RevolutionOptions = DEFAULTS) -> RevolutionProposal | None:
-    """Axis and outer profile that explain the masks best; None when none comes near."""
-    own = options.silhouette
-    rays = contour_rays(views, own)
-    if len(np.unique(rays.view)) < own.least_views:
+    """Axis and outer profile that explain the masks best; None when none comes near.
+
+    What may be a stem below the body, or a cone that silhouettes leave beyond its lip, is believed only where the body
+    without it misses the masks.
+    """
+    rays = contour_rays(views, options.silhouette)
+    if len(np.unique(rays.view)) < options.silhouette.least_views:
         return None
-    start = fit_outer(rays, axis_starts(views, own))
+    best = None
+    for stem in (False, True):
+        found = _propose(views, rays, options, stem)
+        if found is not None and (best is None or np.median(found.iou) > np.median(best.iou)):
+            best = found
+        if best is not None and np.median(best.iou) >= BELIEVED_OVERLAP:
+            break
+    return best
+
+
+def _propose(views: Views, rays: ContourRays, options: RevolutionOptions, stem: bool) -> RevolutionProposal | None:
+    own = options.silhouette
+    start = fit_outer(rays, axis_starts(views, own), stem=stem)
     if start is None:
         return None
-    if (
-        contour_cost(silhouette_residuals(rays.at_most(own.start_points), start, rays.pixel), 2.0)
-        > own.largest_start_cost
-    ):
+    residuals = silhouette_residuals(rays.at_most(own.start_points), start, rays.pixel)
+    if contour_cost(residuals, 2.0) > own.largest_start_cost:
         return None
     base, lid = (_count(end) for end in end_pixels(views, start, options.mouth.pixels))
-    surface = refine_outer(rays, start if lid >= base else start.turned_over())
+    surface = refine_outer(rays, start if lid >= base else start.turned_over(), stem=stem)
     if surface is None:
         return None
     found = silhouette_residuals(rays, surface, rays.pixel)

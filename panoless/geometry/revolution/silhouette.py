@@ -25,8 +25,6 @@ from shinypartial.core.conventions import PIXEL_CENTER
 REACH = 1.5
 TALLEST = 1.05
 JUDGED_SCALE_PX = 2.0
-STEM_GAIN = 0.5
-"""Share of the cost below which a stem is believed. Chosen on a traced bowl and a goblet of the tests."""
 """The normalized object lies in the unit ball; rays are followed a little beyond."""
 
 
@@ -254,14 +252,16 @@ def contour_step(
     )
 
 
-def fit_outer(rays: ContourRays, starts: Sequence[SurfaceOfRevolution]) -> SurfaceOfRevolution | None:
+def fit_outer(
+    rays: ContourRays, starts: Sequence[SurfaceOfRevolution], *, stem: bool = False
+) -> SurfaceOfRevolution | None:
     """Axis and outer profile of the best of several starts, coarse to fine; None when no start has an envelope."""
     options = rays.options
     sparse = rays.at_most(options.start_points)
     cell = options.start_cell_px * rays.pixel
     best, least = None, np.inf
     for start in starts:
-        surface = _refine(sparse, start, cell, options.start_scales_px)
+        surface = _refine(sparse, start, cell, options.start_scales_px, stem)
         if surface is not None:
             cost = contour_cost(silhouette_residuals(sparse, surface, cell), JUDGED_SCALE_PX)
             if cost < least:
@@ -269,22 +269,21 @@ def fit_outer(rays: ContourRays, starts: Sequence[SurfaceOfRevolution]) -> Surfa
     return best
 
 
-def refine_outer(rays: ContourRays, start: SurfaceOfRevolution) -> SurfaceOfRevolution | None:
+def refine_outer(rays: ContourRays, start: SurfaceOfRevolution, *, stem: bool = False) -> SurfaceOfRevolution | None:
     """Axis and profile at a pixel's spacing."""
-    return _refine(rays.at_most(rays.options.points), start, rays.pixel, rays.options.scales_px)
+    return _refine(rays.at_most(rays.options.points), start, rays.pixel, rays.options.scales_px, stem)
 
 
 def _refine(
-    rays: ContourRays, start: SurfaceOfRevolution, cell: float, scales_px: Sequence[float]
+    rays: ContourRays, start: SurfaceOfRevolution, cell: float, scales_px: Sequence[float], stem: bool
 ) -> SurfaceOfRevolution | None:
-    """The envelope around an axis after steps at those scales, with what may be a cone or a stem only where that halves
-    the cost; None when there is none.
+    """The envelope around an axis, with what may be a stem or a cone or without, after steps at those scales; None when
+    there is none.
     """
-    best, least = None, np.inf
-    for surface in outer_surfaces(rays, start, cell):
-        for scale in scales_px:
-            surface = contour_step(rays, surface, cell, scale, 2 * cell)
-        cost = contour_cost(silhouette_residuals(rays, surface, cell), JUDGED_SCALE_PX)
-        if best is None or cost < STEM_GAIN * least:
-            best, least = surface, cost
-    return best
+    surfaces = outer_surfaces(rays, start, cell)
+    if not surfaces:
+        return None
+    surface = surfaces[-1 if stem else 0]
+    for scale in scales_px:
+        surface = contour_step(rays, surface, cell, scale, 2 * cell)
+    return surface
