@@ -23,6 +23,7 @@ from panoless.geometry.revolution.photometric import refine_round, solve_map
 from panoless.geometry.revolution.pixels import CENTER, PixelBundles, evenly
 from panoless.geometry.revolution.profile import resample_profile
 from panoless.geometry.revolution.silhouette import (
+    JUDGED_SCALE_PX,
     ContourRays,
     axis_starts,
     contour_cost,
@@ -61,9 +62,9 @@ def propose_revolution(views: Views, options: RevolutionOptions = DEFAULTS) -> R
     rays = contour_rays(views, options.silhouette)
     if len(np.unique(rays.view)) < options.silhouette.least_views:
         return None
-    best = None
+    best, starts = None, axis_starts(views, options.silhouette)
     for stem in (False, True):
-        found = _propose(views, rays, options, stem)
+        found = _propose(views, rays, starts, options, stem)
         if found is not None and (best is None or np.median(found.iou) > np.median(best.iou)):
             best = found
         if best is not None and np.median(best.iou) >= BELIEVED_OVERLAP:
@@ -71,13 +72,15 @@ def propose_revolution(views: Views, options: RevolutionOptions = DEFAULTS) -> R
     return best
 
 
-def _propose(views: Views, rays: ContourRays, options: RevolutionOptions, stem: bool) -> RevolutionProposal | None:
+def _propose(
+    views: Views, rays: ContourRays, starts: list[SurfaceOfRevolution], options: RevolutionOptions, stem: bool
+) -> RevolutionProposal | None:
     own = options.silhouette
-    start = fit_outer(rays, axis_starts(views, own), stem=stem)
+    start = fit_outer(rays, starts, stem=stem)
     if start is None:
         return None
     residuals = silhouette_residuals(rays.at_most(own.start_points), start, rays.pixel)
-    if contour_cost(residuals, 2.0) > own.largest_start_cost:
+    if contour_cost(residuals, JUDGED_SCALE_PX) > own.largest_start_cost:
         return None
     base, lid = (_count(end) for end in end_pixels(views, start, options.mouth.pixels))
     surface = refine_outer(rays, start if lid >= base else start.turned_over(), stem=stem)
