@@ -1,0 +1,244 @@
+"""What training views say about a finished fit: held-out light, silhouettes, and how much was there to be seen.
+
+Every fifth view is held out from a map that is solved anew for the final geometry. What it leaves unexplained is
+compared with what two models leave that know no mirror: one color a view, and one color a place on the surface, as a
+matte object has.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from panoless.capture.silhouettes import mask_distance_px
+from panoless.capture.views import TrainView, Views, split_held_out
+from panoless.environment.solve import solve_environment
+from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, usable_views
+from panoless.kernels.cubemap import sample_cubemap
+from panoless.numeric.robust import bounded_error
+from panoless.trust.options import TrustOptions
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Figures of a fit. Errors are means of ‖e‖²/(‖e‖² + s²) over held-out rays; what can't be told is None."""
+
+    unexplained: float | None
+    """Of the light that held-out views show, under the mirror and the map of the other views, in [0, 1]."""
+    one_color: float | None
+    """The same under the mean color of each view."""
+    matte: float | None
+    """The same under one color for each place on the surface, found from the other views."""
+    noise: float | None
+    """Standard deviation of the pixels' noise (linear radiance), from their second differences."""
+    error_in_noise: float | None
+    """Median error of a held-out ray's channel in standard deviations of the noise."""
+    silhouette_px: float
+    """Median distance of the fitted silhouette from that of the mask, over all views."""
+    view_shift_px: float
+    """How far the silhouettes of single views are shifted against the fit: root mean square over views."""
+    view_shift_deg: float
+    """The same as a turn of the camera."""
+    overlap: float
+    """Intersection over union of fit and mask: median over views."""
+    left_out: float
+    """Share of the object's pixels that show the object again and are left out of the map."""
+    saturated: float
+    """Share of the object's pixels that end at the largest value."""
+    coverage: float
+    """Share of all directions that some pixel saw."""
+    rank_correlation: float | None
+    """Spearman's, of confidence and the error of held-out rays: negative where confidence tells the truth."""
+    views: int
+    """Number of views in which the object is seen."""
+
+    @property
+    def explained_share(self) -> float | None:
+        """1 − unexplained/one_color: what the mirror explains of what one color does not."""
+        if self.unexplained is None or not self.one_color:
+            return None
+        return 1 - self.unexplained / self.one_color
+
+
+def gather_evidence(
+    views: Views, geometry: Geometry, visibility: Float[Tensor, "6 L L"], options: TrustOptions
+) -> Evidence:
+    """The evidence for a geometry in the views that it was fitted to; `visibility` is that of the final map."""
+    seen = tuple(view for view in views.train if len(view.solid))
+    views = replace(views, train=seen)
+    usable = usable_views(views, geometry)
+    solid, kept = (max(sum(len(view.solid) for view in each.train), 1) for each in (views, usable))
+    looked_at = [_evenly(part, options.views) for part in split_held_out(usable.train)]
+    surfaces = [[(view, geometry.buffers(view.camera)) for view in part] for part in looked_at]
+    light = _light(usable, surfaces, geometry, visibility, options)
+    silhouettes = [_silhouette(*each) for part in surfaces for each in part]
+    distance, shift, overlap = (np.array([each[i] for each in silhouettes]) for i in range(3))
+    focal = np.array([view.camera.fx for part in looked_at for view in part])
+    return Evidence(
+        **light,
+        silhouette_px=_median(distance),
+        view_shift_px=float(np.sqrt(np.mean(shift**2))) if len(shift) else 0.0,
+        view_shift_deg=float(np.degrees(np.sqrt(np.mean((shift / focal) ** 2)))) if len(shift) else 0.0,
+        overlap=_median(overlap),
+        left_out=1 - kept / solid,
+        saturated=_saturated(seen, options),
+        coverage=float((visibility > 0).float().mean()),
+        views=len(seen),
+    )
+
+
+def _evenly(views: Sequence[TrainView], count: int) -> list[TrainView]:
+    """About `count` of the views."""
+    return list(views[:: -(-len(views) // count) or 1])
+
+
+def _median(values: Float[np.ndarray, "V"]) -> float:
+    return float(np.median(values)) if len(values) else 0.0
+
+
+def _light(
+    views: Views,
+    surfaces: Sequence[Sequence[tuple[TrainView, SurfaceBuffers]]],
+    geometry: Geometry,
+    visibility: Float[Tensor, "6 L L"],
+    options: TrustOptions,
+) -> dict[str, float | None]:
+    """The figures that come from held-out light; None where there are too few views."""
+    nothing = dict.fromkeys(("unexplained", "one_color", "matte", "noise", "error_in_noise", "rank_correlation"))
+    kept, held_out = surfaces
+    if not kept or not held_out:
+        return nothing
+    solved = replace(views, train=tuple(split_held_out(views.train)[0]))
+    tested = replace(views, train=tuple(view for view, _ in held_out))
+    rays = list(observe_views(solved, geometry, options.rays))
+    environment = solve_environment(rays, min(options.resolution, visibility.shape[-1]))
+    places = _Places.of(kept, options)
+    stride = max(1, -(-sum(len(view.solid) for view in tested.train) // options.rays))
+    errors, confidence, explained, plain = [], [], _Mean(), {"one_color": _Mean(), "matte": _Mean()}
+    for index, ((view, surface), batch) in enumerate(
+        zip(held_out, observe_views(tested, geometry, options.rays), strict=True)
+    ):
+        error = sample_cubemap(environment, batch.directions) - batch.radiance
+        explained.add(bounded_error(error, options.scale), batch.initial_weight())
+        errors.append(error)
+        confidence.append(sample_cubemap(visibility[:, None], batch.directions)[:, 0])
+        pixels = view.solid[index % stride :: stride]
+        radiance = view.radiance.flatten(1)[:, pixels].T
+        guesses = {"one_color": radiance.mean(0), "matte": places.colors(view, surface, pixels)}
+        for name, guess in guesses.items():
+            plain[name].add(bounded_error(guess - radiance, options.scale), torch.ones_like(radiance[:, 0]))
+    if explained.weight <= 0:
+        return nothing
+    every, sure = torch.cat(errors), torch.cat(confidence)
+    noise = float(np.median([_noise(view) for view in views.train]))
+    return {
+        "unexplained": explained.value,
+        "one_color": plain["one_color"].value,
+        "matte": plain["matte"].value,
+        "noise": noise,
+        "error_in_noise": float(every.abs().median()) / max(noise, options.least_noise),
+        "rank_correlation": _rank_correlation(sure, every.square().sum(1)),
+    }
+
+
+@dataclass
+class _Mean:
+    """A weighted mean of what was added."""
+
+    summed: float = 0.0
+    weight: float = 0.0
+
+    def add(self, values: Float[Tensor, "P"], weights: Float[Tensor, "P"]) -> None:
+        """Count values in."""
+        self.summed += float((values * weights).sum())
+        self.weight += float(weights.sum())
+
+    @property
+    def value(self) -> float:
+        """Zero where nothing was added."""
+        return self.summed / max(self.weight, 1e-9)
+
+
+@dataclass(frozen=True)
+class _Places:
+    """The mean color of the cells of a grid through which the surface passes."""
+
+    colors_of_cells: Float[Tensor, "N 3"]
+    cells: int
+
+    @classmethod
+    def of(cls, seen: Sequence[tuple[TrainView, SurfaceBuffers]], options: TrustOptions) -> "_Places":
+        """From the solid pixels of views and what their cameras see of the surface."""
+        cells = options.cells
+        device = seen[0][0].mask.device
+        summed = torch.zeros(cells**3, 3, device=device)
+        count = torch.zeros(cells**3, device=device)
+        for view, surface in seen:
+            index = _cell_index(view, surface, view.solid, cells)
+            summed.index_add_(0, index, view.radiance.flatten(1)[:, view.solid].T)
+            count.index_add_(0, index, torch.ones_like(index, dtype=count.dtype))
+        overall = summed.sum(0) / count.sum().clamp(min=1)
+        return cls(torch.where(count[:, None] > 0, summed / count.clamp(min=1)[:, None], overall), cells)
+
+    def colors(self, view: TrainView, surface: SurfaceBuffers, pixels: Int[Tensor, "P"]) -> Float[Tensor, "P 3"]:
+        """Of the places that pixels see."""
+        return self.colors_of_cells[_cell_index(view, surface, pixels, self.cells)]
+
+
+def _cell_index(view: TrainView, surface: SurfaceBuffers, pixels: Int[Tensor, "P"], cells: int) -> Int[Tensor, "P"]:
+    """Cells of the grid over the cube of side 2 in which pixels see the surface; the nearest for what lies beyond."""
+    rays = view.rays_camera.flatten(1)[:, pixels]
+    points_camera = rays / rays[2] * surface.depth.flatten()[pixels]
+    points = view.camera_to_world_rotation @ (points_camera - view.camera.world_to_camera[:3, 3:])
+    grid = ((points + 1) / 2 * cells).long().clamp(0, cells - 1)
+    return (grid[0] * cells + grid[1]) * cells + grid[2]
+
+
+def _silhouette(view: TrainView, surface: SurfaceBuffers) -> tuple[float, float, float]:
+    """Median distance (px) of the two contours, the shift (px) that explains most of it, and intersection over union.
+
+    A pixel near the fitted contour has the mask's signed distance less the fitted one; a shift t changes it by n·t.
+    """
+    mask, alpha = view.mask.cpu().numpy(), surface.alpha.cpu().numpy()
+    overlap = float(np.minimum(mask, alpha).sum() / max(np.maximum(mask, alpha).sum(), 1e-9))
+    if min(mask.max(), alpha.max()) < 0.5 or max(mask.min(), alpha.min()) > 0.5:
+        return float(max(mask.shape)), float(max(mask.shape)), overlap
+    of_mask, of_fit = mask_distance_px(mask), mask_distance_px(alpha)
+    rows, columns = np.gradient(of_fit)
+    near = np.abs(of_fit) < 1
+    near[[0, -1]], near[:, [0, -1]] = False, False
+    if not near.any():
+        return float(max(mask.shape)), float(max(mask.shape)), overlap
+    normals, away = np.stack([columns[near], rows[near]], 1), (of_mask - of_fit)[near]
+    shift = np.linalg.lstsq(normals, away, rcond=None)[0]
+    return float(np.median(np.abs(away))), float(np.linalg.norm(shift)), overlap
+
+
+def _noise(view: TrainView) -> float:
+    """Standard deviation of the noise from second differences over rows: their median absolute value over 0.6745 √6."""
+    solid = torch.zeros_like(view.mask, dtype=torch.bool).flatten()
+    solid[view.solid] = True
+    solid = solid.reshape(view.mask.shape)
+    inside = solid[:, 2:] & solid[:, 1:-1] & solid[:, :-2]
+    second = view.radiance[:, :, 2:] - 2 * view.radiance[:, :, 1:-1] + view.radiance[:, :, :-2]
+    values = second[:, inside]
+    return float(values.abs().median()) / (0.6745 * 6**0.5) if values.numel() else 0.0
+
+
+def _saturated(views: Sequence[TrainView], options: TrustOptions) -> float:
+    count, total = 0, 0
+    for view in views:
+        brightest = view.radiance.flatten(1)[:, view.solid].amax(0)
+        count, total = count + int((brightest >= options.saturated).sum()), total + len(brightest)
+    return count / max(total, 1)
+
+
+def _rank_correlation(first: Float[Tensor, "P"], second: Float[Tensor, "P"]) -> float | None:
+    from scipy.stats import spearmanr
+
+    if min(float(each.max() - each.min()) if len(each) else 0.0 for each in (first, second)) == 0:
+        return None
+    return float(spearmanr(first.cpu().numpy(), second.cpu().numpy()).statistic)

@@ -1,0 +1,41 @@
+"""What a fit is trusted by."""
+
+from dataclasses import dataclass
+
+from shinypartial.io.records import Count, NonNegative, Positive
+
+
+@dataclass(frozen=True)
+class TrustOptions:
+    """How evidence is gathered, and from what figures on a fit is doubted.
+
+    Limits were chosen on Vase, Mirror and Sculpture at 100 px, clean and made worse: 27 fits that lost 3 dB, 16 that
+    did not.
+    """
+
+    rays: Count = 300_000
+    """Most rays that the map without held-out views is solved from, and most that test it."""
+    resolution: Count = 128
+    """Most texels along a face side of that map."""
+    scale: Positive = 0.1
+    """Scale s of errors ‖e‖²/(‖e‖² + s²) of linear radiance."""
+    cells: Count = 48
+    """Along a side of the grid on which a matte surface has its colors."""
+    least_noise: Positive = 1e-3
+    """Standard deviation of noise below which none is believed."""
+    saturated: NonNegative = 0.998
+    """Radiance from which a pixel is saturated."""
+    views: Count = 20
+    """Most views of either part, kept and held out, whose silhouettes and places are looked at."""
+    largest_view_shift_px: Positive = 0.8
+    """Root mean square shift of single silhouettes from which a fit is doubted."""
+    largest_silhouette_px: Positive = 1.0
+    """Median distance of the silhouettes from which it is."""
+    largest_share_of_matte: Positive = 0.5
+    """Unexplained light over that of a matte object from which it is."""
+    largest_unexplained: Positive = 0.25
+    """Unexplained share of held-out light from which it is."""
+    largest_saturated: Positive = 0.3
+    """Share of saturated pixels from which it is."""
+    refused: Positive = 2.0
+    """How many times its limit a figure has to be for `do not trust`."""

@@ -1,0 +1,93 @@
+"""One verdict on a finished fit, with its reason and what helps.
+
+Every doubt is a figure of the evidence over its limit; the largest decides. Below one the fit is trusted, from
+`TrustOptions.refused` on it is not, and between them it may be wrong in part.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from panoless.trust.evidence import Evidence
+from panoless.trust.options import TrustOptions
+from shinypartial.prediction.format import Trust, Verdict
+
+POSES = "Refine the camera poses and the focal length, or take them from a board or a textured background."
+MASKS = "Look at the masks, and at the poses of the views whose silhouettes disagree."
+MATTER = "Photograph a shinier object: this one shows its own color."
+SHAPE = "Look at poses, masks and exposure first; parts that are concave or see themselves may be wrong as well."
+VIEWS = "Add views: at least five that see the object from different sides."
+EXPOSURE = "Photograph with a shorter exposure, or in high dynamic range."
+
+
+@dataclass(frozen=True)
+class _Doubt:
+    """A figure that may speak against a fit; `measure` is None where it can't be told."""
+
+    measure: Callable[[Evidence], float | None]
+    limit: Callable[[TrustOptions], float]
+    reason: Callable[[Evidence], str]
+    remedy: str
+
+
+DOUBTS = (
+    _Doubt(
+        lambda found: found.view_shift_px,
+        lambda options: options.largest_view_shift_px,
+        lambda found: (
+            f"single views are shifted by {found.view_shift_px:.2g} px ({found.view_shift_deg:.2g}°) "
+            "against the common shape, as wrong poses do"
+        ),
+        POSES,
+    ),
+    _Doubt(
+        lambda found: found.silhouette_px,
+        lambda options: options.largest_silhouette_px,
+        lambda found: f"the shape misses the silhouettes by {found.silhouette_px:.2g} px",
+        MASKS,
+    ),
+    _Doubt(
+        lambda found: None if found.unexplained is None or not found.matte else found.unexplained / found.matte,
+        lambda options: options.largest_share_of_matte,
+        lambda found: (
+            f"a matte object explains held-out views about as well as a mirror "
+            f"({found.matte:.2f} and {found.unexplained:.2f} of their light are unexplained)"
+        ),
+        MATTER,
+    ),
+    _Doubt(
+        lambda found: found.unexplained,
+        lambda options: options.largest_unexplained,
+        lambda found: f"{found.unexplained:.0%} of the light in held-out views is unexplained",
+        SHAPE,
+    ),
+    _Doubt(
+        lambda found: found.saturated,
+        lambda options: options.largest_saturated,
+        lambda found: f"{found.saturated:.0%} of the object's pixels are saturated",
+        EXPOSURE,
+    ),
+)
+
+
+def judge(found: Evidence, options: TrustOptions) -> Trust:
+    """The verdict on that evidence."""
+    figures = {name: value for name, value in vars(found).items() if value is not None}
+    if found.unexplained is None:
+        reason = f"{found.views} usable views leave none to hold out"
+        return Trust("do not trust", reason, VIEWS, options.refused, figures)
+    risk, doubt = max(_risks(found, options), key=lambda each: each[0])
+    if risk < 1:
+        reason = (
+            f"the mirror explains {1 - found.unexplained:.0%} of the light in held-out views, "
+            f"and silhouettes agree to {found.silhouette_px:.2g} px"
+        )
+        return Trust("trust", reason, "", risk, figures)
+    word: Verdict = "partly" if risk < options.refused else "do not trust"
+    return Trust(word, doubt.reason(found), doubt.remedy, risk, figures)
+
+
+def _risks(found: Evidence, options: TrustOptions) -> Iterator[tuple[float, _Doubt]]:
+    for doubt in DOUBTS:
+        measured = doubt.measure(found)
+        if measured is not None:
+            yield measured / doubt.limit(options), doubt

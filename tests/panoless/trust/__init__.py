@@ -1,0 +1,1 @@
+"""Trust: evidence and verdict."""

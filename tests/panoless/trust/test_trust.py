@@ -1,0 +1,140 @@
+"""What training views say about a fit: figures with known values, and the verdict that follows from them."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from panoless.capture.views import TrainView, Views
+from panoless.geometry.plane.kind import PlaneMirror
+from panoless.trust.evidence import Evidence, gather_evidence
+from panoless.trust.options import TrustOptions
+from panoless.trust.verdict import MATTER, POSES, judge
+from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
+
+OPTIONS = TrustOptions(resolution=32)
+MIRROR = PlaneMirror(plane_of(RECTANGLE))
+VISIBILITY = torch.linspace(0.1, 1.0, 6 * 32 * 32).reshape(6, 32, 32)
+
+
+@pytest.fixture(scope="module")
+def views() -> Views:
+    return reflecting_views(plane_of(RECTANGLE), arc(15, size=64))
+
+
+def evidence(views: Views) -> Evidence:
+    return gather_evidence(views, MIRROR, VISIBILITY, OPTIONS)
+
+
+def each(views: Views, change) -> Views:
+    return replace(views, train=tuple(change(index, view) for index, view in enumerate(views.train)))
+
+
+def turned(view: TrainView, vector_deg: list[float]) -> TrainView:
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec(np.radians(vector_deg)).as_matrix()
+    pose = torch.from_numpy(turn).float() @ view.camera.world_to_camera
+    return replace(view, camera=replace(view.camera, world_to_camera=pose))
+
+
+def test_the_true_mirror_is_trusted(views: Views) -> None:
+    """It leaves a third of what one color a view or a place leaves, or less, and its silhouette is the mask's."""
+    found = evidence(views)
+    assert found.unexplained is not None
+    assert found.one_color is not None
+    assert found.matte is not None
+    assert found.unexplained < min(found.one_color, found.matte) / 3
+    assert found.silhouette_px < 0.05
+    assert found.view_shift_px < 0.05
+    assert found.overlap > 0.99
+    assert (found.views, found.coverage) == (15, 1.0)
+    assert judge(found, OPTIONS).verdict == "trust"
+
+
+def test_turned_cameras_are_measured_and_named(views: Views) -> None:
+    """A turn of 1.5° about the horizontal axis, up and down in turn, shifts each silhouette by that angle; a verdict
+    says so.
+    """
+    found = evidence(each(views, lambda i, view: turned(view, [1.5 * (-1) ** i, 0, 0])))
+    assert found.view_shift_deg == pytest.approx(1.5, rel=0.1)
+    focal = np.array([view.camera.fx for view in views.train])
+    assert found.view_shift_px == pytest.approx(np.tan(np.radians(1.5)) * np.sqrt((focal**2).mean()), rel=0.1)
+    verdict = judge(found, OPTIONS)
+    assert verdict.verdict == "do not trust"
+    assert (verdict.remedy, "wrong poses" in verdict.reason) == (POSES, True)
+
+
+def test_a_matte_object_is_told_from_a_mirror(views: Views) -> None:
+    """Where each place on the surface has its own color in all views, that explains them and a mirror does not."""
+
+    def painted(_: int, view: TrainView) -> TrainView:
+        surface = MIRROR.buffers(view.camera)
+        rays = view.rays_camera
+        points_camera = (rays / rays[2] * surface.depth).flatten(1) - view.camera.world_to_camera[:3, 3:]
+        points = view.camera_to_world_rotation @ points_camera
+        color = 0.5 + 0.5 * torch.sin(6 * points).reshape(rays.shape)
+        return replace(view, radiance=color * view.mask)
+
+    found = evidence(each(views, painted))
+    assert found.matte is not None
+    assert found.unexplained is not None
+    assert found.matte < 0.2 * found.unexplained
+    verdict = judge(found, OPTIONS)
+    assert (verdict.verdict, verdict.remedy) == ("do not trust", MATTER)
+
+
+def test_noise_and_saturation_are_measured(views: Views) -> None:
+    """Gray pictures with noise of a known deviation; and pictures a quarter of whose pixels end at one."""
+    generator = torch.Generator().manual_seed(0)
+
+    def gray(_: int, view: TrainView) -> TrainView:
+        return replace(view, radiance=0.5 + 0.04 * torch.randn(view.radiance.shape, generator=generator))
+
+    found = evidence(each(views, gray))
+    assert found.noise == pytest.approx(0.04, rel=0.05)
+    assert found.error_in_noise == pytest.approx(0.6745, rel=0.15)
+    assert found.saturated == 0
+
+    def bright(index: int, view: TrainView) -> TrainView:
+        radiance = view.radiance.clone().clamp(max=0.9).flatten(1)
+        radiance[1, view.solid[::4]] = 1.0
+        return replace(view, radiance=radiance.reshape(view.radiance.shape))
+
+    assert evidence(each(views, bright)).saturated == pytest.approx(0.25, abs=0.001)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_too_few_views_to_hold_one_out_are_said_to_be_so(views: Views, count: int) -> None:
+    found = evidence(replace(views, train=views.train[:count]))
+    assert found.unexplained is None
+    verdict = judge(found, OPTIONS)
+    assert verdict.verdict == "do not trust"
+    assert f"{count} usable views" in verdict.reason
+    assert all(np.isfinite(value) for value in verdict.evidence.values())
+
+
+def test_views_without_the_object_count_for_nothing(views: Views) -> None:
+    def emptied(index: int, view: TrainView) -> TrainView:
+        if index % 2:
+            return view
+        return replace(view, mask=view.mask * 0, radiance=view.radiance * 0, solid=view.solid[:0])
+
+    found = evidence(each(views, emptied))
+    assert found.views == 7
+    assert judge(found, OPTIONS).verdict == "trust"
+
+
+@pytest.mark.parametrize("figure", ["unexplained", "view_shift_px", "silhouette_px", "saturated"])
+def test_no_worse_figure_lowers_the_risk(views: Views, figure: str) -> None:
+    found, risks = evidence(views), []
+    for value in np.linspace(0, 2, 11):
+        risks.append(judge(replace(found, **{figure: float(value)}), OPTIONS).risk)
+    assert risks == sorted(risks)
+    assert risks[-1] > 1
+
+
+def test_a_verdict_holds_every_figure_by_name(views: Views) -> None:
+    found = evidence(views)
+    assert set(judge(found, OPTIONS).evidence) == {field.name for field in fields(Evidence)}
