@@ -24,6 +24,7 @@ from shinypartial.io.files import folder_lock
 from shinypartial.prediction.format import (
     DEFAULT_FOLDER,
     PredictionInfo,
+    Trust,
     acquire_prediction,
     prediction_frame,
     read_environment_map,
@@ -50,6 +51,11 @@ class Reconstruction:
     def model(self) -> str:
         """The kind of geometry that was taken: `plane`, `height_field`, `revolution` or `surfels`."""
         return self.info.model_selection.chosen if self.info.model_selection else ""
+
+    @property
+    def verdict(self) -> Trust | None:
+        """How far the fit says that it is to be trusted: `trust`, `partly` or `do not trust`, and why."""
+        return self.info.verdict
 
     @property
     def environment(self) -> Float[np.ndarray, "H W 3"]:

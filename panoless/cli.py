@@ -49,17 +49,18 @@ class Fit:
             config=config,
         )
         print(f"Prediction written to {result.folder}\nNext: shinypartial evaluate {result.folder}")
-        if not (self.snapshots or self.snapshot_seconds):
-            return
-        from panoless.geometry.registry import FAMILIES
-        from panoless.reconstruct.snapshots import snapshot_folders
+        if self.snapshots or self.snapshot_seconds:
+            from panoless.geometry.registry import FAMILIES
+            from panoless.reconstruct.snapshots import snapshot_folders
 
-        run_folder = RUNS / result.folder.resolve().name
-        if snapshot_folders(run_folder):
-            print(f"Snapshots: panoless export {run_folder} --output {result.folder} --snapshots")
-        else:
-            label = FAMILIES[result.model].label
-            print(f"No snapshots: this run took {label}, whose map is solved without steps.")
+            run_folder = RUNS / result.folder.resolve().name
+            if snapshot_folders(run_folder):
+                print(f"Snapshots: panoless export {run_folder} --output {result.folder} --snapshots")
+            else:
+                label = FAMILIES[result.model].label
+                print(f"No snapshots: this run took {label}, whose map is solved without steps.")
+        if result.info.verdict:
+            print(f"Verdict: {result.info.verdict.sentence()}")
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.options import PlaneOptions
 from panoless.geometry.revolution.options import RevolutionOptions
 from panoless.selection.options import SelectionOptions
+from panoless.trust.options import TrustOptions
 from shinypartial.core.errors import InputError
 from shinypartial.io.records import Count, NonNegative, Positive, Share, check_record, read_record, write_record
 
@@ -192,6 +193,7 @@ class FitConfig:
     revolution: Tuned[RevolutionOptions] = field(default_factory=RevolutionOptions)
     footprint_map: Tuned[FootprintMapOptions] = field(default_factory=FootprintMapOptions)
     selection: Tuned[SelectionOptions] = field(default_factory=SelectionOptions)
+    trust: Tuned[TrustOptions] = field(default_factory=TrustOptions)
 
 
 def renamed_arguments(arguments: list[str]) -> list[str]:

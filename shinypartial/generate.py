@@ -13,10 +13,12 @@ from typing import Any
 from shinypartial import __version__
 from shinypartial.blender.runtime import check_blender
 from shinypartial.blender.worker_pool import PoolClosed, WorkerPool, open_pool
+from shinypartial.core.sphere import latlong_directions
 from shinypartial.core.trajectory import plan_cameras
 from shinypartial.dataset.camera_plot import CAMERA_PLOT, plot_cameras
 from shinypartial.dataset.schema import (
     CHECKSUMS,
+    ENVIRONMENT_INVERSE_DISTANCE,
     ENVIRONMENT_LATLONG,
     ENVIRONMENT_LATLONG_Y_UP,
     FORMAT_MINOR,
@@ -31,6 +33,7 @@ from shinypartial.dataset.write import (
     is_rendered,
     make_frames,
     write_environment,
+    write_inverse_distance,
     write_transforms,
     write_view,
 )
@@ -80,7 +83,7 @@ def generate(spec: SceneSpec, root: Path) -> Generated:
             _render_frames(spec, missing, len(every))
         write_contact_sheet(root, frames["train"], read_exr_rgb(root / ENVIRONMENT_LATLONG))
         statistics = dataset_statistics(frames["train"], frames["test"])
-        complete_dataset(root, licenses(spec), statistics)
+        complete_dataset(root, licenses(spec), {**statistics, "object_radius": spec.extent})
     return Generated(root, len(missing), len(every) - len(missing))
 
 
@@ -99,7 +102,9 @@ def _as_begun(root: Path, recipe: dict[str, Any]) -> dict[str, Any]:
     """The recipe in the words of the version that began the folder, where they mean the same scene."""
     manifest = read_json(root / MANIFEST, "the manifest") if (root / MANIFEST).exists() else None
     begun = manifest.get("recipe") if isinstance(manifest, dict) else None
-    return begun if isinstance(begun, dict) and begun == older_recipe(recipe) else recipe
+    if not isinstance(begun, dict) or begun.get("split", recipe["split"]) != recipe["split"]:
+        return recipe
+    return begun if older_recipe(begun) == older_recipe(recipe) else recipe
 
 
 def _is_complete(root: Path, frames: Sequence[Frame]) -> bool:
@@ -144,11 +149,14 @@ def _make_frame(pool: WorkerPool, frame: Frame) -> None:
 
 
 def _write_ground_truth(spec: SceneSpec, root: Path) -> None:
-    """The environment, unless an earlier run wrote it; its last file stands for all."""
+    """The environment, whose last file stands for all, and how far its room is, unless an earlier run wrote them."""
     from shinypartial.blender.assemble import world_radiance
 
     if not (root / ENVIRONMENT_LATLONG_Y_UP).exists():
         write_environment(root, world_radiance(spec.world, spec.render.exposure))
+    if spec.room and not (root / ENVIRONMENT_INVERSE_DISTANCE).exists():
+        height = read_exr_rgb(root / ENVIRONMENT_LATLONG).shape[0]
+        write_inverse_distance(root, spec.room.inverse_distance(latlong_directions(height)))
 
 
 def licenses(spec: SceneSpec) -> list[dict[str, str]]:

@@ -105,6 +105,7 @@ def export_prediction(
         model_bytes=sum((folder / name).stat().st_size for name in (mesh_file, ENVIRONMENT)),
         model=state.selection.sentence,
         model_selection=_model_selection(state.selection),
+        verdict=state.verdict,
         iteration=state.iteration if snapshot else None,
     )
     write_info(folder, info)

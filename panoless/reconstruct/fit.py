@@ -16,10 +16,12 @@ from panoless.reconstruct.recorder import Recorder, note_peak_memory, timed
 from panoless.reconstruct.snapshots import NO_SNAPSHOTS, SnapshotSchedule, require_snapshots
 from panoless.reconstruct.state import FitState, acquire_run, load_state, save_state
 from panoless.selection.choose import choose_geometry
+from panoless.trust.evidence import gather_evidence
+from panoless.trust.verdict import judge
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
 from shinypartial.io.files import folder_lock
-from shinypartial.prediction.format import dataset_hash
+from shinypartial.prediction.format import Trust, dataset_hash
 
 MAIN_MEMORY = torch.device("cpu")
 
@@ -53,12 +55,15 @@ def fit(
                 state = begin(views, config)
             state.seconds, state.device = seconds, device_name(device)
             print(f"Model: {state.selection.sentence}", file=sys.stderr)
-        state, views = state.to(device), usable_views(views, state.geometry)
+        state, photographs = state.to(device), views
+        views = usable_views(views, state.geometry)
         if state.training is not None:
             family, recorder = FAMILIES[state.geometry.kind], Recorder(folder, schedule, state)
             state.geometry, state.training = family.train(views, state.geometry, state.training, config, recorder)
         with timed(state.seconds, "solve environment"):
             complete(state, views, config)
+        with timed(state.seconds, "judge"):
+            state.verdict = assess(state, photographs, config)
         note_peak_memory(state)
         save_state(folder, state)
         return state.to(MAIN_MEMORY)
@@ -69,6 +74,13 @@ def begin(views: Views, config: FitConfig) -> FitState:
     geometry, selection = choose_geometry(views, config)
     training = FAMILIES[geometry.kind].begin(usable_views(views, geometry), geometry, config)
     return FitState(geometry, views.object_frame, selection, training)
+
+
+def assess(state: FitState, views: Views, config: FitConfig) -> Trust:
+    """How far a finished state is to be trusted, by the views that it was fitted to."""
+    assert state.visibility is not None
+    with torch.no_grad():
+        return judge(gather_evidence(views, state.geometry, state.visibility, config.trust), config.trust)
 
 
 def find_device(name: str) -> torch.device:

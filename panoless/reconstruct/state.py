@@ -16,6 +16,7 @@ from panoless.geometry.registry import FAMILIES
 from panoless.selection.candidates import Selection, selection_from_plain
 from shinypartial.core.errors import InputError
 from shinypartial.io.files import PARTIAL_PREFIX, atomic_write, read_json, remove_partial_files, write_json
+from shinypartial.prediction.format import Trust
 
 CHECKPOINT = "checkpoint.pt"
 DESCRIPTION = "fit.json"
@@ -38,6 +39,8 @@ class FitState:
     peak_memory_bytes: int = 0
     device: str = "cpu"
     """The name of what computed it."""
+    verdict: Trust | None = None
+    """How far it is to be trusted; None before the end, and in runs of an earlier version."""
 
     @property
     def iteration(self) -> int:
@@ -64,6 +67,7 @@ def save_state(folder: Path, state: FitState) -> None:
         "frame": to_plain(state.frame),
         "selection": asdict(state.selection),
         "training": None if state.training is None else vars(state.training),
+        "verdict": None if state.verdict is None else asdict(state.verdict),
     }
     content["selection"]["candidates"] = [
         {**each, "verdict": str(each["verdict"])} for each in content["selection"]["candidates"]
@@ -86,6 +90,8 @@ def load_state(folder: Path) -> FitState | None:
         content["frame"] = from_plain(ObjectFrame, content["frame"])
         content["selection"] = selection_from_plain(**content["selection"])
         content["training"] = None if content["training"] is None else Training(**content["training"])
+        verdict = content.pop("verdict", None)
+        content["verdict"] = None if verdict is None else Trust(**verdict)
         return FitState(**content)
     except Exception as error:
         raise InputError(

@@ -1,11 +1,13 @@
 """Build the Blender scene of a recipe; nothing is left to defaults that touch radiance."""
 
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from shinypartial.blender.cameras import add_camera
 from shinypartial.blender.geometry import make_mesh
 from shinypartial.blender.materials import environment_color, make_room_material
 from shinypartial.blender.objects import mesh_of, place_objects
@@ -13,9 +15,8 @@ from shinypartial.blender.output import add_passes, set_file
 from shinypartial.blender.runtime import choose_device, studio_light
 from shinypartial.blender.self_reflection import assemble_probe
 from shinypartial.core.errors import InputError
-from shinypartial.core.trajectory import CameraPath
 from shinypartial.io.images import read_exr_rgb
-from shinypartial.scene import FileWorld, Render, SceneSpec, Sphere, StudioWorld
+from shinypartial.scene import FileWorld, Render, Room, SceneSpec, Sphere, StudioWorld
 
 #: Measured in Blender's own maps: −0.0022 (forest), beside radiance up to 1400.
 LOWEST_RADIANCE = -1e-2
@@ -31,8 +32,7 @@ def assemble(bpy: Any, spec: SceneSpec) -> str:
     _set_output(scene, spec.render)
     place_objects(bpy, scene, spec)
     _surround(bpy, scene, spec)
-    scene.camera = _make_camera(bpy, spec.camera)
-    scene.collection.objects.link(scene.camera)
+    add_camera(bpy, scene, spec)
     assemble_probe(bpy)
     return device
 
@@ -89,7 +89,7 @@ def _set_output(scene: Any, render: Render) -> None:
 
 
 def _surround(bpy: Any, scene: Any, spec: SceneSpec) -> None:
-    """Light from infinitely far, or from the inside of a sphere that cameras see through."""
+    """Light from infinitely far, or from the walls of a room that cameras see through."""
     image = bpy.data.images.load(str(world_file(spec.world).resolve()))
     image.colorspace_settings.name = "Non-Color"  # The numbers in the file are the radiance.
     scene.world = bpy.data.worlds.new("world")
@@ -98,24 +98,25 @@ def _surround(bpy: Any, scene: Any, spec: SceneSpec) -> None:
     background, output = nodes.new("ShaderNodeBackground"), nodes.new("ShaderNodeOutputWorld")
     background.inputs["Strength"].default_value = spec.light_factor
     links.new(background.outputs["Background"], output.inputs["Surface"])
-    if spec.world.distance is None:
+    if spec.room is None:
         links.new(environment_color(nodes, links, image), background.inputs["Color"])
         # Light is sampled by a map as fine as the image; the automatic choice costs a second and gains nothing.
         scene.world.cycles.sampling_method = "MANUAL"
         scene.world.cycles.sample_map_resolution = min(image.size[0], 8192)
         return
     background.inputs["Color"].default_value = (0, 0, 0, 1)
-    mesh = mesh_of(bpy, "room", make_mesh(Sphere(radius=spec.world.distance)))
+    mesh = _room_mesh(bpy, spec.room)
     mesh.materials.append(make_room_material(bpy, image, spec.light_factor))
     room = bpy.data.objects.new("room", mesh)
     room.visible_camera = False
     scene.collection.objects.link(room)
 
 
-def _make_camera(bpy: Any, spec: CameraPath) -> Any:
-    camera = bpy.data.cameras.new("camera")
-    camera.type, camera.sensor_fit = "PERSP", "HORIZONTAL"
-    camera.lens, camera.sensor_width = spec.lens_mm, spec.sensor_mm
-    camera.clip_start, camera.clip_end = 1e-3 * spec.radius, 1e3 * spec.radius
-    camera.dof.use_dof = False
-    return bpy.data.objects.new("camera", camera)
+def _room_mesh(bpy: Any, room: Room) -> Any:
+    if room.shape == "sphere":
+        return mesh_of(bpy, "room", make_mesh(Sphere(radius=room.distance)))
+    mesh = bpy.data.meshes.new("room")
+    corners = np.array(list(product((-1, 1), repeat=3))) * room.half_sizes
+    walls = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    mesh.from_pydata(corners.tolist(), [], walls)
+    return mesh

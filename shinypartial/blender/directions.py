@@ -58,8 +58,8 @@ class MirrorPaths:
 
 
 def mirrors_enough(bpy: Any, spec: SceneSpec) -> bool:
-    """Whether the object is mostly a perfect mirror in light from infinitely far, so that paths are worth tracing."""
-    if isinstance(spec.object, BlendFile) or spec.world.distance is not None:
+    """Whether the object is mostly a perfect mirror of a far world for a pinhole, so that paths are worth tracing."""
+    if isinstance(spec.object, BlendFile) or not spec.mirrors_directions:
         return False
     if BOUNCE_STEP * (spec.render.max_bounces + 1) > LEAST_MARKED:  # Their numbers would be taken for marks.
         return False

@@ -73,6 +73,15 @@ def make_room_material(bpy: Any, image: Any, strength: float) -> Any:
     return material
 
 
+def make_light_material(bpy: Any, radiance: float) -> Any:
+    """Gray light, the same from everywhere, that reflected rays find by themselves."""
+    material, nodes, links = _empty(bpy, "light")
+    _, light = _mirror_and_light(nodes, radiance)
+    links.new(light.outputs["Emission"], nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
+    material.cycles.emission_sampling = "NONE"
+    return material
+
+
 def environment_color(nodes: Any, links: Any, image: Any, direction: Any = None) -> Any:
     """The color of a lat-long image in a direction, that of the ray unless another is given; nowhere below zero."""
     texture, positive = nodes.new("ShaderNodeTexEnvironment"), nodes.new("ShaderNodeVectorMath")

@@ -1,14 +1,15 @@
 """Render views of an assembled scene and hand back their passes as arrays.
 
-Where the object mirrors perfectly, paths through a grid of points tell what smooth pixels show (`directions`,
-`footprint`), and only the others are path traced (`sparse_pixels`). Any other object is path traced as a whole.
+Where the object mirrors a far world perfectly, paths through a grid of points tell what smooth pixels show
+(`directions`, `footprint`), and only the others are path traced (`sparse_pixels`). Anything else is path traced as a
+whole.
 """
 
 import contextlib
 import os
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from shinypartial.blender.assemble import assemble, world_radiance
+from shinypartial.blender.cameras import set_view
 from shinypartial.blender.directions import (
     GRID,
     MISSED,
@@ -40,8 +42,9 @@ from shinypartial.blender.region import SMALLEST_DEPTH, Region, image_region, se
 from shinypartial.blender.runtime import import_blender, interrupts_deferred, quiet, set_threads
 from shinypartial.blender.self_reflection import render_probe
 from shinypartial.blender.sparse_pixels import assemble_sparse, nearest_depth, render_sparse
-from shinypartial.core.camera import Camera, opencv_to_opengl, ray_directions_world
+from shinypartial.core.camera import Camera, ray_directions_world
 from shinypartial.core.errors import InputError
+from shinypartial.core.trajectory import CameraPath
 from shinypartial.scene import BlendFile, SceneSpec
 
 PROBE_PASSES = (COLOR_CHANNELS[0],)
@@ -58,7 +61,8 @@ class RenderedView:
 
     `radiance` is linear and premultiplied by `alpha`; `normals_world` are unit vectors that face the camera where
     alpha > 0 and zero elsewhere; `depth` is z along the optical axis in scene units, zero where alpha is zero.
-    `self_reflection`, of the pixel's center and not averaged, is 1 where the mirror ray meets the object or a prop.
+    `self_reflection`, of the pixel's center and not averaged, is 1 where the mirror ray meets the object, a prop or the
+    operator. With an aperture or in motion, all others are also averages over the aperture and the exposure.
     """
 
     radiance: Float[np.ndarray, "H W 3"]
@@ -73,6 +77,7 @@ class Renderer:
     """An assembled scene; Blender holds one at a time in a process."""
 
     bpy: Any
+    spec: CameraPath
     scratch: Path
     device: str
     blender_version: str
@@ -82,7 +87,7 @@ class Renderer:
 
     def render(self, camera: Camera) -> RenderedView:
         """Render one view from a camera with the recipe's lens and resolution."""
-        self.bpy.context.scene.camera.matrix_world = opencv_to_opengl(camera.camera_to_world).T.tolist()
+        set_view(self.bpy, camera, self.spec)
         region = image_region(camera, self.body_vertices_world)
         try:
             with interrupts_deferred(), quiet():
@@ -106,7 +111,8 @@ class Renderer:
         self.bpy.ops.render.render(write_still=True)
         render_probe(self.bpy, probe)
         meets_scene = read_passes(probe, PROBE_PASSES)[PROBE_PASSES[0]] > 0.5
-        return _from_passes(read_passes(path, PASSES), meets_scene)
+        view = _from_passes(read_passes(path, PASSES), meets_scene)
+        return view if self.spec.is_ideal else _turned_to(camera, view)
 
     def _reflected(self, mirror: "_Mirror", camera: Camera, region: Region, depth: float) -> RenderedView:
         """Smooth pixels from their paths, path tracing in the others."""
@@ -167,7 +173,7 @@ def open_renderer(
             if not path_traced and spec.render.samples <= MOST_SAMPLES_OF_MIRRORS and mirrors_enough(bpy, spec):
                 mirror = _prepare_mirror(bpy, spec, vertices, threads or os.cpu_count() or 1)
             set_threads(bpy, threads)
-        yield Renderer(bpy, Path(scratch), device, bpy.app.version_string, vertices, mirror)
+        yield Renderer(bpy, spec.camera, Path(scratch), device, bpy.app.version_string, vertices, mirror)
 
 
 def _prepare_mirror(bpy: Any, spec: SceneSpec, body: Float[np.ndarray, "P 3"], threads: int) -> _Mirror:
@@ -179,8 +185,11 @@ def _prepare_mirror(bpy: Any, spec: SceneSpec, body: Float[np.ndarray, "P 3"], t
 
 
 def _body_vertices(bpy: Any, spec: SceneSpec) -> Float[np.ndarray, "P 3"]:
-    """Those that bound the object; none for a user's file, whose displacements and modifiers may differ in renders."""
-    if isinstance(spec.object, BlendFile):
+    """Those that bound the object, as far as it appears where they do.
+
+    None for a user's file, whose displacements and modifiers may differ in renders, and for blurred pictures.
+    """
+    if isinstance(spec.object, BlendFile) or not spec.camera.is_ideal:
         return np.zeros((0, 3))
     return world_vertices(bpy, bpy.context.scene.objects[BODY])
 
@@ -223,3 +232,15 @@ def _from_passes(passes: Passes, meets_scene: Bool[np.ndarray, "H W"]) -> Render
         np.where(inside, passes[DEPTH_CHANNEL] / np.where(inside, alpha, 1), 0),
         np.where(inside, meets_scene, 0).astype(np.float32),
     )
+
+
+def _turned_to(camera: Camera, view: RenderedView) -> RenderedView:
+    """The view with each normal that faces away from the middle of aperture and exposure turned until it faces aside.
+
+    Other points of the aperture and moments of the exposure see a little farther around the outline.
+    """
+    rays = ray_directions_world(camera)
+    away = np.maximum(np.sum(view.normals_world * rays, -1, keepdims=True), 0)
+    normals = view.normals_world - away * rays
+    length = np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), np.finfo(np.float32).tiny)
+    return replace(view, normals_world=(normals / length).astype(np.float32))

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import tyro
 
-from shinypartial.cli.datasets import Release, Subset, Validate
+from shinypartial.cli.datasets import Perturb, Release, Subset, Validate
 from shinypartial.cli.presenting import Chart, Leaderboard, Report
 from shinypartial.cli.scenes import Generate
 from shinypartial.cli.scoring import Compare, Evaluate, Oracle, Postprocess, Weights
@@ -13,6 +13,7 @@ from shinypartial.core.errors import parse_and_run
 Command = (
     Generate
     | Subset
+    | Perturb
     | Validate
     | Evaluate
     | Oracle

@@ -1,4 +1,4 @@
-"""Commands that cut, check and publish datasets."""
+"""Commands that cut, perturb, check and publish datasets."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +8,7 @@ import tyro
 
 from shinypartial.cli.newest import announce_newest
 from shinypartial.core.errors import InputError
+from shinypartial.dataset.perturb.options import CameraErrors, MaskErrors, Perturbation, SensorErrors, ViewChoice, World
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,44 @@ class Subset:
         print(f"{len(kept.dropped)} left out, in {made.root}")
         for split in made.without_normals:
             print(f"No normals in {split}: only some of its views had any, and scores need all or none.")
+        print(f"Next: panoless fit {made.root}")
+
+
+@dataclass(frozen=True)
+class Perturb:
+    """Make a worse copy of a dataset: its training views are perturbed, all that is scored against stays true.
+
+    Run again to continue where an earlier run stopped.
+    """
+
+    source: tyro.conf.Positional[Path]
+    """Dataset folder, also a plain NeRF-synthetic one, or the name of a bundled one; it is only read."""
+    output: Path
+    """Folder to write."""
+    seed: int = 0
+    """Seed of everything that is drawn by chance."""
+    link: bool = False
+    """Make hard links in place of copies of files that stay the same."""
+    cameras: CameraErrors = CameraErrors()
+    masks: MaskErrors = MaskErrors()
+    sensor: SensorErrors = SensorErrors()
+    views: ViewChoice = ViewChoice()
+    world: World = World()
+
+    def run(self) -> None:
+        """Make the copy and say what to do next."""
+        from shinypartial.dataset.bundled import resolve_dataset
+        from shinypartial.dataset.perturb.options import changed_options
+        from shinypartial.dataset.perturb.worse_copy import perturb
+
+        options = Perturbation(self.cameras, self.masks, self.sensor, self.views, self.world, self.seed)
+        made = perturb(resolve_dataset(self.source), self.output, options, link=self.link)
+        changes = [
+            f"{group}.{name} {value}"
+            for group, values in changed_options(options).items()
+            for name, value in values.items()
+        ]
+        print(f"{made.root}: {len(made.plan.views)} training views, {', '.join(changes) or 'nothing changed'}")
         print(f"Next: panoless fit {made.root}")
 
 

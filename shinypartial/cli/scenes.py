@@ -37,6 +37,12 @@ class CameraOptions:
     """Training views evenly along the path, or drawn by chance."""
     seed: int | None = None
     """Seed of the placement."""
+    f_number: float | None = None
+    """Focal length over the diameter of the aperture, for a scene unit of one meter; blurs what is out of focus."""
+    focus_distance: float | None = None
+    """Depth of the plane that is sharp, in scene units; that of the target when not given."""
+    motion_deg: float | None = None
+    """Angle around the vertical through the target by which the camera moves during the exposure."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,17 @@ class SceneOptions:
     world: str | None = None
     """What lights the scene: city, courtyard, forest, interior, night, studio, sunrise, sunset, or an EXR file."""
     surroundings_distance: float | None = None
-    """Radius of the sphere about the origin that carries the world; infinitely far when not given."""
+    """From the origin to the nearest wall of a room that carries the world; infinitely far when not given."""
+    surroundings_radii: float | None = None
+    """The same in object radii."""
+    surroundings_room: Literal["sphere", "box"] | None = None
+    """Shape of that room about the origin."""
+    surroundings_proportions: tuple[float, float, float] | None = None
+    """Of a box along X, Y and Z; the nearest walls are those of the shortest side."""
+    operator_height: float | None = None
+    """Height in scene units of a figure at each camera that only reflections show; nobody is there when not given."""
+    operator_radiance: float | None = None
+    """Gray light that this figure gives off."""
     exposure: float | None = None
     """Photographic stops: multiplies the light by 2^exposure."""
     roughness: float | None = None

@@ -68,6 +68,17 @@ class CameraPath:
     """Training views spread evenly along the path (`interleaved`) or drawn by chance (`random`)."""
     seed: Seed = 0
     """Seed of the draw; for `interleaved` it chooses the view that is first."""
+    f_number: Annotated[float, limits(0.01, 1000.0)] | None = None
+    """Focal length over the diameter of the aperture, for a scene unit of one meter; a pinhole when not given."""
+    focus_distance: Annotated[float, limits(1e-3, 1e6)] | None = None
+    """Depth of the plane that is sharp, in scene units; that of the target when not given."""
+    motion_deg: Annotated[float, limits(0.0, 30.0)] = 0.0
+    """Angle around the vertical through the target by which the camera moves during the exposure."""
+
+    @property
+    def is_ideal(self) -> bool:
+        """Whether each picture is taken from a single point."""
+        return self.f_number is None and self.motion_deg == 0
 
 
 @dataclass(frozen=True)

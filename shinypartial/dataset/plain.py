@@ -32,12 +32,21 @@ TOLERATED_SHARE = 0.1
 
 
 def is_plain(root: Path, manifest: dict[str, Any]) -> bool:
-    """Whether a folder has the plain layout: a subset by its manifest, else one without any file of a rendered set."""
+    """Whether a folder promises no more than the plain layout does.
+
+    By its manifest a subset or a perturbed copy; else a folder without any file of a rendered set.
+    """
     if (root / MANIFEST).exists():
         recipe = manifest.get("recipe")
-        return isinstance(recipe, dict) and "subset_of" in recipe
+        return isinstance(recipe, dict) and ("subset_of" in recipe or is_perturbed(manifest))
     rendered = (CHECKSUMS, LICENSES, ENVIRONMENT_LATLONG.parent)
     return (root / "transforms_train.json").exists() and not any((root / name).exists() for name in rendered)
+
+
+def is_perturbed(manifest: dict[str, Any]) -> bool:
+    """Whether a folder is a worse copy of another: its training views contradict each other on purpose."""
+    recipe = manifest.get("recipe")
+    return isinstance(recipe, dict) and "perturbation_of" in recipe
 
 
 def read_plain_frames(root: Path, split: str) -> tuple[list[Frame], int, list[Violation]]:
@@ -76,6 +85,14 @@ def check_plain_frame(root: Path, frame: Frame) -> Iterator[Violation]:
     disparity = frame.stem.with_name(frame.stem.name + DISPARITY_SUFFIX)
     if disparity.exists():
         yield from _check_disparity(_name(root, disparity), disparity, solid)
+
+
+def check_perturbed_frame(root: Path, frame: Frame) -> Iterator[Violation]:
+    """A training view of a perturbed copy needs only to be readable: what it shows is wrong on purpose."""
+    try:
+        read_view(frame)
+    except InputError as error:
+        yield violation_of(_name(root, frame.photograph), error, error.remedy)
 
 
 def _name(root: Path, path: Path) -> str:

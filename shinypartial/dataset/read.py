@@ -11,9 +11,11 @@ from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import (
     COLOR_CHANNELS,
     DEPTH_CHANNEL,
+    ENVIRONMENT_INVERSE_DISTANCE,
     ENVIRONMENT_LATLONG,
     FORMAT,
     FORMAT_VERSION,
+    INVERSE_DISTANCE_CHANNEL,
     MANIFEST,
     NORMAL_CHANNELS,
     SELF_REFLECTION_CHANNEL,
@@ -129,13 +131,34 @@ def _read_exr_view(frame: Frame, path: Path) -> View:
     return View(radiance, alpha, normals, depth, high_dynamic_range=True, self_reflection=mask)
 
 
-def _read_picture_view(frame: Frame, path: Path) -> View:
-    image = read_picture(path)
+def read_whole_picture(frame: Frame) -> tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W"]]:
+    """Straight linear color of a photograph beyond its mask, and the share of each pixel that it covers.
+
+    That is alpha where the alpha channel is the mask: then nothing lies behind the object. It is 1 where the mask is a
+    file of its own.
+    """
+    image = read_picture(frame.photograph)
     _check_size(frame, image)
+    color, linear = _linear_color(image)
+    shown = color[..., 3] if color.shape[2] == 4 else np.ones_like(color[..., 0])
+    straight = color[..., :3] / np.where(linear & (shown > 0), shown, 1)[..., None]
+    if frame.mask is not None:
+        shown = (shown > 0).astype(np.float32)
+    return np.where(shown[..., None] > 0, straight, 0), shown
+
+
+def _linear_color(image: Num[np.ndarray, "H W C"]) -> tuple[Float[np.ndarray, "H W D"], bool]:
+    """Linear RGB or RGBA of a picture as stored, and whether it was linear (and premultiplied) already."""
     values, linear = unit_values(image), image.dtype.kind == "f"
     if values.shape[2] == 1:
         values = np.repeat(values, 3, 2)
-    color = values if linear else np.concatenate([srgb_to_linear(values[..., :3]), values[..., 3:]], -1)
+    return values if linear else np.concatenate([srgb_to_linear(values[..., :3]), values[..., 3:]], -1), linear
+
+
+def _read_picture_view(frame: Frame, path: Path) -> View:
+    image = read_picture(path)
+    _check_size(frame, image)
+    color, linear = _linear_color(image)
     radiance, alpha = _cut_out(frame, path, color, premultiplied=linear)
     normals = None
     if frame.normal_png.exists():
@@ -199,3 +222,22 @@ def _missing_mask(frame: Frame, path: Path) -> InputError:
 def read_environment(dataset: Dataset) -> Float[np.ndarray, "H W 3"]:
     """Ground-truth environment as a linear lat-long map in the world frame."""
     return read_exr_rgb(dataset.root / ENVIRONMENT_LATLONG)
+
+
+def read_inverse_distance(dataset: Dataset) -> Float[np.ndarray, "H W"] | None:
+    """Ground-truth 1/D of every direction from the origin, in 1/scene units, 0 for infinitely far; None if unknown."""
+    path = dataset.root / ENVIRONMENT_INVERSE_DISTANCE
+    return read_inverse_distance_map(path) if path.exists() else None
+
+
+def read_inverse_distance_map(path: Path) -> Float[np.ndarray, "H W"]:
+    """Read such a map from a file; raises InputError unless it is a finite 2:1 map ≥ 0."""
+    inverse = stack_channels(read_exr(path), (INVERSE_DISTANCE_CHANNEL,), path)[..., 0]
+    height, width = inverse.shape
+    if width != 2 * height or not np.isfinite(inverse).all() or inverse.min() < 0:
+        raise InputError(
+            expected=f"a finite lat-long map of 1/D ≥ 0, twice as wide as high, in {path}",
+            found=f"{width}×{height}, lowest value {inverse.min():.4g}, highest {inverse.max():.4g}",
+            remedy="Export the map again: 0 stands for infinitely far.",
+        )
+    return inverse

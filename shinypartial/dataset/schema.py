@@ -1,5 +1,6 @@
 """Names and types of the dataset folder: the only place where its layout is spelled out."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,9 @@ from shinypartial.io.images import EXR, PICTURE_SUFFIXES
 
 FORMAT = "shinypartial-dataset"
 FORMAT_VERSION = 1
-#: What a minor version adds may be ignored: 1 adds self-reflection to every view. A manifest without one means 0.
-FORMAT_MINOR = 1
+#: What a minor version adds may be ignored: 1 adds self-reflection to every view, 2 the inverse distance of near
+#: surroundings. A manifest without one means 0.
+FORMAT_MINOR = 2
 MANIFEST = "dataset.json"
 CHECKSUMS = "SHA256SUMS"
 LICENSES = "LICENSES.json"
@@ -25,6 +27,8 @@ SELF_REFLECTION_CHANNEL = "self_reflection.V"
 CONTACT_SHEET = "contact_sheet.jpg"
 ENVIRONMENT_LATLONG = Path("environment/latlong.exr")
 ENVIRONMENT_LATLONG_Y_UP = Path("environment/latlong_yup.exr")
+ENVIRONMENT_INVERSE_DISTANCE = Path("environment/inverse_distance.exr")
+INVERSE_DISTANCE_CHANNEL = "Y"
 ENVIRONMENT_CUBE = Path("environment/cube")
 
 
@@ -127,6 +131,13 @@ class Dataset:
         """`development` or `held-out`, as the recipe of the scene declares it; `unknown` where nothing does."""
         recipe = self.manifest.get("recipe")
         return str(recipe.get("split", "unknown")) if isinstance(recipe, dict) else "unknown"
+
+    @property
+    def object_radius(self) -> float | None:
+        """Distance from the origin that the object does not exceed; None where the manifest doesn't state it."""
+        statistics = self.manifest.get("statistics")
+        radius = statistics.get("object_radius") if isinstance(statistics, dict) else None
+        return float(radius) if isinstance(radius, int | float) and 0 < radius < math.inf else None
 
     def split(self, split: str) -> tuple[Frame, ...]:
         """Frames of `train` or `test`."""

@@ -162,7 +162,7 @@ def make_subset(source: Path, root: Path, options: SubsetOptions, *, link: bool 
     `link` makes hard links in place of copies. Raises InputError when the path doesn't cross itself, when the source
     can't be read or when the folder holds something else.
     """
-    _refuse_nesting(source, root)
+    refuse_nesting(source, root)
     dataset = open_dataset(source)
     selection = select(dataset, options)
     contents = {split: _renamed(dataset, split, getattr(selection, split)) for split in SPLITS}
@@ -187,7 +187,8 @@ def make_subset(source: Path, root: Path, options: SubsetOptions, *, link: bool 
     return Subset(root, selection, len(missing), without_normals)
 
 
-def _refuse_nesting(source: Path, root: Path) -> None:
+def refuse_nesting(source: Path, root: Path) -> None:
+    """Raise InputError for an output folder that is the source or lies in it."""
     if source.resolve() in (root.resolve(), *root.resolve().parents):
         raise InputError(
             expected=f"an output folder apart from the source {source}", found=str(root), remedy="Change --output."
@@ -270,19 +271,26 @@ def _copies(root: Path, split: str, frames: Sequence[Frame]) -> list[tuple[Path,
     pairs = []
     dropped = {frame.normal_png for frame in frames} if _has_some_normals(frames) else set()
     for i, frame in enumerate(frames):
-        name = frame.stem.name
-        here = sorted(frame.stem.parent.iterdir()) if frame.stem.parent.is_dir() else []
-        files = [path for path in here if path.name.startswith((f"{name}.", f"{name}_")) and path.is_file()]
-        if frame.photograph not in files:
-            raise InputError(
-                expected=f"the image of {frame.name} at {frame.photograph}",
-                found="no such file",
-                remedy="Restore it, or remove the frame from the transforms.",
-            )
-        pairs += [(path, root / split / f"r_{i}{path.name[len(name) :]}") for path in files if path not in dropped]
+        end = len(frame.stem.name)
+        kept = [path for path in files_of(frame) if path not in dropped]
+        pairs += [(path, root / split / f"r_{i}{path.name[end:]}") for path in kept]
         if frame.mask is not None:
             pairs.append((frame.mask, root / split / _mask_name(frame.mask, i)))
     return pairs
+
+
+def files_of(frame: Frame) -> list[Path]:
+    """The photograph and all that lies beside it under the same name; InputError when it isn't there."""
+    name = frame.stem.name
+    here = sorted(frame.stem.parent.iterdir()) if frame.stem.parent.is_dir() else []
+    files = [path for path in here if path.name.startswith((f"{name}.", f"{name}_")) and path.is_file()]
+    if frame.photograph not in files:
+        raise InputError(
+            expected=f"the image of {frame.name} at {frame.photograph}",
+            found="no such file",
+            remedy="Restore it, or remove the frame from the transforms.",
+        )
+    return files
 
 
 def _mask_name(mask: Path, index: int) -> str:

@@ -15,15 +15,18 @@ from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import latlong_to_cube
 from shinypartial.dataset.plain import (
     check_normals_of_split,
+    check_perturbed_frame,
     check_plain_frame,
+    is_perturbed,
     is_plain,
     read_plain_frames,
     what_is_absent,
 )
-from shinypartial.dataset.read import open_dataset
+from shinypartial.dataset.read import open_dataset, read_inverse_distance_map
 from shinypartial.dataset.schema import (
     CHECKSUMS,
     ENVIRONMENT_CUBE,
+    ENVIRONMENT_INVERSE_DISTANCE,
     ENVIRONMENT_LATLONG,
     ENVIRONMENT_LATLONG_Y_UP,
     FORMAT,
@@ -31,6 +34,7 @@ from shinypartial.dataset.schema import (
     LICENSES,
     MANIFEST,
     SPLITS,
+    Dataset,
     Frame,
 )
 from shinypartial.dataset.validate_frame import check_frame
@@ -43,6 +47,7 @@ from shinypartial.io.progress import Progress
 RESTORE = "Restore the file from the released dataset, or generate the dataset again."
 CONTINUE = "Run the `shinypartial generate` that began the folder again: it continues where it stopped."
 SUBSET = "`shinypartial subset`"
+PERTURB = "`shinypartial perturb`"
 ANGLE_TOLERANCE_RAD = 1e-6
 #: The lat-long and the cube are each rounded to half precision (relative 5e-4).
 RADIANCE_TOLERANCE = 2e-3
@@ -72,19 +77,22 @@ def validate(root: Path, progress: bool = False) -> list[Violation]:
     minor = manifest.get("format_minor", 0)
     complete = isinstance(minor, int) and minor >= 1
     for frame in frames:
-        if plain and not frame.exr.exists():
+        if is_perturbed(manifest) and frame.name.startswith("train/"):
+            violations += check_perturbed_frame(root, frame)
+        elif plain and not frame.exr.exists():
             violations += check_plain_frame(root, frame)
         else:
             violations += check_frame(root, frame, self_reflection=complete)
         if counter:
             counter.advance()
     if not plain or (root / ENVIRONMENT_LATLONG).exists():
-        violations += _check_environment(root)
+        violations += [*_check_environment(root), *_check_inverse_distance(root, manifest)]
     if not original:
         violations += [*_check_licenses(root), *_check_checksums(root)]
     if plain:  # What made it, and so what makes it again.
+        maker = PERTURB if is_perturbed(manifest) else SUBSET
         violations = [
-            replace(each, remedy=each.remedy.replace("`shinypartial generate`", SUBSET)) for each in violations
+            replace(each, remedy=each.remedy.replace("`shinypartial generate`", maker)) for each in violations
         ]
     return sorted(violations, key=lambda each: each.warning)
 
@@ -98,7 +106,7 @@ def unscored(root: Path) -> str | None:
 def _check_plain_split(root: Path, split: str, manifest: dict[str, Any]) -> tuple[list[Frame], list[Violation]]:
     frames, listed, violations = read_plain_frames(root, split)
     problems = [*_set_problems(frames, listed, split, manifest)]
-    if manifest:  # An original folder is photographed from all around.
+    if manifest and not is_perturbed(manifest):  # An original folder is photographed from all around.
         problems += _hemisphere_problems(frames, manifest)
     file = f"transforms_{split}.json"
     return frames, [
@@ -248,6 +256,27 @@ def _check_environment(root: Path) -> Iterator[Violation]:
             problem = f"the EXR attribute `envmap`, which means +Y up, is {'missing' if expected else 'set'}"
             yield Violation(path.as_posix(), problem, REMAKE)
     yield from _check_resampled(latlong, maps, faces)
+
+
+def _check_inverse_distance(root: Path, manifest: dict[str, Any]) -> Iterator[Violation]:
+    """There from minor version 2 on where the recipe's world is near; of the size of the lat-long map of radiance."""
+    file, path = ENVIRONMENT_INVERSE_DISTANCE.as_posix(), root / ENVIRONMENT_INVERSE_DISTANCE
+    minor, world = manifest.get("format_minor", 0), manifest.get("recipe", {}).get("world")
+    near = isinstance(world, dict) and any(world.get(key) is not None for key in ("distance", "distance_radii"))
+    if not path.exists():
+        if near and isinstance(minor, int) and minor >= 2:
+            yield Violation(file, "the file is missing, though the surroundings are near", REMAKE)
+        return
+    if Dataset(root, manifest, (), ()).object_radius is None:
+        yield Violation(MANIFEST, "`statistics.object_radius` is not a positive number", RESTORE)
+    try:
+        inverse, latlong = read_inverse_distance_map(path), read_exr_rgb(root / ENVIRONMENT_LATLONG)
+    except InputError as error:
+        yield violation_of(file, error)
+        return
+    if inverse.shape != latlong.shape[:2]:
+        (height, width), (high, wide) = inverse.shape, latlong.shape[:2]
+        yield Violation(file, f"expected {wide}×{high} texels, found {width}×{height}", REMAKE)
 
 
 def _check_resampled(

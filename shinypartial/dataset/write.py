@@ -18,10 +18,12 @@ from shinypartial.dataset.schema import (
     COLOR_CHANNELS,
     DEPTH_CHANNEL,
     ENVIRONMENT_CUBE,
+    ENVIRONMENT_INVERSE_DISTANCE,
     ENVIRONMENT_LATLONG,
     ENVIRONMENT_LATLONG_Y_UP,
     FORMAT,
     FORMAT_VERSION,
+    INVERSE_DISTANCE_CHANNEL,
     LICENSES,
     MANIFEST,
     NORMAL_CHANNELS,
@@ -97,13 +99,21 @@ def write_view(frame: Frame, view: View) -> None:
     write_png(frame.normal_png, encode_normals(view.normals_world))
     if view.self_reflection is not None:
         write_png(frame.self_png, encode_unit(view.self_reflection))
-    half = np.clip(np.concatenate([view.radiance, alpha[..., None]], -1), -65504, 65504).astype(np.float16)
+    write_exr(frame.exr, exr_channels(view))
+
+
+def exr_channels(view: View) -> dict[str, np.ndarray]:
+    """Channels of the EXR of a view, as far as the view has them."""
+    rgba = np.concatenate([view.radiance, np.clip(view.alpha, 0, 1)[..., None]], -1)
+    half = np.clip(rgba, -65504, 65504).astype(np.float16)
     channels = {name: half[..., i] for i, name in enumerate(COLOR_CHANNELS)}
-    channels |= {name: view.normals_world[..., i].astype(np.float32) for i, name in enumerate(NORMAL_CHANNELS)}
-    channels[DEPTH_CHANNEL] = view.depth.astype(np.float32)
+    if view.normals_world is not None:
+        channels |= {name: view.normals_world[..., i].astype(np.float32) for i, name in enumerate(NORMAL_CHANNELS)}
+    if view.depth is not None:
+        channels[DEPTH_CHANNEL] = view.depth.astype(np.float32)
     if view.self_reflection is not None:
         channels[SELF_REFLECTION_CHANNEL] = view.self_reflection.astype(np.float16)
-    write_exr(frame.exr, channels)
+    return channels
 
 
 def display_rgba(radiance: Float[np.ndarray, "H W 3"], alpha: Float[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 4"]:
@@ -154,6 +164,12 @@ def write_environment(root: Path, latlong: Float[np.ndarray, "H W 3"], cube_reso
     for name, face in zip(FACES, latlong_to_cube(stored, cube_resolution), strict=True):
         write_exr_rgb(root / ENVIRONMENT_CUBE / f"{name}.exr", face)
     write_exr_rgb(root / ENVIRONMENT_LATLONG_Y_UP, latlong_to_y_up(stored), y_up_environment=True)
+
+
+def write_inverse_distance(root: Path, inverse_distance: Float[np.ndarray, "H W"]) -> None:
+    """Write 1/D of every direction from the origin to the surroundings, a map like the lat-long one of radiance."""
+    channels = {INVERSE_DISTANCE_CHANNEL: inverse_distance.astype(np.float32)}
+    write_exr(root / ENVIRONMENT_INVERSE_DISTANCE, channels)
 
 
 def latlong_to_y_up(latlong: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from shinypartial.core.camera import ray_directions_world, reflect
 from shinypartial.core.color import linear_to_srgb
 from shinypartial.core.errors import InputError
-from shinypartial.dataset.read import open_dataset, read_environment, read_view, require_normals
+from shinypartial.dataset.read import open_dataset, read_environment, read_inverse_distance, read_view, require_normals
 from shinypartial.dataset.schema import ENVIRONMENT_LATLONG, Dataset, Frame
 from shinypartial.evaluation.masks import environment_mask
 from shinypartial.evaluation.pictures import (
@@ -40,6 +40,7 @@ from shinypartial.evaluation.scores import (
     LeftOut,
     PerceptualScores,
     Scores,
+    SurroundingsScores,
     read_oracle_baseline,
     write_scores,
 )
@@ -76,6 +77,7 @@ from shinypartial.prediction.format import (
     read_visibility,
 )
 from shinypartial.prediction.format import VISIBILITY as VISIBILITY_FILE
+from shinypartial.prediction.format import read_inverse_distance as read_predicted_inverse_distance
 
 #: Test views that are shown in the report, spread evenly over the split.
 PICTURED_VIEWS = 4
@@ -161,8 +163,9 @@ def evaluate(
         paper=_pool_paper(maps, results) if with_paper else None,
         oracle=None if oracle is None else str(Path(oracle).resolve()),
         views=tuple(result.scores for result in results),
-        left_out=tuple(left_out),
         counts=count_all(data, results),
+        surroundings=_score_surroundings(prediction, data, observed, left_out),
+        left_out=tuple(left_out),  # Last: the others add to it.
     )
     read_oracle_baseline(prediction, scores)
     write_scores(prediction, scores)
@@ -276,6 +279,19 @@ def _write_environment_pictures(
     if masks.observed is not None:
         resolved = np.zeros_like(masks.observed) if masks.resolved is None else masks.resolved
         write_png(folder / OBSERVED_MAP, observed_picture(masks.observed, resolved))
+
+
+def _score_surroundings(
+    prediction: Path, data: Dataset, observed: _Observed, left_out: list[LeftOut]
+) -> SurroundingsScores | None:
+    truth, radius, mask = read_inverse_distance(data), data.object_radius, observed.masks.observed
+    predicted = read_predicted_inverse_distance(prediction)
+    if truth is None or radius is None:
+        return None
+    if mask is None:
+        left_out.append(LeftOut("surroundings", "no direction is known to be observed by the training views"))
+        return SurroundingsScores(None)
+    return SurroundingsScores(environment_metrics.inverse_distance_error(predicted, truth, radius, mask))
 
 
 def _score_calibration(

@@ -56,6 +56,9 @@ KEY_METRICS = (
     KeyMetric(f"{_RESOLVED}.log_rmse_stops", "Environment, error in stops, resolved directions", ("summary",)),
     KeyMetric("environment.perceptual.lpips_alex", "Environment LPIPS", ("summary", "report")),
     KeyMetric(
+        "surroundings.inverse_distance_error", "Error of 1/distance times object radius", ("summary", "comparison")
+    ),
+    KeyMetric(
         "normals.median_angular_error_deg",
         "Median normal error",
         ("summary", "ranking", "comparison", "chart"),

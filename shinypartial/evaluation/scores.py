@@ -44,6 +44,13 @@ class EnvironmentScores:
 
 
 @dataclass(frozen=True)
+class SurroundingsScores:
+    """How far the surroundings are, over directions that training views see; None where they see none."""
+
+    inverse_distance_error: float | None
+
+
+@dataclass(frozen=True)
 class RenderScores:
     """Renders of the test views: means over views, but `alpha_iou`, which pools pixels."""
 
@@ -89,6 +96,7 @@ class Scores:
 
     All groups follow `protocol` but `paper`, which names its own. `oracle` is the folder of the dataset's oracle
     baseline when it is not the usual one. `normals_environment` takes pixels whose mirror ray leaves the scene.
+    `surroundings` is None, and no group that was left out, where the dataset doesn't know how far they are.
     """
 
     protocol: str
@@ -107,6 +115,7 @@ class Scores:
     views: tuple[ViewScores, ...]
     left_out: tuple[LeftOut, ...]
     counts: Counts
+    surroundings: SurroundingsScores | None = None
 
 
 @dataclass(frozen=True)

@@ -108,16 +108,26 @@ def read_exr_rgb(path: Path) -> Float[np.ndarray, "H W 3"]:
 
 def write_png(path: Path, image: UInt8[np.ndarray, "H W *C"]) -> None:
     """Write an 8-bit image: (H, W) gray, (H, W, 3) RGB or (H, W, 4) RGBA with straight alpha."""
+    _write_picture(path, image, "png", {"oiio:UnassociatedAlpha": 1})
+
+
+def write_jpeg(path: Path, image: UInt8[np.ndarray, "H W 3"], quality: int) -> None:
+    """Write an 8-bit RGB image as JPEG of a quality from 1 to 100, its chroma at half the resolution."""
+    _write_picture(path, image, "jpeg", {"Compression": f"jpeg:{quality}"})
+
+
+def _write_picture(path: Path, image: UInt8[np.ndarray, "H W *C"], kind: str, attributes: dict[str, Any]) -> None:
     import OpenImageIO as oiio
 
     pixels = np.ascontiguousarray(image if image.ndim == 3 else image[..., None])
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "uint8")
-    spec.attribute("oiio:UnassociatedAlpha", 1)
+    for name, value in attributes.items():
+        spec.attribute(name, value)
     with atomic_write(path) as temporary:
-        file = oiio.ImageOutput.create("png")
+        file = oiio.ImageOutput.create(kind)
         assert file is not None
         if not (file.open(str(temporary), spec) and file.write_image(pixels) and file.close()):
-            raise OSError(errno.ENOSPC, f"could not write the PNG ({file.geterror()})", str(path))
+            raise OSError(errno.ENOSPC, f"could not write the {kind.upper()} ({file.geterror()})", str(path))
         _require_complete_write(temporary, path)
 
 

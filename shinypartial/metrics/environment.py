@@ -153,6 +153,15 @@ def direction_weights(mask: Mask | None = None) -> TexelWeights:
     return weights if mask is None else weights * mask
 
 
+def inverse_distance_error(
+    prediction: Float[np.ndarray, "_H _W"] | None, truth: Float[np.ndarray, "_H _W"], radius: float, mask: Mask
+) -> float:
+    """Mean of a |1/D − 1/D'| over the masked directions, a the object's radius; without a prediction 1/D is 0."""
+    true = to_protocol_size(truth[..., None])[..., 0]
+    found = np.zeros_like(true) if prediction is None else to_protocol_size(prediction[..., None])[..., 0]
+    return radius * weighted_mean(np.abs(found - true), direction_weights(mask))
+
+
 def best_exposure_stops(prediction: Latlong, truth: Latlong) -> float:
     """The exposure e that minimizes the weighted squared error of clip(2ᵉ · prediction) against the clipped truth.
 

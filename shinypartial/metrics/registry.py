@@ -65,6 +65,7 @@ METRICS = (
         "coverage", "Solid-angle share of the sphere that training views see", "", _DESCRIPTION, ".1%", DEFINED_HERE
     ),
     Metric("resolved_coverage", "Share that a view samples at 0.7° or finer", "", _DESCRIPTION, ".1%", DEFINED_HERE),
+    Metric("inverse_distance_error", "Object radius times error of 1/distance", "", _LOWER, ".4f", DEFINED_HERE),
     Metric("mean_angular_error_deg", "Mean angular error", "°", _LOWER, ".2f", DEFINED_HERE),
     Metric("median_angular_error_deg", "Median angular error", "°", _LOWER, ".2f", DEFINED_HERE),
     Metric("rmse_angular_error_deg", "Root mean square angular error", "°", _LOWER, ".2f", DEFINED_HERE),

@@ -3,6 +3,7 @@
 PREDICTION/prediction.json            method, configuration, dataset hash, seconds, hardware, size, model selection
 PREDICTION/environment.exr            lat-long, linear radiance, world frame of the dataset
 PREDICTION/visibility.exr             lat-long, channel Y in [0, 1]: how well each direction was observed
+PREDICTION/inverse_distance.exr      optional: lat-long, channel Y, 1/D of every direction from the origin, 0 for far
 PREDICTION/test/r_000.exr r_000.png   linear premultiplied RGBA, unit world normals, z-depth; and the picture
 PREDICTION/decomposition.jpg          optional: what a test view is made of
 PREDICTION/snapshots/000250           optional: earlier moments of the fit, each a prediction folder
@@ -10,13 +11,14 @@ PREDICTION/snapshots/000250           optional: earlier moments of the fit, each
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from shinypartial.core.errors import InputError
-from shinypartial.dataset.schema import CHECKSUMS, Dataset, Frame, View
+from shinypartial.dataset.read import read_inverse_distance_map
+from shinypartial.dataset.schema import CHECKSUMS, INVERSE_DISTANCE_CHANNEL, Dataset, Frame, View
 from shinypartial.dataset.write import write_view
 from shinypartial.io.files import newest_folder, read_json, sha256_of, write_json
 from shinypartial.io.images import read_exr, read_exr_rgb, stack_channels, write_exr, write_exr_rgb
@@ -33,6 +35,7 @@ ORACLE_SUFFIX = "-oracle"
 ENVIRONMENT = "environment.exr"
 VISIBILITY = "visibility.exr"
 VISIBILITY_CHANNEL = "Y"
+INVERSE_DISTANCE = "inverse_distance.exr"
 #: One picture of what a test view is made of, optional.
 DECOMPOSITION = "decomposition.jpg"
 
@@ -70,6 +73,30 @@ class ModelSelection:
         return "; ".join([f"{self.chosen} was chosen{reasons.get(self.chosen, '')}", *others]) + "."
 
 
+Verdict = Literal["trust", "partly", "do not trust"]
+
+
+@dataclass(frozen=True)
+class Trust:
+    """What a method says of its own result, from training views alone.
+
+    `risk` orders fits from sure to hopeless and has no unit; the method's words change at values of its own. `evidence`
+    holds the figures by name.
+    """
+
+    verdict: Verdict
+    reason: Text
+    """In a sentence, without its first capital and its full stop."""
+    remedy: str = ""
+    """What helps; empty where nothing has to."""
+    risk: NonNegative | None = None
+    evidence: dict[str, float] = field(default_factory=dict)
+
+    def sentence(self) -> str:
+        """Verdict, reason and remedy in words."""
+        return f"{self.verdict}: {self.reason}." + (f" {self.remedy}" if self.remedy else "")
+
+
 @dataclass(frozen=True)
 class PredictionInfo:
     """Who made the prediction and at what cost; `curves` are per-iteration training series, for the report only.
@@ -78,7 +105,7 @@ class PredictionInfo:
     `device` what the model was fitted on: "cpu", or the name of the GPU. `primitives` is the number of surfels,
     Gaussians, voxels or vertices, `model_bytes` the size of the files that a renderer needs, `iteration` the number of
     finished steps of a snapshot, `model_selection` how the kind of model was chosen; `model` says the same in free
-    words. Each is None where it is unknown or has no meaning.
+    words; `verdict` is what the method says of its result. Each is None where it is unknown or has no meaning.
     """
 
     method: str
@@ -92,6 +119,7 @@ class PredictionInfo:
     curves: dict[str, list[float]] = field(default_factory=dict)
     model: str | None = None
     model_selection: ModelSelection | None = None
+    verdict: Trust | None = None
     primitives: int | None = None
     model_bytes: int | None = None
     iteration: int | None = None
@@ -164,6 +192,11 @@ def write_visibility(root: Path, visibility: Float[np.ndarray, "H W"]) -> None:
     write_exr(root / VISIBILITY, {VISIBILITY_CHANNEL: visibility.astype(np.float32)})
 
 
+def write_inverse_distance(root: Path, inverse_distance: Float[np.ndarray, "H W"]) -> None:
+    """Write 1/D of every direction from the origin, in 1/scene units and 0 for infinitely far, as a lat-long map."""
+    write_exr(root / INVERSE_DISTANCE, {INVERSE_DISTANCE_CHANNEL: inverse_distance.astype(np.float32)})
+
+
 def write_test_view(root: Path, frame: Frame, view: View) -> None:
     """Write the prediction of one test view."""
     write_view(prediction_frame(root, frame), view)
@@ -211,3 +244,9 @@ def read_visibility(root: Path) -> Float[np.ndarray, "H W"] | None:
     if not path.exists():
         return None
     return stack_channels(read_exr(path), (VISIBILITY_CHANNEL,), path)[..., 0]
+
+
+def read_inverse_distance(root: Path) -> Float[np.ndarray, "H W"] | None:
+    """Read 1/D of every direction; None when the method wrote none, which means infinitely far."""
+    path = root / INVERSE_DISTANCE
+    return read_inverse_distance_map(path) if path.exists() else None

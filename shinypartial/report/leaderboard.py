@@ -46,11 +46,24 @@ def leaderboard_csv(groups: Iterable[Group]) -> str:
     paths = list(dict.fromkeys(row.path for entry in entries for row in entry.rows))
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    facts = ["dataset", "dataset_hash", "protocol", "method", "folder", "seconds", "parameters", "hardware"]
+    facts = [
+        "dataset",
+        "dataset_hash",
+        "protocol",
+        "method",
+        "folder",
+        "seconds",
+        "parameters",
+        "hardware",
+        "verdict",
+        "risk",
+    ]
     writer.writerow([*facts, *paths])
     for entry in entries:
         values = {row.path: row.value for row in entry.rows}
         made = [entry.info.method, entry.folder, entry.seconds or "", entry.parameters or "", entry.info.hardware_text]
+        verdict = entry.info.verdict
+        made += ["", ""] if verdict is None else [verdict.verdict, "" if verdict.risk is None else verdict.risk]
         compared = [entry.scores.dataset, entry.scores.dataset_hash, entry.scores.protocol]
         writer.writerow([*compared, *made, *("" if values.get(path) is None else values[path] for path in paths)])
     return stream.getvalue()

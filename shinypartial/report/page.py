@@ -59,6 +59,7 @@ SUMMARY = (
     ("environment", "environment.as_predicted.full"),
     ("  resolved", "environment.as_predicted.resolved"),
     ("  perceptual", "environment.perceptual"),
+    ("  distance", "surroundings"),
     ("normals", "normals"),
     ("renders", "render"),
     ("visibility", "calibration"),
@@ -154,6 +155,8 @@ def summary_lines(prediction: Path) -> list[str]:
     lines = [f"{info.method} on {scores.dataset}, protocol {scores.protocol}"]
     if not scores.dataset_hash_matches:
         lines.append("  warning       the prediction was made from another version of this dataset")
+    if info.verdict:
+        lines.append(f"  {'verdict':13s} {info.verdict.sentence()}")
     for title, group in SUMMARY:
         shown = [rows[key.path] for key in key_metrics("summary") if key.group == group and key.path in rows]
         parts = [

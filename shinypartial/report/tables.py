@@ -19,6 +19,7 @@ GROUPS = (
     ("environment.unweighted", "Environment as a plain picture"),
     ("environment.perceptual", "Environment, perceptual"),
     ("environment", "Global exposure"),
+    ("surroundings", "How far the surroundings are, over directions that training views see"),
     ("", "Dataset"),
 )
 PAPER_GROUPS = (

@@ -1,8 +1,8 @@
 """Scene recipes: `blender_scenes/NAME/scene.toml` read into frozen dataclasses, strictly.
 
-`shapes` and `spec` say what a recipe may hold and in which range, `check` refuses values that contradict each other,
-and `recipes` finds, loads and varies scenes. The same checks hold for values that the command
-line overrides. May import trajectory and the core below it; never dataset, blender or bpy.
+`shapes`, `room` and `spec` say what a recipe may hold and in which range, `check` refuses values that contradict each
+other, and `recipes` finds, loads and varies scenes. The same checks hold for values that the command line overrides.
+May import trajectory and the core below it; never dataset, blender or bpy.
 """
 
 from shinypartial.scene.recipes import (
@@ -16,6 +16,7 @@ from shinypartial.scene.recipes import (
     scene_names,
     variant_name,
 )
+from shinypartial.scene.room import Room
 from shinypartial.scene.shapes import (
     Assembly,
     BlendFile,
@@ -40,6 +41,7 @@ from shinypartial.scene.spec import (
     STUDIO_LIGHTS,
     Deformation,
     FileWorld,
+    Operator,
     Render,
     SceneSpec,
     StudioWorld,
@@ -58,11 +60,13 @@ __all__ = [
     "FileWorld",
     "Frame",
     "Material",
+    "Operator",
     "Part",
     "Plane",
     "RadialHarmonics",
     "Render",
     "Ring",
+    "Room",
     "SceneSpec",
     "Shape",
     "SoftBalls",

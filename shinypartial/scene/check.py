@@ -4,9 +4,12 @@ import math
 from dataclasses import dataclass
 from itertools import pairwise
 
+import numpy as np
+
 from shinypartial.core.errors import InputError
+from shinypartial.core.trajectory import path_offsets
 from shinypartial.scene.shapes import Assembly, BlendFile, Frame, Part, Plane, SoftBalls, SurfaceOfRevolution, Tube
-from shinypartial.scene.spec import SceneSpec
+from shinypartial.scene.spec import Operator, SceneSpec, World
 
 
 @dataclass(frozen=True)
@@ -42,9 +45,39 @@ def check_scene(spec: SceneSpec, place: Place) -> None:
             .error("cameras outside the object", f"{spec.camera.radius}, but {reach}")
         )
     around = max([spec.extent, *(spec.scale * part.extent for part in spec.props)])
-    if spec.world.distance is not None and spec.world.distance <= around:
-        found = f"{spec.world.distance}, but {reach}, and what stands around it {around:.3g}"
-        raise place.below("world").below("distance").error("surroundings that enclose the object", found)
+    _check_room(spec, around, place.below("world"))
+    if spec.camera.focus_distance is not None and spec.camera.f_number is None:
+        found = f"{spec.camera.focus_distance} for a pinhole"
+        raise place.below("camera").below("focus_distance").error("an f_number with it", found)
+    if spec.operator:
+        _check_operator(spec, spec.operator, around, place.below("operator"))
+
+
+def _check_room(spec: SceneSpec, around: float, place: Place) -> None:
+    world = spec.world
+    if world.distance is not None and world.distance_radii is not None:
+        raise place.below("distance").error("a distance in scene units or in object radii", "both")
+    if spec.room is None and world.room != World.room:
+        raise place.below("room").error("a distance of its walls", "none")
+    if world.room != "box" and world.proportions != World.proportions:
+        raise place.below("proportions").error('the room "box" with them', f'"{world.room}"')
+    if spec.room and spec.room.distance <= around:
+        key = "distance" if world.distance_radii is None else "distance_radii"
+        found = f"{spec.room.distance:.3g}, but the object and what stands around it reach {around:.3g} from the origin"
+        raise place.below(key).error("surroundings that enclose the object", found)
+
+
+def _check_operator(spec: SceneSpec, operator: Operator, around: float, place: Place) -> None:
+    """The figures at all cameras must stand inside the room and beside the object."""
+    cameras = np.array(spec.camera.target) + path_offsets(spec.camera, spec.camera.train + spec.camera.test)
+    width, _ = operator.body_radii
+    standing = operator.height - operator.head_radius
+    feet = cameras - [0.0, 0.0, standing]
+    if spec.room and not spec.room.holds(np.concatenate([cameras, feet]), width):
+        raise place.below("height").error("a figure that the room holds at every camera", f"{operator.height}")
+    nearest = cameras - np.clip(cameras[:, 2:], 0, standing) * [0.0, 0.0, 1.0]
+    if np.linalg.norm(nearest, axis=-1).min() - width <= around:
+        raise place.below("height").error("a figure that stands beside the object", f"{operator.height}")
 
 
 def _check_object(spec: SceneSpec, place: Place) -> None:

@@ -1,7 +1,7 @@
 """Find scenes, load them, and vary them as the command line asks."""
 
-import dataclasses
 import tomllib
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from shinypartial.core.trajectory import SWEPT_PATHS
 from shinypartial.io.records import read_record
 from shinypartial.scene.check import Place, check_scene
 from shinypartial.scene.shapes import BlendFile, Material
-from shinypartial.scene.spec import DEVELOPMENT, HELD_OUT, STUDIO_LIGHTS, FileWorld, SceneSpec
+from shinypartial.scene.spec import DEVELOPMENT, HELD_OUT, STUDIO_LIGHTS, FileWorld, SceneSpec, World
 
 SCENES = Path(__file__).resolve().parents[2] / "blender_scenes"
 RECIPE = "scene.toml"
@@ -21,6 +21,13 @@ ADDED_KEYS = {
     "stretch": [1.0, 1.0, 1.0],
     "turn_deg": [0.0, 0.0, 0.0],
     "offset": [0.0, 0.0, 0.0],
+    "distance_radii": None,
+    "room": "sphere",
+    "proportions": [1.6, 1.3, 1.0],
+    "operator": None,
+    "f_number": None,
+    "focus_distance": None,
+    "motion_deg": 0.0,
 }
 
 
@@ -72,10 +79,10 @@ def load_scene(scene: str) -> SceneSpec:
     remedy = "Correct the path; it is relative to the folder of scene.toml."
     if isinstance(spec.world, FileWorld):
         file = _require(path.parent / spec.world.path, ".exr", f"`world.path` of {path} to name an EXR file", remedy)
-        spec = dataclasses.replace(spec, world=dataclasses.replace(spec.world, path=str(file)))
+        spec = replace(spec, world=replace(spec.world, path=str(file)))
     if isinstance(spec.object, BlendFile):
         file = _require(path.parent / spec.object.path, BLEND, f"`object.path` of {path} to name a .blend file", remedy)
-        spec = dataclasses.replace(spec, object=dataclasses.replace(spec.object, path=str(file)))
+        spec = replace(spec, object=replace(spec.object, path=str(file)))
     return spec
 
 
@@ -112,6 +119,11 @@ def override(
     exposure: float | None = None,
     world: str | None = None,
     surroundings_distance: float | None = None,
+    surroundings_radii: float | None = None,
+    surroundings_room: str | None = None,
+    surroundings_proportions: tuple[float, float, float] | None = None,
+    operator_height: float | None = None,
+    operator_radiance: float | None = None,
     roughness: float | None = None,
     base_color: tuple[float, float, float] | None = None,
     metallic: float | None = None,
@@ -124,16 +136,23 @@ def override(
     `world` is the name of a studio light or the path of an EXR file. A value of the material changes the scene's
     material; where a Blender file's own materials were kept, a mirror with that value takes their place.
     """
-    table = dataclasses.asdict(spec)
+    table = asdict(spec)
     if world is not None:
-        table["world"] = _world_table(world) | {key: table["world"][key] for key in ("strength", "distance")}
+        table["world"] = _world_table(world) | {each.name: table["world"][each.name] for each in fields(World)}
+    if surroundings_distance is not None or surroundings_radii is not None:
+        table["world"] |= {"distance": surroundings_distance, "distance_radii": surroundings_radii}
+    if table["operator"] is None and (operator_height, operator_radiance) != (None, None):
+        table["operator"] = {}
     if table["material"] is None and (roughness, base_color, metallic) != (None, None, None):
-        table["material"] = dataclasses.asdict(Material())
+        table["material"] = asdict(Material())
     for section, key, value in (
         ("render", "resolution", resolution),
         ("render", "samples", samples),
         ("render", "exposure", exposure),
-        ("world", "distance", surroundings_distance),
+        ("world", "room", surroundings_room),
+        ("world", "proportions", surroundings_proportions),
+        ("operator", "height", operator_height),
+        ("operator", "radiance", operator_radiance),
         ("material", "roughness", roughness),
         ("material", "base_color", base_color),
         ("material", "metallic", metallic),
@@ -156,25 +175,34 @@ def variant_name(original: SceneSpec, varied: SceneSpec) -> str:
 
     What else the camera and the sampling have is left out: the recipe in the folder keeps such runs apart.
     """
-    path = [varied.camera.path] if varied.camera.path != original.camera.path else []
-    words = [varied.name, *path, str(varied.render.resolution)]
-    if varied.world != original.world:
-        same_map = dataclasses.replace(varied.world, distance=original.world.distance) == original.world
-        words += [] if same_map else [Path(_world_name(varied)).stem]
-        words += [f"distance{varied.world.distance:g}"] if varied.world.distance != original.world.distance else []
-    if varied.material and varied.material != original.material:
-        before = original.material or Material()
-        color = "-".join(f"{channel:g}" for channel in varied.material.base_color)
-        words += [f"color{color}"] if varied.material.base_color != before.base_color else []
-        words += [f"metallic{varied.material.metallic:g}"] if varied.material.metallic != before.metallic else []
-        changed = original.material is None or varied.material.roughness != before.roughness
-        words += [f"roughness{varied.material.roughness:g}"] if changed else []
-    if varied.deformation != original.deformation:
-        words.append(f"deformation{varied.deformation.amplitude:g}")
-    words += [f"scale{varied.scale:g}"] if varied.scale != original.scale else []
-    if varied.render.exposure != original.render.exposure:
-        words.append(f"exposure{varied.render.exposure:g}")
+    words = [varied.name, *_changes(original.camera, varied.camera, {"path": ""}), str(varied.render.resolution)]
+    before, after = original.world, varied.world
+    if replace(after, **{each.name: getattr(before, each.name) for each in fields(World)}) != before:
+        words.append(Path(_world_name(varied)).stem)
+    for old, new, labels in (
+        (before, after, {"distance": "distance", "distance_radii": "radii", "room": "", "proportions": "proportions"}),
+        (original.operator, varied.operator, {"height": "operator", "radiance": "radiance"}),
+        (original.camera, varied.camera, {"f_number": "f", "focus_distance": "focus", "motion_deg": "motion"}),
+        (original.material or Material(), varied.material, {"base_color": "color", "metallic": "metallic"}),
+        (original.material, varied.material, {"roughness": "roughness"}),
+        (original.deformation, varied.deformation, {"amplitude": "deformation"}),
+        (original, varied, {"scale": "scale"}),
+        (original.render, varied.render, {"exposure": "exposure"}),
+    ):
+        words += _changes(old, new, labels)
     return "-".join(words)
+
+
+def _changes(before: Any, after: Any, labels: dict[str, str]) -> list[str]:
+    """A word for each of these fields that was given another value: its label and that value."""
+    values = [(label, getattr(before, key, None), getattr(after, key, None)) for key, label in labels.items()]
+    return [label + _word(new) for label, old, new in values if new not in (None, old)]
+
+
+def _word(value: Any) -> str:
+    if isinstance(value, tuple):
+        return "-".join(map(_word, value))
+    return value if isinstance(value, str) else f"{value:g}"
 
 
 def older_recipe(recipe: Any) -> Any:

@@ -9,7 +9,8 @@ from typing import Annotated, Any, Literal, get_args
 from shinypartial.core.trajectory import CameraPath, Seed, limits
 from shinypartial.io.files import sha256_of
 from shinypartial.io.records import Text
-from shinypartial.scene.shapes import Assembly, BlendFile, Material, Part, Shape
+from shinypartial.scene.room import Room, RoomShape
+from shinypartial.scene.shapes import Assembly, BlendFile, Length, Material, Part, Shape
 
 FORMAT_VERSION = 1
 #: What a scene may be used for: anything is chosen by its scores, or nothing ever is.
@@ -20,19 +21,31 @@ StudioLight = Literal["city", "courtyard", "forest", "interior", "night", "studi
 STUDIO_LIGHTS = get_args(StudioLight)
 
 
+@dataclass(frozen=True, kw_only=True)
+class World:
+    """How strong the light is and how far away; infinitely far where neither kind of distance is given."""
+
+    strength: Annotated[float, limits(0.0, 1e4)] = 1.0
+    distance: Annotated[float, limits(1e-3, 1e6)] | None = None
+    """From the origin to the nearest wall of the room that carries the map, in scene units."""
+    distance_radii: Annotated[float, limits(1.0, 1e6)] | None = None
+    """The same in object radii, `SceneSpec.extent`."""
+    room: RoomShape = "sphere"
+    """Shape of the room about the origin."""
+    proportions: tuple[Length, Length, Length] = (1.6, 1.3, 1.0)
+    """Of a box along X, Y and Z; the nearest walls are those of the shortest side."""
+
+
 @dataclass(frozen=True)
-class StudioWorld:
+class StudioWorld(World):
     """One of the eight CC0 environment maps that Blender brings along."""
 
     name: StudioLight
     kind: str = "studiolight"
-    strength: Annotated[float, limits(0.0, 1e4)] = 1.0
-    distance: Annotated[float, limits(1e-3, 1e6)] | None = None
-    """Radius of the sphere about the origin that carries the map; infinitely far when not given."""
 
 
 @dataclass(frozen=True)
-class FileWorld:
+class FileWorld(World):
     """A linear lat-long EXR in the world frame (+Z up, image center along +X)."""
 
     path: Text
@@ -42,9 +55,29 @@ class FileWorld:
     source: Text
     """Where the file comes from, copied into the dataset."""
     kind: str = "file"
-    strength: Annotated[float, limits(0.0, 1e4)] = 1.0
-    distance: Annotated[float, limits(1e-3, 1e6)] | None = None
-    """Radius of the sphere about the origin that carries the map; infinitely far when not given."""
+
+
+@dataclass(frozen=True)
+class Operator:
+    """Who holds the camera: an upright figure with the camera before its eyes, which only reflections show.
+
+    The head is a sphere about the camera, the body an ellipsoid below it.
+    """
+
+    height: Length
+    """From the feet to the top of the head, in scene units."""
+    radiance: Annotated[float, limits(0.0, 1e4)] = 0.02
+    """Gray light that the figure gives off everywhere alike; `Render.exposure` multiplies it as it does the world's."""
+
+    @property
+    def head_radius(self) -> float:
+        """A fourteenth of the height."""
+        return self.height / 14
+
+    @property
+    def body_radii(self) -> tuple[float, float]:
+        """Half the width of the body, a seventh of the figure's height, and half of its length up to the head."""
+        return self.height / 7, self.height / 2 - self.head_radius
 
 
 @dataclass(frozen=True)
@@ -95,6 +128,7 @@ class SceneSpec:
     scale: Annotated[float, limits(1e-3, 1e3)] = 1.0
     """Enlarges object and props about the origin."""
     camera: CameraPath = CameraPath()
+    operator: Operator | None = None
     render: Render = Render()
     format: Annotated[int, limits(FORMAT_VERSION, FORMAT_VERSION)] = FORMAT_VERSION
 
@@ -107,6 +141,18 @@ class SceneSpec:
     def extent(self) -> float:
         """Distance from the origin that the object does not exceed; displacements reach three times their RMS."""
         return self.scale * (self.object.extent + 3 * self.deformation.amplitude)
+
+    @property
+    def room(self) -> Room | None:
+        """The room that carries the world; None where light comes from infinitely far."""
+        world = self.world
+        distance = world.distance if world.distance_radii is None else world.distance_radii * self.extent
+        return None if distance is None else Room(world.room, distance, world.proportions)
+
+    @property
+    def mirrors_directions(self) -> bool:
+        """Whether what a perfect mirror shows depends on direction alone, and a pixel on one point of view."""
+        return self.room is None and self.operator is None and self.camera.is_ideal
 
     def recipe(self) -> dict[str, Any]:
         """The specification as JSON holds it; files are named by their content, so that they may move."""

@@ -15,8 +15,9 @@ from panoless.presets import PRESETS
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
 from shinypartial.io.records import write_record
+from shinypartial.prediction.format import read_info
 
-TUNED = ("first_surface", "plane", "height_field", "revolution", "footprint_map", "selection")
+TUNED = ("first_surface", "plane", "height_field", "revolution", "footprint_map", "selection", "trust")
 TINY = ["--config.iterations", "4", "--config.surfels.count", "40", "--config.surfels.hull-resolution", "24"]
 MODELS = get_args(get_args(get_type_hints(FitConfig, include_extras=True)["model"])[0])
 
@@ -150,7 +151,11 @@ def test_options_reach_the_fit_and_are_saved(
     assert saved["loss"]["lambda_ssim"] == 0.25
     assert saved["density"]["enabled"] is False
     assert saved["environment"]["activation"] == "sigmoid"
-    assert "Next: shinypartial evaluate predictions" in capsys.readouterr().out
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.startswith("Next: shinypartial evaluate predictions") for line in lines)
+    verdict = read_info(folder).verdict
+    assert verdict is not None
+    assert lines[-1] == f"Verdict: {verdict.sentence()}"
 
 
 def test_the_newest_folder_is_taken_where_none_is_named(

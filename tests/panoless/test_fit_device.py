@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from panoless.config import FitConfig
+from panoless.environment import fill
 from panoless.environment import solve as cubemap
 from panoless.geometry.plane.model import plane_buffers, unoccluded_share
 from panoless.kernels import backend
@@ -21,10 +22,11 @@ from tests.support.second_device import second_device
 
 @pytest.fixture
 def definition_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both devices compute by the definition, in few rounds."""
+    """Both devices compute by the definition, in few rounds and sweeps."""
     monkeypatch.setattr(backend, "_fastest", lambda dtype, device: "reference")
     monkeypatch.setattr(cubemap, "ROBUST_SCALES", (None,))
     monkeypatch.setattr(cubemap, "REFINING_SCALES", (0.05,))
+    monkeypatch.setattr(fill, "RELAXED_TEXELS", 16)
 
 
 def shortest_config(preset: str) -> FitConfig:
@@ -61,7 +63,14 @@ def test_a_fit_on_another_device_mixes_nothing_and_ends_the_same(
 
 def test_the_same_kind_is_chosen_on_another_device(tmp_path: Path, definition_only: None) -> None:
     dataset = make_plane_dataset(tmp_path / "plane", plane_of(RECTANGLE), size=48, train=4, test=1)
-    config = replace(shortest_config("default"), model="auto")
+    config = shortest_config("default")
+    rounds = tuple(replace(each, resolution=8, steps=1) for each in config.height_field.rounds[-2:])
+    config = replace(
+        config,
+        model="auto",
+        selection=replace(config.selection, trial_resolution=8),
+        height_field=replace(config.height_field, cells=8, rounds=rounds),
+    )
     here = fit(dataset, config, tmp_path / "here")
     with second_device() as device:
         there = fit(dataset, config, tmp_path / "there", device=device)

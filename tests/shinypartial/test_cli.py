@@ -16,6 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = (
     "generate",
     "subset",
+    "perturb",
     "validate",
     "evaluate",
     "report",

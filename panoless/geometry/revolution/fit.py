@@ -14,7 +14,7 @@ from torch.nn.functional import avg_pool2d
 
 from panoless.capture.views import TrainView, Views, split_held_out
 from panoless.geometry.revolution.floor import fit_floor, floor_pixels
-from panoless.geometry.revolution.footprints import informative_pixels, refine_by_footprints
+from panoless.geometry.revolution.footprints import has_edges, informative_pixels, refine_by_footprints
 from panoless.geometry.revolution.interior import end_pixels, search_interior
 from panoless.geometry.revolution.lip import clear_of_lip, lip_pixels, open_at_lip, place_lip, refine_lip
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_buffers
@@ -201,15 +201,16 @@ class _Refinement:
         return solve_map(views, surface, own.map_rays, own.rounds[-1].resolution, environment)
 
     def refine_areas(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
-        """Grooves and edges, by pixels as areas."""
+        """Grooves and edges, by pixels as areas, where there are any."""
         return self._keep_areas(surface, surface, environment)
 
     def _keep_areas(
         self, surface: SurfaceOfRevolution, start: SurfaceOfRevolution, environment: Tensor
     ) -> SurfaceOfRevolution:
-        views = clear_of_lip(self.kept, start, self.options.lip).train
-        candidate = refine_by_footprints(views, self.contours, start, environment, self.options)
-        own = self.options.footprints
+        views, own = clear_of_lip(self.kept, start, self.options.lip), self.options.footprints
+        if not has_edges(views, start, self.pixel, own):
+            return start
+        candidate = refine_by_footprints(views.train, self.contours, start, environment, self.options)
         held_out = informative_pixels(self.held_out.train, start, own.pixels // 4, self.pixel, own)
         return self.keep_if_better(surface, candidate, PixelBundles.of(held_out), environment)
 

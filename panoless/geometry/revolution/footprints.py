@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from panoless.capture.rays import pixel_rays
-from panoless.capture.views import TrainView
+from panoless.capture.views import TrainView, Views, every_kth_pixel
 from panoless.geometry.revolution.lip import place_lip
 from panoless.geometry.revolution.model import SurfaceOfRevolution
 from panoless.geometry.revolution.options import DEFAULTS, FootprintOptions, RevolutionOptions
@@ -44,6 +44,17 @@ def informative_pixels(
     shares = (options.curved_share, 1 - options.curved_share)
     kept = [each * count / max(total, 1) for each, total in zip(shares, counts, strict=True)]
     return [(view, pixels[generator.random(len(pixels)) < np.where(turns, *kept)]) for view, pixels, turns in found]
+
+
+def has_edges(
+    views: Views, surface: SurfaceOfRevolution, pixel: float, options: FootprintOptions = DEFAULTS.footprints
+) -> bool:
+    """Whether enough pixels see an edge or a groove."""
+    edges, count, total = _curved_sides(surface, pixel, options.edge_rad), 0, 0
+    for view, pixels in every_kth_pixel(views, options.counted_pixels):
+        hits = surface.hits(*pixel_rays(view.camera, pixels.cpu().numpy()))
+        count, total = count + int((hits.met & edges[hits.side]).sum()), total + int(hits.met.sum())
+    return count > options.least_edge_share * total
 
 
 def _curved_sides(surface: SurfaceOfRevolution, pixel: float, curved_rad: float) -> Bool[np.ndarray, "S"]:

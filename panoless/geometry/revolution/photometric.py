@@ -276,7 +276,9 @@ def refine_round(
 
     here = evaluate(surface)
     for _ in range(each.steps):
-        before, here = here, advance(here)
+        settled = settle(here.surface)
+        before = here if settled is here.surface else evaluate(settled)
+        here = advance(before)
         if here.cost > (1 - options.least_fall) * before.cost:
             break
     return here.surface

@@ -10,23 +10,35 @@ from panoless.numeric.bspline import cubic_bsplines_at
 
 LEAST_CORNER_SINE = 0.5
 """A vertex whose sides turn by more than half a right angle or so is a corner: it moves to where both sides move."""
+UNEVEN = 0.3
+"""Share of the mean length by which sides may differ before a profile is sampled anew."""
 LARGEST_SHIFT_SIDES = 1.5
 """A vertex moves by at most this many lengths of a side in one step, or the profile could fold."""
 
 
 def resample_profile(surface: SurfaceOfRevolution, spacing: float) -> SurfaceOfRevolution:
-    """The same surface with vertices about `spacing` apart outside and inside; base and lip stay where they are."""
+    """The same surface with vertices about `spacing` apart outside and inside; base and lip stay where they are.
+
+    A part whose vertices are nearly so is left alone: sampling anew cuts its corners.
+    """
     outer, inner = surface.profile[1 : surface.lip + 1], surface.profile[surface.lip :]
-    outer, inner = _even(outer, spacing), _even(inner, spacing)
+    even = [_even(part, spacing) for part in (outer, inner)]
+    if all(each is part for each, part in zip(even, (outer, inner), strict=True)):
+        return surface
+    outer, inner = even
     profile = np.concatenate([[[0.0, outer[0, 1]]], outer, inner[1:]])
     return replace(surface, profile=profile, lip=len(outer))
 
 
 def _even(points: Float[np.ndarray, "N 2"], spacing: float) -> Float[np.ndarray, "M 2"]:
-    """A polyline at equal steps of its length."""
+    """A polyline at equal steps of its length; itself where its steps are nearly equal."""
     if len(points) < 2:
         return points
-    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    pieces = max(int(np.ceil(steps.sum() / spacing)), 1)
+    if (np.abs(steps * pieces / max(steps.sum(), 1e-12) - 1) < UNEVEN).all() and len(steps) == pieces:
+        return points
+    length = np.append(0.0, np.cumsum(steps))
     where = np.linspace(0, length[-1], max(int(np.ceil(length[-1] / spacing)), 1) + 1)
     kept = np.append(True, np.diff(length) > 1e-12)
     return np.stack([np.interp(where, length[kept], column[kept]) for column in points.T], 1)

@@ -24,8 +24,9 @@ from shinypartial.core.conventions import PIXEL_CENTER
 
 REACH = 1.5
 TALLEST = 1.05
-JUDGED_SCALE_PX = 2.0
 """The normalized object lies in the unit ball; rays are followed a little beyond."""
+JUDGED_SCALE_PX = 2.0
+"""Scale s of the errors e²/(e² + s²) by which starts are compared."""
 
 
 @dataclass(frozen=True)

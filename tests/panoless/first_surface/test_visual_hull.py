@@ -16,8 +16,8 @@ from panoless.kernels.rasterize import RasterCamera
 
 RADIUS = 0.6
 CENTER = np.array([0.05, -0.1, 0.08])
-SIDE = 192
-RESOLUTION = 48
+SIDE = 128
+RESOLUTION = 32
 VOXEL = 2 * HULL_HALF_SIDE / (RESOLUTION - 1)
 SAMPLES = 4
 

@@ -330,6 +330,8 @@ def test_a_fit_loads_neither_metrics_nor_blender(tmp_path: Path, sphere_dataset:
         "assert not found, found; sys.exit(code)"
     )
     options = ["--config.iterations", "3", "--config.surfels.count", "50", "--config.surfels.hull-resolution", "24"]
+    options += ["--config.environment.resolution", "16", "--config.environment.solve-resolution", "16"]
+    options += ["--set", "selection.trial_resolution=16"]
     command = [sys.executable, "-c", program, "fit", str(sphere_dataset.root), "--output", "out", *options]
     environment = {
         "PYTHONPATH": str(ROOT),

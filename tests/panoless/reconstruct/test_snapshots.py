@@ -231,11 +231,12 @@ def test_marks_in_seconds_come_once_however_often_the_fit_is_killed(tmp_path: Pa
 
 
 def test_a_finished_run_without_snapshots_says_so(tmp_path: Path, sphere_dataset: Dataset) -> None:
-    fit(sphere_dataset, CONFIG, tmp_path / "run")
+    config = tiny_config(iterations=4, count=40)
+    fit(sphere_dataset, config, tmp_path / "run")
     with pytest.raises(InputError, match="ran without"):
-        fit(sphere_dataset, CONFIG, tmp_path / "run", MARKS)
+        fit(sphere_dataset, config, tmp_path / "run", snapshot_schedule(2, (), config.iterations))
     with pytest.raises(InputError, match="--snapshots"):
-        export_snapshots(sphere_dataset, tmp_path / "run", CONFIG, tmp_path / "prediction")
+        export_snapshots(sphere_dataset, tmp_path / "run", config, tmp_path / "prediction")
 
 
 def test_the_commands_take_and_export_snapshots(

@@ -26,6 +26,7 @@ from panoless.reconstruct.state import (
 )
 from panoless.selection.candidates import Candidate, Selection, Verdict
 from shinypartial.core.errors import InputError
+from shinypartial.prediction.format import Trust
 from tests.support.mirror_height_field import bumpy
 from tests.support.mirror_plane import L_SHAPE, plane_of
 from tests.support.mirror_revolution import around, funnel, goblet, rays_of
@@ -51,6 +52,7 @@ def some_state(final: bool, geometry: Geometry | None = None) -> FitState:
         seconds={"optimize": 1.5},
         curves={"loss": [3.0, 2.0]},
         peak_memory_bytes=10,
+        verdict=Trust("partly", "a reason", "a remedy", 1.5, {"unexplained": 0.3}) if final else None,
     )
 
 
@@ -71,7 +73,7 @@ def test_a_state_survives_the_disk(tmp_path: Path, final: bool) -> None:
     torch.testing.assert_close(loaded.geometry.surfels.named(), state.geometry.surfels.named(), rtol=0, atol=0)
     assert not loaded.geometry.curved
     np.testing.assert_array_equal(loaded.frame.center, state.frame.center)
-    for name in ("selection", "seconds", "curves", "peak_memory_bytes", "iteration", "device"):
+    for name in ("selection", "seconds", "curves", "peak_memory_bytes", "iteration", "device", "verdict"):
         assert getattr(loaded, name) == getattr(state, name), name
     assert loaded.training is not None
     assert state.training is not None

@@ -23,8 +23,27 @@ from tests.support.mirror_plane import NORMAL, RECTANGLE, arc, make_plane_datase
 from tests.support.mirror_revolution import around, goblet, pillar_views, revolution_views
 from tests.support.mirror_sphere import tiny_config
 
-CONFIG = replace(tiny_config(iterations=200, count=200), model="auto")
 SIZE_PX = 64
+
+
+def coarse_config() -> FitConfig:
+    """As few surfels and steps as tell kinds apart, and maps as coarse as views of these few pixels resolve."""
+    config = tiny_config(iterations=200, count=200)
+    photometric, footprints = config.revolution.photometric, config.revolution.footprints
+    return replace(
+        config,
+        model="auto",
+        selection=replace(config.selection, trial_resolution=32),
+        height_field=replace(config.height_field, rounds=config.height_field.rounds[:3]),
+        revolution=replace(
+            config.revolution,
+            photometric=replace(photometric, coarse=photometric.coarse[:1], fine=photometric.fine[:1]),
+            footprints=replace(footprints, rounds=footprints.rounds[:2]),
+        ),
+    )
+
+
+CONFIG = coarse_config()
 
 
 def framed(frame_height: float, bend: float = 0.0) -> Views:
@@ -120,7 +139,7 @@ def test_surfels_that_cover_nothing_do_not_beat_the_plane() -> None:
 
 def test_a_box_is_refused_by_its_silhouettes() -> None:
     """Before anything is fitted, as plane and as surface of revolution; the table says how far away they are."""
-    geometry, selection = choose_geometry(pillar_views(around(16)), CONFIG, no_trial)
+    geometry, selection = choose_geometry(pillar_views(around(10, SIZE_PX)), CONFIG, no_trial)
     assert geometry.kind == "surfels"
     refused = Verdict.REFUSED_BY_SILHOUETTES, Verdict.NOT_PROPOSED
     assert all(verdicts(selection)[kind] in refused for kind in ("plane", "height_field", "revolution"))
@@ -131,7 +150,7 @@ def test_a_box_is_refused_by_its_silhouettes() -> None:
 
 def test_a_fit_remembers_why_it_took_surfels() -> None:
     """The table becomes part of the state, from which it goes into the prediction."""
-    state = begin(pillar_views(around(16)), CONFIG)
+    state = begin(pillar_views(around(10, SIZE_PX)), CONFIG)
     assert state.selection.chosen == state.geometry.kind == "surfels"
     assert [each.kind for each in state.selection.candidates] == ["plane", "height_field", "revolution", "surfels"]
     assert state.training is not None
@@ -139,7 +158,7 @@ def test_a_fit_remembers_why_it_took_surfels() -> None:
 
 def test_a_goblet_takes_the_surface_of_revolution() -> None:
     """Surfels that only start on it explain no more."""
-    geometry, selection = choose_geometry(revolution_views(goblet(), around(12)), CONFIG, as_started)
+    geometry, selection = choose_geometry(revolution_views(goblet(), around(12, SIZE_PX)), CONFIG, as_started)
     assert geometry.kind == "revolution"
     assert selection.candidates[-1].reason == "surfels are no better"
 

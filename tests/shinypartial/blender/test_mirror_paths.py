@@ -211,6 +211,10 @@ FALLBACKS = {
     "tinted": {"base_color": (0.9, 1.0, 1.0)},
     "no metal": {"metallic": 0.5},
     "near room": {"surroundings_distance": 5.0},
+    "near box": {"surroundings_radii": 5.0, "surroundings_room": "box"},
+    "operator": {"operator_height": 1.0},
+    "aperture": {"f_number": 2.8},
+    "motion": {"motion_deg": 1.0},
     "many samples": {"samples": MOST_SAMPLES_OF_MIRRORS + 1},
 }
 

@@ -15,6 +15,7 @@ from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import open_dataset
 from shinypartial.dataset.schema import CHECKSUMS, Dataset, Frame
 from shinypartial.dataset.validate import validate
+from shinypartial.dataset.write import write_inverse_distance
 from shinypartial.io.files import sha256_of
 from shinypartial.io.images import read_exr, read_exr_rgb, read_png, write_exr, write_exr_rgb, write_png
 
@@ -90,6 +91,11 @@ def add_self_reflection(value: float) -> Callable[[Path], None]:
     return edit_frame(lambda c: c.update({"self_reflection.V": np.full_like(c["A"], value)}))
 
 
+def add_inverse_distance(inverse_distance: np.ndarray) -> Callable[[Path], None]:
+    """A map that says how far the surroundings are, in a dataset that doesn't say how large its object is."""
+    return lambda root: write_inverse_distance(root, inverse_distance)
+
+
 def turn_inside_out(channels: dict[str, np.ndarray]) -> None:
     """Normals that point away from the camera."""
     for axis in "XYZ":
@@ -106,6 +112,7 @@ def half_normals(channels: dict[str, np.ndarray]) -> None:
     channels["normal.X"] = channels["normal.X"].astype(np.float16)
 
 
+INVERSE_DISTANCE = "environment/inverse_distance.exr"
 TRAIN = "transforms_train.json"
 DAMAGES = {
     "no self-reflection": (
@@ -187,6 +194,15 @@ DAMAGES = {
     "no face": (remove("environment/cube/px.exr"), "environment/cube/px.exr", "no such file"),
     "mirrored face": (edit_map("cube/ny.exr", lambda m: m[:, ::-1]), "environment/cube/ny.exr", "differ"),
     "small face": (edit_map("cube/pz.exr", lambda m: m[::2, ::2]), "environment/cube/pz.exr", "texels"),
+    "no object radius": (add_inverse_distance(np.ones((32, 64))), "dataset.json", "object_radius"),
+    "negative distance": (add_inverse_distance(np.full((32, 64), -1.0)), INVERSE_DISTANCE, "lowest value -1"),
+    "distance without end": (add_inverse_distance(np.full((32, 64), np.inf)), INVERSE_DISTANCE, "highest inf"),
+    "small map of distance": (add_inverse_distance(np.ones((16, 32))), INVERSE_DISTANCE, "64×32 texels"),
+    "near, but where": (
+        edit_json("dataset.json", lambda m: (m.update(format_minor=2), m["recipe"].update(world={"distance": 5.0}))),
+        INVERSE_DISTANCE,
+        "missing",
+    ),
     "no licenses": (remove("LICENSES.json"), "LICENSES.json", "no such file"),
     "empty licenses": (lambda r: (r / "LICENSES.json").write_text("[]"), "LICENSES.json", "row"),
     "license without source": (

@@ -14,18 +14,22 @@ import pytest
 
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import open_dataset, read_view
-from shinypartial.dataset.schema import Dataset
+from shinypartial.dataset.schema import MANIFEST, Dataset
 from shinypartial.dataset.write import write_environment
+from shinypartial.dataset.write import write_inverse_distance as write_true_inverse_distance
 from shinypartial.evaluation.evaluate import evaluate
 from shinypartial.evaluation.scores import read_scores, score_rows
 from shinypartial.evaluation.view_scores import pool_environment_normals, pool_normals, score_view
 from shinypartial.metrics import perceptual
 from shinypartial.metrics.registry import Direction
 from shinypartial.prediction.format import (
+    ENVIRONMENT,
     prediction_frame,
     read_info,
+    read_inverse_distance,
     write_environment_map,
     write_info,
+    write_inverse_distance,
     write_test_view,
     write_visibility,
 )
@@ -45,6 +49,13 @@ def no_lpips(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 @pytest.fixture
 def truth(tmp_path: Path, sphere_dataset: Dataset) -> Path:
     return write_truth_prediction(tmp_path / "truth", sphere_dataset)
+
+
+@pytest.fixture
+def truth_views(truth: Path) -> Path:
+    """Without the map, which takes the longest to score."""
+    (truth / ENVIRONMENT).unlink()
+    return truth
 
 
 def test_the_ground_truth_scores_perfectly(truth: Path) -> None:
@@ -68,13 +79,17 @@ def test_scores_are_strict_json_and_read_back_as_written(truth: Path) -> None:
     def refuse(constant: str) -> None:
         raise AssertionError(f"{constant} is not JSON")
 
-    json.loads((truth / "scores.json").read_text(), parse_constant=refuse)
+    content = json.loads((truth / "scores.json").read_text(), parse_constant=refuse)
     assert read_scores(truth) == scores
+    del content["surroundings"]  # As scores of a version that knew no distances.
+    (truth / "scores.json").write_text(json.dumps(content))
+    assert read_scores(truth) == scores
+    assert not any(row.path.startswith("surroundings") for row in score_rows(scores))
 
 
 def test_threads_change_no_score(truth: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     """Damaged, so that scores are no round numbers; views that finish in another order are pooled in theirs."""
-    write_environment_map(truth, np.random.default_rng(0).random((32, 64, 3)).astype(np.float32))
+    write_environment_map(truth, np.random.default_rng(0).random((256, 512, 3)).astype(np.float32))
     frame = sphere_dataset.test[0]
     view = read_view(frame)
     write_test_view(truth, frame, replace(view, radiance=view.radiance * 0.7))
@@ -152,7 +167,9 @@ def test_a_rotated_environment_has_the_analytic_loss(damaged_dataset: Path, tmp_
     assert scores.as_predicted.full.l1_linear == pytest.approx(amplitude * 2 / math.pi, rel=1e-3)
 
 
-def test_tilted_normals_have_their_tilt_as_error_and_holes_ninety_degrees(truth: Path, sphere_dataset: Dataset) -> None:
+def test_tilted_normals_have_their_tilt_as_error_and_holes_ninety_degrees(
+    truth_views: Path, sphere_dataset: Dataset
+) -> None:
     tilt = math.radians(7.0)
     solid = 0
     for frame in sphere_dataset.test:
@@ -163,20 +180,45 @@ def test_tilted_normals_have_their_tilt_as_error_and_holes_ninety_degrees(truth:
         across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
         tilted = normals * math.cos(tilt) + across * math.sin(tilt)
         solid += int((view.alpha > 0.99).sum())
-        write_test_view(truth, frame, replace(view, normals_world=tilted.astype(np.float32)))
-    normals_scores = evaluate(truth).normals
+        write_test_view(truth_views, frame, replace(view, normals_world=tilted.astype(np.float32)))
+    normals_scores = evaluate(truth_views).normals
     assert normals_scores is not None
     assert normals_scores.mean_angular_error_deg == pytest.approx(7.0, abs=1e-4)  # float32 normals: 1e-5°
     frame = sphere_dataset.test[0]
     view = read_view(frame)
-    write_test_view(truth, frame, replace(view, normals_world=np.zeros_like(view.normals_world)))
-    scores = evaluate(truth)
+    write_test_view(truth_views, frame, replace(view, normals_world=np.zeros_like(view.normals_world)))
+    scores = evaluate(truth_views)
     holes = int((view.alpha > 0.99).sum())
     assert scores.normals is not None
     assert scores.counts.normal_holes == holes
     assert scores.counts.normal_pixels == solid
     assert scores.normals.normal_coverage == pytest.approx(1 - holes / solid)
     assert scores.normals.mean_angular_error_deg == pytest.approx((7 * (solid - holes) + 90 * holes) / solid, abs=1e-4)
+
+
+def test_distance_is_scored_where_the_dataset_knows_it_and_counts_as_infinite_where_the_prediction_does_not(
+    damaged_dataset: Path, tmp_path: Path
+) -> None:
+    """A wall at 4 below and at 8 above, around an object of radius 2: the far world is wrong by 2/4 and 2/8."""
+    prediction = write_truth_prediction(tmp_path / "truth", open_dataset(damaged_dataset))
+    write_true_inverse_distance(
+        damaged_dataset, np.where(np.arange(32)[:, None] < 16, 1 / 8, 1 / 4) * np.ones((32, 64))
+    )
+    manifest = json.loads((damaged_dataset / MANIFEST).read_text())
+    manifest["statistics"] = {**manifest.get("statistics", {}), "object_radius": 2.0}
+    (damaged_dataset / MANIFEST).write_text(json.dumps(manifest))
+    far = evaluate(prediction, protocol="linear-v1").surroundings
+    assert far is not None
+    assert far.inverse_distance_error is not None
+    assert 0.25 < far.inverse_distance_error < 0.5, "Between both halves, by how much of each is observed."
+    write_inverse_distance(prediction, np.full((8, 16), 1 / 8))
+    half = evaluate(prediction, protocol="linear-v1").surroundings
+    assert half == read_scores(prediction).surroundings
+    assert half is not None
+    assert half.inverse_distance_error == pytest.approx(far.inverse_distance_error - 0.25, abs=1e-6)
+    write_inverse_distance(prediction, np.full((8, 16), -1.0))
+    with pytest.raises(InputError, match=r"1/D ≥ 0.*inverse_distance\.exr"):
+        read_inverse_distance(prediction)
 
 
 def test_a_plain_folder_is_scored_on_what_it_has(tmp_path: Path) -> None:
@@ -196,26 +238,26 @@ def test_a_dataset_without_test_views_is_scored_on_its_environment(damaged_datas
     assert {"normals", "render"} <= {entry.name for entry in scores.left_out}
 
 
-def test_another_version_of_the_dataset_is_flagged(truth: Path) -> None:
-    write_info(truth, replace(read_info(truth), dataset_hash="0" * 64))
-    assert not evaluate(truth).dataset_hash_matches
+def test_another_version_of_the_dataset_is_flagged(truth_views: Path) -> None:
+    write_info(truth_views, replace(read_info(truth_views), dataset_hash="0" * 64))
+    assert not evaluate(truth_views).dataset_hash_matches
 
 
-def test_an_explicit_dataset_replaces_the_stored_path(truth: Path, sphere_dataset: Dataset) -> None:
-    write_info(truth, replace(read_info(truth), dataset="no/such/folder"))
+def test_an_explicit_dataset_replaces_the_stored_path(truth_views: Path, sphere_dataset: Dataset) -> None:
+    write_info(truth_views, replace(read_info(truth_views), dataset="no/such/folder"))
     with pytest.raises(InputError, match=r"no/such/folder.*--dataset"):
-        evaluate(truth)
-    assert evaluate(truth, sphere_dataset.root).normals is not None
+        evaluate(truth_views)
+    assert evaluate(truth_views, sphere_dataset.root).normals is not None
 
 
-def test_a_missing_view_is_named(truth: Path, sphere_dataset: Dataset) -> None:
-    for path in prediction_frame(truth, sphere_dataset.test[1]).files:
+def test_a_missing_view_is_named(truth_views: Path, sphere_dataset: Dataset) -> None:
+    for path in prediction_frame(truth_views, sphere_dataset.test[1]).files:
         path.unlink()
     with pytest.raises(InputError, match=r"test/r_001.*Export every test view"):
-        evaluate(truth)
+        evaluate(truth_views)
 
 
-def test_a_view_of_another_size_is_named(truth: Path, sphere_dataset: Dataset) -> None:
+def test_a_view_of_another_size_is_named(truth_views: Path, sphere_dataset: Dataset) -> None:
     frame = sphere_dataset.test[2]
     view = read_view(frame)
     assert view.normals_world is not None
@@ -227,12 +269,12 @@ def test_a_view_of_another_size_is_named(truth: Path, sphere_dataset: Dataset) -
         normals_world=view.normals_world[::2, ::2],
         depth=view.depth[::2, ::2],
     )
-    write_test_view(truth, frame, small)
+    write_test_view(truth_views, frame, small)
     with pytest.raises(InputError, match=r"32×32.*truth/test/r_002.*16×16"):
-        evaluate(truth)
+        evaluate(truth_views)
 
 
-def test_a_view_with_nan_is_named(truth: Path, sphere_dataset: Dataset) -> None:
+def test_a_view_with_nan_is_named(truth_views: Path, sphere_dataset: Dataset) -> None:
     frame = sphere_dataset.test[0]
     view = read_view(frame)
     assert view.normals_world is not None
@@ -240,17 +282,17 @@ def test_a_view_with_nan_is_named(truth: Path, sphere_dataset: Dataset) -> None:
     normals[5, 5] = np.nan
     # The 8-bit companion of a NaN is undefined; only the EXR matters here.
     with np.errstate(invalid="ignore"):
-        write_test_view(truth, frame, replace(view, normals_world=normals))
+        write_test_view(truth_views, frame, replace(view, normals_world=normals))
     with pytest.raises(InputError, match=r"finite normals.*truth/test/r_000"):
-        evaluate(truth)
+        evaluate(truth_views)
 
 
-def test_normals_in_some_views_only_are_refused(truth: Path, sphere_dataset: Dataset) -> None:
-    frame = prediction_frame(truth, sphere_dataset.test[1])
+def test_normals_in_some_views_only_are_refused(truth_views: Path, sphere_dataset: Dataset) -> None:
+    frame = prediction_frame(truth_views, sphere_dataset.test[1])
     frame.exr.unlink()
     frame.normal_png.unlink()
     with pytest.raises(InputError, match=r"test/r_001 has none"):
-        evaluate(truth)
+        evaluate(truth_views)
 
 
 @pytest.mark.parametrize("value", [1.5, -0.5, math.nan])

@@ -12,6 +12,7 @@ from shinypartial.metrics.environment import (
     RegionMasks,
     best_exposure_stops,
     direction_weights,
+    inverse_distance_error,
     region_scores,
     to_protocol_size,
     unweighted_scores,
@@ -122,3 +123,17 @@ def test_a_cell_is_resolved_by_one_view_not_by_many_coarse_ones() -> None:
     assert coarse.observed.sum() == 1
     assert not coarse.union(coarse).resolved.any()
     assert cells_of_view(np.repeat(one, 16, 0)).resolved.sum() == 1
+
+
+def test_the_error_of_inverse_distance_is_a_mean_over_the_mask_in_object_radii() -> None:
+    """Truth 1/2 above and 0 below, radius 3: a mask of everything, of one half, and predictions that are off by 1/6."""
+    upper = latlong_directions(PROTOCOL_HEIGHT)[..., 2] > 0
+    truth = np.where(upper, 0.5, 0.0)
+    everywhere = np.ones_like(upper)
+    assert inverse_distance_error(None, truth, 3.0, everywhere) == pytest.approx(3 * 0.5 / 2)
+    assert inverse_distance_error(None, truth, 3.0, upper) == pytest.approx(3 * 0.5)
+    assert inverse_distance_error(None, truth, 3.0, ~upper) == 0.0
+    assert inverse_distance_error(truth, truth, 3.0, everywhere) == 0.0
+    assert inverse_distance_error(truth + 1 / 6, truth, 3.0, everywhere) == pytest.approx(0.5)
+    coarse = np.full((4, 8), 0.25)
+    assert inverse_distance_error(coarse, truth, 3.0, everywhere) == pytest.approx(3 * 0.25)

@@ -30,7 +30,7 @@ from tests.support.truth_prediction import write_truth_prediction
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """Large enough for a map that is worth something."""
-    return make_sphere_dataset(tmp_path_factory.mktemp("oracle") / "ball", 96, train=8, test=2, environment_height=64)
+    return make_sphere_dataset(tmp_path_factory.mktemp("oracle") / "ball", 96, train=8, test=2, environment_height=256)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
-from shinypartial.prediction.format import DESCRIPTION, Candidate, ModelSelection, read_info, write_info
+from shinypartial.prediction.format import DESCRIPTION, Candidate, ModelSelection, Trust, read_info, write_info
 from tests.support.truth_prediction import write_truth_prediction
 
 SELECTION = ModelSelection(
@@ -20,6 +20,7 @@ SELECTION = ModelSelection(
         Candidate("surfels", None, None, 0.1245, "not better"),
     ),
 )
+VERDICT = Trust("partly", "a reason", "a remedy", 1.2, {"unexplained": 0.3})
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,9 @@ def rewrite(prediction: Path, folder: Path, **entries: Any) -> Path:
 
 
 def test_every_field_reads_back_as_written(prediction: Path, tmp_path: Path) -> None:
-    info = replace(read_info(prediction), model_selection=SELECTION, model="words", primitives=7, model_bytes=9)
+    info = replace(
+        read_info(prediction), model_selection=SELECTION, verdict=VERDICT, model="words", primitives=7, model_bytes=9
+    )
     write_info(tmp_path, info)
     assert read_info(tmp_path) == info
 

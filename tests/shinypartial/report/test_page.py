@@ -16,7 +16,7 @@ from shinypartial.evaluation.scores import read_scores, score_rows
 from shinypartial.io.images import write_png
 from shinypartial.io.picture_sheet import write_picture_sheet
 from shinypartial.metrics import perceptual
-from shinypartial.prediction.format import DECOMPOSITION, Candidate, ModelSelection, read_info, write_info
+from shinypartial.prediction.format import DECOMPOSITION, Candidate, ModelSelection, Trust, read_info, write_info
 from shinypartial.report.line_chart import LEFT, Series, color_bar, line_chart
 from shinypartial.report.page import summary_lines, write_report
 from tests.support.truth_prediction import write_truth_prediction
@@ -116,6 +116,17 @@ def test_the_choice_of_the_model_is_a_table_and_a_sentence(evaluated: Path) -> N
     assert "revolution was chosen (&lt;better&gt; by 4 σ); plane: rejected (16 px away)." in text
     for word in ("16.2 px", "65.1%", "–", "0.0534 px", "99.9%", "0.0311"):
         assert word in text
+    write_info(evaluated, info)
+
+
+def test_a_verdict_stands_before_everything_else(evaluated: Path) -> None:
+    info = read_info(evaluated)
+    write_info(evaluated, replace(info, verdict=Trust("do not trust", "cameras <disagree>", "Refine them.", 3.0)))
+    text = write_report(evaluated).read_text(encoding="utf-8")
+    body = re.sub(r"<[^>]+>", " ", text[text.index("<body") :])
+    assert "Do not trust : cameras &lt;disagree&gt;. Refine them." in body
+    assert body.index("Do not trust") < body.index("Protocol")
+    assert any("do not trust: cameras <disagree>. Refine them." in line for line in summary_lines(evaluated))
     write_info(evaluated, info)
 
 

@@ -1,5 +1,6 @@
 """Splits: every scene declares one, the held-out ones are many and varied, and no constant was chosen by them."""
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -106,6 +107,15 @@ def test_a_dataset_tells_the_split_of_its_scene_and_an_older_one_continues(tmp_p
     assert open_dataset(root).scene_split == "unknown"
     (root / "train/r_000.exr").unlink()
     assert generate(spec, root).rendered == 1
+    manifest = json.loads((root / MANIFEST).read_text(encoding="utf-8"))
+    manifest["recipe"] |= {"split": DEVELOPMENT}
+    del manifest["recipe"]["operator"], manifest["recipe"]["camera"]["motion_deg"], manifest["recipe"]["world"]["room"]
+    (root / MANIFEST).write_text(json.dumps(manifest), encoding="utf-8")
+    assert generate(spec, root).rendered == 0, "A folder of a version in between."
+    with pytest.raises(InputError, match=r"another recipe.*operator"):
+        generate(override(spec, operator_height=1.0), root)
+    with pytest.raises(InputError, match=r"another recipe.*split"):
+        generate(dataclasses.replace(spec, split=HELD_OUT), root)
     with pytest.raises(InputError, match="another recipe"):
         generate(parse_scene(spec.recipe() | {"world": {"kind": "studiolight", "name": "city"}}, "other"), root)
 
@@ -113,9 +123,16 @@ def test_a_dataset_tells_the_split_of_its_scene_and_an_older_one_continues(tmp_p
 def test_an_older_recipe_lacks_what_later_versions_added_and_nothing_else() -> None:
     recipe = load_scene("cola").recipe()
     older = older_recipe(recipe)
-    assert recipe.keys() - older.keys() == {"split"}
+    assert recipe.keys() - older.keys() == {"split", "operator"}
+    assert recipe["world"].keys() - older["world"].keys() == {"distance_radii", "room", "proportions"}
+    assert recipe["camera"].keys() - older["camera"].keys() == {"f_number", "focus_distance", "motion_deg"}
     assert recipe["render"].keys() - older["render"].keys() == {"max_bounces"}
     assert [part.keys() for part in older["object"]["parts"]] == [{"shape", "material"}] * 4
-    assert older_recipe(load_scene("kettle").recipe())["world"] == load_scene("kettle").recipe()["world"]
+    near = load_scene("kettle").recipe()["world"] | {
+        "distance_radii": 5.0,
+        "room": "box",
+        "proportions": [1.0, 1.0, 1.0],
+    }
+    assert older_recipe(near) == near
     moved = recipe | {"render": recipe["render"] | {"max_bounces": 4}}
     assert older_recipe(moved)["render"]["max_bounces"] == 4

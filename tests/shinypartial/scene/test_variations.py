@@ -15,12 +15,16 @@ from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import sample_latlong
 from shinypartial.core.trajectory import plan_cameras
 from shinypartial.io.images import write_exr_rgb
-from shinypartial.scene import STUDIO_LIGHTS, SceneSpec, load_scene, override, variant_name
+from shinypartial.scene import STUDIO_LIGHTS, Room, SceneSpec, load_scene, override, variant_name
+from shinypartial.scene.spec import World
 from tests.support.tiny_scene import tiny_scene
 
 OPTIONS = {
     "world": "night",
     "surroundings_distance": 5.0,
+    "operator_height": 1.8,
+    "f_number": 2.8,
+    "motion_deg": 2.0,
     "exposure": 1.0,
     "roughness": 0.3,
     "base_color": (0.9, 0.5, 0.2),
@@ -64,6 +68,15 @@ def test_no_option_changes_nothing() -> None:
     assert override(vase, **dict.fromkeys(OPTIONS)) == vase
 
 
+def test_a_room_in_radii_grows_with_the_object_and_takes_the_place_of_one_in_scene_units() -> None:
+    sphere = load_scene("sphere")
+    near = override(sphere, surroundings_radii=10.0, object_scale=0.5)
+    assert near.room is not None
+    assert near.room.distance == pytest.approx(10 * 0.5 * sphere.object.extent)
+    assert override(near, surroundings_distance=4.0).room == Room("sphere", 4.0, World.proportions)
+    assert override(near, world="night").room == near.room
+
+
 @given(chosen=st.lists(st.sampled_from(sorted(OPTIONS)), unique=True))
 def test_different_variations_have_different_names(chosen: list[str]) -> None:
     vase = load_scene("vase")
@@ -75,6 +88,30 @@ BAD = {
     "unknown world": ({"world": "kitchen"}, "--world"),
     "missing file": ({"world": "none.exr"}, "not there"),
     "room inside the object": ({"surroundings_distance": 0.5}, "world.distance"),
+    "two distances": ({"surroundings_distance": 5.0, "surroundings_radii": 5.0}, "world.distance.*both"),
+    "less than a radius": ({"surroundings_radii": 0.5}, "world.distance_radii"),
+    "one radius": ({"surroundings_radii": 1.0}, "world.distance_radii"),
+    "box infinitely far": ({"surroundings_room": "box"}, "world.room"),
+    "unknown room": ({"surroundings_distance": 5.0, "surroundings_room": "tent"}, "world.room"),
+    "proportions of a sphere": (
+        {"surroundings_distance": 5.0, "surroundings_proportions": (1.0, 2.0, 1.0)},
+        "world.proportions",
+    ),
+    "flat box": (
+        {"surroundings_distance": 5.0, "surroundings_room": "box", "surroundings_proportions": (1.0, 0.0, 1.0)},
+        "world.proportions.1",
+    ),
+    "operator without height": ({"operator_radiance": 0.1}, "operator.height"),
+    "operator without size": ({"operator_height": 0.0}, "operator.height"),
+    "operator darker than black": ({"operator_height": 1.8, "operator_radiance": -0.1}, "operator.radiance"),
+    "operator in the wall": ({"operator_height": 1.8, "surroundings_distance": 3.3}, "operator.height.*room"),
+    "feet in the wall": ({"operator_height": 8.0, "surroundings_distance": 6.0}, "operator.height.*room"),
+    "operator in the object": ({"operator_height": 20.0}, "operator.height.*beside"),
+    "aperture without end": ({"f_number": 0.0}, "camera.f_number"),
+    "focus of a pinhole": ({"focus_distance": 3.0}, "camera.focus_distance"),
+    "focus behind the camera": ({"f_number": 2.8, "focus_distance": -1.0}, "camera.focus_distance"),
+    "motion backward": ({"motion_deg": -1.0}, "camera.motion_deg"),
+    "half a turn": ({"motion_deg": 180.0}, "camera.motion_deg"),
     "negative distance": ({"surroundings_distance": -3.0}, "world.distance"),
     "rough": ({"roughness": 1.5}, "material.roughness"),
     "color": ({"base_color": (0.0, 2.0, 0.0)}, "material.base_color.1"),

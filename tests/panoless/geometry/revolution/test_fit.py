@@ -1,6 +1,7 @@
 """Whole fits of vessels that Embree traced: normals, map and axis, whichever way the world is turned."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,6 +13,7 @@ from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
 from panoless.geometry.revolution.fit import propose_revolution, refine_revolution
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_rays
+from panoless.geometry.revolution.options import DEFAULTS
 from panoless.kernels.cubemap import sample_cubemap
 from tests.support.traced_vessel import Photographs, Vessel, cut_bowl, dished_jar, photograph, stripes
 
@@ -123,7 +125,11 @@ def test_both_ends_are_tried_where_cameras_see_both() -> None:
     photographs = photograph(cut_bowl(), VIEWS, SIZE, elevations_deg=(-40.0, 8.0, 25.0, 45.0))
     proposal = propose_revolution(photographs.views)
     assert proposal is not None
+    # The first rounds decide; those that follow refine what they found.
+    photometric = replace(DEFAULTS.photometric, fine=DEFAULTS.photometric.fine[:1])
+    footprints = replace(DEFAULTS.footprints, rounds=DEFAULTS.footprints.rounds[:1])
+    options = replace(DEFAULTS, photometric=photometric, footprints=footprints)
     for start in (proposal.surface, proposal.surface.turned_over()):
-        surface = refine_revolution(photographs.views, start)
+        surface = refine_revolution(photographs.views, start, options)
         assert surface.is_open
         assert surface.axis[2] > 0.99
