@@ -53,7 +53,10 @@ def test_a_region_is_never_empty(point: tuple[float, float, float]) -> None:
 
 
 def test_no_pixel_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same renderer with and without a border: equal to the bit, in every pass."""
+    """The same renderer with and without a border: equal in every pass.
+
+    But for the last bits of the averaged light: numpy's vector functions round by where an array lies in memory.
+    """
     pytest.importorskip("bpy")
     shape = '{ kind = "plane", size = [1.0, 0.6], normal = [1.0, 0.5, 0.4] }'
     spec = tiny_scene(tmp_path, shape=shape, samples=8, resolution=37)
@@ -68,5 +71,6 @@ def test_no_pixel_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     inside[region.top : region.bottom, region.left : region.right] = True
     assert (whole.alpha[~inside] == 0).all()
     assert whole.alpha.any()
-    for name in ("radiance", "alpha", "normals_world", "depth", "self_reflection"):
+    np.testing.assert_allclose(bordered.radiance, whole.radiance, rtol=4 * np.finfo(np.float32).eps, atol=0)
+    for name in ("alpha", "normals_world", "depth", "self_reflection"):
         np.testing.assert_array_equal(getattr(bordered, name), getattr(whole, name))
