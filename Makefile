@@ -28,7 +28,7 @@ test: setup
 	$(BIN)/mypy shinypartial panoless
 	$(BIN)/lint-imports
 	$(BIN)/mkdocs build --quiet --strict -f docs/mkdocs.yml
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --durations=15
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --durations=15
 
 RESOLUTION ?= 400
 SCENES ?=

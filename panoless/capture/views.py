@@ -166,8 +166,22 @@ def split_held_out(views: Sequence[Item]) -> tuple[list[Item], list[Item]]:
 
 
 def every_kth_pixel(views: Views, most: int) -> Iterator[tuple[TrainView, Int[Tensor, "P"]]]:
-    """About `most` pixels of all views that lie wholly on the object: every k-th, beginning elsewhere in each view."""
-    stride = max(1, sum(len(view.solid) for view in views.train) // most)
+    """About `most` pixels of all views that lie wholly on the object, and less than twice as many."""
+    return _pixels_at(views, _count_solid(views) // most)
+
+
+def at_most_pixels(views: Views, most: int) -> Iterator[tuple[TrainView, Int[Tensor, "P"]]]:
+    """No more than about `most` pixels of all views that lie wholly on the object, and more than half as many."""
+    return _pixels_at(views, -(-_count_solid(views) // most))
+
+
+def _count_solid(views: Views) -> int:
+    return sum(len(view.solid) for view in views.train)
+
+
+def _pixels_at(views: Views, stride: int) -> Iterator[tuple[TrainView, Int[Tensor, "P"]]]:
+    """Every k-th solid pixel, beginning elsewhere in each view; all for a stride of zero."""
+    stride = max(stride, 1)
     for index, view in enumerate(views.train):
         yield view, view.solid[index % stride :: stride]
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.object_frame import ObjectFrame
-from panoless.capture.views import TrainView, Views
+from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints
 from panoless.environment.rays import Rays
@@ -238,10 +238,6 @@ def usable_views(views: Views, geometry: Geometry) -> Views:
 
 
 def observe_views(views: Views, geometry: Geometry, max_rays: int) -> Iterator[Rays]:
-    """What solid pixels observed, a batch a view.
-
-    When the views hold more than `max_rays` such pixels, every k-th is taken, beginning elsewhere in each view.
-    """
-    stride = max(1, -(-sum(len(view.solid) for view in views.train) // max_rays))
-    for index, view in enumerate(views.train):
-        yield geometry.observe(view, view.solid[index % stride :: stride])
+    """What solid pixels observed, at most `max_rays` of them, a batch a view."""
+    for view, pixels in at_most_pixels(views, max_rays):
+        yield geometry.observe(view, pixels)

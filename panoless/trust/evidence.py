@@ -13,8 +13,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from panoless.capture.masks import MASK_LEVEL
 from panoless.capture.silhouettes import mask_distance_px
-from panoless.capture.views import TrainView, Views, split_held_out
+from panoless.capture.views import TrainView, Views, at_most_pixels, split_held_out
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, usable_views
 from panoless.kernels.cubemap import sample_cubemap
@@ -54,13 +55,6 @@ class Evidence:
     """Spearman's, of confidence and the error of held-out rays: negative where confidence tells the truth."""
     views: int
     """Number of views in which the object is seen."""
-
-    @property
-    def explained_share(self) -> float | None:
-        """1 − unexplained/one_color: what the mirror explains of what one color does not."""
-        if self.unexplained is None or not self.one_color:
-            return None
-        return 1 - self.unexplained / self.one_color
 
 
 def gather_evidence(
@@ -116,16 +110,13 @@ def _light(
     rays = list(observe_views(solved, geometry, options.rays))
     environment = solve_environment(rays, min(options.resolution, visibility.shape[-1]))
     places = _Places.of(kept, options)
-    stride = max(1, -(-sum(len(view.solid) for view in tested.train) // options.rays))
     errors, confidence, explained, plain = [], [], _Mean(), {"one_color": _Mean(), "matte": _Mean()}
-    for index, ((view, surface), batch) in enumerate(
-        zip(held_out, observe_views(tested, geometry, options.rays), strict=True)
-    ):
+    for (view, surface), (_, pixels) in zip(held_out, at_most_pixels(tested, options.rays), strict=True):
+        batch = geometry.observe(view, pixels)
         error = sample_cubemap(environment, batch.directions) - batch.radiance
         explained.add(bounded_error(error, options.scale), batch.initial_weight())
         errors.append(error)
         confidence.append(sample_cubemap(visibility[:, None], batch.directions)[:, 0])
-        pixels = view.solid[index % stride :: stride]
         radiance = view.radiance.flatten(1)[:, pixels].T
         guesses = {"one_color": radiance.mean(0), "matte": places.colors(view, surface, pixels)}
         for name, guess in guesses.items():
@@ -204,7 +195,7 @@ def _silhouette(view: TrainView, surface: SurfaceBuffers) -> tuple[float, float,
     """
     mask, alpha = view.mask.cpu().numpy(), surface.alpha.cpu().numpy()
     overlap = float(np.minimum(mask, alpha).sum() / max(np.maximum(mask, alpha).sum(), 1e-9))
-    if min(mask.max(), alpha.max()) < 0.5 or max(mask.min(), alpha.min()) > 0.5:
+    if min(mask.max(), alpha.max()) < MASK_LEVEL or max(mask.min(), alpha.min()) > MASK_LEVEL:
         return float(max(mask.shape)), float(max(mask.shape)), overlap
     of_mask, of_fit = mask_distance_px(mask), mask_distance_px(alpha)
     rows, columns = np.gradient(of_fit)

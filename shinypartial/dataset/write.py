@@ -134,15 +134,8 @@ def encode_normals(normals: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H 
 
 def write_transforms(root: Path, split: str, frames: Sequence[Frame]) -> None:
     """Write `transforms_SPLIT.json` with OpenGL poses, as NeRF-synthetic and nerfstudio readers expect."""
-    camera = frames[0].camera
     content = {
-        "camera_angle_x": 2 * math.atan(camera.width / (2 * camera.fx)),
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "w": camera.width,
-        "h": camera.height,
+        **intrinsics_of(frames[0].camera),
         "frames": [
             {
                 "file_path": f"./{split}/{frame.stem.name}",
@@ -152,6 +145,19 @@ def write_transforms(root: Path, split: str, frames: Sequence[Frame]) -> None:
         ],
     }
     write_json(root / f"transforms_{split}.json", content)
+
+
+def intrinsics_of(camera: Camera) -> dict[str, float]:
+    """Field of view (rad), focal lengths, principal point and size (px) by their names in `transforms_SPLIT.json`."""
+    return {
+        "camera_angle_x": 2 * math.atan(camera.width / (2 * camera.fx)),
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "w": camera.width,
+        "h": camera.height,
+    }
 
 
 def write_environment(root: Path, latlong: Float[np.ndarray, "H W 3"], cube_resolution: int = 256) -> None:
@@ -168,8 +174,12 @@ def write_environment(root: Path, latlong: Float[np.ndarray, "H W 3"], cube_reso
 
 def write_inverse_distance(root: Path, inverse_distance: Float[np.ndarray, "H W"]) -> None:
     """Write 1/D of every direction from the origin to the surroundings, a map like the lat-long one of radiance."""
-    channels = {INVERSE_DISTANCE_CHANNEL: inverse_distance.astype(np.float32)}
-    write_exr(root / ENVIRONMENT_INVERSE_DISTANCE, channels)
+    write_inverse_distance_map(root / ENVIRONMENT_INVERSE_DISTANCE, inverse_distance)
+
+
+def write_inverse_distance_map(path: Path, inverse_distance: Float[np.ndarray, "H W"]) -> None:
+    """Write the one channel of such a map."""
+    write_exr(path, {INVERSE_DISTANCE_CHANNEL: inverse_distance.astype(np.float32)})
 
 
 def latlong_to_y_up(latlong: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:

@@ -18,8 +18,8 @@ from jaxtyping import Float
 
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import read_inverse_distance_map
-from shinypartial.dataset.schema import CHECKSUMS, INVERSE_DISTANCE_CHANNEL, Dataset, Frame, View
-from shinypartial.dataset.write import write_view
+from shinypartial.dataset.schema import CHECKSUMS, Dataset, Frame, View
+from shinypartial.dataset.write import write_inverse_distance_map, write_view
 from shinypartial.io.files import newest_folder, read_json, sha256_of, write_json
 from shinypartial.io.images import read_exr, read_exr_rgb, stack_channels, write_exr, write_exr_rgb
 from shinypartial.io.records import NonNegative, Share, Text, read_record, write_record
@@ -194,7 +194,7 @@ def write_visibility(root: Path, visibility: Float[np.ndarray, "H W"]) -> None:
 
 def write_inverse_distance(root: Path, inverse_distance: Float[np.ndarray, "H W"]) -> None:
     """Write 1/D of every direction from the origin, in 1/scene units and 0 for infinitely far, as a lat-long map."""
-    write_exr(root / INVERSE_DISTANCE, {INVERSE_DISTANCE_CHANNEL: inverse_distance.astype(np.float32)})
+    write_inverse_distance_map(root / INVERSE_DISTANCE, inverse_distance)
 
 
 def write_test_view(root: Path, frame: Frame, view: View) -> None:

@@ -39,6 +39,16 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return place
 
 
+@pytest.fixture(scope="module")
+def finished_run(sphere_dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that tests copy before they damage it."""
+    place = tmp_path_factory.mktemp("finished")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(place)
+        assert main(["fit", str(sphere_dataset.root), "--output", "out", *TINY]) == 0
+    return place / "runs" / "out"
+
+
 def assert_refused(capsys: pytest.CaptureFixture[str], code: int, *words: str) -> None:
     err = capsys.readouterr().err
     assert code == 2, err
@@ -234,10 +244,10 @@ def test_export_of_an_unfinished_run(workplace: Path, sphere_dataset: Dataset, c
 @pytest.mark.parametrize(
     "damage", ["missing", "no checkpoint", "broken checkpoint", "broken description", "old options"]
 )
-def test_export_of_what_is_no_run(damage: str, workplace: Path, sphere_dataset: Dataset, capsys) -> None:
+def test_export_of_what_is_no_run(damage: str, workplace: Path, finished_run: Path, capsys) -> None:
     run = workplace / "runs" / "out"
     if damage != "missing":
-        assert main(["fit", str(sphere_dataset.root), "--output", "out", *TINY]) == 0
+        shutil.copytree(finished_run, run)
     if damage == "no checkpoint":
         (run / "checkpoint.pt").unlink()
     if damage == "broken checkpoint":

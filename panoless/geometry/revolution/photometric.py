@@ -274,11 +274,12 @@ def refine_round(
         )
         return here if moved is here.surface else evaluations[-1]
 
-    here = evaluate(surface)
+    here: _Evaluation | None = None
     for _ in range(each.steps):
-        settled = settle(here.surface)
-        before = here if settled is here.surface else evaluate(settled)
+        settled = settle(surface)
+        before = here if here is not None and settled is here.surface else evaluate(settled)
         here = advance(before)
+        surface = here.surface
         if here.cost > (1 - options.least_fall) * before.cost:
             break
-    return here.surface
+    return surface

@@ -35,11 +35,11 @@ def _even(points: Float[np.ndarray, "N 2"], spacing: float) -> Float[np.ndarray,
     if len(points) < 2:
         return points
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    pieces = max(int(np.ceil(steps.sum() / spacing)), 1)
-    if (np.abs(steps * pieces / max(steps.sum(), 1e-12) - 1) < UNEVEN).all() and len(steps) == pieces:
-        return points
     length = np.append(0.0, np.cumsum(steps))
-    where = np.linspace(0, length[-1], max(int(np.ceil(length[-1] / spacing)), 1) + 1)
+    pieces = max(int(np.ceil(length[-1] / spacing)), 1)
+    if len(steps) == pieces and (np.abs(steps * pieces / max(length[-1], 1e-12) - 1) < UNEVEN).all():
+        return points
+    where = np.linspace(0, length[-1], pieces + 1)
     kept = np.append(True, np.diff(length) > 1e-12)
     return np.stack([np.interp(where, length[kept], column[kept]) for column in points.T], 1)
 

@@ -107,21 +107,25 @@ def _bare(origin: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"]) -> Surfa
     return SurfaceOfRevolution(origin - (origin @ axis) * axis, axis, np.zeros((0, 2)), 0)
 
 
-def outer_surfaces(rays: ContourRays, start: SurfaceOfRevolution, cell: float) -> list[SurfaceOfRevolution]:
-    """The envelope around an axis, closed flat at both ends, and without the cones beyond them; none without one."""
+def outer_surface(
+    rays: ContourRays, start: SurfaceOfRevolution, cell: float, *, stem: bool = False
+) -> SurfaceOfRevolution | None:
+    """The envelope around an axis, closed flat at both ends, with what may be a `stem` or a cone or without; None where
+    there is none.
+    """
     origins, directions = in_axis_frame(rays, start)
     cells = int(2 * TALLEST / cell)
     rank = int(rays.options.rank_share * len(rays.view) / (2 * TALLEST / cell)) + 1
     smallest = envelope(origins, directions, -TALLEST, cell, cells, rank + 1, REACH)[:, rank]
     radius = np.where(np.isfinite(smallest), smallest, 0.0)
     heights = -TALLEST + (np.arange(cells) + 0.5) * cell
-    surfaces = []
-    for lowest, highest in _ends(origins, heights, radius, cell, rays.options):
+    ends = _ends(origins, heights, radius, cell, rays.options)
+    for lowest, highest in reversed(ends) if stem else ends:
         if highest - lowest >= rays.options.least_cells:
             outer = np.stack([radius, heights], 1)[lowest : highest + 1]
             profile = np.concatenate([[[0.0, outer[0, 1]]], outer, [[0.0, outer[-1, 1]]]])
-            surfaces.append(resample_profile(replace(start, profile=profile, lip=len(outer)), cell))
-    return surfaces
+            return resample_profile(replace(start, profile=profile, lip=len(outer)), cell)
+    return None
 
 
 def _ends(
@@ -278,13 +282,10 @@ def refine_outer(rays: ContourRays, start: SurfaceOfRevolution, *, stem: bool = 
 def _refine(
     rays: ContourRays, start: SurfaceOfRevolution, cell: float, scales_px: Sequence[float], stem: bool
 ) -> SurfaceOfRevolution | None:
-    """The envelope around an axis, with what may be a stem or a cone or without, after steps at those scales; None when
-    there is none.
-    """
-    surfaces = outer_surfaces(rays, start, cell)
-    if not surfaces:
+    """The envelope around an axis after steps at those scales; None when there is none."""
+    surface = outer_surface(rays, start, cell, stem=stem)
+    if surface is None:
         return None
-    surface = surfaces[-1 if stem else 0]
     for scale in scales_px:
         surface = contour_step(rays, surface, cell, scale, 2 * cell)
     return surface

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from panoless.capture.object_frame import ObjectFrame
-from panoless.capture.views import TrainView, Views
+from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints
 from panoless.environment.rays import Rays
@@ -101,11 +101,7 @@ class SurfelMirror:
         configuration does; then all rays are solved.
         """
         most = config.environment.rays
-        stride = max(1, math.ceil(sum(len(view.solid) for view in views.train) / most))
-        observed = [
-            (view, *self.observe_covered(view, view.solid[index % stride :: stride]))
-            for index, view in enumerate(views.train)
-        ]
+        observed = [(view, *self.observe_covered(view, pixels)) for view, pixels in at_most_pixels(views, most)]
         resolution = config.environment.solve_resolution
         few = most * TRIAL_SHARE
         coarse = solve_environment(_thin([rays for _, rays, _ in observed], few), resolution or TRIAL_RESOLUTION)

@@ -3,7 +3,6 @@
 A run that is killed continues when it is started again, and a folder that holds anything else is refused.
 """
 
-import math
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from shinypartial import __version__
-from shinypartial.core.camera import Camera, opencv_to_opengl
+from shinypartial.core.camera import opencv_to_opengl
 from shinypartial.core.color import to_display
 from shinypartial.core.conventions import FACES
 from shinypartial.core.errors import InputError
@@ -42,6 +41,7 @@ from shinypartial.dataset.write import (
     encode_normals,
     encode_unit,
     exr_channels,
+    intrinsics_of,
 )
 from shinypartial.io.files import copy_or_link, folder_lock, read_json, remove_partial_files, sha256_of, write_json
 from shinypartial.io.images import EXR, write_exr, write_jpeg, write_png
@@ -50,7 +50,6 @@ from shinypartial.io.progress import Progress
 TRAIN, TEST = "transforms_train.json", "transforms_test.json"
 #: Photographs of these formats become PNG when they are made anew, others become EXR.
 EIGHT_BIT = (".png", ".jpg", ".jpeg")
-INTRINSICS = ("camera_angle_x", "fl_x", "fl_y", "cx", "cy", "w", "h")
 
 
 @dataclass(frozen=True)
@@ -221,8 +220,8 @@ def _png(ending: str, view: View) -> UInt8[np.ndarray, "H W *C"]:
 def _transforms(plan: Plan, dataset: Dataset) -> dict[str, Any]:
     """Content of `transforms_train.json`: as in the source, but for what is perturbed."""
     content = read_json(dataset.root / TRAIN, "the cameras")
-    intrinsics = [_intrinsics(view.camera) for view in plan.views]
-    as_before = intrinsics == [_intrinsics(view.source.camera) for view in plan.views]
+    intrinsics = [intrinsics_of(view.camera) for view in plan.views]
+    as_before = intrinsics == [intrinsics_of(view.source.camera) for view in plan.views]
     alike = all(each == intrinsics[0] for each in intrinsics)
     entries = []
     for view, own in zip(plan.views, intrinsics, strict=True):
@@ -230,7 +229,7 @@ def _transforms(plan: Plan, dataset: Dataset) -> dict[str, Any]:
         if not np.array_equal(view.camera.camera_to_world, frame.camera.camera_to_world):
             entry["transform_matrix"] = opencv_to_opengl(view.camera.camera_to_world).tolist()
         if not as_before:
-            entry = {key: value for key, value in entry.items() if key not in INTRINSICS} | ({} if alike else own)
+            entry = {key: value for key, value in entry.items() if key not in own} | ({} if alike else own)
         if plan.options.changes_pictures:
             entry.pop("mask_path", None)
             suffix = ".jpg" if _suffix(frame, plan.options) == ".jpg" else ".png" if frame.suffix else ""
@@ -239,11 +238,6 @@ def _transforms(plan: Plan, dataset: Dataset) -> dict[str, Any]:
     sensor = plan.options.sensor
     lens = {"k1": sensor.k1, "k2": sensor.k2} if sensor.record_distortion else {}
     return {**content, **({} if as_before or not alike else intrinsics[0]), **lens, "frames": entries}
-
-
-def _intrinsics(camera: Camera) -> dict[str, float]:
-    values = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-    return dict(zip(INTRINSICS, (2 * math.atan(camera.width / (2 * camera.fx)), *values), strict=True))
 
 
 def _recipe(dataset: Dataset, options: Perturbation) -> dict[str, Any]:
