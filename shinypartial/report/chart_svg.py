@@ -3,7 +3,7 @@
 import io
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -82,11 +82,16 @@ class Plot:
 
 def draw(plot: Plot) -> str:
     """The plot as SVG text, the same for the same plot: a file of its own, or part of a page."""
+    return svg_text(lambda: make_figure(plot), plot.title)
+
+
+def svg_text(make: Callable[[], "Figure"], salt: str) -> str:
+    """A figure, made in our style, as SVG text that holds nothing of when it was made; `salt` tells its ids apart."""
     import matplotlib
 
     stream = io.StringIO()
-    with matplotlib.rc_context({**SETTINGS, "svg.hashsalt": plot.title}):
-        make_figure(plot).savefig(stream, format="svg", bbox_inches="tight", metadata={"Date": None})
+    with matplotlib.rc_context({**SETTINGS, "svg.hashsalt": salt}):
+        make().savefig(stream, format="svg", bbox_inches="tight", metadata={"Date": None})
     text = stream.getvalue()
     text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
     return text.replace("<svg ", '<svg role="img" ', 1)
