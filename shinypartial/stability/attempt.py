@@ -1,6 +1,6 @@
 """One job of the suite: run its command, and record how it ended in place of stopping the suite.
 
-    python -m shinypartial.stability.attempt fit/vase.0.fast --threads 1
+    python -m shinypartial.stability.attempt fit/vase.0.fast --threads 1 --folder stability
 
 The log is locked while the command or anything that it started lives. So after a kill the next attempt waits for what
 is still at work, and does not begin it a second time.
@@ -8,7 +8,6 @@ is still at work, and does not begin it a second time.
 
 import argparse
 import os
-import shlex
 import signal
 import subprocess
 import sys
@@ -88,17 +87,13 @@ def _reason(log: str, code: int) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Attempt the job that is named, in the working directory."""
+    """Attempt the job that is named."""
     parser = argparse.ArgumentParser(description="Run one job of a stability suite.")
     parser.add_argument("job", help="KIND/NAME")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--folder", type=Path, default=Path(), help="of the suite; the working directory by default")
     options = parser.parse_args(arguments)
-    return attempt(options.job, options.threads)
-
-
-def command_line(job: str, threads: int) -> str:
-    """The shell's line for one job."""
-    return shlex.join([sys.executable, "-m", "shinypartial.stability.attempt", job, "--threads", str(threads)])
+    return attempt(options.job, options.threads, options.folder)
 
 
 if __name__ == "__main__":

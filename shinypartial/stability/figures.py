@@ -37,7 +37,9 @@ def make_curves(results: Results, axis: Axis) -> "Figure":
     left, right = figure.subplots(1, 2)
     _draw(left, results, axis, "Environment, observed directions [dB]", lambda each: each.environment_db)
     _draw(right, results, axis, "Normals, mean error [°]", lambda each: each.normals_mean_deg)
-    right.set_yscale("log")
+    shown = [point for line in right.lines for point in line.get_ydata()]
+    if shown and min(shown) > 0:
+        right.set_yscale("log")
     left.legend(frameon=False, fontsize=7)
     return figure
 

@@ -42,12 +42,11 @@ def page_lines(results: Results, pictures: Sequence[tuple[str, str]]) -> Iterato
     size = results.size
     seeds = len({each.cell.seed for each in results.outcomes})
     yield from ("# Stability", "")
-    yield f"{len(results.outcomes)} fits on data that get worse step by step: {_count(len(results.scenes), 'scene')}"
-    yield f"({', '.join(results.scenes)}), {_count(len(results.methods), 'method')} ({', '.join(results.methods)}) and"
-    yield f"{_count(seeds, 'seed')}. Rendered scenes have {size.train} training views of"
-    yield f"{size.resolution} × {size.resolution} pixels. The page is made by `shinypartial stability --page`"
-    yield "([how to](how-to/test-where-it-fails.md)); its numbers lie in"
-    yield f"[{RESULTS.name}]({RESULTS.as_posix()})."
+    counts = (_count(len(results.scenes), "scene"), _count(len(results.methods), "method"), _count(seeds, "seed"))
+    yield f"{_count(len(results.outcomes), 'fit')} on data that get worse step by step: {', '.join(counts)}. Rendered"
+    yield f"datasets have {size.train} training views of {size.resolution} × {size.resolution} pixels."
+    yield from ("", f"- Scenes: {', '.join(results.scenes)}", f"- Methods: {', '.join(results.methods)}")
+    yield f"- Numbers: [{RESULTS.name}]({RESULTS.as_posix()}), made with this page by `shinypartial stability --page`"
     yield from ("", "Environment: PSNR of linear light over the directions that the true training views observe.")
     yield "Normals: pooled over pixels of test views that see the environment."
     yield from ("", "## Where methods break", "", *_limit_table(results))
@@ -92,8 +91,8 @@ def _limit_text(axis: Axis, positions: Sequence[float | None]) -> str:
 
 def _verdict_lines(results: Results) -> Iterator[str]:
     yield f"A fit is *lost* where its environment is {LOST_DB:g} dB or more worse than that of the clean fit of the"
-    yield "same scene, method and seed. AUROC: the chance that a lost fit states the higher risk than one that is not lost."
-    yield "Fits that state no risk are left out."
+    yield "same scene, method and seed. AUROC: the chance that a lost fit states a higher risk than one that is"
+    yield "not lost. Fits that state no risk are left out."
     yield ""
     yield "| Scenes | Fits | Lost | AUROC of the risk |\n| --- | --- | --- | --- |"
     groups = {split: list(judged(results, split)) for split in SPLITS}

@@ -56,7 +56,7 @@ def run_suite(folder: Path, plan: Plan, cores: int, arguments: Sequence[str] = (
 def snakemake_arguments(folder: Path, cores: int, arguments: Sequence[str]) -> list[str]:
     """The command line of Snakemake; cores are those of this machine, unless an executor has machines of its own."""
     words = ["--snakefile", str(SNAKEFILE), "--directory", str(folder.resolve()), "--nolock", "--rerun-incomplete"]
-    words += ["--keep-going", "--rerun-triggers", "mtime"]
+    words += ["--config", f"folder={folder.resolve()}", "--keep-going", "--rerun-triggers", "mtime"]
     if not any(word.partition("=")[0] in EXECUTOR for word in arguments):
         words += ["--cores", str(cores)]
     if DRY_RUN.isdisjoint(arguments):
@@ -95,7 +95,7 @@ def _call(snakemake, words: list[str]) -> int:  # type: ignore[no-untyped-def]
 
 def _watch(folder: Path, plan: Plan, ended: threading.Event) -> None:
     """Report the cells that are done; those of earlier runs don't count in the speed."""
-    marks = [folder / DONE / "score" / cell.name for cell in plan.cells]
+    marks = [folder / RECORDS / "score" / f"{cell.name}.json" for cell in plan.cells]
     progress = Progress("Cells", len(marks), sum(mark.exists() for mark in marks))
     while not ended.wait(WATCH_INTERVAL_S):
         _report(progress, marks)
