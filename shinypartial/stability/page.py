@@ -19,6 +19,7 @@ from shinypartial.stability.collect import (
     write_results,
 )
 from shinypartial.stability.figures import write_curves, write_pictures
+from shinypartial.stability.plan import TINY
 
 RESULTS, ASSETS = Path("results/stability.json"), Path("assets")
 SPLITS = ("development", "held-out")
@@ -43,8 +44,9 @@ def page_lines(results: Results, pictures: Sequence[tuple[str, str]]) -> Iterato
     seeds = len({each.cell.seed for each in results.outcomes})
     yield from ("# Stability", "")
     counts = (_count(len(results.scenes), "scene"), _count(len(results.methods), "method"), _count(seeds, "seed"))
-    yield f"{_count(len(results.outcomes), 'fit')} on data that get worse step by step: {', '.join(counts)}. Rendered"
-    yield f"datasets have {size.train} training views of {size.resolution} × {size.resolution} pixels."
+    yield f"{_count(len(results.outcomes), 'fit')} on data that get worse step by step: {', '.join(counts)}."
+    if TINY not in results.scenes:
+        yield f"Datasets have {size.train} training views of {size.resolution} × {size.resolution} pixels."
     yield from ("", f"- Scenes: {', '.join(results.scenes)}", f"- Methods: {', '.join(results.methods)}")
     yield f"- Numbers: [{RESULTS.name}]({RESULTS.as_posix()}), made with this page by `shinypartial stability --page`"
     yield from ("", "Environment: PSNR of linear light over the directions that the true training views observe.")
