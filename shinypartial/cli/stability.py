@@ -27,7 +27,7 @@ class Stability:
     """Names of scenes; those of the plan when not given."""
     axes: tuple[str, ...] = ()
     """Names of axes; those of the plan when not given."""
-    seeds: tuple[int, ...] = (0, 1, 2)
+    seeds: tuple[int, ...] = (0, 1)
     """Seeds of what is drawn by chance, in the copies and in the methods."""
     size: tyro.conf.OmitArgPrefixes[Size] = Size()
     cores: int = 2

@@ -124,8 +124,8 @@ def make_figure(plot: Plot) -> "Figure":
     axes.set_ylabel(plot.y_title + (", logarithmic axis" if logarithmic else ""))
     axes.set_xlim(_limits(across, True))
     axes.set_ylim(_limits(upward, logarithmic))
-    _set_ticks(axes.xaxis, across, True)
-    _set_ticks(axes.yaxis, upward, logarithmic)
+    set_ticks(axes.xaxis, across, True)
+    set_ticks(axes.yaxis, upward, logarithmic)
     for curve in plot.curves:
         axes.plot(curve.x, curve.y, ".-", color=_color(curve.number), linewidth=0.9, markersize=3, alpha=0.7)
     if plot.oracle is not None:
@@ -171,7 +171,7 @@ def _limits(values: Sequence[float], logarithmic: bool) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def _set_ticks(axis: "Axis", values: Sequence[float], logarithmic: bool) -> None:
+def set_ticks(axis: "Axis", values: Sequence[float], logarithmic: bool) -> None:
     """Ticks at round values, or at 1, 2 and 5 times powers of ten over more than one of these; short numbers."""
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 

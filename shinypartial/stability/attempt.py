@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from shinypartial.core.errors import EXIT_INTERRUPTED
 from shinypartial.io.files import read_json, write_json
 from shinypartial.stability.plan import PLAN
 
@@ -93,7 +94,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--folder", type=Path, default=Path(), help="of the suite; the working directory by default")
     options = parser.parse_args(arguments)
-    return attempt(options.job, options.threads, options.folder)
+    try:
+        return attempt(options.job, options.threads, options.folder)
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
 
 
 if __name__ == "__main__":

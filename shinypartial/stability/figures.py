@@ -9,7 +9,7 @@ from shinypartial.io.files import write_text
 from shinypartial.io.picture_sheet import write_picture_sheet
 from shinypartial.metrics.environment import to_protocol_size
 from shinypartial.prediction.format import DESCRIPTION, read_environment_map
-from shinypartial.report.chart_svg import CARD, COLORS, INK, svg_text
+from shinypartial.report.chart_svg import CARD, COLORS, INK, set_ticks, svg_text
 from shinypartial.stability.axes import BY_NAME, Axis
 from shinypartial.stability.collect import Outcome, Results, mean
 
@@ -40,6 +40,7 @@ def make_curves(results: Results, axis: Axis) -> "Figure":
     shown = [point for line in right.lines for point in line.get_ydata()]
     if shown and min(shown) > 0:
         right.set_yscale("log")
+        set_ticks(right.yaxis, shown, True)
     left.legend(frameon=False, fontsize=7)
     return figure
 

@@ -3,9 +3,12 @@
 from pathlib import Path
 
 import pytest
+import tyro
 
+from shinypartial.cli.datasets import Perturb
+from shinypartial.cli.scenes import Generate
 from shinypartial.core.errors import InputError
-from shinypartial.stability.axes import AXES, BY_NAME
+from shinypartial.stability.axes import AXES, BY_NAME, Axis
 from shinypartial.stability.plan import METHODS, Plan, conditions, make_plan, parse_methods, read_plan, write_plan
 
 COPY = {"copy": "cp -r {dataset} {prediction} # {seed}"}
@@ -71,6 +74,14 @@ def test_levels_become_options_and_positions() -> None:
     assert [BY_NAME["room"].position(level) for level in (None, 5)] == [0, 0.2]
     assert BY_NAME["room"].text(0.2) == "5 radii"
     assert all(axis.text(axis.position(level)).startswith(f"{level:g}") for axis in AXES for level in axis.levels)
+
+
+@pytest.mark.parametrize("axis", AXES, ids=lambda axis: axis.name)
+def test_options_of_every_axis_are_those_of_its_command(axis: Axis) -> None:
+    """Each level parses, and changes something that no other level does."""
+    command, words = (Generate, ["--scene", "vase"]) if axis.rendered else (Perturb, ["tiny-vase", "--output", "copy"])
+    parsed = [tyro.cli(command, args=[*words, *options]) for options in ([], *map(axis.arguments, axis.levels))]
+    assert len(set(map(repr, parsed))) == 1 + len(axis.levels)
 
 
 def test_methods() -> None:
