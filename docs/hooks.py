@@ -20,7 +20,7 @@ ROOMS = re.compile(r"<!-- rooms of (?P<package>\w+) -->")
 ORDER = (
     *("api", "capture", "first_surface", "environment", "geometry", "selection", "trust", "reconstruct", "export"),
     *("core", "io", "scene", "blender", "generate", "dataset", "release", "prediction", "oracle"),
-    *("metrics", "evaluation", "comparison", "report", "numeric", "kernels", "config", "presets"),
+    *("metrics", "evaluation", "comparison", "report", "stability", "numeric", "kernels", "config", "presets"),
 )
 """Rooms in the order of the data; others come after them."""
 ROOT = Path(__file__).resolve().parents[1]

@@ -8,6 +8,7 @@ from shinypartial.cli.datasets import Perturb, Release, Subset, Validate
 from shinypartial.cli.presenting import Chart, Leaderboard, Report
 from shinypartial.cli.scenes import Generate
 from shinypartial.cli.scoring import Compare, Evaluate, Oracle, Postprocess, Weights
+from shinypartial.cli.stability import Stability
 from shinypartial.core.errors import parse_and_run
 
 Command = (
@@ -24,6 +25,7 @@ Command = (
     | Release
     | Leaderboard
     | Chart
+    | Stability
 )
 
 

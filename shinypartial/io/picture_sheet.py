@@ -18,8 +18,14 @@ QUALITIES = (90, 80, 65, 50, 30, 10)
 INK, PAPER = (225, 225, 225), (24, 24, 24)
 
 
-def write_picture_sheet(path: Path, pictures: Mapping[str, np.ndarray]) -> None:
-    """Write 8-bit gray or RGB pictures of any size, three a row with their titles above, as a JPEG below 300 kB.
+def write_picture_sheet(
+    path: Path,
+    pictures: Mapping[str, np.ndarray],
+    *,
+    tile_size: tuple[int, int] = (TILE_PX, TILE_PX),
+    max_bytes: int = MAX_BYTES,
+) -> None:
+    """Write 8-bit gray or RGB pictures of any size, three a row with their titles above, as a JPEG below `max_bytes`.
 
     Raises ValueError when there is no picture.
     """
@@ -27,23 +33,24 @@ def write_picture_sheet(path: Path, pictures: Mapping[str, np.ndarray]) -> None:
 
     if not pictures:
         raise ValueError("a sheet needs a picture")
+    width, height = tile_size
     rows = math.ceil(len(pictures) / COLUMNS)
-    sheet = Image.new("RGB", (min(COLUMNS, len(pictures)) * TILE_PX, rows * (TILE_PX + TITLE_PX)), PAPER)
+    sheet = Image.new("RGB", (min(COLUMNS, len(pictures)) * width, rows * (height + TITLE_PX)), PAPER)
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(14)
     for index, (title, picture) in enumerate(pictures.items()):
-        left, top = index % COLUMNS * TILE_PX, index // COLUMNS * (TILE_PX + TITLE_PX)
+        left, top = index % COLUMNS * width, index // COLUMNS * (height + TITLE_PX)
         draw.text((left + 6, top + 3), title, INK, font=font)
         tile = Image.fromarray(picture).convert("RGB")
-        scale = TILE_PX / max(tile.size)
+        scale = min(width / tile.width, height / tile.height)
         size = (max(1, round(tile.width * scale)), max(1, round(tile.height * scale)))
         tile = tile.resize(size, Image.Resampling.BOX if scale < 1 else Image.Resampling.BICUBIC)
-        sheet.paste(tile, (left + (TILE_PX - size[0]) // 2, top + TITLE_PX + (TILE_PX - size[1]) // 2))
+        sheet.paste(tile, (left + (width - size[0]) // 2, top + TITLE_PX + (height - size[1]) // 2))
     encoded = b""
     for quality in QUALITIES:
         stream = io.BytesIO()
         sheet.save(stream, "JPEG", quality=quality, optimize=True)
         encoded = stream.getvalue()
-        if len(encoded) < MAX_BYTES:
+        if len(encoded) < max_bytes:
             break
     with atomic_write(path) as temporary:
         temporary.write_bytes(encoded)

@@ -3,7 +3,7 @@
 import io
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -82,11 +82,16 @@ class Plot:
 
 def draw(plot: Plot) -> str:
     """The plot as SVG text, the same for the same plot: a file of its own, or part of a page."""
+    return svg_text(lambda: make_figure(plot), plot.title)
+
+
+def svg_text(make: Callable[[], "Figure"], salt: str) -> str:
+    """A figure, made in our style, as SVG text that holds nothing of when it was made; `salt` tells its ids apart."""
     import matplotlib
 
     stream = io.StringIO()
-    with matplotlib.rc_context({**SETTINGS, "svg.hashsalt": plot.title}):
-        make_figure(plot).savefig(stream, format="svg", bbox_inches="tight", metadata={"Date": None})
+    with matplotlib.rc_context({**SETTINGS, "svg.hashsalt": salt}):
+        make().savefig(stream, format="svg", bbox_inches="tight", metadata={"Date": None})
     text = stream.getvalue()
     text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
     return text.replace("<svg ", '<svg role="img" ', 1)
@@ -119,8 +124,8 @@ def make_figure(plot: Plot) -> "Figure":
     axes.set_ylabel(plot.y_title + (", logarithmic axis" if logarithmic else ""))
     axes.set_xlim(_limits(across, True))
     axes.set_ylim(_limits(upward, logarithmic))
-    _set_ticks(axes.xaxis, across, True)
-    _set_ticks(axes.yaxis, upward, logarithmic)
+    set_ticks(axes.xaxis, across, True)
+    set_ticks(axes.yaxis, upward, logarithmic)
     for curve in plot.curves:
         axes.plot(curve.x, curve.y, ".-", color=_color(curve.number), linewidth=0.9, markersize=3, alpha=0.7)
     if plot.oracle is not None:
@@ -166,7 +171,7 @@ def _limits(values: Sequence[float], logarithmic: bool) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def _set_ticks(axis: "Axis", values: Sequence[float], logarithmic: bool) -> None:
+def set_ticks(axis: "Axis", values: Sequence[float], logarithmic: bool) -> None:
     """Ticks at round values, or at 1, 2 and 5 times powers of ten over more than one of these; short numbers."""
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 

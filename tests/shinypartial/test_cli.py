@@ -25,6 +25,7 @@ COMMANDS = (
     "oracle",
     "compare",
     "weights",
+    "stability",
 )
 
 
