@@ -19,6 +19,7 @@ from panoless.selection.choose import choose_geometry
 from panoless.trust.evidence import gather_evidence
 from panoless.trust.verdict import judge
 from shinypartial.core.errors import InputError
+from shinypartial.dataset.read import photographs_hash
 from shinypartial.dataset.schema import Dataset
 from shinypartial.io.files import folder_lock
 from shinypartial.prediction.format import Trust, dataset_hash
@@ -41,7 +42,7 @@ def fit(
     """
     check_config(config)
     with folder_lock(folder):
-        acquire_run(folder, dataset.root, dataset_hash(dataset), config)
+        acquire_run(folder, dataset.root, dataset_hash(dataset), config, photographs_hash(dataset))
         state = load_state(folder)
         if state is not None and state.environment is not None:
             if state.training is not None:

@@ -101,9 +101,15 @@ def load_state(folder: Path) -> FitState | None:
         ) from None
 
 
-def acquire_run(folder: Path, dataset: Path, dataset_hash: str, config: FitConfig) -> None:
-    """Make `folder` the run of this dataset and configuration; InputError when it belongs to another."""
+def acquire_run(
+    folder: Path, dataset: Path, dataset_hash: str, config: FitConfig, photographs_hash: str | None = None
+) -> None:
+    """Make `folder` the run of this dataset and configuration; InputError when it belongs to another.
+
+    A run that has a checkpoint belongs to its photographs, too; one of an earlier version doesn't know them.
+    """
     description = json.loads(json.dumps({"dataset_hash": dataset_hash, "config": asdict(config)}))
+    whole = {"dataset": str(dataset.resolve()), "photographs_hash": photographs_hash, **description}
     path = folder / DESCRIPTION
     if path.exists():
         found = read_json(path, "the description of a run")
@@ -114,6 +120,14 @@ def acquire_run(folder: Path, dataset: Path, dataset_hash: str, config: FitConfi
                 remedy="Choose another --output, or delete that folder.",
             )
         remove_partial_files(folder)
+        if not (folder / CHECKPOINT).exists():
+            write_json(path, whole)
+        elif photographs_hash not in (None, found.get("photographs_hash", photographs_hash)):
+            raise InputError(
+                expected=f"the photographs, masks and cameras from which the run at {folder} began",
+                found=f"others in {dataset}",
+                remedy="Delete that run folder, or choose another --output.",
+            )
         return
     if folder.exists() and (not folder.is_dir() or any(not _is_partial(path) for path in folder.iterdir())):
         raise InputError(
@@ -121,7 +135,7 @@ def acquire_run(folder: Path, dataset: Path, dataset_hash: str, config: FitConfi
             found="files that are not a run",
             remedy="Choose another --output.",
         )
-    write_json(path, {"dataset": str(dataset.resolve()), **description})
+    write_json(path, whole)
 
 
 def _is_partial(path: Path) -> bool:

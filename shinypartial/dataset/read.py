@@ -1,5 +1,7 @@
 """Open a dataset folder, ours or a plain NeRF-synthetic one, and read its views."""
 
+import hashlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +27,7 @@ from shinypartial.dataset.schema import (
     View,
 )
 from shinypartial.dataset.transforms import read_frames
-from shinypartial.io.files import newest_folder, read_json
+from shinypartial.io.files import newest_folder, read_json, sha256_of
 from shinypartial.io.images import EXR, read_exr, read_exr_rgb, read_picture, read_png, stack_channels, unit_values
 
 DEFAULT_FOLDER = Path("datasets")
@@ -103,6 +105,22 @@ def read_view(frame: Frame) -> View:
                 remedy="Delete the image and make it again.",
             )
     return view
+
+
+def photographs_hash(dataset: Dataset) -> str:
+    """SHA-256 of the training cameras and of every file that training views are read from."""
+    digest = hashlib.sha256()
+    for path in (dataset.root / "transforms_train.json", *_training_files(dataset)):
+        if path.is_file():
+            digest.update(f"{path.name} {sha256_of(path)}\n".encode())
+    return digest.hexdigest()
+
+
+def _training_files(dataset: Dataset) -> Iterator[Path]:
+    for frame in dataset.train:
+        yield from (frame.photograph, frame.alpha_png)
+        if frame.mask is not None:
+            yield frame.mask
 
 
 def require_normals(frame: Frame, view: View) -> Float[np.ndarray, "H W 3"]:

@@ -1,5 +1,6 @@
 """A run folder: its state survives the disk, damage is named, and nobody else's folder is taken."""
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -170,6 +171,24 @@ def test_another_fit_is_refused(tmp_path: Path, dataset_hash: str, config) -> No
     with pytest.raises(InputError, match="another dataset or configuration"):
         acquire_run(tmp_path / "run", DATASET, dataset_hash, config)
     assert (tmp_path / "run" / DESCRIPTION).read_bytes() == before
+
+
+def test_other_photographs_are_refused_once_there_is_a_checkpoint(tmp_path: Path) -> None:
+    for photographs in ("first", "corrected"):
+        acquire_run(tmp_path, DATASET, "hash", CONFIG, photographs)
+    save_state(tmp_path, some_state(False))
+    acquire_run(tmp_path, DATASET, "hash", CONFIG, "corrected")
+    with pytest.raises(InputError, match="photographs, masks and cameras"):
+        acquire_run(tmp_path, DATASET, "hash", CONFIG, "other")
+
+
+def test_a_run_of_an_earlier_version_continues(tmp_path: Path) -> None:
+    acquire_run(tmp_path, DATASET, "hash", CONFIG)
+    description = json.loads((tmp_path / DESCRIPTION).read_text())
+    del description["photographs_hash"]
+    (tmp_path / DESCRIPTION).write_text(json.dumps(description))
+    save_state(tmp_path, some_state(False))
+    acquire_run(tmp_path, DATASET, "hash", CONFIG, "any")
 
 
 @pytest.mark.parametrize("what", ["folder", "file"])
