@@ -37,5 +37,7 @@ class TrustOptions:
     """Unexplained share of held-out light from which it is."""
     largest_saturated: Positive = 0.3
     """Share of saturated pixels from which it is."""
+    least_one_color: Positive = 0.01
+    """Light that one color a view leaves unexplained, up to which a fit is doubted."""
     refused: Positive = 2.0
     """How many times its limit a figure has to be for `do not trust`."""

@@ -16,7 +16,10 @@ MASKS = "Look at the masks, and at the poses of the views whose silhouettes disa
 MATTER = "Photograph a shinier object: this one shows its own color."
 SHAPE = "Look at poses, masks and exposure first; parts that are concave or see themselves may be wrong as well."
 VIEWS = "Add views: at least five that see the object from different sides."
+TEXTURE = "Take it to surroundings that differ from one direction to another, or expose longer."
 EXPOSURE = "Photograph with a shorter exposure, or in high dynamic range."
+#: Light that one color a view leaves unexplained is not told from none below this.
+LEAST_TOLD = 1e-3
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,12 @@ DOUBTS = (
         lambda options: options.largest_saturated,
         lambda found: f"{found.saturated:.0%} of the object's pixels are saturated",
         EXPOSURE,
+    ),
+    _Doubt(
+        lambda found: None if found.one_color is None else 1 / max(found.one_color, LEAST_TOLD),
+        lambda options: 1 / options.least_one_color,
+        lambda found: "the photographs show one plain color, so that they don't tell one direction from another",
+        TEXTURE,
     ),
 )
 

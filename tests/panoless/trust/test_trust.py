@@ -11,7 +11,7 @@ from panoless.capture.views import TrainView, Views
 from panoless.geometry.plane.kind import PlaneMirror
 from panoless.trust.evidence import Evidence, gather_evidence
 from panoless.trust.options import TrustOptions
-from panoless.trust.verdict import MATTER, POSES, judge
+from panoless.trust.verdict import MATTER, POSES, TEXTURE, judge
 from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
 
 OPTIONS = TrustOptions(resolution=32)
@@ -133,6 +133,14 @@ def test_no_worse_figure_lowers_the_risk(views: Views, figure: str) -> None:
         risks.append(judge(replace(found, **{figure: float(value)}), OPTIONS).risk)
     assert risks == sorted(risks)
     assert risks[-1] > 1
+
+
+@pytest.mark.parametrize("radiance", [0.0, 0.4])
+def test_photographs_of_one_color_tell_nothing(views: Views, radiance: float) -> None:
+    found = evidence(each(views, lambda _, view: replace(view, radiance=torch.full_like(view.radiance, radiance))))
+    verdict = judge(found, OPTIONS)
+    assert verdict.verdict == "do not trust"
+    assert verdict.remedy == TEXTURE
 
 
 def test_a_verdict_holds_every_figure_by_name(views: Views) -> None:
