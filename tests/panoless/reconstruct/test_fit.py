@@ -1,6 +1,7 @@
 """Whole fits of a mirror sphere, a second each: they improve, repeat themselves, survive a kill and see no score."""
 
 import math
+import resource
 import subprocess
 import sys
 from dataclasses import replace
@@ -20,7 +21,7 @@ from panoless.geometry.surfels.kind import SurfelFamily
 from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.geometry.surfels.model import Surfels
 from panoless.geometry.surfels.placement import initial_surfels
-from panoless.geometry.surfels.train import LossTerms, SurfelTrainer
+from panoless.geometry.surfels.train import LossTerms, SurfelTrainer, train_surfels
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.kernels.objective import Objective
 from panoless.presets import PRESETS
@@ -342,3 +343,26 @@ def test_a_fit_loads_neither_metrics_nor_blender(tmp_path: Path, sphere_dataset:
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "out" / "prediction.json").exists()
+
+
+class MemoryWatch(Unobserved):
+    """Resident memory (bytes) after every thousandth step."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.resident: list[int] = []
+
+    def after_step(self, iteration: int, seconds: float, current: object) -> None:
+        if iteration % 1000 == 0:
+            pages = int(Path("/proc/self/statm").read_text().split()[1])
+            self.resident.append(pages * resource.getpagesize())
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux's /proc")
+def test_memory_is_flat_over_twenty_thousand_steps(views: Views) -> None:
+    """The last steps need no more than a few megabytes over what the first thousands did."""
+    config, watch = tiny_config(iterations=20_000, count=200), MemoryWatch()
+    train_surfels(views, *begin(views, config), config, watch)
+    assert len(watch.resident) == 20
+    assert max(watch.resident[10:]) - max(watch.resident[2:6]) < 10 * 2**20
