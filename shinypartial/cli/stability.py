@@ -18,7 +18,7 @@ class Stability:
     snakemake: tyro.conf.Positional[tuple[str, ...]] = ()
     """Arguments of Snakemake, after --."""
     plan: Plans = "core"
-    """The core axes; all axes; or a tiny plan without rendering, which takes minutes."""
+    """The core axes; all axes; clean data alone, for the spread over many --seeds; or a tiny plan without rendering."""
     methods: tuple[str, ...] = ("fast",)
     """Presets of panoless: fast, default and paper."""
     method: tyro.conf.UseAppendAction[tuple[str, ...]] = ()

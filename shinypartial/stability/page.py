@@ -51,10 +51,14 @@ def page_lines(results: Results, pictures: Sequence[tuple[str, str]]) -> Iterato
     yield f"- Numbers: [{RESULTS.name}]({RESULTS.as_posix()}), made with this page by `shinypartial stability --page`"
     yield from ("", "Environment: PSNR of linear light over the directions that the true training views observe.")
     yield "Normals: pooled over pixels of test views that see the environment."
-    yield from ("", "## Where methods break", "", *_limit_table(results))
-    yield from ("", "## Curves", "", "Means over scenes; the band is the range over seeds. Failed fits are left out.")
+    if results.axes:
+        yield from ("", "## Where methods break", "", *_limit_table(results))
+        text = "Means over scenes; the band is the range over seeds. Failed fits are left out."
+        yield from ("", "## Curves", "", text)
     for axis in results.axes:
         yield from ("", f"![Curves: {axis.title}]({ASSETS.as_posix()}/stability-{axis.name}.svg)")
+    if seeds > 1:
+        yield from ("", "## Spread over seeds", "", *_spread_lines(results))
     yield from ("", "## How well the verdicts knew", "", *_verdict_lines(results))
     yield from ("", "## Pose jitter, beside the paper", "", *_jitter_lines(results))
     if pictures:
@@ -89,6 +93,23 @@ def _limit_text(axis: Axis, positions: Sequence[float | None]) -> str:
     middle = statistics.median_low(ordered)
     median = "–" if math.isinf(middle) else axis.text(middle)
     return median if texts[0] == texts[1] else f"{median} ({texts[0]} to {texts[1]})"
+
+
+def _spread_lines(results: Results) -> Iterator[str]:
+    yield "Standard deviation over seeds on clean data, of the environment and of the normals' mean error."
+    yield ""
+    yield "| Scene | Method | Seeds | Environment | Normals |\n| --- | --- | --- | --- | --- |"
+    for scene in results.scenes:
+        for method in results.methods:
+            clean = [each for each in results.outcomes if each.cell.axis is None and not each.failure]
+            fits = [each for each in clean if (each.cell.scene, each.cell.method) == (scene, method)]
+            decibels = [each.environment_db for each in fits if each.environment_db is not None]
+            degrees = [each.normals_mean_deg for each in fits if each.normals_mean_deg is not None]
+            texts = [
+                f"{statistics.stdev(values):.3f}{unit}" if len(values) > 1 else "–"
+                for values, unit in ((decibels, " dB"), (degrees, "°"))
+            ]
+            yield f"| {scene} | {method} | {len(fits)} | {' | '.join(texts)} |"
 
 
 def _verdict_lines(results: Results) -> Iterator[str]:

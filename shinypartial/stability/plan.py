@@ -27,7 +27,7 @@ SCENES = {
 #: The small plan takes what comes with the package, so that it needs no Blender.
 TINY = "tiny-vase"
 SIMPLE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
-Plans = Literal["core", "all", "tiny"]
+Plans = Literal["core", "all", "clean", "tiny"]
 Kind = Literal["render", "perturb", "fit", "score"]
 
 
@@ -90,8 +90,8 @@ def conditions(plan: Plans, axes: Sequence[str] = ()) -> Iterator[tuple[str | No
         if name not in BY_NAME:
             known = ", ".join(BY_NAME)
             raise InputError(expected=f"axes: {known}", found=repr(name), remedy="Choose some of them.")
-    if plan == "tiny":
-        yield from (("rotation", 0.5), ("rotation", 2.0))
+    if plan in ("clean", "tiny"):
+        yield from (("rotation", 0.5), ("rotation", 2.0)) if plan == "tiny" else ()
         return
     taken = [axis for axis in AXES if axis.name in axes or (not axes and axis.kind in ("core", _further(plan)))]
     found = [(axis.name, float(level)) for axis in taken for level in axis.levels]

@@ -18,6 +18,11 @@ def commands(plan: Plan) -> dict[str, str]:
     return {job.name: job.command for job in plan.jobs}
 
 
+def test_a_plan_of_clean_data_holds_a_fit_a_seed() -> None:
+    cells = make_plan("clean", COPY, [1, 2], scenes=["vase", "mirror"]).cells
+    assert [cell.name for cell in cells] == ["vase.1.copy", "vase.2.copy", "mirror.1.copy", "mirror.2.copy"]
+
+
 def test_tiny_plan() -> None:
     plan = make_plan("tiny", COPY, [7])
     assert [cell.name for cell in plan.cells] == [

@@ -1,5 +1,6 @@
 """What is made of finished cells, against numbers worked out by hand."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from shinypartial.stability.collect import (
     verdict_auroc,
     write_results,
 )
-from shinypartial.stability.page import write_stability_page
+from shinypartial.stability.page import page_lines, write_stability_page
 from shinypartial.stability.plan import Cell, Size
 
 ROTATION = BY_NAME["rotation"]
@@ -84,3 +85,12 @@ def test_the_page_is_the_same_for_the_same_results(tmp_path: Path) -> None:
     assert "| development | 5 | 2 | 0.833 |" in page
     assert "| 0.5° | 12.04 dB | 14.00 dB |" in page
     assert "error: &lt;none> \\| nothing" in page
+
+
+def test_the_spread_over_seeds_is_stated() -> None:
+    """Of 20, 21 and 22 dB the deviation is 1 dB; a failed fit and worse data don't count."""
+    fits = [(None, 20.0), (None, 21.0), (None, 22.0), (0.5, 5.0), (None, None)]
+    outcomes = [outcome(level, decibels) for level, decibels in fits]
+    seeded = [replace(each, cell=replace(each.cell, seed=seed)) for seed, each in enumerate(outcomes)]
+    page = "\n".join(page_lines(Results(Size(), tuple(seeded)), []))
+    assert "| vase | fast | 3 | 1.000 dB |" in page
