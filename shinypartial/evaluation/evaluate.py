@@ -151,6 +151,7 @@ def evaluate(
     scores = Scores(
         protocol=PROTOCOL,
         dataset=data.name,
+        split=data.scene_split,
         dataset_hash=dataset_hash(data),
         dataset_hash_matches=dataset_hash(data) == info.dataset_hash,
         coverage=observed.coverage,

@@ -116,6 +116,8 @@ class Scores:
     left_out: tuple[LeftOut, ...]
     counts: Counts
     surroundings: SurroundingsScores | None = None
+    split: str = "unknown"
+    """Of the scene: development, held-out, or unknown where the dataset doesn't say."""
 
 
 @dataclass(frozen=True)

@@ -293,6 +293,7 @@ def _costs(info: PredictionInfo) -> list[tuple[str, list[tuple[str, str]]]]:
 def _provenance(info: PredictionInfo, scores: Scores) -> list[tuple[str, str]]:
     return [
         ("dataset", scores.dataset),
+        ("split of the scene", scores.split),
         ("dataset hash (evaluated)", scores.dataset_hash),
         ("dataset hash (prediction)", info.dataset_hash),
         ("protocol", scores.protocol),

@@ -12,7 +12,7 @@ from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
 from shinypartial.evaluation.evaluate import evaluate
 from shinypartial.evaluation.pictures import NEUTRAL_GRAY, NORMAL_ERROR, VISIBILITY, colormap_colors, scalar_picture
-from shinypartial.evaluation.scores import read_scores, score_rows
+from shinypartial.evaluation.scores import read_scores, score_rows, write_scores
 from shinypartial.io.images import write_png
 from shinypartial.io.picture_sheet import write_picture_sheet
 from shinypartial.metrics import perceptual
@@ -74,6 +74,15 @@ def test_the_page_is_well_formed_and_needs_no_other_file(page: str) -> None:
     assert "http" not in page
     assert "<script" not in page
     assert "url(" not in page
+
+
+def test_the_page_says_whether_the_scene_was_held_out(evaluated: Path) -> None:
+    scores = read_scores(evaluated)
+    write_scores(evaluated, replace(scores, split="held-out"))
+    page = write_report(evaluated).read_text()
+    write_scores(evaluated, scores)
+    assert "split of the scene" in page
+    assert "held-out" in page
 
 
 def test_every_figure_has_a_caption(page: str) -> None:
