@@ -49,7 +49,7 @@ class Reconstruction:
 
     @property
     def model(self) -> str:
-        """The kind of geometry that was taken: `plane`, `height_field`, `revolution` or `surfels`."""
+        """The kind of geometry that was taken: `plane`, `height_field`, `revolution`, `free_form` or `surfels`."""
         return self.info.model_selection.chosen if self.info.model_selection else ""
 
     @property

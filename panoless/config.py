@@ -15,6 +15,7 @@ from msgspec import Meta
 
 from panoless.environment.options import FootprintMapOptions
 from panoless.first_surface.options import FirstSurfaceOptions
+from panoless.geometry.free_form.options import FreeFormOptions
 from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.options import PlaneOptions
 from panoless.geometry.revolution.options import RevolutionOptions
@@ -26,7 +27,7 @@ from shinypartial.io.records import Count, NonNegative, Positive, Share, check_r
 Options = TypeVar("Options")
 Tuned = Annotated[Options, tyro.conf.Suppress]
 """Tuned numbers of a stage, which `--set` changes: too many for the help of a command."""
-Model = Literal["auto", "plane", "height_field", "revolution", "surfels"]
+Model = Literal["auto", "plane", "height_field", "revolution", "free_form", "surfels"]
 #: Values of --model that an earlier version had, and today's.
 RENAMED_MODELS = {"bent": "height_field"}
 
@@ -164,7 +165,8 @@ class FitConfig:
     """Seed of the initial surfels and of the order of views."""
     model: Annotated[Model, tyro.conf.arg(prefix_name=False)] = "auto"
     """`auto`: the simplest that explains held-out views; `plane`: three numbers and a boundary; `height_field`: a
-    smooth height over that plane; `revolution`: an axis and a profile; `surfels`: curved."""
+    smooth height over that plane; `revolution`: an axis and a profile; `free_form`: a closed smooth surface; `surfels`:
+    curved."""
     albedo: bool = False
     """Learn a diffuse term A (Eq. 8); a perfect mirror has none."""
     tint: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
@@ -191,6 +193,7 @@ class FitConfig:
     plane: Tuned[PlaneOptions] = field(default_factory=PlaneOptions)
     height_field: Tuned[HeightFieldOptions] = field(default_factory=HeightFieldOptions)
     revolution: Tuned[RevolutionOptions] = field(default_factory=RevolutionOptions)
+    free_form: Tuned[FreeFormOptions] = field(default_factory=FreeFormOptions)
     footprint_map: Tuned[FootprintMapOptions] = field(default_factory=FootprintMapOptions)
     selection: Tuned[SelectionOptions] = field(default_factory=SelectionOptions)
     trust: Tuned[TrustOptions] = field(default_factory=TrustOptions)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 from panoless.config import DensityConfig, EnvironmentConfig, FitConfig, LossConfig, RateConfig, SurfelConfig
+from panoless.geometry.free_form.options import FreeFormOptions, FreeFormRound
 
 _PAPER = FitConfig(
     preset="paper",
@@ -44,6 +45,14 @@ PRESETS: dict[str, FitConfig] = {
         downscale=2,
         surfels=SurfelConfig(count=3000, hull_resolution=64),
         environment=EnvironmentConfig(resolution=64, rays=2_000_000),
+        free_form=FreeFormOptions(
+            rounds=(
+                FreeFormRound(20, 16, 0.30, 1, 20_000, 100.0, 4),
+                FreeFormRound(20, 32, 0.20, 1, 30_000, 100.0, 3),
+                FreeFormRound(28, 64, 0.15, 4, 40_000, 30.0, 3),
+            ),
+            finer=(),
+        ),
     ),
     "default": FitConfig(),
     "best": FitConfig(

@@ -121,8 +121,10 @@ class MaskContours:
         return MaskContours(*(getattr(self, field.name)[::stride] for field in fields(self)))
 
 
-def mask_contours(views: Views) -> MaskContours:
-    """The longest closed or open contour of each mask, without what runs along a border that the mask touches."""
+def mask_contours(views: Views, *, longest_only: bool = True) -> MaskContours:
+    """The longest closed or open contour of each mask, or all of them, without what runs along a border that the mask
+    touches.
+    """
     from skimage.measure import find_contours
 
     parts = []
@@ -131,7 +133,8 @@ def mask_contours(views: Views) -> MaskContours:
         contours = find_contours(mask.astype(np.float64), MASK_LEVEL)
         if not contours:
             continue
-        pixels = max(contours, key=len)[:-1, ::-1] + PIXEL_CENTER
+        chosen = [max(contours, key=len)] if longest_only else contours
+        pixels = np.concatenate([contour[:-1, ::-1] for contour in chosen]) + PIXEL_CENTER
         if any(cut := cut_sides(mask)):
             inner = np.concatenate([pixels, [camera.width, camera.height] - pixels], 1) > BORDER_PX
             pixels = pixels[(inner | ~np.array(cut)).all(1)]

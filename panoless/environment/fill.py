@@ -46,7 +46,7 @@ def _relax(
     gaps = torch.nonzero(known.flatten() < 1)[:, 0]
     if not len(gaps):
         return color
-    around = _neighbors(resolution).to(gaps.device)[:, gaps]
+    around = texel_neighbors(resolution).to(gaps.device)[:, gaps]
     free = (1 - known.flatten()[gaps])[:, None]
     fixed = color.permute(0, 2, 3, 1).flatten(0, 2)[gaps]
     texels = (color + (1 - known) * start).permute(0, 2, 3, 1).flatten(0, 2)
@@ -56,7 +56,7 @@ def _relax(
 
 
 @lru_cache(maxsize=16)
-def _neighbors(resolution: int) -> Int[Tensor, "4 P"]:
+def texel_neighbors(resolution: int) -> Int[Tensor, "4 P"]:
     """Flat indices of the texels to either side of each along s and t; at a border, of the one straight across."""
     centers = 2 * (np.arange(resolution) + 0.5) / resolution - 1
     face, t, s = np.meshgrid(np.arange(6), centers, centers, indexing="ij")

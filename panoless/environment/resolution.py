@@ -18,7 +18,9 @@ RAYS_PER_TEXEL = 8
 """Fewest in the median observed texel of a map. Chosen on the development scenes."""
 
 
-def finest_resolution(rays: Sequence[Rays], start: Float[Tensor, "6 3 L L"], least_gain: float = LEAST_GAIN) -> int:
+def finest_resolution(
+    rays: Sequence[Rays], start: Float[Tensor, "6 3 L L"] | None = None, least_gain: float = LEAST_GAIN
+) -> int:
     """Texels along a face side: the first of 64, 128, 256 that held-out views explain as well as the next.
 
     Every fifth view is held out. Their error is the mean of ‖e‖²/(‖e‖² + s²), s = 0.1, weighted by trust: rays that see

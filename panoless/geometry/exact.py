@@ -1,6 +1,6 @@
 """What kinds in closed form share: exact rays, one map, no steps of optimization."""
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import torch
 from jaxtyping import Float, Int
@@ -32,14 +32,18 @@ class ExactGeometry:
         """None: a pixel is its center."""
         return None
 
-    def solve_map(self: Geometry, views: Views, config: FitConfig) -> tuple[Float[Tensor, "6 3 L L"], list[Rays]]:
+    def map_resolution(self, rays: list[Rays]) -> int:
+        """Texels along a face side of a map from these rays: as many as they fill."""
+        return densest_resolution(rays)
+
+    def solve_map(self, views: Views, config: FitConfig) -> tuple[Float[Tensor, "6 3 L L"], list[Rays]]:
         """The map from all rays, and from footprints where the kind has them.
 
         It starts from nothing, because a coarse start would reject what is finer. Footprints are means of radiance, so
         they take no part where radiance is encoded.
         """
-        rays = normalize_confidence(list(observe_views(views, self, config.environment.rays)))
-        resolution = config.environment.solve_resolution or densest_resolution(rays)
+        rays = normalize_confidence(list(observe_views(views, cast(Geometry, self), config.environment.rays)))
+        resolution = config.environment.solve_resolution or self.map_resolution(rays)
         environment = solve_environment(rays, resolution)
         encoding = encoding_of(config)
         if not encoding.high_dynamic_range:

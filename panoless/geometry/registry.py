@@ -1,12 +1,14 @@
 """Every kind of geometry, the simplest first. A new kind is one line here and one folder beside it."""
 
 from panoless.geometry.base import Family
+from panoless.geometry.free_form.kind import FreeFormFamily
 from panoless.geometry.height_field.kind import HeightFieldFamily
 from panoless.geometry.plane.kind import PlaneFamily
 from panoless.geometry.revolution.kind import RevolutionFamily
 from panoless.geometry.surfels.kind import SurfelFamily
 
 FAMILIES: dict[str, Family] = {
-    family.kind: family for family in (PlaneFamily(), HeightFieldFamily(), RevolutionFamily(), SurfelFamily())
+    family.kind: family
+    for family in (PlaneFamily(), HeightFieldFamily(), RevolutionFamily(), FreeFormFamily(), SurfelFamily())
 }
 """In the order of model selection; the last one explains what no other does."""

@@ -60,3 +60,19 @@ LEAST_RISE = 1e-6
 
 LEAST_FACING = 0.05
 """A ray sees the front of a slope if the cosine between it and the normal's opposite is above this."""
+
+LEAST_STEP = 0.25
+"""A ray toward a level set proceeds by at least so many cells."""
+
+MAX_ROOT_STEPS, ROOT_CONVERGED = 60, 1e-9
+"""Of a ray within the cell where it meets a level set; it is there when a step is this short, relative to its length.
+"""
+
+LEAST_SLANT = 0.05
+"""Cosine between a ray and the surface's normal by which the slide of its hit is divided at least."""
+
+SHORTEST_DIRECTION = 1e-30
+"""A direction whose components are all smaller looks nowhere."""
+
+SUB_PIXELS = {1: ((0.0, 0.0),), 4: ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))}
+"""Places of one and of four rays of a pixel, from its center, in pixels."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
@@ -33,4 +34,36 @@ def conjugate_gradients(
         new_energy = (residual * scaled).sum()
         direction = scaled + (new_energy / energy.clamp(min=1e-12)) * direction
         energy = new_energy
+    return result
+
+
+def solve_by_products(
+    product: Callable[[Float[np.ndarray, "*S"]], Float[np.ndarray, "*S"]],
+    right_side: Float[np.ndarray, "*S"],
+    precondition: Float[np.ndarray, "*S"],
+    steps: int,
+    tolerance: float,
+) -> Float[np.ndarray, "*S"]:
+    """x with A x ≈ b from zero on, for arrays of any shape; A has to be positive definite where `precondition` is not
+    zero, and x is zero elsewhere.
+
+    Ends after so many steps, or when rᵀ P r is `tolerance` times its first value, r = b − A x, P the preconditioner.
+    """
+    result, residual = np.zeros_like(right_side), right_side.copy()
+    scaled = precondition * residual
+    direction, energy = scaled.copy(), float((residual * scaled).sum())
+    enough = tolerance * energy
+    for _ in range(steps):
+        if energy <= enough:
+            break
+        ahead = product(direction)
+        curvature = float((direction * ahead).sum())
+        if curvature <= 0:
+            break
+        result += energy / curvature * direction
+        residual -= energy / curvature * ahead
+        scaled = precondition * residual
+        following = float((residual * scaled).sum())
+        direction = scaled + following / energy * direction
+        energy = following
     return result

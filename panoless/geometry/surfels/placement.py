@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from panoless.capture.views import Views
 from panoless.config import SurfelConfig
 from panoless.first_surface.completion import complete_surface, hull_surface
-from panoless.first_surface.mesh import unit
+from panoless.first_surface.mesh import TriangleMesh, unit
 from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.first_surface.visual_hull import Hull, carve_hull
 from panoless.geometry.surfels.model import Surfels
@@ -36,27 +36,41 @@ def hull_surfels(views: Views, config: SurfelConfig, seed: int, options: FirstSu
     """
     hull = carve_hull(views, config.hull_resolution, config.hull_votes, options)
     surface = complete_surface(hull, views, options) if config.initial == "thin-plate" else hull_surface(hull)
+    facing = _faces_some_camera(surface, views)
+    return surfels_on_mesh(surface, config.count, hull.pixel, seed, facing, hull)
+
+
+def surfels_on_mesh(
+    surface: TriangleMesh,
+    count: int,
+    pixel: float,
+    seed: int,
+    facing: Bool[np.ndarray, "T"] | None = None,
+    hull: Hull | None = None,
+) -> Surfels:
+    """Surfels over the triangles of a mesh that are `facing`, or all, curved as it is, and within a hull if given."""
     vertex_normals, tensors = surface.vertex_normals(), surface.shape_tensors()
     corners = surface.vertices[surface.triangles]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    facing = _faces_some_camera(corners.mean(1), vertex_normals[surface.triangles].sum(1), views)
-    areas = np.where(facing, np.linalg.norm(cross, axis=1) / 2, 0)
+    areas = np.linalg.norm(cross, axis=1) / 2 * (1.0 if facing is None else facing)
     face_normals = unit(vertex_normals[surface.triangles].sum(1))
     bends, _ = _principal(tensors[surface.triangles].mean(1), _tangent_frames(face_normals))
-    radii, largest = _radii(areas, bends, config.count, hull.pixel)
+    radii, largest = _radii(areas, bends, count, pixel)
     rng = np.random.default_rng(seed)
     expected = np.cumsum(areas / radii.prod(1))
     # Stratified over the cumulative number, and more than are needed, so that they can be spread.
-    candidates = CANDIDATES * config.count
+    candidates = CANDIDATES * count
     picks = np.searchsorted(expected, (np.arange(candidates) + rng.random(candidates)) * expected[-1] / candidates)
     faces = surface.triangles[np.minimum(picks, len(corners) - 1)]
     shares = rng.dirichlet([1.0, 1.0, 1.0], candidates)
     points = np.einsum("kv,kvi->ki", shares, surface.vertices[faces])
-    chosen = _spread(points, config.count)
+    chosen = _spread(points, count)
     points, faces, shares = points[chosen], faces[chosen], shares[chosen]
     normals, tensors = (np.einsum("kv,kv...->k...", shares, values[faces]) for values in (vertex_normals, tensors))
     bends, frames = _principal(tensors, _tangent_frames(unit(normals)))
-    scales = _within_hull(hull, points, frames, np.minimum(_reach(bends, hull.pixel), largest))
+    scales = np.minimum(_reach(bends, pixel), largest)
+    if hull is not None:
+        scales = _within_hull(hull, points, frames, scales)
     return surfels_at(points, frames, scales, _shape_operators(tensors, frames))
 
 
@@ -190,7 +204,9 @@ def surfels_at(
     )
 
 
-def _faces_some_camera(points: Float[np.ndarray, "P 3"], normals: Float[np.ndarray, "P 3"], views: Views) -> np.ndarray:
+def _faces_some_camera(surface: TriangleMesh, views: Views) -> Bool[np.ndarray, "T"]:
+    points = surface.vertices[surface.triangles].mean(1)
+    normals = surface.vertex_normals()[surface.triangles].sum(1)
     facing = np.zeros(len(points), dtype=bool)
     for view in views.train:
         facing |= ((view.position - points) * normals).sum(1) > 0

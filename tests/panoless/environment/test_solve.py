@@ -8,7 +8,7 @@ from torch.nn.functional import normalize
 
 from panoless.config import EnvironmentConfig
 from panoless.environment.cubemap import initial_environment, look_up, resample
-from panoless.environment.fill import _neighbors, fill_unobserved
+from panoless.environment.fill import fill_unobserved, texel_neighbors
 from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap
@@ -116,7 +116,7 @@ def test_the_fill_stays_between_what_is_known(seed: int) -> None:
 
 def test_neighbors_are_mutual_and_one_texel_away() -> None:
     """Each texel has four, is the neighbor of its neighbors, and no pair is further apart than texels of a face are."""
-    around, directions = _neighbors(LENGTH), cubemap_directions(LENGTH).reshape(-1, 3)
+    around, directions = texel_neighbors(LENGTH), cubemap_directions(LENGTH).reshape(-1, 3)
     for texel, neighbors in enumerate(around.T.tolist()):
         assert len(set(neighbors)) == 4
         assert all(texel in around[:, other].tolist() for other in neighbors)
@@ -142,7 +142,7 @@ def test_a_fill_between_top_and_bottom_is_linear_around_the_four_sides() -> None
 def test_a_hidden_texel_is_the_mean_of_its_neighbors_over_edges_too(seed: int) -> None:
     weight = (random_map(seed, 1)[:, 0] > 0.9).float()
     texels = fill_unobserved(random_map(seed + 1, 3), weight).permute(0, 2, 3, 1).flatten(0, 2)
-    off = (texels - texels[_neighbors(LENGTH)].mean(0)).abs()[weight.flatten() == 0]
+    off = (texels - texels[texel_neighbors(LENGTH)].mean(0)).abs()[weight.flatten() == 0]
     # Push–pull alone: 0.015 to 0.020; relaxed: below 0.001.
     assert float(off.mean()) < 0.002
 

@@ -40,6 +40,9 @@ def coarse_config() -> FitConfig:
             photometric=replace(photometric, coarse=photometric.coarse[:1], fine=photometric.fine[:1]),
             footprints=replace(footprints, rounds=footprints.rounds[:2]),
         ),
+        free_form=replace(
+            config.free_form, rounds=tuple(replace(each, rays=5000) for each in config.free_form.rounds[:2]), finer=()
+        ),
     )
 
 
@@ -101,11 +104,12 @@ def test_right_surfels_beat_the_plane_of_a_bent_mirror() -> None:
         "plane": Verdict.REFUSED_BY_HELD_OUT_VIEWS,
         "height_field": Verdict.REFUSED_BY_HELD_OUT_VIEWS,
         "revolution": Verdict.NOT_PROPOSED,
+        "free_form": Verdict.REFUSED_BY_HELD_OUT_VIEWS,
         "surfels": Verdict.CHOSEN,
     }
     assert isinstance(geometry, SurfelMirror)
     assert geometry.started_on is not None
-    assert geometry.started_on.kind == "height_field"
+    assert geometry.started_on.kind == "free_form"
 
 
 def test_surfels_that_explain_as_much_do_not_beat_the_plane() -> None:
@@ -139,21 +143,22 @@ def test_surfels_that_cover_nothing_do_not_beat_the_plane() -> None:
 
 def test_a_box_is_refused_by_its_silhouettes() -> None:
     """Before anything is fitted, as plane and as surface of revolution; the table says how far away they are."""
-    geometry, selection = choose_geometry(pillar_views(around(10, SIZE_PX)), CONFIG, no_trial)
-    assert geometry.kind == "surfels"
+    geometry, selection = choose_geometry(pillar_views(around(10, SIZE_PX)), CONFIG, as_started)
+    assert geometry.kind == "free_form"
     refused = Verdict.REFUSED_BY_SILHOUETTES, Verdict.NOT_PROPOSED
     assert all(verdicts(selection)[kind] in refused for kind in ("plane", "height_field", "revolution"))
     plane = selection.candidates[0]
     assert plane.verdict == Verdict.NOT_PROPOSED or plane.silhouette_px > 0.5 or plane.overlap < 0.98
-    assert selection.sentence.startswith("surfels (no simpler kind explains the views); before it plane: ")
+    assert selection.sentence.startswith("free_form (surfels are no better;")
 
 
-def test_a_fit_remembers_why_it_took_surfels() -> None:
+def test_a_fit_remembers_why_it_took_its_kind() -> None:
     """The table becomes part of the state, from which it goes into the prediction."""
     state = begin(pillar_views(around(10, SIZE_PX)), CONFIG)
-    assert state.selection.chosen == state.geometry.kind == "surfels"
-    assert [each.kind for each in state.selection.candidates] == ["plane", "height_field", "revolution", "surfels"]
-    assert state.training is not None
+    assert state.selection.chosen == state.geometry.kind
+    kinds = ["plane", "height_field", "revolution", "free_form", "surfels"]
+    assert [each.kind for each in state.selection.candidates] == kinds[: kinds.index(state.geometry.kind) + 1]
+    assert (state.training is None) == (state.geometry.kind != "surfels")
 
 
 def test_a_goblet_takes_the_surface_of_revolution() -> None:

@@ -1,0 +1,1 @@
+"""A free-form mirror: the zero level of a tricubic B-spline."""

@@ -1,0 +1,161 @@
+"""The free-form surface as a kind of geometry."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from panoless.capture.object_frame import ObjectFrame
+from panoless.capture.views import TrainView, Views
+from panoless.config import FitConfig
+from panoless.environment.footprints import Footprints, PixelFootprints
+from panoless.environment.rays import Rays
+from panoless.environment.resolution import finest_resolution
+from panoless.first_surface.completion import complete_surface
+from panoless.first_surface.visual_hull import carve_hull
+from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, to_plain
+from panoless.geometry.exact import ExactFamily, ExactGeometry
+from panoless.geometry.free_form.fit import fit_free_form
+from panoless.geometry.free_form.observations import PixelRays, inner_distance_px
+from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions
+from panoless.geometry.free_form.photometric import Sights
+from panoless.geometry.free_form.rendering import free_form_buffers, free_form_light
+from panoless.geometry.free_form.surface import LevelSet, level_set_of
+from panoless.geometry.free_form.trust import Trust
+from panoless.geometry.surfels.mirror import SurfelMirror
+from panoless.geometry.surfels.placement import surfels_on_mesh
+from panoless.kernels.rasterize import RasterCamera
+from shinypartial.io.records import read_record, write_record
+
+
+@dataclass(frozen=True)
+class FreeFormMirror(ExactGeometry):
+    """A closed surface, and how far each part of it is trusted."""
+
+    kind: ClassVar[str] = "free_form"
+    surface: LevelSet
+    trust: Trust
+    occlusion_test: bool = True
+    """Whether pixels that see the object again are left out."""
+    options: FreeFormOptions = DEFAULTS
+
+    @property
+    def num_parameters(self) -> int:
+        """The coefficients whose support meets the surface."""
+        return int((np.abs(self.surface.at_nodes()) < self.options.band_cells).sum())
+
+    def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
+        """Solid pixels that see the surroundings by way of the surface, but for the outermost ones."""
+        return view.solid[torch.from_numpy(self._sights(view, view.solid)[1]).to(view.solid.device)]
+
+    def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
+        """The rays of those of the pixels that see the surroundings, with the trust of the surface there."""
+        sights, seeing = self._sights(view, pixels)
+        chosen = pixels[torch.from_numpy(seeing).to(pixels.device)]
+        trust = self.trust.at(self.surface.points(sights.hits.places[seeing]))
+        outgoing, trusted = (torch.from_numpy(each).float() for each in (sights.outgoing[seeing, 0], trust))
+        radiance = view.radiance.flatten(1)[:, chosen].T.contiguous()
+        return Rays(outgoing.to(radiance.device), radiance, trusted.to(radiance.device))
+
+    def _sights(self, view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Sights, Bool[np.ndarray, "P"]]:
+        index = pixels.cpu().numpy()
+        sights = Sights.of(
+            self.surface,
+            PixelRays.centers(view.camera, index),
+            1,
+            self.options.least_map_cosine,
+            occlusion_test=self.occlusion_test,
+        )
+        return sights, sights.clear & (inner_distance_px(view).ravel()[index] > self.options.map_inner_px)
+
+    def map_resolution(self, rays: list[Rays]) -> int:
+        """As fine as held-out views want it."""
+        return finest_resolution(rays)
+
+    def footprints(self, views: Views) -> Footprints | None:
+        """Four directions over each of about `footprints` pixels that are trusted and turn little."""
+        stride = max(1, -(-sum(len(view.solid) for view in views.train) // self.options.footprints))
+        found = []
+        for first, view in enumerate(views.train):
+            pixels = view.solid[first % stride :: stride]
+            rays = PixelRays.centers(view.camera, pixels.cpu().numpy())
+            sights = Sights.of(self.surface, rays, 4, self.options.least_map_cosine, occlusion_test=self.occlusion_test)
+            trusted = self.trust.at(self.surface.points(sights.hits.places)) > self.options.least_footprint_trust
+            kept = sights.clear & trusted & (sights.turn < self.options.widest_footprint_rad)
+            directions = torch.from_numpy(sights.outgoing[kept]).float().to(view.radiance.device)
+            chosen = pixels[torch.from_numpy(kept).to(pixels.device)]
+            found.append(PixelFootprints(directions, view.radiance.flatten(1)[:, chosen].T.contiguous()))
+        parts = [part for part in found if len(part.radiance)]
+        if not parts:
+            return None
+        areas = PixelFootprints(
+            torch.cat([part.directions for part in parts]), torch.cat([part.radiance for part in parts])
+        )
+        return Footprints([areas], lambda: areas)
+
+    def shade(
+        self,
+        environment: Float[Tensor, "6 3 L L"],
+        camera: RasterCamera,
+        pixels: Int[Tensor, "P"],
+        normals_camera: Float[Tensor, "3 P"],
+    ) -> Float[Tensor, "P 3"]:
+        """Means over the pixels' areas; where the object sees itself, along the ray that leaves in the end."""
+        return free_form_light(self.surface, environment, camera, pixels, normals_camera)
+
+    def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
+        """By intersection; alpha by 4×4 rays at outlines."""
+        return free_form_buffers(self.surface, camera)
+
+    def to_surfels(self, config: FitConfig) -> SurfelMirror:
+        """Surfels all over the surface, curved as it is."""
+        mesh, _ = self.surface.mesh(points_a_cell=1)
+        pixel = self.surface.spacing * self.options.surfel_pixel
+        return SurfelMirror.of(surfels_on_mesh(mesh, config.surfels.count, pixel, config.seed), config, self)
+
+    def mesh(self, frame: ObjectFrame) -> Mesh:
+        """Marching cubes, with the exact normals of the vertices."""
+        mesh, normals = self.surface.mesh()
+        columns = dict(zip(("nx", "ny", "nz"), normals.T, strict=True))
+        return Mesh(frame.to_world(mesh.vertices), mesh.triangles, columns)
+
+    def state_dict(self) -> dict[str, Any]:
+        """All numbers as lists and plain values."""
+        options = write_record(self.options)
+        surface, trust = to_plain(self.surface), to_plain(self.trust)
+        return {"surface": surface, "trust": trust, "occlusion_test": self.occlusion_test, "options": options}
+
+    @classmethod
+    def from_state_dict(cls, content: dict[str, Any]) -> "FreeFormMirror":
+        """The geometry that `state_dict` was taken from."""
+        options = read_record(FreeFormOptions, content["options"], "the options of a free-form surface")
+        surface, trust = from_plain(LevelSet, content["surface"]), from_plain(Trust, content["trust"])
+        return cls(surface, trust, content["occlusion_test"], options)
+
+
+class FreeFormFamily(ExactFamily):
+    """Closed surfaces, which explain any silhouettes."""
+
+    kind: ClassVar[str] = "free_form"
+    geometry: ClassVar[type[Geometry]] = FreeFormMirror
+    label: ClassVar[str] = "a free-form surface"
+
+    def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
+        """The first surface as a level set; one that is closed explains any silhouettes in the end.
+
+        None where there are too few views to judge it by.
+        """
+        if len(views.train) < config.free_form.least_views and not asked:
+            return None
+        hull = carve_hull(views, config.surfels.hull_resolution, config.surfels.hull_votes, config.first_surface)
+        first = complete_surface(hull, views, config.first_surface)
+        surface = level_set_of(first, config.free_form.start_cells, config.free_form.margin)
+        return Proposal(surface, 0.0, 1.0)
+
+    def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
+        """All coefficients by outlines and photographs together."""
+        surface, trust = fit_free_form(views, proposal.shape, config.free_form)
+        return FreeFormMirror(surface, trust, config.environment.trace, config.free_form)

@@ -1,0 +1,41 @@
+"""The map that a fit works with: weighted least squares of pixels as means of a few rays, from the one before."""
+
+from jaxtyping import Float
+from torch import Tensor
+
+from panoless.environment.fill import fill_unobserved, texel_neighbors
+from panoless.environment.footprints import PixelFootprints
+from panoless.numeric.conjugate_gradients import conjugate_gradients
+
+
+def splatted_map(pixels: PixelFootprints, weights: Float[Tensor, "P"], resolution: int) -> Float[Tensor, "6 3 L L"]:
+    """Each texel the mean of what fell on it, gaps filled."""
+    total = pixels.spread(weights[:, None], resolution)
+    return fill_unobserved(
+        pixels.spread(weights[:, None] * pixels.radiance, resolution) / total.clamp(min=1e-9), total[:, 0]
+    )
+
+
+def sharpened_map(
+    environment: Float[Tensor, "6 3 L L"],
+    pixels: PixelFootprints,
+    weights: Float[Tensor, "P"],
+    smoothness: float,
+    steps: int,
+) -> Float[Tensor, "6 3 L L"]:
+    """min_E Σ w ‖mean_k E(ω_k) − c‖² + λ Σ ‖E_i − E_j‖² over neighboring texels: a few steps from a map on."""
+    resolution = environment.shape[-1]
+    around = texel_neighbors(resolution).to(environment.device)
+
+    def differences(image: Tensor) -> Tensor:
+        texels = image.movedim(1, -1).reshape(-1, image.shape[1])
+        change = 4 * texels - texels[around].sum(0)
+        return change.reshape(6, resolution, resolution, -1).movedim(-1, 1)
+
+    def product(image: Tensor) -> Tensor:
+        return pixels.spread(pixels.seen(image) * weights[:, None], resolution) + smoothness * differences(image)
+
+    diagonal = pixels.spread(weights[:, None], resolution) + 4 * smoothness
+    residual = pixels.spread(pixels.radiance * weights[:, None], resolution) - product(environment)
+    found = conjugate_gradients(product, environment, residual, 1 / diagonal, steps)
+    return found.clamp(min=0)

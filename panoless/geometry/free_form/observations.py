@@ -1,0 +1,86 @@
+"""Pixels and outlines of all views as rays in the normalized frame."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from panoless.capture.rays import pose_of
+from panoless.capture.silhouettes import mask_contours
+from panoless.capture.views import TrainView, Views, concatenated, every_kth_pixel
+from panoless.kernels.rasterize import RasterCamera
+from shinypartial.core.conventions import PIXEL_CENTER, SOLID_ALPHA
+
+
+@dataclass(frozen=True)
+class PixelRays:
+    """Rays of unit direction through places of pictures.
+
+    `steps` are the changes of the direction by a pixel to the right and down; `size` is a pixel's angle (rad).
+    """
+
+    origins: Float[np.ndarray, "P 3"]
+    directions: Float[np.ndarray, "P 3"]
+    steps: Float[np.ndarray, "P 2 3"]
+    size: Float[np.ndarray, "P"]
+
+    @classmethod
+    def through(cls, camera: RasterCamera, column: Float[np.ndarray, "P"], row: Float[np.ndarray, "P"]) -> "PixelRays":
+        """Through places (column, row) of a picture, in pixels."""
+        rotation, center = pose_of(camera)
+        x, y = (column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
+        directions = np.stack([x, y, np.ones_like(x)], 1) @ rotation
+        length = np.linalg.norm(directions, axis=1, keepdims=True)
+        directions /= length
+        axes = rotation[:2] / np.array([[camera.fx], [camera.fy]])
+        across = np.einsum("pi,ai->pa", directions, axes)
+        steps = (axes - across[..., None] * directions[:, None]) / length[..., None]
+        return cls(np.tile(center, (len(x), 1)), directions, steps, 1 / (camera.fx * length[:, 0]))
+
+    def chosen(self, index: slice | Bool[np.ndarray, "P"]) -> "PixelRays":
+        """Some of them."""
+        return PixelRays(self.origins[index], self.directions[index], self.steps[index], self.size[index])
+
+    @classmethod
+    def centers(cls, camera: RasterCamera, pixels: Int[np.ndarray, "P"]) -> "PixelRays":
+        """Through the centers of pixels, given by flat indices."""
+        row, column = np.divmod(pixels, camera.width)
+        return cls.through(camera, column + PIXEL_CENTER, row + PIXEL_CENTER)
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Solid pixels of all views, what they saw, and how far inside their mask they lie (px)."""
+
+    rays: PixelRays
+    radiance: Float[np.ndarray, "P 3"]
+    inner_px: Float[np.ndarray, "P"]
+
+
+def inner_distance_px(view: TrainView) -> Float[np.ndarray, "H W"]:
+    """How far each pixel lies from the nearest one that is not solid; the picture's border counts as such."""
+    from scipy.ndimage import distance_transform_edt
+
+    solid = np.pad(view.mask.cpu().numpy() > SOLID_ALPHA, 1)
+    found: np.ndarray = distance_transform_edt(solid)[1:-1, 1:-1]
+    return found
+
+
+def solid_pixels(views: Views, count: int) -> Pixels:
+    """About `count` solid pixels of all views, evenly."""
+    rays, radiance, inner = [], [], []
+    for view, pixels in every_kth_pixel(views, count):
+        index = pixels.cpu().numpy()
+        rays.append(PixelRays.centers(view.camera, index))
+        radiance.append(view.radiance.flatten(1)[:, pixels].T.cpu().numpy().astype(np.float64))
+        inner.append(inner_distance_px(view).ravel()[index])
+    return Pixels(concatenated(rays), np.concatenate(radiance), np.concatenate(inner))
+
+
+def outline_rays(views: Views) -> PixelRays:
+    """Rays through all contours of the masks."""
+    contours = mask_contours(views, longest_only=False)
+    length = np.linalg.norm(contours.rays, axis=1)
+    focal = np.array([view.camera.fx for view in views.train])[contours.view]
+    steps = np.zeros((len(length), 2, 3))
+    return PixelRays(contours.centers, contours.rays / length[:, None], steps, 1 / (focal * length))

@@ -1,0 +1,142 @@
+"""The tuned numbers of a free-form surface's fit."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class FreeFormRound:
+    """Gauss–Newton steps on one grid and one map."""
+
+    cells: int
+    """Cells along the longest side of the box, of which the object takes about three quarters."""
+    resolution: int
+    """Texels along a face side of the map."""
+    robust_scale: float
+    """Residual (linear radiance) beyond which a pixel loses its vote."""
+    samples: int
+    """Mirrored rays over a pixel, 1 or 4."""
+    rays: int
+    """About so many pixels of all views take part."""
+    smoothing: float
+    """Weight λ of the integral of |D³φ|² in the normalized frame, against `counted_rays` pixels."""
+    steps: int
+    """Most steps."""
+
+
+@dataclass(frozen=True)
+class FreeFormOptions:
+    """How a level set is fitted to silhouettes and photographs.
+
+    "Development shapes" are sculpture and an ellipsoid, a torus and a wavy ball that are traced analytically. Where
+    nothing else is said, a value was chosen on these; "not tuned" is what only has to be large or small enough.
+    """
+
+    rounds: tuple[FreeFormRound, ...] = (
+        FreeFormRound(20, 16, 0.30, 1, 40_000, 100.0, 5),
+        FreeFormRound(20, 32, 0.20, 1, 40_000, 100.0, 5),
+        FreeFormRound(28, 32, 0.20, 1, 60_000, 30.0, 3),
+        FreeFormRound(28, 64, 0.15, 4, 80_000, 30.0, 4),
+    )
+    """From coarse to fine, always taken: the first texels are as wide as a ray turns when its normal does by 2.8°."""
+    finer: tuple[FreeFormRound, ...] = (
+        FreeFormRound(42, 128, 0.10, 4, 150_000, 10.0, 5),
+        FreeFormRound(60, 128, 0.10, 4, 200_000, 3.0, 4),
+    )
+    """Each taken if held-out views gain by the one before it. The last one that was is taken again with all views."""
+    least_views: int = 5
+    """With fewer views none is held out, and model selection leaves the kind out. Not tuned."""
+    start_cells: int = 40
+    """Cells along the longest side of the first surface, before its first round. Not tuned."""
+    margin: float = 0.175
+    """Between the start and the sides of its box, in its longest side: the support of a spline on the first grid, and
+    some room to move. Not tuned."""
+    band_cells: float = 3.5
+    """Coefficients within so many cells of the surface are unknowns: all whose support meets it. Not tuned."""
+    counted_rays: float = 100_000.0
+    """The photographs weigh as much as so many pixels, however many take part."""
+    radiance_sigma: float = 0.02
+    """Standard deviation of a pixel (linear radiance)."""
+    outline_sigma_px: float = 0.15
+    """Standard deviation of an outline's point."""
+    outline_scale_px: float = 2.0
+    """Robust scale of outlines."""
+    outline_points: int = 30_000
+    """Most outline points of all views. Not tuned."""
+    miss_weight: float = 0.3
+    """Weight of a pixel on the object that misses the surface, against an outline's point."""
+    miss_scale_px: float = 20.0
+    """Its robust scale."""
+    gauge: float = 10.0
+    """Weight of (|∇φ| − 1)² at each node within `gauge_cells`."""
+    gauge_cells: float = 2.0
+    """From the surface."""
+    inner_px: float = 1.5
+    """Pixels nearer to the outline of their mask have no say: they mix two things. Not tuned."""
+    least_cosine: float = 0.12
+    """Between the ray and the surface's normal, for a pixel to have a say in the shape."""
+    least_map_cosine: float = 0.03
+    """The same for the final map."""
+    map_inner_px: float = 1.0
+    """Pixels of the final map lie farther inside their mask. Not tuned."""
+    footprints: int = 2_000_000
+    """Pixels whose areas sharpen the final map, for memory."""
+    widest_footprint_rad: float = 0.15
+    """Pixels that mirror more in one direction take no part in that. On sculpture at 200 px 0.05, 0.15 and 0.5 give
+    32.8, 33.8 and 33.6 dB."""
+    least_footprint_trust: float = 0.3
+    """Nor do pixels that are trusted less; 0.7 costs 0.04 dB there."""
+    surfel_pixel: float = 0.2
+    """The sag of surfels that start on the surface is told in pixels of so many cells. Not tuned."""
+    wide_texels: float = 4.0
+    """A pixel that mirrors so many texels has half a vote."""
+    map_smoothness: float = 0.05
+    """Weight of squared differences of neighboring texels, in rays."""
+    map_rounds: int = 2
+    """Robust rounds of the map after each step."""
+    first_map_rounds: int = 3
+    """The same at the start of a round of steps."""
+    map_steps: int = 6
+    """Conjugate-gradient steps of each of them."""
+    texel_prior: float = 0.5
+    """Rays that ask for nothing in the mean of a texel."""
+    trust_cells: int = 40
+    """Cells along the longest side in which trust is measured."""
+    trust_scale: float = 2.0
+    """Robust scale of trust, in medians of the residuals…"""
+    least_trust_scale: float = 0.02
+    """…but at least this (linear radiance)."""
+    trust_prior: float = 1e-5
+    """Share of all rays that each cell of trust has beside its own, of trust `trust_floor`."""
+    trust_floor: float = 0.1
+    """Trust where no ray tells, in means."""
+    trust_power: float = 2.0
+    """Trust is raised to this power."""
+    damping: float = 1e-3
+    """First μ of Marquardt's damping μ diag(H)."""
+    damping_less: float = 0.3
+    """Factor of μ after a whole step."""
+    damping_more: float = 4.0
+    """Factor of μ after a shortened one."""
+    damping_range: tuple[float, float] = (1e-5, 1.0)
+    """Bounds of μ."""
+    shortening: float = 0.35
+    """Factor of a step that raises the cost."""
+    trials: int = 4
+    """Lengths that are tried."""
+    solver_steps: int = 30
+    """Conjugate-gradient steps for a Gauss–Newton step. Sixty are no better on sculpture, for twice the time."""
+    solver_tolerance: float = 1e-5
+    """They end when the preconditioned residual's energy has fallen to this share."""
+    largest_step_cells: float = 1.0
+    """No coefficient moves by more in one step."""
+    least_held_out_gain: float = 0.002
+    """Share of the held-out error by which a finer round has to lower it."""
+    held_out_rays: int = 200_000
+    """Pixels of held-out views, and of the others, that tell it. Not tuned."""
+    held_out_resolution: int = 128
+    """Texels along a face side of the map that predicts them."""
+    least_gain: float = 3e-3
+    """A round ends when a step lowers the cost by less than this share."""
+
+
+DEFAULTS = FreeFormOptions()

@@ -1,0 +1,204 @@
+"""What pixels see by way of a level set under a map that follows it, and what it costs."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from panoless.environment.cubemap import resample
+from panoless.environment.footprints import PixelFootprints
+from panoless.geometry.free_form.equations import Rows, gauge_rows, joined_rows, silhouette_rows
+from panoless.geometry.free_form.map import sharpened_map, splatted_map
+from panoless.geometry.free_form.observations import PixelRays, Pixels
+from panoless.geometry.free_form.options import FreeFormOptions, FreeFormRound
+from panoless.geometry.free_form.surface import Hits, LevelSet
+from panoless.geometry.free_form.trust import Trust
+from panoless.kernels.level_set import mirror_rows, mirrored, seen_with_slopes, third_differences, without_means
+from panoless.kernels.reference.cubemap import padded_texels
+from panoless.numeric.robust import bounded_error, robust_weight
+
+
+@dataclass(frozen=True)
+class Sights:
+    """Where rays of pixels meet a surface and what they mirror: K directions over each pixel, how far these turn over
+    it (rad), and whether it sees the surroundings at a useful angle.
+    """
+
+    hits: Hits
+    outgoing: Float[np.ndarray, "P K 3"]
+    turn: Float[np.ndarray, "P"]
+    clear: Bool[np.ndarray, "P"]
+
+    @classmethod
+    def of(
+        cls, surface: LevelSet, rays: PixelRays, samples: int, least_cosine: float, *, occlusion_test: bool = True
+    ) -> "Sights":
+        """By tracing the rays, and, but without an occlusion test, their mirrored rays against the surface itself."""
+        hits = surface.hits(rays.origins, rays.directions)
+        distance = np.where(hits.met, hits.distance, 0.0) / surface.spacing
+        normals, outgoing, turn = mirrored(hits.derivatives, rays.directions, distance, rays.steps, samples)
+        facing = -(normals * rays.directions).sum(1)
+        clear = hits.met & (facing > least_cosine)
+        chosen = np.flatnonzero(clear & occlusion_test)
+        middle = rays.directions[chosen] + 2 * facing[chosen, None] * normals[chosen]
+        clear[chosen[surface.meets_again(hits.places[chosen], middle)]] = False
+        return cls(hits, outgoing, turn, clear)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What one round of steps is solved for."""
+
+    pixels: Pixels
+    outlines: PixelRays
+    photograph_weight: float
+    """Of a pixel, in units of 1/σ²."""
+    outline_weight: float
+    """Of an outline's point."""
+    settings: FreeFormRound
+    options: FreeFormOptions
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A surface, the map that explains the pixels best with it, and what both cost."""
+
+    task: Task
+    surface: LevelSet
+    sights: Sights
+    trust: Trust
+    environment: Float[Tensor, "6 3 L L"]
+    residual: Float[np.ndarray, "P 3"]
+    slopes: Float[np.ndarray, "P 3 3"]
+    texels: Int[np.ndarray, "P"]
+    free: Float[np.ndarray, "P"]
+    """Weights of the pixels without trust and robust weights."""
+
+    @classmethod
+    def at(
+        cls, task: Task, surface: LevelSet, trust: Trust, start: Float[Tensor, "6 3 M M"] | None, rounds: int
+    ) -> "Solution":
+        """With the map solved in so many robust rounds from another one, or from nothing."""
+        options, settings = task.options, task.settings
+        sights = Sights.of(surface, task.pixels.rays, settings.samples, options.least_cosine)
+        clear = sights.clear & (task.pixels.inner_px > options.inner_px)
+        texel = np.pi / 2 / settings.resolution
+        free = clear / (1 + (sights.turn / (options.wide_texels * texel)) ** 2)
+        weights = free * trust.at(surface.points(sights.hits.places))
+        areas = PixelFootprints(
+            torch.from_numpy(sights.outgoing).float(), torch.from_numpy(task.pixels.radiance).float()
+        )
+        if start is None:
+            environment = splatted_map(areas, torch.from_numpy(weights).float(), settings.resolution)
+        else:
+            environment = start if start.shape[-1] == settings.resolution else resample(start, settings.resolution)
+        for _ in range(rounds):
+            error = areas.seen(environment) - areas.radiance
+            votes = torch.from_numpy(weights).float() * robust_weight(error, settings.robust_scale)
+            environment = sharpened_map(environment, areas, votes, options.map_smoothness, options.map_steps)
+        length = settings.resolution + 2
+        padded = padded_texels(environment).reshape(6, length, length, 3).double().numpy()
+        seen, slopes, texels = seen_with_slopes(padded, sights.outgoing)
+        residual = seen - task.pixels.radiance
+        return cls(task, surface, sights, trust, environment, residual, slopes, texels, free)
+
+    @cached_property
+    def weights(self) -> Float[np.ndarray, "P"]:
+        """Of the pixels, with trust, but without robust weights; in units of 1/σ²."""
+        trusted = self.trust.at(self.surface.points(self.sights.hits.places))
+        return self.task.photograph_weight * self.free * trusted
+
+    @cached_property
+    def photographs(self) -> Rows:
+        """Pixels under the map."""
+        rows = mirror_rows(self.sights.hits.derivatives, self.task.pixels.rays.directions, self.slopes)
+        weights = self.weights * robust_weight(self.residual, self.task.settings.robust_scale)
+        return Rows(self.sights.hits.places, rows, self.residual, weights)
+
+    @cached_property
+    def silhouettes(self) -> Rows:
+        """Outlines and missed pixels."""
+        sigmas = self.task.options.radiance_sigma / self.task.options.outline_sigma_px
+        return silhouette_rows(
+            self.surface,
+            self.task.outlines,
+            self.task.pixels.rays.chosen(~self.sights.hits.met),
+            self.task.outline_weight,
+            self.task.photograph_weight * sigmas**2,
+            self.task.options,
+        )
+
+    @cached_property
+    def gauge(self) -> Rows:
+        """‖∇φ‖ = 1 near the surface."""
+        near = np.abs(self._values) < self.task.options.gauge_cells
+        return gauge_rows(self.surface, near, self.task.options.gauge)
+
+    @cached_property
+    def constraints(self) -> Rows:
+        """Silhouettes and gauge in one."""
+        return joined_rows(self.silhouettes, self.gauge)
+
+    @cached_property
+    def active(self) -> Bool[np.ndarray, "A B C"]:
+        """Coefficients that are unknowns."""
+        return np.abs(self._values) < self.task.options.band_cells
+
+    @cached_property
+    def _values(self) -> Float[np.ndarray, "A B C"]:
+        return self.surface.at_nodes()
+
+    @property
+    def smoothing(self) -> float:
+        """Weight of the third differences, in cells, whose sum of squares is h times the integral of |D³φ|²."""
+        return self.task.settings.smoothing / self.surface.spacing
+
+    @cached_property
+    def bent(self) -> Float[np.ndarray, "A B C"]:
+        """The gradient of half the prior."""
+        return self.smoothing * third_differences(self.surface.coefficients, self.active)
+
+    def cost(self, before: "Solution") -> float:
+        """Half the sum of all robust squares, pixels weighed as in a solution `before`.
+
+        A pixel that no longer sees the surroundings costs what it did before, so it is not lost for gain.
+        """
+        scale = self.task.settings.robust_scale
+        residual = np.where(self.sights.clear[:, None], self.residual, before.residual)
+        photographs = scale**2 * float((before.weights * bounded_error(residual, scale)).sum()) / 2
+        prior = float((self.bent * self.surface.coefficients).sum()) / 2
+        return photographs + self.constraints.cost + prior
+
+    @cached_property
+    def _texel_total(self) -> Float[np.ndarray, "T"]:
+        count = 6 * self.task.settings.resolution**2
+        total = np.bincount(self.texels, self.photographs.weights, count)
+        return total + self.task.options.texel_prior * self.task.photograph_weight
+
+    def beyond_map(self, residual: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+        """(1 − Π) e: what the map does not take over."""
+        return without_means(residual, self.photographs.weights, self.texels, self._texel_total)
+
+    def gradient(self) -> Float[np.ndarray, "A B C"]:
+        """Of the cost, over active coefficients."""
+        shape = self.surface.shape
+        total = self.photographs.backward(self.beyond_map(self.photographs.residual), shape)
+        total += self.constraints.backward(self.constraints.residual, shape)
+        return (total + self.bent) * self.active
+
+    def product(self, change: Float[np.ndarray, "A B C"]) -> Float[np.ndarray, "A B C"]:
+        """The Gauss–Newton matrix times a change of active coefficients."""
+        shape = self.surface.shape
+        total = self.photographs.backward(self.beyond_map(self.photographs.forward(change)), shape)
+        total += self.constraints.backward(self.constraints.forward(change), shape)
+        return (total + self.smoothing * third_differences(change, self.active)) * self.active
+
+    def diagonal(self, smoothing_diagonal: float) -> Float[np.ndarray, "A B C"]:
+        """The matrix's diagonal, but for what the map takes over; at least a millionth of its largest."""
+        shape = self.surface.shape
+        total = self.photographs.squares(shape) + self.constraints.squares(shape)
+        total += self.smoothing * smoothing_diagonal
+        return np.maximum(total, 1e-6 * total[self.active].max(initial=1e-30))

@@ -1,0 +1,202 @@
+"""Free-form surfaces from pictures of bodies that are traced by something else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from panoless.capture.views import Views, views_of
+from panoless.config import FitConfig
+from panoless.geometry.free_form.fit import fit_free_form, gauss_newton_step, make_task
+from panoless.geometry.free_form.kind import FreeFormFamily, FreeFormMirror
+from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions, FreeFormRound
+from panoless.geometry.free_form.photometric import Solution
+from panoless.geometry.free_form.surface import LevelSet
+from panoless.geometry.free_form.trust import full_trust
+from shinypartial.core.camera import Camera
+from tests.support.mirror_body import (
+    Body,
+    body_views,
+    camera_rays_world,
+    cameras_around,
+    ellipsoid,
+    in_frame,
+    photograph,
+    sphere,
+    torus,
+    true_normals,
+    wavy_ball,
+)
+
+OPTIONS = FreeFormOptions(
+    rounds=tuple(replace(settings, rays=settings.rays // 2) for settings in DEFAULTS.rounds), finer=()
+)
+CONFIG = replace(FitConfig(), free_form=OPTIONS)
+VIEWS, SIZE_PX = 20, 64
+
+
+def fitted(views: Views, options: FreeFormOptions = OPTIONS) -> LevelSet:
+    proposal = FreeFormFamily().propose(views, replace(CONFIG, free_form=options), asked=True)
+    assert proposal is not None
+    return fit_free_form(views, proposal.shape, options)[0]
+
+
+def normal_errors_deg(surface: LevelSet, body: Body, views: Views, cameras: list[Camera]) -> np.ndarray:
+    """Where the body mirrors the surroundings at once; a miss counts as 90°."""
+    errors = []
+    for camera in cameras:
+        normals, _, clear = true_normals(body, camera)
+        origins, directions = camera_rays_world(camera, 1)
+        hits = surface.hits(in_frame(views.object_frame, origins[clear]), directions[clear])
+        cross = np.linalg.norm(np.cross(hits.normals, normals[clear]), axis=1)
+        angle = np.degrees(np.arctan2(cross, (hits.normals * normals[clear]).sum(1)))
+        errors.append(np.where(hits.met, angle, 90.0))
+    return np.concatenate(errors)
+
+
+@pytest.fixture(scope="module")
+def ring() -> tuple[Views, FreeFormMirror]:
+    """A torus, which sees itself, and its fit."""
+    views, family = body_views(torus(), VIEWS, 96), FreeFormFamily()
+    proposal = family.propose(views, CONFIG, asked=False)
+    assert proposal is not None
+    geometry = family.fit(views, proposal, CONFIG)
+    assert isinstance(geometry, FreeFormMirror)
+    return views, geometry
+
+
+@pytest.mark.parametrize(
+    "body",
+    [ellipsoid(), pytest.param(sphere(), marks=pytest.mark.slow), pytest.param(wavy_ball(), marks=pytest.mark.slow)],
+    ids=["ellipsoid", "sphere", "wavy"],
+)
+def test_a_body_is_recovered_from_its_visual_hull(body: Body) -> None:
+    views = body_views(body, VIEWS, SIZE_PX)
+    errors = normal_errors_deg(fitted(views), body, views, cameras_around(7, 60)[1::2])
+    assert np.median(errors) < 0.3
+    assert np.quantile(errors, 0.9) < 0.6
+
+
+def test_a_ring_is_recovered_though_it_sees_itself(ring: tuple[Views, FreeFormMirror]) -> None:
+    views, geometry = ring
+    errors = normal_errors_deg(geometry.surface, torus(), views, cameras_around(7, 60)[1::2])
+    assert np.median(errors) < 0.3
+    assert np.quantile(errors, 0.9) < 1.2
+
+
+def test_the_hole_of_a_ring_stays_open(ring: tuple[Views, FreeFormMirror]) -> None:
+    """The mesh of a torus is closed and its Euler characteristic is zero."""
+    mesh, normals = ring[1].surface.mesh()
+    edges = np.sort(mesh.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    unique, counts = np.unique(edges, axis=0, return_counts=True)
+    assert (counts == 2).all()
+    assert len(np.unique(mesh.triangles)) - len(unique) + len(mesh.triangles) == 0
+    faces = mesh.vertices[mesh.triangles]
+    across = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
+    assert ((across * normals[mesh.triangles].sum(1)).sum(1) > 0).mean() > 0.999
+
+
+@pytest.mark.slow
+def test_a_world_that_is_turned_and_scaled_gives_the_same_surface() -> None:
+    """Up to the grid, whose axes are those of the world: normals agree far below their errors' scale."""
+    body, turn = ellipsoid(), np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    cameras = cameras_around(VIEWS, SIZE_PX)
+    views = body_views(body, VIEWS, SIZE_PX)
+    photographs = []
+    for camera in cameras:
+        pose = camera.camera_to_world.copy()
+        pose[:3] = np.concatenate([turn @ pose[:3, :3], 7 * turn @ pose[:3, 3:] + [[1], [2], [3]]], 1)
+        photographs.append(replace(photograph(body, camera), camera=replace(camera, camera_to_world=pose)))
+    turned = views_of(photographs)
+    assert turned.object_frame.radius == pytest.approx(7 * views.object_frame.radius, rel=1e-4)
+    before, after = fitted(views), fitted(turned)
+    origins, directions = camera_rays_world(cameras[3], 1)
+    origins = in_frame(views.object_frame, origins)
+    hits, moved = before.hits(origins, directions), after.hits(origins @ turn.T, directions @ turn.T)
+    both = hits.met & moved.met
+    angle = np.degrees(np.linalg.norm(hits.normals[both] @ turn.T - moved.normals[both], axis=1))
+    assert np.median(angle) < 0.05
+
+
+@pytest.fixture(scope="module")
+def solution() -> Solution:
+    """A wavy ball between two rounds."""
+    views = body_views(wavy_ball(), 12, 60)
+    options = replace(OPTIONS, rounds=OPTIONS.rounds[:1])
+    surface = fitted(views, options)
+    settings = OPTIONS.rounds[1]
+    return Solution.at(make_task(views, settings, options), surface, full_trust(surface, 20), None, 2)
+
+
+def test_a_step_with_the_map_made_anew_gains_what_its_equations_promise(solution: Solution) -> None:
+    step = gauss_newton_step(solution, 1e-3)
+    promised = -float((step * solution.gradient()).sum()) - float((step * solution.product(step)).sum()) / 2
+    surface = replace(solution.surface, coefficients=solution.surface.coefficients + step)
+    moved = Solution.at(solution.task, surface, solution.trust, solution.environment, 3)
+    gained = solution.cost(solution) - moved.cost(solution)
+    assert promised > 0
+    assert 0.4 < gained / promised < 1.6
+
+
+def test_the_gradient_is_that_of_finite_differences(solution: Solution) -> None:
+    """Of outlines and gauge; outlines near to zero hardly feel the slope that their distances are divided by."""
+    parts = solution.silhouettes, solution.gauge
+    gradient = sum(rows.backward(rows.residual, solution.surface.shape) for rows in parts) * solution.active
+    change, costs = 1e-3 * gradient / np.abs(gradient).max(), []
+    for sign in (-1, 1):
+        surface = replace(solution.surface, coefficients=solution.surface.coefficients + sign * change)
+        moved = replace(solution, surface=surface)
+        costs.append(moved.silhouettes.cost + moved.gauge.cost)
+    assert (costs[1] - costs[0]) / 2 == pytest.approx(float((gradient * change).sum()), rel=0.02)
+
+
+def test_the_matrix_is_symmetric_and_positive(solution: Solution) -> None:
+    rng = np.random.default_rng(1)
+    one, other = (rng.normal(size=solution.surface.shape) * solution.active for _ in range(2))
+    assert (one * solution.product(other)).sum() == pytest.approx((other * solution.product(one)).sum(), rel=1e-6)
+    assert (one * solution.product(one)).sum() > 0
+
+
+def test_held_out_views_refuse_cells_that_a_ball_does_not_need() -> None:
+    """Two more rounds are offered, and the one with a rough surface is not taken."""
+    rough = FreeFormRound(40, 64, 0.15, 4, 40_000, 1e-6, 3)
+    options = replace(OPTIONS, finer=(rough,))
+    views = body_views(sphere(), 15, 48)
+    surface = fitted(views, options)
+    assert max(surface.shape) < 40
+
+
+def test_the_same_views_give_the_same_surface() -> None:
+    """A killed fit in closed form starts again, so it ends where the other would have."""
+    views = body_views(sphere(), 10, 40)
+    options = replace(OPTIONS, rounds=OPTIONS.rounds[:1])
+    np.testing.assert_array_equal(fitted(views, options).coefficients, fitted(views, options).coefficients)
+
+
+def test_the_kind_keeps_the_protocol(ring: tuple[Views, FreeFormMirror]) -> None:
+    """State, rays, buffers, light, mesh and surfels of one fit."""
+    views, geometry = ring
+    again = FreeFormMirror.from_state_dict(geometry.state_dict())
+    np.testing.assert_array_equal(again.surface.coefficients, geometry.surface.coefficients)
+    np.testing.assert_array_equal(again.trust.values, geometry.trust.values)
+    assert again.options == geometry.options
+    assert 500 < geometry.num_parameters < geometry.surface.coefficients.size
+
+    view = views.train[5]
+    usable = geometry.usable_pixels(view)
+    assert 0.5 < len(usable) / len(view.solid) < 1
+    rays = geometry.observe(view, usable)
+    assert len(rays.directions) == len(usable)
+    assert rays.trust is not None
+    buffers = geometry.buffers(view.camera)
+    assert float((buffers.alpha - view.mask).abs().mean()) < 0.01
+    solid = buffers.alpha > 0.99
+    assert float((buffers.normals_camera.norm(dim=0)[solid] - 1).abs().max()) < 1e-5
+    environment, _ = geometry.solve_map(views, CONFIG)
+    light = geometry.shade(environment, view.camera, view.solid, buffers.normals_camera.flatten(1)[:, view.solid])
+    error = (light - view.radiance.flatten(1)[:, view.solid].T).abs()
+    assert float(error.median()) < 0.02
+    assert len(geometry.to_surfels(CONFIG).surfels.means) == CONFIG.surfels.count
+    mesh = geometry.mesh(views.object_frame)
+    assert np.abs(torus().value(mesh.vertices)).max() < 0.15
+    assert set(mesh.columns) == {"nx", "ny", "nz"}
