@@ -7,6 +7,7 @@ are in docs/reference/metrics.md.
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Literal
 
@@ -141,6 +142,7 @@ def evaluate(
     progress = Progress("evaluate", total=len(data.train) + len(data.test) + 1)
     observed = _observed_directions(data, left_out, progress)
     with_paper = protocol == "both"
+    _import_metrics()
     with ThreadPoolExecutor(1) as beside:
         scoring = beside.submit(_score_maps, prediction, data, observed, networks, left_out, with_paper)
         results = list(_score_views(prediction, data, networks, progress, with_paper))
@@ -175,6 +177,12 @@ def evaluate(
 
 def _pool_paper(maps: _MapScores, results: list[ViewResult]) -> PaperScores:
     return pool_paper(maps.paper, [result.paper for result in results if result.paper is not None])
+
+
+def _import_metrics() -> None:
+    """Load what metrics import when they are called: two threads that import one package at once can both fail."""
+    for name in ("scipy.optimize", "scipy.sparse", "scipy.stats", "skimage.metrics._structural_similarity"):
+        import_module(name)
 
 
 def _open_dataset(info: PredictionInfo, dataset: Path | None, prediction: Path) -> Dataset:

@@ -31,7 +31,7 @@ from tests.support.mirror_body import (
 OPTIONS = FreeFormOptions(
     rounds=tuple(replace(settings, rays=settings.rays // 2) for settings in DEFAULTS.rounds), finer=()
 )
-CONFIG = replace(FitConfig(), free_form=OPTIONS)
+CONFIG = replace(FitConfig(), free_form=OPTIONS, surfels=replace(FitConfig().surfels, hull_resolution=40))
 VIEWS, SIZE_PX = 20, 64
 
 
