@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from panoless.capture.rays import pose_of
 from panoless.capture.views import Views, views_of
