@@ -254,7 +254,8 @@ def test_what_all_cameras_share_is_taken_back() -> None:
     shifted = common(centers + own.shifts) - centers
     both = Poses((turn * Rotation.from_rotvec(own.turns)).as_rotvec(), shifted)
     found = both.without(both.common(centers, prior), centers)
-    np.testing.assert_allclose(found.stacked, own.stacked, atol=2e-4)
+    # The least squares are those of small changes, so squares of these are left.
+    np.testing.assert_allclose(found.stacked, own.stacked, atol=5e-4)
 
 
 @pytest.mark.slow
