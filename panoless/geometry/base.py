@@ -95,6 +95,10 @@ class Geometry(Protocol):
         """Of how many primitives it consists."""
         ...
 
+    def corrected(self, views: Views) -> Views:
+        """The views with their cameras where the geometry found them; as they are where it believes them."""
+        ...
+
     def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
         """Those of the solid pixels of a view (flat indices) that show the surroundings, not the object again."""
         ...
@@ -232,7 +236,8 @@ def from_plain(cls: type[Numbers], content: dict[str, Any]) -> Numbers:
 
 
 def usable_views(views: Views, geometry: Geometry) -> Views:
-    """The views with the usable pixels of a geometry as their solid ones."""
+    """The views with their cameras as a geometry has them, and its usable pixels as their solid ones."""
+    views = geometry.corrected(views)
     clear = tuple(replace(view, solid=geometry.usable_pixels(view)) for view in views.train)
     return replace(views, train=clear)
 

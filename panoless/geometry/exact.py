@@ -28,6 +28,10 @@ class ExactGeometry:
         """One."""
         return 1
 
+    def corrected(self, views: Views) -> Views:
+        """The views as they are: their cameras are believed."""
+        return views
+
     def footprints(self, views: Views) -> Footprints | None:
         """None: a pixel is its center."""
         return None

@@ -5,6 +5,7 @@ compared with what two models leave that know no mirror: one color a view, and o
 matte object has.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -53,6 +54,8 @@ class Evidence:
     """Share of all directions that some pixel saw."""
     rank_correlation: float | None
     """Spearman's, of confidence and the error of held-out rays: negative where confidence tells the truth."""
+    camera_turn_deg: float
+    """By which the fit turned the cameras: median over views."""
     views: int
     """Number of views in which the object is seen."""
 
@@ -61,9 +64,10 @@ def gather_evidence(
     views: Views, geometry: Geometry, visibility: Float[Tensor, "6 L L"], options: TrustOptions
 ) -> Evidence:
     """The evidence for a geometry in the views that it was fitted to; `visibility` is that of the final map."""
-    seen = tuple(view for view in views.train if len(view.solid))
-    views = replace(views, train=seen)
-    usable = usable_views(views, geometry)
+    found = usable_views(views, geometry).train
+    used = [index for index, view in enumerate(views.train) if len(view.solid)]
+    seen = tuple(views.train[index] for index in used)
+    views, usable = replace(views, train=seen), replace(views, train=tuple(found[index] for index in used))
     solid, kept = (max(sum(len(view.solid) for view in each.train), 1) for each in (views, usable))
     looked_at = [_evenly(part, options.views) for part in split_held_out(usable.train)]
     surfaces = [[(view, geometry.buffers(view.camera)) for view in part] for part in looked_at]
@@ -80,6 +84,7 @@ def gather_evidence(
         left_out=1 - kept / solid,
         saturated=_saturated(seen, options),
         coverage=float((visibility > 0).float().mean()),
+        camera_turn_deg=_median(np.array([_turn_deg(*each) for each in zip(seen, usable.train, strict=True)])),
         views=len(seen),
     )
 
@@ -91,6 +96,12 @@ def _evenly(views: Sequence[TrainView], count: int) -> list[TrainView]:
 
 def _median(values: Float[np.ndarray, "V"]) -> float:
     return float(np.median(values)) if len(values) else 0.0
+
+
+def _turn_deg(said: TrainView, found: TrainView) -> float:
+    """Between two rotations of a camera: ‖A − B‖ = 2√2 sin(α/2)."""
+    apart = torch.linalg.norm(said.camera.world_to_camera[:3, :3] - found.camera.world_to_camera[:3, :3])
+    return 2 * math.degrees(math.asin(min(float(apart) / 8**0.5, 1.0)))
 
 
 def _light(

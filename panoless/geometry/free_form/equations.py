@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 
 from panoless.geometry.free_form.observations import PixelRays
 from panoless.geometry.free_form.options import FreeFormOptions
+from panoless.geometry.free_form.poses import PoseRows, outline_pose_rows
 from panoless.geometry.free_form.surface import LEAST_SLOPE, LevelSet
 from panoless.kernels.level_set import add_rows, add_squares, apply_rows, evaluate
 from panoless.numeric.robust import bounded_error, robust_weight
@@ -51,11 +52,12 @@ def silhouette_rows(
     outline_weight: float,
     miss_weight: float,
     options: FreeFormOptions,
-) -> Rows:
+) -> tuple[Rows, PoseRows]:
     """Outlines, along whose rays the least φ should be zero, and pixels on the object that miss it, for which it
     should be negative.
 
-    The residual is φ/(‖∇φ‖ a t) where φ is least, in pixels, with a the pixel's angle and t the distance.
+    The residual is φ/(‖∇φ‖ a t) where φ is least, in pixels, with a the pixel's angle and t the distance. It changes
+    with the pose of its view, too.
     """
     parts = []
     for rays, weight, scale in (
@@ -68,11 +70,15 @@ def silhouette_rows(
         residual = near.derivatives[:, 0] * by_value
         weights = weight * near.met * robust_weight(residual, scale)
         cost = weight * scale**2 * float((near.met * bounded_error(residual, scale)).sum())
-        parts.append((near.places, by_value, residual, weights, cost))
-    places, by_value, residual, weights = (np.concatenate([part[k] for part in parts]) for k in range(4))
+        distance = np.where(near.met, near.distance, 0.0) / surface.spacing
+        by_pose = outline_pose_rows(near.derivatives[:, 1:4], rays.directions, distance, by_value)
+        by_pose[..., 3:] /= surface.spacing
+        parts.append((near.places, by_value, residual, weights, rays.view, by_pose, cost))
+    places, by_value, residual, weights, view, by_pose = (np.concatenate([part[k] for part in parts]) for k in range(6))
     rows = np.zeros((len(places), 1, 4))
     rows[:, 0, 0] = by_value
-    return Rows(places, rows, residual[:, None], weights, sum(part[4] for part in parts) / 2)
+    cost = sum(part[6] for part in parts) / 2
+    return Rows(places, rows, residual[:, None], weights, cost), PoseRows(view, by_pose, weights)
 
 
 def gauge_rows(surface: LevelSet, near: Bool[np.ndarray, "A B C"], weight: float) -> Rows:

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from panoless.capture.rays import pose_of
 from panoless.capture.views import Views, split_held_out
 from panoless.environment.rays import Rays
 from panoless.environment.resolution import prediction_error
@@ -15,6 +16,7 @@ from panoless.environment.solve import solve_environment
 from panoless.geometry.free_form.observations import outline_rays, solid_pixels
 from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.photometric import Sights, Solution, Task
+from panoless.geometry.free_form.poses import Poses
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import Trust, full_trust
 from panoless.numeric.conjugate_gradients import solve_by_products
@@ -35,13 +37,18 @@ class FitStage:
     damping: float
     settings: FreeFormRound | None = None
     """Of the round that led here."""
+    poses: Poses | None = None
+    """Of the views, where they are unknowns."""
 
 
-def fit_free_form(views: Views, start: LevelSet, options: FreeFormOptions = DEFAULTS) -> tuple[LevelSet, Trust]:
-    """The surface that explains photographs and outlines best, no finer than held-out views want it, and its trust.
+def fit_free_form(
+    views: Views, start: LevelSet, options: FreeFormOptions = DEFAULTS
+) -> tuple[LevelSet, Trust, Poses | None]:
+    """The surface that explains photographs and outlines best, no finer than held-out views want it, its trust, and the
+    poses of the views where these are unknowns.
 
     Rounds are taken with four fifths of the views as long as the others gain by them, and the last of those once more
-    with all.
+    with all. The poses are set free after the rounds that are always taken, if held-out views gain by that.
     """
     kept, held_out = split_held_out(views.train)
     solved = replace(views, train=tuple(kept)) if kept and held_out else views
@@ -49,9 +56,16 @@ def fit_free_form(views: Views, start: LevelSet, options: FreeFormOptions = DEFA
     every = [*options.rounds, *options.finer, (*options.rounds, *options.finer)[-1]]
     progress = Progress("fitting a free-form surface", sum(settings.steps for settings in every))
     with torch.no_grad():
-        stage = FitStage(start, full_trust(start, options.trust_cells), None, options.damping)
+        poses = Poses.none(len(solved.train)) if options.poses == "on" else None
+        stage = FitStage(start, full_trust(start, options.trust_cells), None, options.damping, poses=poses)
         for settings in options.rounds:
             stage = take_round(solved, stage, settings, options, progress)
+        if held_out and options.poses == "auto":
+            stage = keep_if_better(
+                (stage, _with_poses(solved, stage, options)),
+                lambda each: held_out_error(solved, tested, each, options),
+                options.least_pose_gain,
+            )
         if held_out and options.finer:
             stage = keep_if_better(
                 _stages(solved, stage, options, progress),
@@ -59,11 +73,44 @@ def fit_free_form(views: Views, start: LevelSet, options: FreeFormOptions = DEFA
                 options.least_held_out_gain,
             )
         assert stage.settings is not None, "a fit has rounds"
-        skipped = progress.total - progress.done - stage.settings.steps
+        last = stage.settings
+        skipped = progress.total - progress.done - last.steps
         if skipped > 0:
             progress.advance(steps=skipped)
-        stage = take_round(views, stage, stage.settings, options, progress)
-    return stage.surface, stage.trust
+        if stage.poses is not None and held_out:
+            stage = replace(stage, poses=_joined(stage.poses, found_poses(solved, tested, stage, options)))
+        stage = take_round(views, stage, last, options, progress)
+    return stage.surface, stage.trust, stage.poses
+
+
+def _with_poses(views: Views, stage: FitStage, options: FreeFormOptions) -> FitStage:
+    """A stage after its round was taken again with free poses."""
+    assert stage.settings is not None, "a round was taken"
+    free = replace(stage, poses=Poses.none(len(views.train)))
+    return take_round(views, free, replace(stage.settings, steps=options.pose_steps), options)
+
+
+def _joined(solved: Poses, tested: Poses) -> Poses:
+    """Poses of all views from those of the two parts."""
+    order = np.argsort(np.concatenate(split_held_out(range(len(solved.turns) + len(tested.turns)))))
+    both = np.concatenate([solved.stacked, tested.stacked])[order]
+    return Poses(both[:, :3], both[:, 3:])
+
+
+def found_poses(solved: Views, views: Views, stage: FitStage, options: FreeFormOptions) -> Poses:
+    """Poses of views that took no part, under the surface and the map of those that did, which stay as they are."""
+    assert stage.settings is not None, "a round was taken"
+    known = make_task(solved, stage.settings, options)
+    environment = Solution.at(
+        known, stage.surface, stage.trust, None, options.first_map_rounds, stage.poses
+    ).environment
+    still = replace(options, map_rounds=0, texel_prior=1e9)
+    task = make_task(views, replace(stage.settings, steps=options.pose_steps), still)
+    poses = Poses.none(len(views.train))
+    solution = Solution.at(task, stage.surface, stage.trust, environment, 0, poses)
+    moved = take_steps(solution, stage.damping, still=True)[0].poses
+    assert moved is not None, "poses were free"
+    return moved
 
 
 def _stages(views: Views, stage: FitStage, options: FreeFormOptions, progress: Progress) -> Iterator[FitStage]:
@@ -82,9 +129,15 @@ def take_round(
     if stage.settings is None or stage.settings.cells != settings.cells:
         surface = surface.resampled(settings.cells)
     task = make_task(views, settings, options)
-    solution = Solution.at(task, surface, stage.trust, stage.environment, options.first_map_rounds)
+    solution = Solution.at(task, surface, stage.trust, stage.environment, options.first_map_rounds, stage.poses)
     solution, damping = take_steps(solution, stage.damping, progress)
-    return FitStage(solution.surface, solution.trust, solution.environment, damping, settings)
+    found = FitStage(solution.surface, solution.trust, solution.environment, damping, settings, solution.poses)
+    if solution.poses is None:
+        return found
+    # The map follows with the next round, which starts it anew.
+    common = solution.poses.common(task.centers, solution.pose_prior)
+    poses = solution.poses.without(common, task.centers)
+    return replace(found, surface=solution.surface.taken_back(common), poses=poses, environment=None)
 
 
 def make_task(views: Views, settings: FreeFormRound, options: FreeFormOptions) -> Task:
@@ -94,16 +147,28 @@ def make_task(views: Views, settings: FreeFormRound, options: FreeFormOptions) -
     chosen = outlines.chosen(slice(None, None, max(1, -(-len(outlines.size) // options.outline_points))))
     share = options.counted_rays / options.radiance_sigma**2 / max(len(pixels.inner_px), 1)
     density = options.counted_rays / total * len(outlines.size) / max(len(chosen.size), 1)
-    return Task(pixels, chosen, share, density / options.outline_sigma_px**2, settings, options)
+    centers = np.array([pose_of(view.camera)[1] for view in views.train])
+    return Task(pixels, chosen, share, density / options.outline_sigma_px**2, settings, options, centers)
 
 
-def take_steps(solution: Solution, damping: float, progress: Progress | None = None) -> tuple[Solution, float]:
+def _step(
+    solution: Solution, damping: float, still: bool
+) -> tuple[Float[np.ndarray, "A B C"], Float[np.ndarray, "V 6"] | None]:
+    if solution.poses is None:
+        return gauss_newton_step(solution, damping), None
+    return gauss_newton_step_with_poses(solution, damping, still=still)
+
+
+def take_steps(
+    solution: Solution, damping: float, progress: Progress | None = None, *, still: bool = False
+) -> tuple[Solution, float]:
     """The steps of a round, each of which lowers the cost with hits, visibility and map made anew; the last damping."""
     options, settings = solution.task.options, solution.task.settings
     for index in range(settings.steps):
-        solution = replace(solution, trust=measured_trust(solution))
+        if not still:
+            solution = replace(solution, trust=measured_trust(solution))
         before = solution
-        solution, length = _accepted(solution, gauss_newton_step(solution, damping))
+        solution, length = _accepted(solution, *_step(solution, damping, still))
         factor = options.damping_less if length == 1 else options.damping_more
         damping = float(np.clip(damping * factor, *options.damping_range))
         gain = 1 - solution.cost(before) / before.cost(before)
@@ -115,7 +180,9 @@ def take_steps(solution: Solution, damping: float, progress: Progress | None = N
     return solution, damping
 
 
-def _accepted(solution: Solution, step: Float[np.ndarray, "A B C"]) -> tuple[Solution, float]:
+def _accepted(
+    solution: Solution, step: Float[np.ndarray, "A B C"], poses: Float[np.ndarray, "V 6"] | None = None
+) -> tuple[Solution, float]:
     """The solution after the longest of the tried lengths of a step that lowers the cost, and that length; the same
     solution after none.
     """
@@ -123,7 +190,8 @@ def _accepted(solution: Solution, step: Float[np.ndarray, "A B C"]) -> tuple[Sol
     for _ in range(options.trials):
         coefficients = solution.surface.coefficients + length * step
         surface = replace(solution.surface, coefficients=coefficients)
-        moved = Solution.at(solution.task, surface, solution.trust, solution.environment, options.map_rounds)
+        posed = solution.poses if poses is None or solution.poses is None else solution.poses.after(length * poses)
+        moved = Solution.at(solution.task, surface, solution.trust, solution.environment, options.map_rounds, posed)
         if moved.cost(solution) < before:
             return moved, length
         length *= options.shortening
@@ -148,6 +216,45 @@ def gauss_newton_step(solution: Solution, damping: float) -> Float[np.ndarray, "
     return np.clip(step, -options.largest_step_cells, options.largest_step_cells)
 
 
+def gauss_newton_step_with_poses(
+    solution: Solution, damping: float, *, still: bool = False
+) -> tuple[Float[np.ndarray, "A B C"], Float[np.ndarray, "V 6"]]:
+    """The same with the poses of the views as further unknowns; of a `still` surface, those alone.
+
+    Poses are preconditioned by their blocks: with H = L Lᵀ of a view its unknowns are y = Lᵀ x.
+    """
+    options, shape = solution.task.options, solution.surface.shape
+    diagonal, size = solution.diagonal(THIRD_DIFFERENCE_DIAGONAL), int(np.prod(solution.surface.shape))
+    blocks = solution.pose_blocks() * (1 + damping * np.eye(6))
+    back = np.linalg.inv(np.linalg.cholesky(blocks)).transpose(0, 2, 1)
+
+    def unpacked(values: Float[np.ndarray, "N"]) -> tuple[Float[np.ndarray, "A B C"], Float[np.ndarray, "V 6"]]:
+        poses = np.matmul(back, values[size:].reshape(-1, 6, 1))[..., 0]
+        return values[:size].reshape(shape), poses
+
+    def packed(change: Float[np.ndarray, "A B C"], poses: Float[np.ndarray, "V 6"]) -> Float[np.ndarray, "N"]:
+        return np.concatenate([change.ravel(), np.matmul(back.transpose(0, 2, 1), poses[..., None]).ravel()])
+
+    diagonals = np.einsum("vii->vi", blocks) * (damping / (1 + damping))
+
+    def product(values: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
+        change, poses = unpacked(values)
+        by_change, by_pose = solution.product_with_poses(change, poses)
+        return packed(by_change + damping * diagonal * change, by_pose + diagonals * poses)
+
+    free = np.zeros(shape) if still else solution.active / (diagonal * (1 + damping))
+    step, poses = unpacked(
+        solve_by_products(
+            product,
+            packed(-solution.gradient(), -solution.pose_gradient()),
+            np.concatenate([free.ravel(), np.ones(blocks.shape[0] * 6)]),
+            options.solver_steps,
+            options.solver_tolerance,
+        )
+    )
+    return np.clip(step, -options.largest_step_cells, options.largest_step_cells), poses
+
+
 def measured_trust(solution: Solution) -> Trust:
     """Trust by the residuals of a solution."""
     points, clear = solution.surface.points(solution.sights.hits.places), solution.free > 0
@@ -155,14 +262,20 @@ def measured_trust(solution: Solution) -> Trust:
 
 
 def held_out_error(solved: Views, tested: Views, stage: FitStage, options: FreeFormOptions) -> float:
-    """Mean of ‖e‖²/(‖e‖² + s²) over rays of views that neither surface nor map have seen."""
-    rays = [_rays(views, stage, options) for views in (solved, tested)]
-    return prediction_error(rays[1:], solve_environment(rays[:1], options.held_out_resolution))
+    """Mean of ‖e‖²/(‖e‖² + s²) over rays of views that neither surface nor map have seen.
+
+    Where poses are unknowns, those of the tested views are found first: six numbers each, against thousands of pixels.
+    """
+    poses = None if stage.poses is None else found_poses(solved, tested, stage, options)
+    known = _rays(solved, stage.surface, stage.poses, options)
+    unknown = _rays(tested, stage.surface, poses, options)
+    return prediction_error([unknown], solve_environment([known], options.held_out_resolution))
 
 
-def _rays(views: Views, stage: FitStage, options: FreeFormOptions) -> Rays:
+def _rays(views: Views, surface: LevelSet, poses: Poses | None, options: FreeFormOptions) -> Rays:
     pixels = solid_pixels(views, options.held_out_rays)
-    sights = Sights.of(stage.surface, pixels.rays, 1, options.least_cosine)
+    rays = pixels.rays if poses is None else pixels.rays.moved(poses)
+    sights = Sights.of(surface, rays, 1, options.least_cosine)
     clear = sights.clear & (pixels.inner_px > options.inner_px)
     outgoing, radiance = (
         torch.from_numpy(values[clear]).float() for values in (sights.outgoing[:, 0], pixels.radiance)

@@ -22,6 +22,7 @@ from panoless.geometry.free_form.fit import fit_free_form
 from panoless.geometry.free_form.observations import PixelRays, inner_distance_px
 from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions
 from panoless.geometry.free_form.photometric import Sights
+from panoless.geometry.free_form.poses import Poses
 from panoless.geometry.free_form.rendering import free_form_buffers, free_form_light
 from panoless.geometry.free_form.surface import LevelSet, level_set_of
 from panoless.geometry.free_form.trust import Trust
@@ -38,14 +39,21 @@ class FreeFormMirror(ExactGeometry):
     kind: ClassVar[str] = "free_form"
     surface: LevelSet
     trust: Trust
+    poses: Poses | None = None
+    """Of the training views, where these were unknowns."""
     occlusion_test: bool = True
     """Whether pixels that see the object again are left out."""
     options: FreeFormOptions = DEFAULTS
 
     @property
     def num_parameters(self) -> int:
-        """The coefficients whose support meets the surface."""
-        return int((np.abs(self.surface.at_nodes()) < self.options.band_cells).sum())
+        """The coefficients whose support meets the surface, and the poses."""
+        poses = 0 if self.poses is None else self.poses.stacked.size
+        return int((np.abs(self.surface.at_nodes()) < self.options.band_cells).sum()) + poses
+
+    def corrected(self, views: Views) -> Views:
+        """With their cameras where the fit found them."""
+        return views if self.poses is None else self.poses.moved(views)
 
     def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
         """Solid pixels that see the surroundings by way of the surface, but for the outermost ones."""
@@ -125,15 +133,17 @@ class FreeFormMirror(ExactGeometry):
     def state_dict(self) -> dict[str, Any]:
         """All numbers as lists and plain values."""
         options = write_record(self.options)
-        surface, trust = to_plain(self.surface), to_plain(self.trust)
-        return {"surface": surface, "trust": trust, "occlusion_test": self.occlusion_test, "options": options}
+        surface, trust, poses = to_plain(self.surface), to_plain(self.trust), to_plain(self.poses)
+        known = {"occlusion_test": self.occlusion_test, "options": options}
+        return {"surface": surface, "trust": trust, "poses": poses, **known}
 
     @classmethod
     def from_state_dict(cls, content: dict[str, Any]) -> "FreeFormMirror":
         """The geometry that `state_dict` was taken from."""
         options = read_record(FreeFormOptions, content["options"], "the options of a free-form surface")
         surface, trust = from_plain(LevelSet, content["surface"]), from_plain(Trust, content["trust"])
-        return cls(surface, trust, content["occlusion_test"], options)
+        poses = None if content["poses"] is None else from_plain(Poses, content["poses"])
+        return cls(surface, trust, poses, content["occlusion_test"], options)
 
 
 class FreeFormFamily(ExactFamily):
@@ -157,5 +167,5 @@ class FreeFormFamily(ExactFamily):
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """All coefficients by outlines and photographs together."""
-        surface, trust = fit_free_form(views, proposal.shape, config.free_form)
-        return FreeFormMirror(surface, trust, config.environment.trace, config.free_form)
+        surface, trust, poses = fit_free_form(views, proposal.shape, config.free_form)
+        return FreeFormMirror(surface, trust, poses, config.environment.trace, config.free_form)

@@ -4,10 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
 
 from panoless.capture.rays import pose_of
 from panoless.capture.silhouettes import mask_contours
 from panoless.capture.views import TrainView, Views, concatenated, every_kth_pixel
+from panoless.geometry.free_form.poses import Poses
 from panoless.kernels.rasterize import RasterCamera
 from shinypartial.core.conventions import PIXEL_CENTER, SOLID_ALPHA
 
@@ -23,10 +25,13 @@ class PixelRays:
     directions: Float[np.ndarray, "P 3"]
     steps: Float[np.ndarray, "P 2 3"]
     size: Float[np.ndarray, "P"]
+    view: Int[np.ndarray, "P"]
 
     @classmethod
-    def through(cls, camera: RasterCamera, column: Float[np.ndarray, "P"], row: Float[np.ndarray, "P"]) -> "PixelRays":
-        """Through places (column, row) of a picture, in pixels."""
+    def through(
+        cls, camera: RasterCamera, column: Float[np.ndarray, "P"], row: Float[np.ndarray, "P"], view: int = 0
+    ) -> "PixelRays":
+        """Through places (column, row) of a picture, in pixels; `view` is its number."""
         rotation, center = pose_of(camera)
         x, y = (column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
         directions = np.stack([x, y, np.ones_like(x)], 1) @ rotation
@@ -35,17 +40,25 @@ class PixelRays:
         axes = rotation[:2] / np.array([[camera.fx], [camera.fy]])
         across = np.einsum("pi,ai->pa", directions, axes)
         steps = (axes - across[..., None] * directions[:, None]) / length[..., None]
-        return cls(np.tile(center, (len(x), 1)), directions, steps, 1 / (camera.fx * length[:, 0]))
+        size, number = 1 / (camera.fx * length[:, 0]), np.full(len(x), view)
+        return cls(np.tile(center, (len(x), 1)), directions, steps, size, number)
 
     def chosen(self, index: slice | Bool[np.ndarray, "P"]) -> "PixelRays":
         """Some of them."""
-        return PixelRays(self.origins[index], self.directions[index], self.steps[index], self.size[index])
+        return PixelRays(*(values[index] for values in vars(self).values()))
+
+    def moved(self, poses: Poses) -> "PixelRays":
+        """With their cameras there."""
+        turns = Rotation.from_rotvec(poses.turns).as_matrix()[self.view]
+        directions = np.matmul(turns, self.directions[..., None])[..., 0]
+        steps = np.matmul(self.steps, turns.transpose(0, 2, 1))
+        return PixelRays(self.origins + poses.shifts[self.view], directions, steps, self.size, self.view)
 
     @classmethod
-    def centers(cls, camera: RasterCamera, pixels: Int[np.ndarray, "P"]) -> "PixelRays":
+    def centers(cls, camera: RasterCamera, pixels: Int[np.ndarray, "P"], view: int = 0) -> "PixelRays":
         """Through the centers of pixels, given by flat indices."""
         row, column = np.divmod(pixels, camera.width)
-        return cls.through(camera, column + PIXEL_CENTER, row + PIXEL_CENTER)
+        return cls.through(camera, column + PIXEL_CENTER, row + PIXEL_CENTER, view)
 
 
 @dataclass(frozen=True)
@@ -69,9 +82,9 @@ def inner_distance_px(view: TrainView) -> Float[np.ndarray, "H W"]:
 def solid_pixels(views: Views, count: int) -> Pixels:
     """About `count` solid pixels of all views, evenly."""
     rays, radiance, inner = [], [], []
-    for view, pixels in every_kth_pixel(views, count):
+    for number, (view, pixels) in enumerate(every_kth_pixel(views, count)):
         index = pixels.cpu().numpy()
-        rays.append(PixelRays.centers(view.camera, index))
+        rays.append(PixelRays.centers(view.camera, index, number))
         radiance.append(view.radiance.flatten(1)[:, pixels].T.cpu().numpy().astype(np.float64))
         inner.append(inner_distance_px(view).ravel()[index])
     return Pixels(concatenated(rays), np.concatenate(radiance), np.concatenate(inner))
@@ -83,4 +96,4 @@ def outline_rays(views: Views) -> PixelRays:
     length = np.linalg.norm(contours.rays, axis=1)
     focal = np.array([view.camera.fx for view in views.train])[contours.view]
     steps = np.zeros((len(length), 2, 3))
-    return PixelRays(contours.centers, contours.rays / length[:, None], steps, 1 / (focal * length))
+    return PixelRays(contours.centers, contours.rays / length[:, None], steps, 1 / (focal * length), contours.view)

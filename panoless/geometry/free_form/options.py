@@ -1,6 +1,7 @@
 """The tuned numbers of a free-form surface's fit."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,16 @@ class FreeFormOptions:
     """They end when the preconditioned residual's energy has fallen to this share."""
     largest_step_cells: float = 1.0
     """No coefficient moves by more in one step."""
+    poses: Literal["auto", "off", "on"] = "auto"
+    """Whether the cameras' poses are unknowns, too: where held-out views gain by it, never, or always."""
+    pose_turn_deg: float = 1.0
+    """Expected error of a camera's rotation."""
+    pose_shift: float = 0.02
+    """Expected error of its position, in radii of the object."""
+    pose_steps: int = 6
+    """Most steps of the round in which poses are set free, and of finding those of other views."""
+    least_pose_gain: float = 0.02
+    """Share of the held-out error by which poses as unknowns have to lower it."""
     least_held_out_gain: float = 0.002
     """Share of the held-out error by which a finer round has to lower it."""
     held_out_rays: int = 200_000

@@ -14,6 +14,7 @@ from panoless.geometry.free_form.equations import Rows, gauge_rows, joined_rows,
 from panoless.geometry.free_form.map import sharpened_map, splatted_map
 from panoless.geometry.free_form.observations import PixelRays, Pixels
 from panoless.geometry.free_form.options import FreeFormOptions, FreeFormRound
+from panoless.geometry.free_form.poses import PoseRows, Poses, pixel_pose_rows
 from panoless.geometry.free_form.surface import Hits, LevelSet
 from panoless.geometry.free_form.trust import Trust
 from panoless.kernels.level_set import mirror_rows, mirrored, seen_with_slopes, third_differences, without_means
@@ -60,6 +61,8 @@ class Task:
     """Of an outline's point."""
     settings: FreeFormRound
     options: FreeFormOptions
+    centers: Float[np.ndarray, "V 3"]
+    """Of the cameras of all views."""
 
 
 @dataclass(frozen=True)
@@ -76,14 +79,23 @@ class Solution:
     texels: Int[np.ndarray, "P"]
     free: Float[np.ndarray, "P"]
     """Weights of the pixels without trust and robust weights."""
+    poses: Poses | None = None
+    """Of the views; None: as they are said to be."""
 
     @classmethod
     def at(
-        cls, task: Task, surface: LevelSet, trust: Trust, start: Float[Tensor, "6 3 M M"] | None, rounds: int
+        cls,
+        task: Task,
+        surface: LevelSet,
+        trust: Trust,
+        start: Float[Tensor, "6 3 M M"] | None,
+        rounds: int,
+        poses: Poses | None = None,
     ) -> "Solution":
         """With the map solved in so many robust rounds from another one, or from nothing."""
         options, settings = task.options, task.settings
-        sights = Sights.of(surface, task.pixels.rays, settings.samples, options.least_cosine)
+        rays = task.pixels.rays if poses is None else task.pixels.rays.moved(poses)
+        sights = Sights.of(surface, rays, settings.samples, options.least_cosine)
         clear = sights.clear & (task.pixels.inner_px > options.inner_px)
         texel = np.pi / 2 / settings.resolution
         free = clear / (1 + (sights.turn / (options.wide_texels * texel)) ** 2)
@@ -103,7 +115,13 @@ class Solution:
         padded = padded_texels(environment).reshape(6, length, length, 3).double().numpy()
         seen, slopes, texels = seen_with_slopes(padded, sights.outgoing)
         residual = seen - task.pixels.radiance
-        return cls(task, surface, sights, trust, environment, residual, slopes, texels, free)
+        return cls(task, surface, sights, trust, environment, residual, slopes, texels, free, poses)
+
+    @cached_property
+    def rays(self) -> PixelRays:
+        """Of the pixels, from where their cameras are."""
+        rays = self.task.pixels.rays
+        return rays if self.poses is None else rays.moved(self.poses)
 
     @cached_property
     def weights(self) -> Float[np.ndarray, "P"]:
@@ -114,18 +132,34 @@ class Solution:
     @cached_property
     def photographs(self) -> Rows:
         """Pixels under the map."""
-        rows = mirror_rows(self.sights.hits.derivatives, self.task.pixels.rays.directions, self.slopes)
+        rows = mirror_rows(self.sights.hits.derivatives, self.rays.directions, self.slopes)
         weights = self.weights * robust_weight(self.residual, self.task.settings.robust_scale)
         return Rows(self.sights.hits.places, rows, self.residual, weights)
 
-    @cached_property
+    @property
     def silhouettes(self) -> Rows:
         """Outlines and missed pixels."""
+        return self._silhouettes[0]
+
+    @cached_property
+    def pose_rows(self) -> tuple[PoseRows, PoseRows]:
+        """By the poses of views: of photographs, and of silhouettes."""
+        hits = self.sights.hits
+        distance = np.where(hits.met, hits.distance, 0.0) / self.surface.spacing
+        rows = pixel_pose_rows(
+            hits.derivatives, self.rays.directions, distance, self.slopes, self.photographs.rows[..., 1:]
+        )
+        rows[..., 3:] /= self.surface.spacing
+        return PoseRows(self.rays.view, rows, self.photographs.weights), self._silhouettes[1]
+
+    @cached_property
+    def _silhouettes(self) -> tuple[Rows, PoseRows]:
+        outlines = self.task.outlines
         sigmas = self.task.options.radiance_sigma / self.task.options.outline_sigma_px
         return silhouette_rows(
             self.surface,
-            self.task.outlines,
-            self.task.pixels.rays.chosen(~self.sights.hits.met),
+            outlines if self.poses is None else outlines.moved(self.poses),
+            self.rays.chosen(~self.sights.hits.met),
             self.task.outline_weight,
             self.task.photograph_weight * sigmas**2,
             self.task.options,
@@ -170,7 +204,15 @@ class Solution:
         residual = np.where(self.sights.clear[:, None], self.residual, before.residual)
         photographs = scale**2 * float((before.weights * bounded_error(residual, scale)).sum()) / 2
         prior = float((self.bent * self.surface.coefficients).sum()) / 2
+        if self.poses is not None:
+            prior += float((self.pose_prior * self.poses.stacked**2).sum()) / 2
         return photographs + self.constraints.cost + prior
+
+    @property
+    def pose_prior(self) -> Float[np.ndarray, "6"]:
+        """Weights of squared turns and shifts."""
+        options = self.task.options
+        return np.repeat([np.radians(options.pose_turn_deg), options.pose_shift], 3) ** -2.0
 
     @cached_property
     def _texel_total(self) -> Float[np.ndarray, "T"]:
@@ -195,6 +237,35 @@ class Solution:
         total = self.photographs.backward(self.beyond_map(self.photographs.forward(change)), shape)
         total += self.constraints.backward(self.constraints.forward(change), shape)
         return (total + self.smoothing * third_differences(change, self.active)) * self.active
+
+    def pose_gradient(self) -> Float[np.ndarray, "V 6"]:
+        """Of the cost, by the poses of the views."""
+        assert self.poses is not None
+        photographs, silhouettes = self.pose_rows
+        count = len(self.poses.turns)
+        total = photographs.backward(self.beyond_map(self.photographs.residual), count)
+        total += silhouettes.backward(self.silhouettes.residual, count)
+        return total + self.pose_prior * self.poses.stacked
+
+    def product_with_poses(
+        self, change: Float[np.ndarray, "A B C"], moved: Float[np.ndarray, "V 6"]
+    ) -> tuple[Float[np.ndarray, "A B C"], Float[np.ndarray, "V 6"]]:
+        """The Gauss–Newton matrix over coefficients and poses times a change of both."""
+        shape, count = self.surface.shape, len(moved)
+        photographs, silhouettes = self.pose_rows
+        seen = self.beyond_map(self.photographs.forward(change) + photographs.forward(moved))
+        outlined = self.silhouettes.forward(change) + silhouettes.forward(moved)
+        total = self.photographs.backward(seen, shape) + self.silhouettes.backward(outlined, shape)
+        total += self.gauge.backward(self.gauge.forward(change), shape)
+        total += self.smoothing * third_differences(change, self.active)
+        by_pose = photographs.backward(seen, count) + silhouettes.backward(outlined, count)
+        return total * self.active, by_pose + self.pose_prior * moved
+
+    def pose_blocks(self) -> Float[np.ndarray, "V 6 6"]:
+        """The matrix's diagonal blocks of the views, but for what the map takes over."""
+        assert self.poses is not None
+        blocks = sum(rows.blocks(len(self.poses.turns)) for rows in self.pose_rows)
+        return blocks + np.diag(self.pose_prior)
 
     def diagonal(self, smoothing_diagonal: float) -> Float[np.ndarray, "A B C"]:
         """The matrix's diagonal, but for what the map takes over; at least a millionth of its largest."""

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from panoless.first_surface.mesh import TriangleMesh
+from panoless.geometry.free_form.poses import Similarity
 from panoless.kernels.level_set import evaluate, first_hits, nearest_approach
 
 NEAREST = 6
@@ -120,6 +121,13 @@ class LevelSet:
         places = np.clip(self.places(points), 0, np.array(self.shape) - 3.0)
         value = evaluate(self.coefficients, places)[:, 0] * (self.spacing / spacing)
         return empty.interpolating(value.reshape(empty.shape))
+
+    def taken_back(self, common: Similarity) -> "LevelSet":
+        """The surface in a world from which a similarity was taken back, on the same grid."""
+        points = common(self.points(self.nodes().reshape(-1, 3)))
+        places = np.clip(self.places(points), 0, np.array(self.shape) - 3.0)
+        value = evaluate(self.coefficients, places)[:, 0] / common.scale
+        return self.interpolating(value.reshape(self.shape))
 
     def interpolating(self, values: Float[np.ndarray, "A B C"]) -> "LevelSet":
         """The spline with these values, in cells, at the nodes."""

@@ -68,6 +68,10 @@ class SurfelMirror:
         """The number of surfels."""
         return self.surfels.count
 
+    def corrected(self, views: Views) -> Views:
+        """As the geometry has them on which the surfels started."""
+        return views if self.started_on is None else self.started_on.corrected(views)
+
     def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
         """Those that the geometry it started on calls usable; all solid ones where there is none."""
         return view.solid if self.started_on is None else self.started_on.usable_pixels(view)
