@@ -13,7 +13,7 @@ NEED_PYTHON := expected Python 3.11 as python3.11 or python3 (the newest Blender
 PIP_INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 CODE := shinypartial panoless tests docs
 
-.PHONY: demo test results docs format setup clean
+.PHONY: demo test lint kernels results docs format setup clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/.installed-demo
@@ -23,12 +23,22 @@ demo: $(VENV)/.installed-demo
 	$(BIN)/shinypartial report
 
 test: setup
+	@$(MAKE) --no-print-directory -j2 lint kernels
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --durations=15
+
+lint: setup
 	$(BIN)/ruff check $(CODE)
 	$(BIN)/ruff format --check $(CODE)
 	$(BIN)/mypy shinypartial panoless
 	$(BIN)/lint-imports
 	$(BIN)/mkdocs build --quiet --strict -f docs/mkdocs.yml
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --durations=15
+
+# Small fits compile kernels once, beside the checks, in place of once in every process of the tests.
+kernels: setup
+	@rm -rf build/kernels && mkdir -p build/kernels
+	@cd build/kernels && for model in surfels free_form revolution; do \
+	  $(abspath $(BIN))/panoless fit tiny-vase --preset fast --model $$model --output $$model >log.txt 2>&1 \
+	    || { cat log.txt; exit 1; }; done
 
 RESOLUTION ?= 400
 SCENES ?=

@@ -1,9 +1,11 @@
 """One verdict on a finished fit, with its reason and what helps.
 
-Every doubt is a figure of the evidence over its limit; the largest decides. Below one the fit is trusted, from
-`TrustOptions.refused` on it is not, and between them it may be wrong in part.
+Every doubt is a figure of the evidence over its limit. The risk is the root of the sum of their squares, because
+doubts add up: below one the fit is trusted, from `TrustOptions.refused` on it is not, and between them it may be wrong
+in part. The largest doubt is the reason that is given.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -84,7 +86,9 @@ def judge(found: Evidence, options: TrustOptions) -> Trust:
     if found.unexplained is None:
         reason = f"{found.views} usable views leave none to hold out"
         return Trust("do not trust", reason, VIEWS, options.refused, figures)
-    risk, doubt = max(_risks(found, options), key=lambda each: each[0])
+    risks = list(_risks(found, options))
+    doubt = max(risks, key=lambda each: each[0])[1]
+    risk = math.hypot(*(each for each, _ in risks))
     if risk < 1:
         reason = (
             f"the mirror explains {1 - found.unexplained:.0%} of the light in held-out views, "

@@ -18,6 +18,8 @@ from shinypartial.stability.plan import Cell, Plan, Size
 FORMAT, FORMAT_VERSION = "shinypartial-stability", 1
 #: A fit is lost where its environment is this much worse than that of the clean fit, or its normals this many times.
 LOST_DB, LOST_FACTOR = 3.0, 3.0
+#: The verdict on a fit that is of no use.
+REFUSED = "do not trust"
 DIGITS = 4
 
 
@@ -192,12 +194,19 @@ class Judged:
 
 
 def judged(results: Results, split: str) -> Iterator[Judged]:
-    """Fits of a split with a verdict, against the clean fit of the same scene, method and seed."""
+    """Fits of a split with a verdict, against the clean fit of the same scene, method and seed.
+
+    Where that one is refused by its own verdict there is nothing to lose, so such a scene and method is left out.
+    """
 
     def key(cell: Cell) -> tuple[str, str, int]:
         return cell.scene, cell.method, cell.seed
 
-    clean = {key(each.cell): each.environment_db for each in results.outcomes if each.cell.axis is None}
+    clean = {
+        key(each.cell): each.environment_db
+        for each in results.outcomes
+        if each.cell.axis is None and each.verdict != REFUSED
+    }
     for each in results.outcomes:
         reference = clean.get(key(each.cell))
         known = None not in (each.verdict, each.risk, each.environment_db, reference)

@@ -10,6 +10,7 @@ from shinypartial.stability.axes import BY_NAME, Axis
 from shinypartial.stability.collect import (
     LOST_DB,
     LOST_FACTOR,
+    REFUSED,
     Judged,
     Results,
     judged,
@@ -113,9 +114,12 @@ def _spread_lines(results: Results) -> Iterator[str]:
 
 
 def _verdict_lines(results: Results) -> Iterator[str]:
+    clean = [each for each in results.outcomes if each.cell.axis is None and each.verdict == REFUSED]
+    refused = dict.fromkeys(f"{each.cell.scene} with {each.cell.method}" for each in clean)
     yield f"A fit is *lost* where its environment is {LOST_DB:g} dB or more worse than that of the clean fit of the"
     yield "same scene, method and seed. AUROC: the chance that a lost fit states a higher risk than one that is"
-    yield "not lost. Fits that state no risk are left out."
+    yield "not lost. Fits that state no risk are left out, and those of a scene and method whose clean fit is"
+    yield f"refused by its own verdict: {', '.join(refused) or 'none'}."
     yield ""
     yield "| Scenes | Fits | Lost | AUROC of the risk |\n| --- | --- | --- | --- |"
     groups = {split: list(judged(results, split)) for split in SPLITS}
