@@ -18,14 +18,14 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
     """The geometry of the scene and the evidence for it; of surfels it is the start.
 
     Candidates are examined from the simplest on. One is refused when it misses the silhouettes, or when surfels that
-    start on it explain held-out views clearly better. Surfels explain what is left; they start on the last candidate
-    that explained the silhouettes. `config.model` overrides.
+    start on it explain held-out views clearly better. Surfels explain what is left; of the candidates that explained
+    the silhouettes they start on the one from which they explained held-out views best. `config.model` overrides.
     Raises InputError when a kind is asked for and can't be proposed.
     """
     if config.model != ANY:
         return _fit_asked(views, config)
     *families, last = FAMILIES.values()
-    table, refused, start = list[Candidate](), dict[str, Proposal](), None
+    table, refused, starts = list[Candidate](), dict[str, Proposal](), list[tuple[float, Geometry]]()
     for family in families:
         if family.refines is None:
             proposal = family.propose(views, config, asked=False)
@@ -36,7 +36,9 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
         if geometry is not None and proposal is not None:
             if candidate.verdict == Verdict.CHOSEN:
                 return geometry, Selection(family.kind, tuple(table))
-            refused[family.kind], start = proposal, geometry
+            refused[family.kind] = proposal
+            starts.append((candidate.surfels_error or 0.0, geometry))
+    start = min(reversed(starts), key=lambda each: each[0])[1] if starts else None
     geometry = last.fit(views, Proposal(start, 0.0, 1.0), config)
     table.append(Candidate(last.kind, Verdict.CHOSEN, "no simpler kind explains the views"))
     return geometry, Selection(last.kind, tuple(table))

@@ -87,7 +87,8 @@ def _with_poses(views: Views, stage: FitStage, options: FreeFormOptions) -> FitS
     """A stage after its round was taken again with free poses."""
     assert stage.settings is not None, "a round was taken"
     free = replace(stage, poses=Poses.none(len(views.train)))
-    return take_round(views, free, replace(stage.settings, steps=options.pose_steps), options)
+    found = take_round(views, free, replace(stage.settings, steps=options.pose_steps), options)
+    return replace(found, settings=stage.settings)
 
 
 def _joined(solved: Poses, tested: Poses) -> Poses:
