@@ -34,7 +34,7 @@ from tests.support.mirror_body import (
 )
 
 OPTIONS = FreeFormOptions(
-    rounds=tuple(replace(settings, rays=settings.rays // 2) for settings in DEFAULTS.rounds), finer=()
+    rounds=tuple(replace(settings, rays=settings.rays // 2) for settings in DEFAULTS.rounds), finer=(), poses="off"
 )
 CONFIG = replace(FitConfig(), free_form=OPTIONS)
 VIEWS, SIZE_PX = 20, 64
@@ -127,7 +127,7 @@ def test_a_world_that_is_turned_and_scaled_gives_the_same_surface() -> None:
 def solution() -> Solution:
     """A wavy ball between two rounds."""
     views = body_views(wavy_ball(), 12, 60)
-    options = replace(OPTIONS, rounds=OPTIONS.rounds[:1], poses="off")
+    options = replace(OPTIONS, rounds=OPTIONS.rounds[:1])
     surface = fitted(views, options)
     settings = OPTIONS.rounds[1]
     return Solution.at(make_task(views, settings, options), surface, full_trust(surface, 20), None, 2)
@@ -165,7 +165,7 @@ def test_the_matrix_is_symmetric_and_positive(solution: Solution) -> None:
 def test_held_out_views_refuse_cells_that_a_ball_does_not_need() -> None:
     """Two more rounds are offered, and the one with a rough surface is not taken."""
     rough = FreeFormRound(34, 32, 0.15, 1, 20_000, 1e-6, 2)
-    options = replace(OPTIONS, rounds=OPTIONS.rounds[:2], finer=(rough,), poses="off")
+    options = replace(OPTIONS, rounds=OPTIONS.rounds[:2], finer=(rough,))
     views = body_views(sphere(), 10, 40)
     surface = fitted(views, options)
     assert max(surface.shape) < 34
@@ -174,7 +174,7 @@ def test_held_out_views_refuse_cells_that_a_ball_does_not_need() -> None:
 def test_the_same_views_give_the_same_surface() -> None:
     """A killed fit in closed form starts again, so it ends where the other would have."""
     views = body_views(sphere(), 10, 40)
-    options = replace(OPTIONS, rounds=OPTIONS.rounds[:1], poses="off")
+    options = replace(OPTIONS, rounds=OPTIONS.rounds[:1])
     np.testing.assert_array_equal(fitted(views, options).coefficients, fitted(views, options).coefficients)
 
 
@@ -266,12 +266,12 @@ def test_cameras_that_are_turned_by_half_a_degree_are_found() -> None:
     wrong = rng.normal(size=(count, 3))
     wrong *= np.radians(0.5) / np.linalg.norm(wrong, axis=1, keepdims=True)
     turned = Poses(wrong, np.zeros((count, 3))).moved(views)
-    proposal = FreeFormFamily().propose(turned, CONFIG, asked=True)
+    proposal, options = FreeFormFamily().propose(turned, CONFIG, asked=True), replace(OPTIONS, poses="auto")
     assert proposal is not None
-    surface, _, poses = fit_free_form(turned, proposal.shape, OPTIONS)
+    surface, _, poses = fit_free_form(turned, proposal.shape, options)
     assert poses is not None
     left = Rotation.from_rotvec(poses.turns) * Rotation.from_rotvec(wrong)
     assert np.degrees(np.median((left.mean().inv() * left).magnitude())) < 0.05
     errors = normal_errors_deg(surface, body, views, cameras_around(7, 60)[1::2])
     assert np.median(errors) < 0.2
-    assert fit_free_form(views, proposal.shape, OPTIONS)[2] is None
+    assert fit_free_form(views, proposal.shape, options)[2] is None
