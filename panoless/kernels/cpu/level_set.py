@@ -229,23 +229,28 @@ def _march(coefficients, empty, ox, oy, oz, dx, dy, dz, start, end):
 
     Through empty cells by their number, elsewhere by a share of φ, in steps that are neither tiny nor long.
     """
-    t, before = start, start
+    if start >= end:
+        return np.inf
+    t, value = start, 0.0
     widest = max(abs(dx), abs(dy), abs(dz))
-    while t < end:
-        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-        free = _free(empty, x, y, z)
+    x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+    free = _free(empty, x, y, z)
+    if free == 0:
+        value = value_at(coefficients, x, y, z)
+    while True:
         before = t
         if free > 0:
             t += max(free - 1.0, LEAST_STEP) / widest
         else:
-            value = value_at(coefficients, x, y, z)
             t += min(max(SAFE_SHARE * value, LEAST_STEP), LONGEST_STEP)
         if t >= end:
             return np.inf
         x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-        if _free(empty, x, y, z) == 0 and value_at(coefficients, x, y, z) <= 0:
-            return _root(coefficients, ox, oy, oz, dx, dy, dz, before, t)
-    return np.inf
+        free = _free(empty, x, y, z)
+        if free == 0:
+            value = value_at(coefficients, x, y, z)
+            if value <= 0:
+                return _root(coefficients, ox, oy, oz, dx, dy, dz, before, t)
 
 
 @njit(**VECTORIZED_LOOPS)
