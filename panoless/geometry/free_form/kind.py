@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from panoless.capture.object_frame import ObjectFrame
-from panoless.capture.views import TrainView, Views
+from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays
@@ -85,10 +85,8 @@ class FreeFormMirror(ExactGeometry):
 
     def footprints(self, views: Views) -> Footprints | None:
         """Four directions over each of about `footprints` pixels that are trusted and turn little."""
-        stride = max(1, -(-sum(len(view.solid) for view in views.train) // self.options.footprints))
         found = []
-        for first, view in enumerate(views.train):
-            pixels = view.solid[first % stride :: stride]
+        for view, pixels in at_most_pixels(views, self.options.footprints):
             rays = PixelRays.centers(view.camera, pixels.cpu().numpy())
             sights = Sights.of(self.surface, rays, 4, self.options.least_map_cosine, occlusion_test=self.occlusion_test)
             trusted = self.trust.at(self.surface.points(sights.hits.places)) > self.options.least_footprint_trust

@@ -224,10 +224,15 @@ class Solution:
         """(1 − Π) e: what the map does not take over."""
         return without_means(residual, self.photographs.weights, self.texels, self._texel_total)
 
+    @cached_property
+    def _unexplained(self) -> Float[np.ndarray, "P 3"]:
+        """The photographs' residual beyond the map."""
+        return self.beyond_map(self.photographs.residual)
+
     def gradient(self) -> Float[np.ndarray, "A B C"]:
         """Of the cost, over active coefficients."""
         shape = self.surface.shape
-        total = self.photographs.backward(self.beyond_map(self.photographs.residual), shape)
+        total = self.photographs.backward(self._unexplained, shape)
         total += self.constraints.backward(self.constraints.residual, shape)
         return (total + self.bent) * self.active
 
@@ -243,7 +248,7 @@ class Solution:
         assert self.poses is not None
         photographs, silhouettes = self.pose_rows
         count = len(self.poses.turns)
-        total = photographs.backward(self.beyond_map(self.photographs.residual), count)
+        total = photographs.backward(self._unexplained, count)
         total += silhouettes.backward(self.silhouettes.residual, count)
         return total + self.pose_prior * self.poses.stacked
 

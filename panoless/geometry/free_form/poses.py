@@ -134,10 +134,6 @@ class Poses:
         turns = Rotation.from_matrix(common.rotation.T) * Rotation.from_rotvec(self.turns)
         return Poses(turns.as_rotvec(), common.undone(centers + self.shifts) - centers)
 
-    def chosen(self, index: "list[int] | slice") -> "Poses":
-        """Those of some views."""
-        return Poses(self.turns[index], self.shifts[index])
-
     def moved(self, views: Views) -> Views:
         """The views with their cameras there."""
         turns = Rotation.from_rotvec(self.turns).as_matrix()
