@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -31,7 +32,9 @@ class Fit:
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the fit computes; `cuda` (NVIDIA or AMD) needs a GPU, torch for it and Triton; see
     docs/how-to/use-a-gpu.md."""
-    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="OPTION=VALUE")] = ()
+    set: Annotated[
+        tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="OPTION=VALUE [OPTION=VALUE ...]")
+    ] = ()
     """Change tuned numbers, such as plane.max_vertices=64; docs/reference/fit-options.md lists them."""
     config: FitConfig = field(default_factory=FitConfig)
 
@@ -39,7 +42,7 @@ class Fit:
         """Fit, export and say what to do next."""
         from panoless.api import RUNS, fit
 
-        config = with_overrides(self.config, self.set)
+        config = with_overrides(self.config, tuple(chain(*self.set)))
         result = fit(
             self.dataset,
             output=self.output,

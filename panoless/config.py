@@ -175,6 +175,8 @@ class FitConfig:
     """`paper`: (A + L)·α as Eq. 10 is written, though A is blended already; `once`: A + L·α."""
     downscale: Count = 1
     """Average the training images over blocks of this many pixels a side."""
+    least_object_px: NonNegative = 0.0
+    """Smaller blocks, where the object (the root of its area) would have fewer pixels across."""
     crop_margin_px: Annotated[int, Meta(ge=-1)] = 12
     """Work on the mask's bounding box with this margin; −1 works on whole images."""
     visibility: Literal["final", "online"] = "final"

@@ -40,9 +40,9 @@ _PAPER = FitConfig(
 PRESETS: dict[str, FitConfig] = {
     "fast": FitConfig(
         preset="fast",
-        model="surfels",
         iterations=300,
         downscale=2,
+        least_object_px=96.0,
         surfels=SurfelConfig(count=3000, hull_resolution=64),
         environment=EnvironmentConfig(resolution=64, rays=2_000_000),
         free_form=FreeFormOptions(

@@ -25,6 +25,8 @@ from shinypartial.io.progress import Progress
 
 #: Of the views, this one in turn is held out to judge by.
 HELD_OUT_EVERY = 5
+SIZED_VIEWS = 5
+"""From so many views at most the size of the object is taken."""
 Item = TypeVar("Item")
 
 
@@ -112,13 +114,21 @@ class Views:
         return replace(self, train=tuple(view.to(device) for view in self.train))
 
 
-def load_views(dataset: Dataset, crop_margin_px: int, downscale: int = 1, encoding: RadianceEncoding = LDR) -> Views:
+def load_views(
+    dataset: Dataset,
+    crop_margin_px: int,
+    downscale: int = 1,
+    encoding: RadianceEncoding = LDR,
+    least_object_px: float = 0.0,
+) -> Views:
     """Read the training split, averaged over blocks of `downscale` pixels a side, its radiance encoded.
 
+    Blocks are smaller where the object, the root of its area, would have fewer than `least_object_px` pixels across.
     Raises InputError for unreadable images and for masks that are all empty.
     """
     progress = Progress("reading views", len(dataset.train))
     photographs = []
+    downscale = max(1, min(downscale, int(_object_px(dataset) / least_object_px))) if least_object_px else downscale
     for frame in dataset.train:
         view = read_view(frame)
         alpha = _block_means(np.clip(view.alpha, 0, 1), downscale)
@@ -132,6 +142,12 @@ def load_views(dataset: Dataset, crop_margin_px: int, downscale: int = 1, encodi
         photographs.append(cropped(frame.camera.downscaled(downscale), radiance, alpha, crop_margin_px))
         progress.advance()
     return views_of(photographs)
+
+
+def _object_px(dataset: Dataset) -> float:
+    """√area of the object's mask: the median over a few views."""
+    views = dataset.train[:: -(-len(dataset.train) // SIZED_VIEWS)]
+    return float(np.median([np.sqrt(read_view(frame).alpha.clip(0, 1).sum()) for frame in views]))
 
 
 def views_of(photographs: Sequence[Photograph]) -> Views:

@@ -130,7 +130,9 @@ def export_snapshots(dataset: Dataset, run: Path, config: FitConfig, prediction:
         if _is_exported(target, state, config, dataset):
             continue
         if views is None:
-            loaded = load_views(dataset, config.crop_margin_px, config.downscale, encoding_of(config))
+            loaded = load_views(
+                dataset, config.crop_margin_px, config.downscale, encoding_of(config), config.least_object_px
+            )
             views = usable_views(loaded, state.geometry)
         with timed(state.seconds, "solve environment"):
             complete(state, views, config)

@@ -50,7 +50,9 @@ def fit(
             return state
         seconds: dict[str, float] = {}
         with timed(seconds, "read views"):
-            views = load_views(dataset, config.crop_margin_px, config.downscale, encoding_of(config)).to(device)
+            views = load_views(
+                dataset, config.crop_margin_px, config.downscale, encoding_of(config), config.least_object_px
+            ).to(device)
         if state is None:
             with timed(seconds, "initialize"):
                 state = begin(views, config)

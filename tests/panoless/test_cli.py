@@ -143,12 +143,14 @@ def test_options_reach_the_fit_and_are_saved(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     options = [*TINY, "--preset", "paper", "--config.density.no-enabled", "--config.loss.lambda-ssim", "0.25"]
+    options += ["--set", "selection.least_gain=0.1", "trust.views=21", "--set", "plane.max_vertices=9"]
     assert main(["fit", str(sphere_dataset.root), *options]) == 0
     folder = tmp_path / "predictions" / f"{sphere_dataset.name}-paper"
     saved = json.loads((folder / "prediction.json").read_text())["config"]
     assert saved == json.loads((tmp_path / "runs" / folder.name / "fit.json").read_text())["config"]
     assert saved["iterations"] == 4
     assert saved["loss"]["lambda_ssim"] == 0.25
+    assert (saved["selection"]["least_gain"], saved["plane"]["max_vertices"]) == (0.1, 9)
     assert saved["density"]["enabled"] is False
     assert saved["environment"]["activation"] == "sigmoid"
     lines = capsys.readouterr().out.splitlines()

@@ -74,6 +74,14 @@ def test_rays_are_those_of_the_dataset(sphere_dataset: Dataset) -> None:
         np.testing.assert_allclose(world.numpy(), ray_directions_world(frame.camera), atol=1e-6)
 
 
+def test_blocks_are_smaller_where_the_object_would_be_too_small(sphere_dataset: Dataset) -> None:
+    whole = load_views(sphere_dataset, WHOLE)
+    across = np.median([float(view.mask.sum()) ** 0.5 for view in whole.train])
+    for least, side in ((0.0, 4), (across / 4.01, 4), (across / 2.5, 2), (across * 2, 1)):
+        views = load_views(sphere_dataset, WHOLE, downscale=4, least_object_px=least)
+        assert views.train[0].mask.shape[0] == whole.train[0].mask.shape[0] // side
+
+
 def test_the_normalized_frame_holds_the_sphere(views: Views) -> None:
     # A sphere of radius 1 at the origin; masks of 40 px place it within half a pixel, 0.03 units.
     np.testing.assert_allclose(views.object_frame.center, 0, atol=0.03)

@@ -104,16 +104,15 @@ def test_values_that_stay_keep_their_moments_and_others_restart() -> None:
         pull(optimizer)
         optimizer.step(1.0, geometry=True, frozen=frozenset({"albedo"}))
     before = copy.deepcopy(optimizer.state_dict()["state"])
-    names = [group["name"] for group in optimizer.state_dict()["param_groups"]]
     surfels = optimizer.surfels.detached()
     optimizer.set_values(replace(surfels, opacity_logits=surfels.opacity_logits - 3))
     assert torch.equal(optimizer.surfels.opacity_logits, surfels.opacity_logits - 3)
-    for index, state in optimizer.state_dict()["state"].items():
+    for name, state in optimizer.state_dict()["state"].items():
         for key in ("exp_avg", "exp_avg_sq"):
-            if names[index] == "opacity_logits":
+            if name == "opacity_logits":
                 assert not state[key].any()
             else:
-                assert torch.equal(state[key], before[index][key]), names[index]
+                assert torch.equal(state[key], before[name][key]), name
         assert state["step"] == 3
 
 
@@ -135,6 +134,21 @@ def test_a_restored_optimizer_takes_the_same_step() -> None:
     for optimizer in (first, second):
         pull(optimizer)
         optimizer.step(0.5, geometry=True, frozen=frozenset({"albedo"}))
+    for name, value in snapshot(first).items():
+        assert torch.equal(value, snapshot(second)[name]), name
+
+
+def test_checkpoints_with_numbered_groups_are_read() -> None:
+    first = make()
+    pull(first)
+    first.step(1.0, geometry=True, frozen=frozenset())
+    named = first.state_dict()["state"]
+    groups = [{"name": name} for name in named]
+    second = SurfelOptimizer(first.surfels.detached(), first.environment.detach(), RATES)
+    second.load_state_dict({"state": dict(enumerate(named.values())), "param_groups": groups})
+    for optimizer in (first, second):
+        pull(optimizer)
+        optimizer.step(0.5, geometry=True, frozen=frozenset())
     for name, value in snapshot(first).items():
         assert torch.equal(value, snapshot(second)[name]), name
 
