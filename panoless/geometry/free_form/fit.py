@@ -60,7 +60,7 @@ def fit_free_form(
         stage = FitStage(start, full_trust(start, options.trust_cells), None, options.damping, poses=poses)
         for settings in options.rounds:
             stage = take_round(solved, stage, settings, options, progress)
-        if held_out and options.poses == "auto":
+        if held_out and options.poses == "auto" and pose_pull(solved, stage, options) > options.least_pose_pull:
             stage = keep_if_better(
                 (stage, _with_poses(solved, stage, options)),
                 lambda each: held_out_error(solved, tested, each, options),
@@ -81,6 +81,16 @@ def fit_free_form(
             stage = replace(stage, poses=_joined(stage.poses, found_poses(solved, tested, stage, options)))
         stage = take_round(views, stage, last, options, progress)
     return stage.surface, stage.trust, stage.poses
+
+
+def pose_pull(views: Views, stage: FitStage, options: FreeFormOptions) -> float:
+    """The share of the cost that one step of the poses alone would take: Σ ½ gᵀH⁻¹g of the views, over the cost."""
+    assert stage.settings is not None, "a round was taken"
+    task, poses = make_task(views, stage.settings, options), Poses.none(len(views.train))
+    solution = Solution.at(task, stage.surface, stage.trust, stage.environment, 0, poses)
+    gradient = solution.pose_gradient()
+    steps = np.linalg.solve(solution.pose_blocks(), gradient[..., None])[..., 0]
+    return float((gradient * steps).sum()) / 2 / solution.cost(solution)
 
 
 def _with_poses(views: Views, stage: FitStage, options: FreeFormOptions) -> FitStage:
