@@ -48,14 +48,6 @@ def sphere_dataset(tmp_path_factory: pytest.TempPathFactory):
     return make_sphere_dataset(tmp_path_factory.mktemp("datasets") / "sphere")
 
 
-@pytest.fixture(scope="session")
-def scored_sphere_dataset(tmp_path_factory: pytest.TempPathFactory):
-    """The same with its map at the height at which maps are scored, so that scoring resamples none of them."""
-    from tests.support.synthetic_dataset import make_sphere_dataset
-
-    return make_sphere_dataset(tmp_path_factory.mktemp("scored-datasets") / "sphere", environment_height=256)
-
-
 @pytest.fixture
 def damaged_dataset(tmp_path: Path, sphere_dataset) -> Path:
     """A copy of that dataset for a test to damage."""

@@ -12,16 +12,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from shinypartial import __version__
 from shinypartial.core.errors import InputError
 from shinypartial.core.trajectory import Trajectory, unit_vectors
 from shinypartial.dataset.camera_plot import CAMERA_PLOT, plot_cameras
 from shinypartial.dataset.crossing import angles_rad, find_crossings, look_at_point
-from shinypartial.dataset.read import open_dataset
-from shinypartial.dataset.schema import CHECKSUMS, SPLITS, Dataset, Frame
-from shinypartial.dataset.write import claim_folder, complete_dataset
-from shinypartial.io.files import copy_or_link, folder_lock, read_json, remove_partial_files, sha256_of, write_json
-from shinypartial.io.progress import Progress
+from shinypartial.dataset.derived import Job, open_source, write_derived
+from shinypartial.dataset.schema import SPLITS, Dataset, Frame
+from shinypartial.io.files import read_json, sha256_of, write_json
 
 #: Share of the kept cameras that is for training, in percent, as Partial Shiny Blender has it.
 TRAIN_PERCENT = 40
@@ -162,37 +159,21 @@ def make_subset(source: Path, root: Path, options: SubsetOptions, *, link: bool 
     `link` makes hard links in place of copies. Raises InputError when the path doesn't cross itself, when the source
     can't be read or when the folder holds something else.
     """
-    refuse_nesting(source, root)
-    dataset = open_dataset(source)
+    dataset = open_source(source, root)
     selection = select(dataset, options)
     contents = {split: _renamed(dataset, split, getattr(selection, split)) for split in SPLITS}
     without_normals = tuple(split for split in SPLITS if _has_some_normals(getattr(selection, split)))
     files = [pair for split in SPLITS for pair in _copies(root, split, getattr(selection, split))]
-    with folder_lock(root):
-        claim_folder(root, _recipe(dataset, selection, options), {"shinypartial": __version__})
-        missing = [(old, new) for old, new in files if not new.exists()]
-        if (root / CHECKSUMS).exists() and not missing:
-            return Subset(root, selection, 0, without_normals)
-        (root / CHECKSUMS).unlink(missing_ok=True)
-        remove_partial_files(root)
-        progress = Progress("Linking" if link else "Copying", len(files), len(files) - len(missing))
-        for old, new in missing:
-            copy_or_link(old, new, link)
-            progress.advance()
+
+    def finish() -> dict[str, Any]:
         for split in SPLITS:
             write_json(root / f"transforms_{split}.json", contents[split])
         plot_cameras(root / CAMERA_PLOT, selection.trajectory)
-        licenses = [{"asset": "images", "license": "that of the source", "source": f"dataset {dataset.name}"}]
-        complete_dataset(root, licenses, _statistics(selection))
-    return Subset(root, selection, len(missing), without_normals)
+        return _statistics(selection)
 
-
-def refuse_nesting(source: Path, root: Path) -> None:
-    """Raise InputError for an output folder that is the source or lies in it."""
-    if source.resolve() in (root.resolve(), *root.resolve().parents):
-        raise InputError(
-            expected=f"an output folder apart from the source {source}", found=str(root), remedy="Change --output."
-        )
+    jobs = [Job.copy(old, new, link) for old, new in files]
+    title, recipe = "Linking" if link else "Copying", _recipe(dataset, selection, options)
+    return Subset(root, selection, write_derived(root, dataset, recipe, jobs, title, finish), without_normals)
 
 
 def _recipe(dataset: Dataset, selection: Selection, options: SubsetOptions) -> dict[str, Any]:

@@ -35,9 +35,6 @@ from panoless.geometry.revolution.silhouette import (
 from panoless.numeric.gauss_newton import keep_if_better
 from shinypartial.io.progress import Progress
 
-BELIEVED_OVERLAP = 0.98
-"""Of body and masks, from which no stem is looked for: what model selection asks for."""
-
 
 @dataclass(frozen=True)
 class RevolutionProposal:
@@ -67,7 +64,7 @@ def propose_revolution(views: Views, options: RevolutionOptions = DEFAULTS) -> R
         found = _propose(views, rays, starts, options, stem)
         if found is not None and (best is None or np.median(found.iou) > np.median(best.iou)):
             best = found
-        if best is not None and np.median(best.iou) >= BELIEVED_OVERLAP:
+        if best is not None and np.median(best.iou) >= options.silhouette.believed_overlap:
             break
     return best
 

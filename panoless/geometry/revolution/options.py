@@ -48,6 +48,8 @@ class SilhouetteOptions:
     """Mean of e²/(e² + s²), s = 2 px, over a coarse fit above which no axis is near."""
     least_views: int = 6
     """Fewer views with a contour propose nothing."""
+    believed_overlap: float = 0.98
+    """Of the closed body with the masks, from which no stem is looked for: what model selection asks for."""
     scored_views: int = 16
     """Views over which the overlap of a proposal is measured."""
 

@@ -4,7 +4,7 @@ A run that is killed continues when it is started again, and a folder that holds
 """
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,39 +13,34 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from shinypartial import __version__
 from shinypartial.core.camera import opencv_to_opengl
 from shinypartial.core.color import to_display
 from shinypartial.core.conventions import FACES
 from shinypartial.core.errors import InputError
+from shinypartial.dataset.derived import Job, open_source, write_derived
 from shinypartial.dataset.perturb import picture as pictures
 from shinypartial.dataset.perturb.options import Perturbation, changed_options
 from shinypartial.dataset.perturb.plan import Plan, PlannedView, generator, make_plan
 from shinypartial.dataset.perturb.turned import write_turned_environment, write_turned_normals, write_turned_transforms
-from shinypartial.dataset.read import open_dataset
 from shinypartial.dataset.schema import (
     CHECKSUMS,
     ENVIRONMENT_CUBE,
     ENVIRONMENT_LATLONG,
     ENVIRONMENT_LATLONG_Y_UP,
-    LICENSES,
     Dataset,
     Frame,
     View,
 )
-from shinypartial.dataset.subset import files_of, refuse_nesting
+from shinypartial.dataset.subset import files_of
 from shinypartial.dataset.write import (
-    claim_folder,
-    complete_dataset,
     display_rgba,
     encode_normals,
     encode_unit,
     exr_channels,
     intrinsics_of,
 )
-from shinypartial.io.files import copy_or_link, folder_lock, read_json, remove_partial_files, sha256_of, write_json
+from shinypartial.io.files import read_json, sha256_of, write_json
 from shinypartial.io.images import EXR, write_exr, write_jpeg, write_png
-from shinypartial.io.progress import Progress
 
 TRAIN, TEST = "transforms_train.json", "transforms_test.json"
 #: Photographs of these formats become PNG when they are made anew, others become EXR.
@@ -62,46 +57,22 @@ class PerturbedCopy:
     """Number of files that were not there before."""
 
 
-@dataclass(frozen=True)
-class _Job:
-    """Files of the copy that come into being together, and what makes them."""
-
-    files: tuple[Path, ...]
-    make: Callable[[], None]
-
-    @property
-    def done(self) -> bool:
-        return all(path.exists() for path in self.files)
-
-
 def perturb(source: Path, root: Path, options: Perturbation, *, link: bool = False) -> PerturbedCopy:
     """Write a perturbed copy of the dataset `source` to the folder `root`, or finish what an earlier run began there.
 
     `link` makes hard links in place of copies for files that stay the same. Raises InputError for options out of range,
     when the source can't be read or when the folder holds something else.
     """
-    refuse_nesting(source, root)
-    dataset = open_dataset(source)
+    dataset = open_source(source, root)
     plan = make_plan(dataset, options)
-    jobs = list({job.files: job for job in _jobs(_Copy(dataset, root, plan, link))}.values())
     transforms = _transforms(plan, dataset)
-    with folder_lock(root):
-        claim_folder(root, _recipe(dataset, options), {"shinypartial": __version__})
-        missing = [job for job in jobs if not job.done]
-        if (root / CHECKSUMS).exists() and not missing:
-            return PerturbedCopy(root, plan, 0)
-        (root / CHECKSUMS).unlink(missing_ok=True)
-        remove_partial_files(root)
-        progress = Progress("Perturbing", len(jobs), len(jobs) - len(missing))
-        for job in missing:
-            job.make()
-            progress.advance()
+
+    def finish() -> dict[str, Any]:
         write_json(root / TRAIN, transforms)
-        licenses = [{"asset": "images", "license": "that of the source", "source": f"dataset {dataset.name}"}]
-        if (source / LICENSES).exists():
-            licenses = read_json(source / LICENSES, "the licenses")
-        complete_dataset(root, licenses, _statistics(plan, dataset))
-    return PerturbedCopy(root, plan, sum(len(job.files) for job in missing))
+        return _statistics(plan, dataset)
+
+    jobs, recipe = _jobs(_Copy(dataset, root, plan, link)), _recipe(dataset, options)
+    return PerturbedCopy(root, plan, write_derived(root, dataset, recipe, jobs, "Perturbing", finish))
 
 
 @dataclass(frozen=True)
@@ -124,21 +95,21 @@ class _Copy:
             )
         return self.root / below
 
-    def kept(self, path: Path) -> _Job:
+    def kept(self, path: Path) -> Job:
         """A file that stays the same."""
-        return _Job((self.place(path),), partial(copy_or_link, path, self.place(path), self.link))
+        return Job.copy(path, self.place(path), self.link)
 
-    def kept_frame(self, frame: Frame) -> Iterator[_Job]:
+    def kept_frame(self, frame: Frame) -> Iterator[Job]:
         """Files of a frame that stay the same, but for normals where the world turns."""
         turn = self.plan.turn
         for path in (*files_of(frame), *([frame.mask] if frame.mask else [])):
             if turn is not None and path in (frame.exr, frame.normal_png):
-                yield _Job((self.place(path),), partial(write_turned_normals, path, self.place(path), turn))
+                yield Job((self.place(path),), partial(write_turned_normals, path, self.place(path), turn))
             else:
                 yield self.kept(path)
 
 
-def _jobs(copy: _Copy) -> Iterator[_Job]:
+def _jobs(copy: _Copy) -> Iterator[Job]:
     """All of the copy but the training cameras, which are written last."""
     plan, source = copy.plan, copy.dataset.root
     for view in plan.views:
@@ -150,11 +121,11 @@ def _jobs(copy: _Copy) -> Iterator[_Job]:
         yield from map(copy.kept, [source / TEST] * bool(copy.dataset.test) + maps)
         return
     if copy.dataset.test:
-        yield _Job((copy.root / TEST,), partial(write_turned_transforms, source / TEST, copy.root / TEST, plan.turn))
+        yield Job((copy.root / TEST,), partial(write_turned_transforms, source / TEST, copy.root / TEST, plan.turn))
     if (source / ENVIRONMENT_LATLONG).exists():
         files = (ENVIRONMENT_LATLONG, *(ENVIRONMENT_CUBE / f"{name}.exr" for name in FACES), ENVIRONMENT_LATLONG_Y_UP)
         made = tuple(copy.root / file for file in files)
-        yield _Job(made, partial(write_turned_environment, source, copy.root, plan.turn))
+        yield Job(made, partial(write_turned_environment, source, copy.root, plan.turn))
 
 
 def _suffix(frame: Frame, options: Perturbation) -> str:
@@ -164,7 +135,7 @@ def _suffix(frame: Frame, options: Perturbation) -> str:
     return ".png" if options.sensor.srgb8 or frame.photograph.suffix.lower() in EIGHT_BIT else EXR
 
 
-def _rewritten(copy: _Copy, view: PlannedView) -> Iterator[_Job]:
+def _rewritten(copy: _Copy, view: PlannedView) -> Iterator[Job]:
     """A training view made anew; what lies beside it is copied unless its pixels have moved or turned."""
     options, frame = copy.plan.options, view.source
     sensor, views = options.sensor, options.views
@@ -179,7 +150,7 @@ def _rewritten(copy: _Copy, view: PlannedView) -> Iterator[_Job]:
     suffix = _suffix(frame, options)
     photographs = (new.png, new.exr) if suffix == EXR else (new.stem.with_name(new.stem.name + suffix),)
     files = (*map(copy.place, truth), new.alpha_png, *photographs)
-    yield _Job(files, partial(_write_frame, copy.plan, view, files))
+    yield Job(files, partial(_write_frame, copy.plan, view, files))
 
 
 def _write_frame(plan: Plan, planned: PlannedView, files: tuple[Path, ...]) -> None:

@@ -48,7 +48,7 @@ def test_a_dataset_comes_back_as_it_was_rendered(sphere_dataset: Dataset) -> Non
 
 
 def test_the_environment_comes_back(sphere_dataset: Dataset) -> None:
-    np.testing.assert_allclose(read_environment(sphere_dataset), environment_latlong(32), rtol=2**-11, atol=1e-6)
+    np.testing.assert_allclose(read_environment(sphere_dataset), environment_latlong(256), rtol=2**-11, atol=1e-6)
 
 
 def test_names_and_files_of_a_frame(sphere_dataset: Dataset) -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from shinypartial.cli import main
 from shinypartial.core.errors import InputError
-from shinypartial.dataset import subset as subset_module
+from shinypartial.dataset import derived
 from shinypartial.dataset.camera_plot import CAMERA_PLOT
 from shinypartial.dataset.read import open_dataset, read_view
 from shinypartial.dataset.schema import CHECKSUMS, MANIFEST, SPLITS, Dataset
@@ -249,7 +249,7 @@ def test_a_finished_subset_is_left_alone_and_a_deleted_file_is_copied_again(sour
 def test_a_run_that_was_stopped_continues(
     source: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, link: bool
 ) -> None:
-    place, placed = subset_module.copy_or_link, []
+    place, placed = derived.copy_or_link, []
 
     def stop_early(old: Path, new: Path, link: bool) -> None:
         if len(placed) == 9:
@@ -259,12 +259,12 @@ def test_a_run_that_was_stopped_continues(
         place(old, new, link)
 
     root = tmp_path / "partial"
-    monkeypatch.setattr(subset_module, "copy_or_link", stop_early)
+    monkeypatch.setattr(derived, "copy_or_link", stop_early)
     with pytest.raises(KeyboardInterrupt):
         make_subset(source.root, root, SubsetOptions(), link=link)
     with pytest.raises(InputError, match="not ended"):
         open_dataset(root)
-    monkeypatch.setattr(subset_module, "copy_or_link", place)
+    monkeypatch.setattr(derived, "copy_or_link", place)
     made = make_subset(source.root, root, SubsetOptions(), link=link)
     kept = len(made.selection.train) + len(made.selection.test)
     assert made.copied == 4 * kept - 9

@@ -1,0 +1,79 @@
+"""A dataset folder made from another one: the same files, copied, linked or made anew.
+
+A run that is killed continues when it is started again, and a folder that holds anything else is refused.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from shinypartial import __version__
+from shinypartial.core.errors import InputError
+from shinypartial.dataset.read import open_dataset
+from shinypartial.dataset.schema import CHECKSUMS, LICENSES, Dataset
+from shinypartial.dataset.write import claim_folder, complete_dataset
+from shinypartial.io.files import copy_or_link, folder_lock, read_json, remove_partial_files
+from shinypartial.io.progress import Progress
+
+
+@dataclass(frozen=True)
+class Job:
+    """Files of the new folder that come into being together, and what makes them."""
+
+    files: tuple[Path, ...]
+    make: Callable[[], None]
+
+    @classmethod
+    def copy(cls, old: Path, new: Path, link: bool) -> "Job":
+        """A file that stays the same, as a copy or as a hard link."""
+        return cls((new,), partial(copy_or_link, old, new, link))
+
+    @property
+    def done(self) -> bool:
+        """Whether all of its files are there; each is written whole."""
+        return all(path.exists() for path in self.files)
+
+
+def open_source(source: Path, root: Path) -> Dataset:
+    """The dataset to derive from; InputError where the new folder is that one or lies in it."""
+    if source.resolve() in (root.resolve(), *root.resolve().parents):
+        raise InputError(
+            expected=f"an output folder apart from the source {source}", found=str(root), remedy="Change --output."
+        )
+    return open_dataset(source)
+
+
+def write_derived(
+    root: Path,
+    source: Dataset,
+    recipe: dict[str, Any],
+    jobs: Iterable[Job],
+    title: str,
+    finish: Callable[[], dict[str, Any]],
+) -> int:
+    """Do the jobs that are not done, then `finish`, which gives the manifest's statistics; return how many files came.
+
+    Raises InputError when the folder holds something else.
+    """
+    every = list({job.files: job for job in jobs}.values())
+    with folder_lock(root):
+        claim_folder(root, recipe, {"shinypartial": __version__})
+        missing = [job for job in every if not job.done]
+        if (root / CHECKSUMS).exists() and not missing:
+            return 0
+        (root / CHECKSUMS).unlink(missing_ok=True)
+        remove_partial_files(root)
+        progress = Progress(title, len(every), len(every) - len(missing))
+        for job in missing:
+            job.make()
+            progress.advance()
+        complete_dataset(root, _licenses(source), finish())
+    return sum(len(job.files) for job in missing)
+
+
+def _licenses(source: Dataset) -> list[dict[str, str]]:
+    if (source.root / LICENSES).exists():
+        return read_json(source.root / LICENSES, "the licenses")  # type: ignore[no-any-return]
+    return [{"asset": "images", "license": "that of the source", "source": f"dataset {source.name}"}]
