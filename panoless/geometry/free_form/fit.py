@@ -39,6 +39,8 @@ class FitStage:
     """Of the round that led here."""
     poses: Poses | None = None
     """Of the views, where they are unknowns."""
+    loose: bool = False
+    """Whether photographs outweigh outlines, which are wrong by pixels."""
 
 
 def fit_free_form(
@@ -48,7 +50,7 @@ def fit_free_form(
     poses of the views where these are unknowns.
 
     Rounds are taken with four fifths of the views as long as the others gain by them, and the last of those once more
-    with all. The poses are set free after the rounds that are always taken, if held-out views gain by that.
+    with all. After the rounds that are always taken, outlines are loosened and poses set free, if held-out views gain.
     """
     kept, held_out = split_held_out(views.train)
     solved = replace(views, train=tuple(kept)) if kept and held_out else views
@@ -60,6 +62,12 @@ def fit_free_form(
         stage = FitStage(start, full_trust(start, options.trust_cells), None, options.damping, poses=poses)
         for settings in options.rounds:
             stage = take_round(solved, stage, settings, options, progress)
+        if held_out and options.loosen and outline_pull(solved, stage, options) > options.least_outline_pull:
+            stage = keep_if_better(
+                (stage, _with_loose_outlines(solved, stage, options)),
+                lambda each: held_out_error(solved, tested, each, options),
+                options.least_outline_gain,
+            )
         if held_out and options.poses == "auto" and pose_pull(solved, stage, options) > options.least_pose_pull:
             stage = keep_if_better(
                 (stage, _with_poses(solved, stage, options)),
@@ -83,10 +91,30 @@ def fit_free_form(
     return stage.surface, stage.trust, stage.poses
 
 
+def outline_pull(views: Views, stage: FitStage, options: FreeFormOptions) -> float:
+    """The share of the cost that a step promises, −½ gᵀΔ, with loose outlines, beyond what it does with tight ones."""
+    assert stage.settings is not None, "a round was taken"
+    promises = []
+    for loose in (True, False):
+        task = stage_task(views, replace(stage, loose=loose), stage.settings, options)
+        solution = Solution.at(task, stage.surface, stage.trust, stage.environment, 0, stage.poses)
+        step, _ = _step(solution, options.damping, still=False)
+        promises.append(-float((solution.gradient() * step).sum()) / 2 / solution.cost(solution))
+    return promises[0] - promises[1]
+
+
+def _with_loose_outlines(views: Views, stage: FitStage, options: FreeFormOptions) -> FitStage:
+    """A stage after its round was taken again with loose outlines."""
+    assert stage.settings is not None, "a round was taken"
+    settings = replace(stage.settings, steps=options.loose_steps)
+    found = take_round(views, replace(stage, loose=True), settings, options)
+    return replace(found, settings=stage.settings)
+
+
 def pose_pull(views: Views, stage: FitStage, options: FreeFormOptions) -> float:
     """The share of the cost that one step of the poses alone would take: Σ ½ gᵀH⁻¹g of the views, over the cost."""
     assert stage.settings is not None, "a round was taken"
-    task, poses = make_task(views, stage.settings, options), Poses.none(len(views.train))
+    task, poses = stage_task(views, stage, stage.settings, options), Poses.none(len(views.train))
     solution = Solution.at(task, stage.surface, stage.trust, stage.environment, 0, poses)
     gradient = solution.pose_gradient()
     steps = np.linalg.solve(solution.pose_blocks(), gradient[..., None])[..., 0]
@@ -111,12 +139,12 @@ def _joined(solved: Poses, tested: Poses) -> Poses:
 def found_poses(solved: Views, views: Views, stage: FitStage, options: FreeFormOptions) -> Poses:
     """Poses of views that took no part, under the surface and the map of those that did, which stay as they are."""
     assert stage.settings is not None, "a round was taken"
-    known = make_task(solved, stage.settings, options)
+    known = stage_task(solved, stage, stage.settings, options)
     environment = Solution.at(
         known, stage.surface, stage.trust, None, options.first_map_rounds, stage.poses
     ).environment
     still = replace(options, map_rounds=0, texel_prior=1e9)
-    task = make_task(views, replace(stage.settings, steps=options.pose_steps), still)
+    task = stage_task(views, stage, replace(stage.settings, steps=options.pose_steps), still)
     poses = Poses.none(len(views.train))
     solution = Solution.at(task, stage.surface, stage.trust, environment, 0, poses)
     moved = take_steps(solution, stage.damping, still=True)[0].poses
@@ -139,16 +167,29 @@ def take_round(
     surface = stage.surface
     if stage.settings is None or stage.settings.cells != settings.cells:
         surface = surface.resampled(settings.cells)
-    task = make_task(views, settings, options)
+    task = stage_task(views, stage, settings, options)
     solution = Solution.at(task, surface, stage.trust, stage.environment, options.first_map_rounds, stage.poses)
     solution, damping = take_steps(solution, stage.damping, progress)
-    found = FitStage(solution.surface, solution.trust, solution.environment, damping, settings, solution.poses)
+    found = replace(
+        stage,
+        surface=solution.surface,
+        trust=solution.trust,
+        environment=solution.environment,
+        damping=damping,
+        settings=settings,
+        poses=solution.poses,
+    )
     if solution.poses is None:
         return found
     # The map follows with the next round, which starts it anew.
     common = solution.poses.common(task.centers, solution.pose_prior)
     poses = solution.poses.without(common, task.centers)
     return replace(found, surface=solution.surface.taken_back(common), poses=poses, environment=None)
+
+
+def stage_task(views: Views, stage: FitStage, settings: FreeFormRound, options: FreeFormOptions) -> Task:
+    """The task of a round that follows a stage."""
+    return make_task(views, settings, options.with_loose_outlines() if stage.loose else options)
 
 
 def make_task(views: Views, settings: FreeFormRound, options: FreeFormOptions) -> Task:

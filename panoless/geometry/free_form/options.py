@@ -1,6 +1,6 @@
 """The tuned numbers of a free-form surface's fit."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 
@@ -130,6 +130,20 @@ class FreeFormOptions:
     """They end when the preconditioned residual's energy has fallen to this share."""
     largest_step_cells: float = 1.0
     """No coefficient moves by more in one step."""
+    loosen: bool = True
+    """Whether outlines give way to photographs where held-out views gain by it."""
+    loose_sigma_px: float = 1.5
+    """Standard deviation of an outline's point where they do…"""
+    loose_scale_px: float = 6.0
+    """…and their robust scale."""
+    loose_steps: int = 8
+    """Most steps of the round in which they are loosened."""
+    least_outline_pull: float = 0.015
+    """Share of the cost that a step has to promise with loose outlines, beyond that with tight ones, for them to be
+    tried. On sculpture at 160 px it is 0.004 with true masks, and 0.10, 0.07 and 0.05 with masks eroded by 1 px, by
+    2 px, and dilated by 2 px."""
+    least_outline_gain: float = 0.02
+    """Share of the held-out error by which loose outlines have to lower it."""
     poses: Literal["auto", "off", "on"] = "auto"
     """Whether the cameras' poses are unknowns, too: where held-out views gain by it, never, or always."""
     pose_turn_deg: float = 1.0
@@ -151,6 +165,10 @@ class FreeFormOptions:
     """Texels along a face side of the map that predicts them."""
     least_gain: float = 3e-3
     """A round ends when a step lowers the cost by less than this share."""
+
+    def with_loose_outlines(self) -> "FreeFormOptions":
+        """The same, but photographs outweigh outlines."""
+        return replace(self, outline_sigma_px=self.loose_sigma_px, outline_scale_px=self.loose_scale_px)
 
 
 DEFAULTS = FreeFormOptions()
