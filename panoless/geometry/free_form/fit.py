@@ -14,7 +14,7 @@ from panoless.environment.rays import Rays
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
 from panoless.geometry.free_form.observations import outline_rays, solid_pixels
-from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions, FreeFormRound
+from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions, FreeFormRound, Outlines
 from panoless.geometry.free_form.photometric import Sights, Solution, Task
 from panoless.geometry.free_form.poses import Poses
 from panoless.geometry.free_form.surface import LevelSet
@@ -39,8 +39,10 @@ class FitStage:
     """Of the round that led here."""
     poses: Poses | None = None
     """Of the views, where they are unknowns."""
-    loose: bool = False
-    """Whether photographs outweigh outlines, which are wrong by pixels."""
+    outlines: Outlines = "tight"
+    """How far these are believed."""
+    outline_offset_px: float = 0.0
+    """How far outside the surface these lie all in all."""
 
 
 def fit_free_form(
@@ -95,8 +97,8 @@ def outline_pull(views: Views, stage: FitStage, options: FreeFormOptions) -> flo
     """The share of the cost that a step promises, −½ gᵀΔ, with loose outlines, beyond what it does with tight ones."""
     assert stage.settings is not None, "a round was taken"
     promises = []
-    for loose in (True, False):
-        task = stage_task(views, replace(stage, loose=loose), stage.settings, options)
+    for outlines in ("loose", "tight"):
+        task = stage_task(views, replace(stage, outlines=outlines), stage.settings, options)
         solution = Solution.at(task, stage.surface, stage.trust, stage.environment, 0, stage.poses)
         step, _ = _step(solution, options.damping, still=False)
         promises.append(-float((solution.gradient() * step).sum()) / 2 / solution.cost(solution))
@@ -104,10 +106,12 @@ def outline_pull(views: Views, stage: FitStage, options: FreeFormOptions) -> flo
 
 
 def _with_loose_outlines(views: Views, stage: FitStage, options: FreeFormOptions) -> FitStage:
-    """A stage after its round was taken again with loose outlines."""
+    """A stage after its round was taken again with loose outlines, and then with their offset."""
     assert stage.settings is not None, "a round was taken"
     settings = replace(stage.settings, steps=options.loose_steps)
-    found = take_round(views, replace(stage, loose=True), settings, options)
+    found = take_round(views, replace(stage, outlines="loose"), settings, options)
+    settings = replace(stage.settings, steps=options.offset_steps)
+    found = take_round(views, replace(found, outlines="offset"), settings, options)
     return replace(found, settings=stage.settings)
 
 
@@ -178,6 +182,7 @@ def take_round(
         damping=damping,
         settings=settings,
         poses=solution.poses,
+        outline_offset_px=solution.task.outline_offset_px,
     )
     if solution.poses is None:
         return found
@@ -189,7 +194,8 @@ def take_round(
 
 def stage_task(views: Views, stage: FitStage, settings: FreeFormRound, options: FreeFormOptions) -> Task:
     """The task of a round that follows a stage."""
-    return make_task(views, settings, options.with_loose_outlines() if stage.loose else options)
+    task = make_task(views, settings, options.believing(stage.outlines))
+    return replace(task, outline_offset_px=stage.outline_offset_px)
 
 
 def make_task(views: Views, settings: FreeFormRound, options: FreeFormOptions) -> Task:
@@ -218,7 +224,7 @@ def take_steps(
     options, settings = solution.task.options, solution.task.settings
     for index in range(settings.steps):
         if not still:
-            solution = replace(solution, trust=measured_trust(solution))
+            solution = replace(solution, trust=measured_trust(solution), task=remeasured_task(solution))
         before = solution
         solution, length = _accepted(solution, *_step(solution, damping, still))
         factor = options.damping_less if length == 1 else options.damping_more
@@ -230,6 +236,12 @@ def take_steps(
         if last:
             break
     return solution, damping
+
+
+def remeasured_task(solution: Solution) -> Task:
+    """The task of a solution, with the offset of its outlines where these are loose."""
+    task = solution.task
+    return replace(task, outline_offset_px=solution.outline_offset_px) if task.options.offset_outlines else task
 
 
 def _accepted(

@@ -3,6 +3,9 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
+Outlines = Literal["tight", "loose", "offset"]
+"""Outlines are where the surface ends; somewhere near; or that, but for one distance in all views."""
+
 
 @dataclass(frozen=True)
 class FreeFormRound:
@@ -132,12 +135,18 @@ class FreeFormOptions:
     """No coefficient moves by more in one step."""
     loosen: bool = True
     """Whether outlines give way to photographs where held-out views gain by it."""
+    offset_outlines: bool = False
+    """Whether outlines may be off by one distance in all views, as those of masks that were grown or shrunk are."""
     loose_sigma_px: float = 1.5
     """Standard deviation of an outline's point where they do…"""
     loose_scale_px: float = 6.0
     """…and their robust scale."""
-    loose_steps: int = 8
+    loose_steps: int = 16
     """Most steps of the round in which they are loosened."""
+    offset_sigma_px: float = 0.3
+    """Standard deviation of an outline's point once its offset is found."""
+    offset_steps: int = 6
+    """Most steps of the round in which it is."""
     least_outline_pull: float = 0.015
     """Share of the cost that a step has to promise with loose outlines, beyond that with tight ones, for them to be
     tried. On sculpture at 160 px it is 0.004 with true masks, and 0.10, 0.07 and 0.05 with masks eroded by 1 px, by
@@ -166,9 +175,15 @@ class FreeFormOptions:
     least_gain: float = 3e-3
     """A round ends when a step lowers the cost by less than this share."""
 
-    def with_loose_outlines(self) -> "FreeFormOptions":
-        """The same, but photographs outweigh outlines."""
-        return replace(self, outline_sigma_px=self.loose_sigma_px, outline_scale_px=self.loose_scale_px)
+    def believing(self, outlines: Outlines) -> "FreeFormOptions":
+        """The same, with outlines that are believed less."""
+        if outlines == "tight":
+            return self
+        sigma, scale = {
+            "loose": (self.loose_sigma_px, self.loose_scale_px),
+            "offset": (self.offset_sigma_px, self.outline_scale_px),
+        }[outlines]
+        return replace(self, outline_sigma_px=sigma, outline_scale_px=scale, offset_outlines=True)
 
 
 DEFAULTS = FreeFormOptions()
