@@ -23,6 +23,9 @@ from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.robust import bounded_error
 from panoless.trust.options import TrustOptions
 
+LIGHT_FIGURES = ("unexplained", "one_color", "matte", "unexplained_part", "noise", "error_in_noise", "rank_correlation")
+"""What comes from held-out light."""
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -34,6 +37,8 @@ class Evidence:
     """The same under the mean color of each view."""
     matte: float | None
     """The same under one color for each place on the surface, found from the other views."""
+    unexplained_part: float | None
+    """Share of the light in held-out views that comes from places on the surface of which most is unexplained."""
     noise: float | None
     """Standard deviation of the pixels' noise (linear radiance), from their second differences."""
     error_in_noise: float | None
@@ -112,7 +117,7 @@ def _light(
     options: TrustOptions,
 ) -> dict[str, float | None]:
     """The figures that come from held-out light; None where there are too few views."""
-    nothing = dict.fromkeys(("unexplained", "one_color", "matte", "noise", "error_in_noise", "rank_correlation"))
+    nothing = dict.fromkeys(LIGHT_FIGURES)
     kept, held_out = surfaces
     if not kept or not held_out:
         return nothing
@@ -120,7 +125,7 @@ def _light(
     tested = replace(views, train=tuple(view for view, _ in held_out))
     rays = list(observe_views(solved, geometry, options.rays))
     environment = solve_environment(rays, min(options.resolution, visibility.shape[-1]))
-    places = _Places.of(kept, options)
+    places, parts = _Places.of(kept, options), _Parts.empty(options.part_cells, views.train[0].mask.device)
     errors, confidence, explained, plain = [], [], _Mean(), {"one_color": _Mean(), "matte": _Mean()}
     for (view, surface), (_, pixels) in zip(held_out, at_most_pixels(tested, options.rays), strict=True):
         batch = geometry.observe(view, pixels)
@@ -129,6 +134,9 @@ def _light(
         errors.append(error)
         confidence.append(sample_cubemap(visibility[:, None], batch.directions)[:, 0])
         radiance = view.radiance.flatten(1)[:, pixels].T
+        normals = surface.normals_camera.flatten(1)[:, pixels]
+        shown = geometry.shade(environment, view.camera, pixels, normals) - radiance
+        parts.add(_cell_index(view, surface, pixels, parts.cells), bounded_error(shown, options.scale))
         guesses = {"one_color": radiance.mean(0), "matte": places.colors(view, surface, pixels)}
         for name, guess in guesses.items():
             plain[name].add(bounded_error(guess - radiance, options.scale), torch.ones_like(radiance[:, 0]))
@@ -140,6 +148,7 @@ def _light(
         "unexplained": explained.value,
         "one_color": plain["one_color"].value,
         "matte": plain["matte"].value,
+        "unexplained_part": parts.share_above(options.part_unexplained * plain["matte"].value),
         "noise": noise,
         "error_in_noise": float(every.abs().median()) / max(noise, options.least_noise),
         "rank_correlation": _rank_correlation(sure, every.square().sum(1)),
@@ -162,6 +171,30 @@ class _Mean:
     def value(self) -> float:
         """Zero where nothing was added."""
         return self.summed / max(self.weight, 1e-9)
+
+
+@dataclass
+class _Parts:
+    """Summed errors and numbers of pixels by cells of a grid through which the surface passes."""
+
+    summed: Float[Tensor, "N"]
+    count: Float[Tensor, "N"]
+    cells: int
+
+    @classmethod
+    def empty(cls, cells: int, device: torch.device) -> "_Parts":
+        """Before any pixel."""
+        return cls(torch.zeros(cells**3, device=device), torch.zeros(cells**3, device=device), cells)
+
+    def add(self, index: Int[Tensor, "P"], errors: Float[Tensor, "P"]) -> None:
+        """Count pixels in."""
+        self.summed.index_add_(0, index, errors)
+        self.count.index_add_(0, index, torch.ones_like(errors))
+
+    def share_above(self, limit: float) -> float:
+        """The share of the pixels that lie in cells whose mean error is above a limit."""
+        above = self.summed > limit * self.count
+        return float(self.count[above].sum() / self.count.sum().clamp(min=1))
 
 
 @dataclass(frozen=True)

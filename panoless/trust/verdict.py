@@ -17,6 +17,7 @@ POSES = "Refine the camera poses and the focal length, or take them from a board
 MASKS = "Look at the masks, and at the poses of the views whose silhouettes disagree."
 MATTER = "Photograph a shinier object: this one shows its own color."
 SHAPE = "Look at poses, masks and exposure first; parts that are concave or see themselves may be wrong as well."
+PART = "Look at the confidence of the mesh: a hollow that no outline shows may have been missed, or be too deep."
 VIEWS = "Add views: at least five that see the object from different sides."
 TEXTURE = "Take it to surroundings that differ from one direction to another, or expose longer."
 EXPOSURE = "Photograph with a shorter exposure, or in high dynamic range."
@@ -64,6 +65,15 @@ DOUBTS = (
         lambda options: options.largest_unexplained,
         lambda found: f"{found.unexplained:.0%} of the light in held-out views is unexplained",
         SHAPE,
+    ),
+    _Doubt(
+        lambda found: found.unexplained_part,
+        lambda options: options.largest_unexplained_part,
+        lambda found: (
+            f"{found.unexplained_part:.0%} of what held-out views show of the object lies where its shape "
+            "explains little of it"
+        ),
+        PART,
     ),
     _Doubt(
         lambda found: found.saturated,

@@ -81,6 +81,22 @@ def wavy_ball(depth: float = 0.05, waves: float = 3.0) -> Body:
     return Body(value)
 
 
+def dented(
+    axes: tuple[float, float, float],
+    middle: tuple[float, float, float],
+    hollow: tuple[float, float, float],
+    rounding: float = 0.1,
+) -> Body:
+    """An ellipsoid without another one, whose middle is given, with a rounded rim."""
+    outer, inner = ellipsoid(axes).value, ellipsoid(hollow).value
+
+    def value(x: Points) -> Float[np.ndarray, "P"]:
+        one, other = outer(x), -inner(x - np.array(middle))
+        return np.maximum(one, other) + np.maximum(rounding - np.abs(one - other), 0) ** 2 / (4 * rounding)
+
+    return Body(value)
+
+
 def pattern(directions: Points) -> Float[np.ndarray, "P 3"]:
     """Waves of three lengths, and soft edges, in [0, 1]."""
     waves = np.random.default_rng(6).normal(size=(3, 3)) * 3

@@ -1,6 +1,6 @@
 """A free-form surface from silhouettes and photographs: accepted Gauss–Newton steps, from coarse to fine."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from panoless.capture.views import Views, split_held_out
 from panoless.environment.rays import Rays
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
+from panoless.geometry.free_form.concave import concave_start
 from panoless.geometry.free_form.observations import outline_rays, solid_pixels
 from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions, FreeFormRound, Outlines
 from panoless.geometry.free_form.photometric import Sights, Solution, Task
@@ -59,29 +60,25 @@ def fit_free_form(
     tested = replace(views, train=tuple(held_out))
     every = [*options.rounds, *options.finer, (*options.rounds, *options.finer)[-1]]
     progress = Progress("fitting a free-form surface", sum(settings.steps for settings in every))
+
+    def error(stage: FitStage) -> float:
+        return held_out_error(solved, tested, stage, options)
+
+    def better(stage: FitStage, other: FitStage, least_gain: float) -> FitStage:
+        return keep_if_better((stage, other), error, least_gain)
+
     with torch.no_grad():
-        poses = Poses.none(len(solved.train)) if options.poses == "on" else None
-        stage = FitStage(start, full_trust(start, options.trust_cells), None, options.damping, poses=poses)
-        for settings in options.rounds:
-            stage = take_round(solved, stage, settings, options, progress)
+        stage = coarse_stage(solved, start, options.rounds, options, progress)
+        hollowed = concave_start(solved, start, options.concave) if options.concave.search else None
+        if hollowed is not None:
+            deeper = coarse_stage(solved, hollowed, options.concave.rounds, options)
+            stage = better(stage, deeper, options.concave.least_held_out_gain) if held_out else deeper
         if held_out and options.loosen and outline_pull(solved, stage, options) > options.least_outline_pull:
-            stage = keep_if_better(
-                (stage, _with_loose_outlines(solved, stage, options)),
-                lambda each: held_out_error(solved, tested, each, options),
-                options.least_outline_gain,
-            )
+            stage = better(stage, _with_loose_outlines(solved, stage, options), options.least_outline_gain)
         if held_out and options.poses == "auto" and pose_pull(solved, stage, options) > options.least_pose_pull:
-            stage = keep_if_better(
-                (stage, _with_poses(solved, stage, options)),
-                lambda each: held_out_error(solved, tested, each, options),
-                options.least_pose_gain,
-            )
+            stage = better(stage, _with_poses(solved, stage, options), options.least_pose_gain)
         if held_out and options.finer:
-            stage = keep_if_better(
-                _stages(solved, stage, options, progress),
-                lambda each: held_out_error(solved, tested, each, options),
-                options.least_held_out_gain,
-            )
+            stage = keep_if_better(_stages(solved, stage, options, progress), error, options.least_held_out_gain)
         assert stage.settings is not None, "a fit has rounds"
         last = stage.settings
         skipped = progress.total - progress.done - last.steps
@@ -123,6 +120,21 @@ def pose_pull(views: Views, stage: FitStage, options: FreeFormOptions) -> float:
     gradient = solution.pose_gradient()
     steps = np.linalg.solve(solution.pose_blocks(), gradient[..., None])[..., 0]
     return float((gradient * steps).sum()) / 2 / solution.cost(solution)
+
+
+def coarse_stage(
+    views: Views,
+    start: LevelSet,
+    rounds: Sequence[FreeFormRound],
+    options: FreeFormOptions,
+    progress: Progress | None = None,
+) -> FitStage:
+    """What rounds lead to from a first surface."""
+    poses = Poses.none(len(views.train)) if options.poses == "on" else None
+    stage = FitStage(start, full_trust(start, options.trust_cells), None, options.damping, poses=poses)
+    for settings in rounds:
+        stage = take_round(views, stage, settings, options, progress)
+    return stage
 
 
 def _with_poses(views: Views, stage: FitStage, options: FreeFormOptions) -> FitStage:

@@ -123,9 +123,10 @@ class FreeFormMirror(ExactGeometry):
         return SurfelMirror.of(surfels_on_mesh(mesh, config.surfels.count, pixel, config.seed), config, self)
 
     def mesh(self, frame: ObjectFrame) -> Mesh:
-        """Marching cubes, with the exact normals of the vertices."""
+        """Marching cubes, with the exact normals of the vertices and the trust there, `confidence` in [0, 1]."""
         mesh, normals = self.surface.mesh()
         columns = dict(zip(("nx", "ny", "nz"), normals.T, strict=True))
+        columns["confidence"] = self.trust.at(mesh.vertices)
         return Mesh(frame.to_world(mesh.vertices), mesh.triangles, columns)
 
     def state_dict(self) -> dict[str, Any]:

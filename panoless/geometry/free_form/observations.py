@@ -43,7 +43,7 @@ class PixelRays:
         size, number = 1 / (camera.fx * length[:, 0]), np.full(len(x), view)
         return cls(np.tile(center, (len(x), 1)), directions, steps, size, number)
 
-    def chosen(self, index: slice | Bool[np.ndarray, "P"]) -> "PixelRays":
+    def chosen(self, index: slice | Bool[np.ndarray, "P"] | Int[np.ndarray, "M"]) -> "PixelRays":
         """Some of them."""
         return PixelRays(*(values[index] for values in vars(self).values()))
 

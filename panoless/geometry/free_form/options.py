@@ -28,6 +28,68 @@ class FreeFormRound:
 
 
 @dataclass(frozen=True)
+class ConcaveOptions:
+    """How hollows are looked for where outlines don't tell the shape.
+
+    "Concave shapes" are an ellipsoid with a hollow off its middle, a bowl with a thick wall and an egg with two
+    sockets, traced analytically. Where nothing else is said, a value was chosen on these.
+    """
+
+    search: bool = True
+    """Whether hollows are looked for at all."""
+    rays: int = 40_000
+    """About so many pixels of all views are traced against the surface that is searched."""
+    pixels: int = 2_500
+    """Most of them under one hollow that score a candidate."""
+    least_pixels: int = 300
+    """Patches that fewer see are left alone. Not tuned."""
+    cells: int = 40
+    """Cells along the longest side of the box on which candidates are traced."""
+    bounces: int = 3
+    """Reflections that a ray is followed through. Half the pixels of a deep bowl need two or more."""
+    scale: float = 0.3
+    """Color (linear radiance) beyond which disagreement counts no more: wide, so that the score falls early."""
+    resolutions: tuple[int, ...] = (6, 8, 12)
+    """Cells along a face side in which directions are compared, from coarse to fine."""
+    evaluations: tuple[int, ...] = (160, 200, 260)
+    """Candidates of the descent at each of them."""
+    descents: int = 3
+    """Best first guesses that are followed at the first resolution."""
+    neighborhood: float = 0.12
+    """Radius, in the normalized frame, over which the disagreement of pixels is averaged…"""
+    least_disagreement: float = 0.95
+    """…and from which they count as unexplained, in what pixels of any direction have: convex parts of a visual hull
+    have 0.7, beside a socket 0.83, and a lid 1.0."""
+    least_part: int = 60
+    """Parts of fewer unexplained pixels are left alone. Not tuned."""
+    whole_share: float = 0.6
+    """A patch of which at least this share is unexplained is the lid of one hollow; else each part of it may be."""
+    lid_angle_deg: float = 40.0
+    """A patch is what lies within so much of its mean normal."""
+    insets: tuple[float, ...] = (1.0, 0.93, 0.86, 0.79)
+    """Sizes of the first guesses, in those of the patch."""
+    depths: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.3)
+    """Depths of the first guesses, in mean radii of the patch: right ones are told from wrong ones within a tenth."""
+    exponents: tuple[float, ...] = (1.3, 1.7, 2.0, 2.5, 4.0)
+    """Exponents p of their profiles ρᵖ + δᵖ = 1: from nearly a cone to nearly a box."""
+    rounding_cells: float = 0.7
+    """Width over which hollow and surface melt together at the rim."""
+    least_gain: float = 0.1
+    """A hollow is kept if it lowers the disagreement under it by this share…"""
+    standard_errors: float = 4.0
+    """…and by so many standard errors of the views' differences."""
+    rounds: tuple[FreeFormRound, ...] = (
+        FreeFormRound(28, 16, 0.30, 1, 40_000, 30.0, 5),
+        FreeFormRound(28, 32, 0.20, 1, 40_000, 30.0, 5),
+        FreeFormRound(36, 32, 0.20, 1, 60_000, 30.0, 3),
+        FreeFormRound(36, 64, 0.15, 4, 80_000, 30.0, 4),
+    )
+    """What is taken from a surface with hollows, instead of the first rounds: these would smooth a socket away."""
+    least_held_out_gain: float = 0.02
+    """Share of the held-out error, after these rounds, by which hollows have to lower it."""
+
+
+@dataclass(frozen=True)
 class FreeFormOptions:
     """How a level set is fitted to silhouettes and photographs.
 
@@ -47,6 +109,8 @@ class FreeFormOptions:
         FreeFormRound(60, 128, 0.10, 4, 200_000, 3.0, 4),
     )
     """Each taken if held-out views gain by the one before it. The last one that was is taken again with all views."""
+    concave: ConcaveOptions = ConcaveOptions()
+    """How hollows are looked for."""
     least_views: int = 5
     """With fewer views none is held out, and model selection leaves the kind out. Not tuned."""
     start_cells: int = 40

@@ -53,6 +53,27 @@ def test_the_true_mirror_is_trusted(views: Views) -> None:
     assert judge(found, OPTIONS).verdict == "trust"
 
 
+def test_the_share_of_places_that_are_not_explained_is_measured_and_named(views: Views) -> None:
+    """The right half of each picture shows anything, as a part does whose shape is wrong."""
+
+    def half_wrong(index: int, view: TrainView) -> TrainView:
+        column = view.solid % view.camera.width
+        right = view.solid[column > column.float().median()]
+        colors = view.radiance.flatten(1).clone()
+        generator = torch.Generator().manual_seed(index)
+        colors[:, right] = torch.rand((3, len(right)), generator=generator).round()
+        return replace(view, radiance=colors.reshape(view.radiance.shape))
+
+    clean, mixed = evidence(views), evidence(each(views, half_wrong))
+    assert clean.unexplained_part is not None
+    assert mixed.unexplained_part is not None
+    assert clean.unexplained_part < 0.02
+    assert 0.3 < mixed.unexplained_part < 0.7
+    verdict = judge(mixed, replace(OPTIONS, largest_unexplained=1.0))
+    assert verdict.verdict == "do not trust"
+    assert "lies where its shape explains little of it" in verdict.reason
+
+
 def test_turned_cameras_are_measured_and_named(views: Views) -> None:
     """A turn of 1.5° about the horizontal axis, up and down in turn, shifts each silhouette by that angle; a verdict
     says so.

@@ -206,7 +206,10 @@ def test_the_kind_keeps_the_protocol(ring: tuple[Views, FreeFormMirror]) -> None
     assert len(geometry.to_surfels(CONFIG).surfels.means) == CONFIG.surfels.count
     mesh = geometry.mesh(views.object_frame)
     assert np.abs(torus().value(mesh.vertices)).max() < 0.15
-    assert set(mesh.columns) == {"nx", "ny", "nz"}
+    assert set(mesh.columns) == {"nx", "ny", "nz", "confidence"}
+    confidence = mesh.columns["confidence"]
+    assert 0 <= confidence.min() < 0.1, "Nobody saw the back."
+    assert np.median(confidence[mesh.columns["nx"] > 0.8]) > 0.8
 
 
 def test_the_gradient_by_poses_is_that_of_finite_differences(solution: Solution) -> None:

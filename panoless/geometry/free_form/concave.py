@@ -1,0 +1,242 @@
+"""Concave starts: hollows under patches of the first surface that make pixels agree on what they mirror.
+
+Outlines say nothing of the inside of a dish. There a few numbers are searched: each candidate is traced, and its score
+is the spread of colors among the rays that leave in the same direction, so no map is needed.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from panoless.capture.views import Views
+from panoless.geometry.free_form.hollows import HALF_SIDE, SIDE, Chart, Hollow, Relief
+from panoless.geometry.free_form.observations import PixelRays, Pixels, solid_pixels
+from panoless.geometry.free_form.options import ConcaveOptions
+from panoless.geometry.free_form.spread import FinalRays, disagreement
+from panoless.geometry.free_form.surface import LevelSet
+from panoless.numeric.evolution import evolve
+from panoless.numeric.robust import bounded_error
+
+FIRST_STEPS = np.array([0.08] * 2 + [0.06] + [0.05] * 4 + [0.08] + [0.08] * 3 + [0.08] * 2)
+"""Standard deviations of a hollow's numbers at the first resolution; halved at each later one."""
+LEAST_VARIETY = 1e-6
+"""Disagreement with the mean color below which pixels show one color, so that nothing can be told from them."""
+LEAST_FACING = 0.1
+"""Cosine between normals of a patch and its chart's."""
+
+
+@dataclass(frozen=True)
+class Scored:
+    """Pixels under a patch, and how badly they agree under a surface: 1 is as badly as pixels of any direction."""
+
+    rays: PixelRays
+    radiance: Float[np.ndarray, "P 3"]
+    options: ConcaveOptions
+
+    def by_pixel(self, surface: LevelSet, resolution: int) -> Float[np.ndarray, "P"]:
+        """Disagreement of each pixel over the mean of what it has with the mean color."""
+        final, scale = FinalRays.of(surface, self.rays, self.options.bounces), self.options.scale
+        found = disagreement(final.directions, final.left, self.radiance, self.rays.view, resolution, scale)
+        return found / max(float(bounded_error(self.radiance - self.radiance.mean(0), scale).mean()), LEAST_VARIETY)
+
+    def __call__(self, surface: LevelSet, resolution: int) -> float:
+        """The mean over pixels."""
+        return float(self.by_pixel(surface, resolution).mean())
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A part of a surface under which a hollow may lie: its relief, an outline, and the pixels that see it."""
+
+    relief: Relief
+    size: float
+    waves: Float[np.ndarray, "4"]
+    scored: Scored
+
+
+def concave_start(views: Views, surface: LevelSet, options: ConcaveOptions) -> LevelSet | None:
+    """The surface with the hollows that make pixels agree better; None where there is none.
+
+    Hollows are looked for under one patch after the other, each on the surface that those before it left.
+    """
+    pixels = solid_pixels(views, options.rays)
+    coarse, found = surface.resampled(options.cells), False
+    for chart in charts(coarse, pixels.rays, options):
+        for patch in unexplained_patches(chart, coarse, pixels, options):
+            hollow = searched(patch, options)
+            carved = coarse if hollow is None else patch.relief.carved(hollow)
+            if hollow is not None and explains_better(carved, coarse, patch.scored, options):
+                coarse, found = carved, True
+    return coarse if found else None
+
+
+def explains_better(carved: LevelSet, before: LevelSet, scored: Scored, options: ConcaveOptions) -> bool:
+    """Whether pixels agree better by the least gain, and by more than chance would have it among views."""
+    resolution = options.resolutions[-1]
+    new, old = (scored.by_pixel(each, resolution) for each in (carved, before))
+    gains = [float((old - new)[scored.rays.view == view].mean()) for view in np.unique(scored.rays.view)]
+    noise = options.standard_errors * float(np.std(gains)) / max(len(gains), 1) ** 0.5
+    return bool((old - new).mean() > max(options.least_gain * old.mean(), noise))
+
+
+def charts(surface: LevelSet, rays: PixelRays, options: ConcaveOptions, seeds: int = 8) -> Iterator[Chart]:
+    """Over the patches that pixels see, each of them once: the largest first."""
+    final = FinalRays.of(surface, rays, 0)
+    met = np.flatnonzero((final.normals**2).sum(1) > 0.5)
+    if len(met) < options.least_pixels:
+        return
+    points, normals = final.points[met], final.normals[met]
+    least, found = np.cos(np.radians(options.lid_angle_deg)), list[tuple[int, Chart]]()
+    for seed in _far_apart(points, seeds):
+        normal, members = normals[seed], np.arange(0)
+        for _ in range(6):
+            members = np.flatnonzero(normals @ normal > least)
+            if not len(members):
+                break
+            normal = normals[members].mean(0)
+            normal /= np.linalg.norm(normal)
+        if len(members) < options.least_pixels or any(known.axes[2] @ normal > least for _, known in found):
+            continue
+        middle = (points[members].min(0) + points[members].max(0)) / 2
+        across = np.linalg.norm(np.cross(points[members] - middle, normal), axis=1)
+        found.append((len(members), Chart.about(middle, normal, float(np.quantile(across, 0.9)))))
+    for _, chart in sorted(found, key=lambda each: -each[0]):
+        yield chart
+
+
+def _far_apart(points: Float[np.ndarray, "P 3"], count: int) -> list[int]:
+    """Indices of points, the first in the middle, each as far from those before it as can be."""
+    chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmin())]
+    distance = np.linalg.norm(points - points[chosen[0]], axis=1)
+    for _ in range(count - 1):
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return chosen
+
+
+def unexplained_patches(chart: Chart, surface: LevelSet, pixels: Pixels, options: ConcaveOptions) -> Iterator[Patch]:
+    """The part of a surface that faces a chart where pixels disagree on most of it; else each part where they do."""
+    relief = Relief(surface, chart, options.rounding_cells)
+    size, waves = outline_of(relief, options.lid_angle_deg)
+    whole = patch_inside(relief, size, waves, pixels, options)
+    if whole is None:
+        return
+    final = FinalRays.of(surface, whole.scored.rays, 0)
+    parts = unexplained_parts(final.points, whole.scored.by_pixel(surface, options.resolutions[-1]), options)
+    if sum(map(len, parts)) > options.whole_share * len(final.points):
+        yield whole
+        return
+    for part in parts:
+        about, ratio = chart_about(final.points[part], final.normals[part])
+        waves = np.array([np.log(ratio) / 2, 0.0, 0.0, 0.0])
+        patch = patch_inside(Relief(surface, about, options.rounding_cells), 0.0, waves, pixels, options)
+        if patch is not None:
+            yield patch
+
+
+def unexplained_parts(
+    points: Float[np.ndarray, "P 3"], disagreed: Float[np.ndarray, "P"], options: ConcaveOptions
+) -> list[Int[np.ndarray, "M"]]:
+    """Indices of points where they disagree around, by connected parts: the largest first."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    tree, count = cKDTree(points), len(points)
+    near = tree.query_pairs(options.neighborhood, output_type="ndarray")
+    total, number = disagreed.copy(), np.ones(count)
+    for one, other in (near.T, near.T[::-1]):
+        total += np.bincount(one, disagreed[other], count)
+        number += np.bincount(one, minlength=count)
+    bad = total / number > options.least_disagreement
+    joined = near[bad[near].all(1)]
+    links = coo_matrix((np.ones(len(joined)), joined.T), shape=(count, count))
+    label = connected_components(links, directed=False)[1]
+    parts = [np.flatnonzero(bad & (label == each)) for each in np.unique(label[bad])]
+    return sorted((part for part in parts if len(part) >= options.least_part), key=len, reverse=True)
+
+
+def chart_about(points: Float[np.ndarray, "P 3"], normals: Float[np.ndarray, "P 3"]) -> tuple[Chart, float]:
+    """A chart over points along the axes of the ellipse that they fill, and the ratio of these."""
+    normal = normals.mean(0) / max(float(np.linalg.norm(normals.mean(0))), 1e-12)
+    flat = points - points.mean(0)
+    flat = flat - (flat @ normal)[:, None] * normal
+    _, axes = np.linalg.eigh(flat.T @ flat / len(flat) - np.outer(normal, normal))
+    wide, narrow = axes[:, 2], np.cross(normal, axes[:, 2])
+    along, across = (2 * float(np.sqrt(np.mean((flat @ axis) ** 2))) for axis in (wide, narrow))
+    radius = max(np.sqrt(along * across), 1e-3)
+    return Chart(points.mean(0), np.stack([wide, narrow, normal]), radius), along / max(across, 1e-3)
+
+
+def patch_inside(
+    relief: Relief, size: float, waves: Float[np.ndarray, "4"], pixels: Pixels, options: ConcaveOptions
+) -> Patch | None:
+    """The part inside an outline that faces the chart; None where too few pixels see it."""
+    final = FinalRays.of(relief.surface, pixels.rays, 0)
+    place = relief.chart.coordinates(final.points)
+    share = Hollow.bowl(size, waves, 1.0).share(place[:, 0], place[:, 1])
+    facing = final.normals @ relief.chart.axes[2] > LEAST_FACING
+    inside = np.flatnonzero((share < 1) & facing & (np.abs(place[:, 2]) < HALF_SIDE))
+    if len(inside) < options.least_pixels:
+        return None
+    chosen = inside[:: -(-len(inside) // options.pixels)]
+    return Patch(relief, size, waves, Scored(pixels.rays.chosen(chosen), pixels.radiance[chosen], options))
+
+
+def outline_of(relief: Relief, angle_deg: float) -> tuple[float, Float[np.ndarray, "4"]]:
+    """Size and waves of the part about the middle whose normals stay within an angle of the chart's."""
+    step = 2 * HALF_SIDE / (SIDE - 1)
+    slope = np.hypot(*np.gradient(np.where(np.isfinite(relief.heights), relief.heights, -1e3), step))
+    flat = slope < np.tan(np.radians(angle_deg))
+    turns = np.arange(72) * (2 * np.pi / 72)
+    reach = np.arange(step, HALF_SIDE, step / 2)
+    index = [
+        np.round((np.outer(each(turns), reach) + HALF_SIDE) / step).astype(int).clip(0, SIDE - 1)
+        for each in (np.cos, np.sin)
+    ]
+    inside = np.logical_and.accumulate(flat[index[0], index[1]], axis=1)
+    radius = np.log(np.maximum(inside.sum(1), 1) * (step / 2) + step / 2)
+    terms = np.stack([each(order * turns) for order in (2, 3) for each in (np.cos, np.sin)], 1)
+    return float(radius.mean()), 2 * terms.T @ (radius - radius.mean()) / len(turns)
+
+
+def searched(patch: Patch, options: ConcaveOptions) -> Hollow | None:
+    """The hollow under which pixels agree best: first guesses of many depths, then descents from the best of them.
+
+    None where no guess makes them agree better, or the first descents gain too little.
+    """
+    first, before = options.resolutions[0], patch.scored(patch.relief.surface, options.resolutions[0])
+
+    def cost(values: Float[np.ndarray, "13"], resolution: int) -> float:
+        return patch.scored(patch.relief.carved(Hollow.from_vector(values)), resolution)
+
+    guesses = first_guesses(patch, options)
+    costs = np.array([cost(guess, first) for guess in guesses])
+    if costs.min() >= before:
+        return None
+    best, least = min(
+        (
+            evolve(lambda x: cost(x, first), guesses[k], FIRST_STEPS, options.evaluations[0])
+            for k in np.argsort(costs, kind="stable")[: options.descents]
+        ),
+        key=lambda each: each[1],
+    )
+    if least >= (1 - options.least_gain / 2) * before:
+        return None
+    later = zip(options.resolutions[1:], options.evaluations[1:], strict=True)
+    for number, (resolution, evaluations) in enumerate(later, 1):
+        steps = FIRST_STEPS * 0.5**number
+        best, _ = evolve(lambda x, r=resolution: cost(x, r), best, steps, evaluations, number)  # type: ignore[misc]
+    return Hollow.from_vector(best)
+
+
+def first_guesses(patch: Patch, options: ConcaveOptions) -> list[Float[np.ndarray, "13"]]:
+    """Hollows of all sizes, depths and exponents of the options under a patch."""
+    return [
+        Hollow.bowl(patch.size + np.log(inset), patch.waves, depth * np.exp(patch.size), exponent).vector
+        for inset in options.insets
+        for depth in options.depths
+        for exponent in options.exponents
+    ]
