@@ -18,7 +18,8 @@ from mkdocs.structure.pages import Page
 OPTIONS = "<!-- options -->"
 ROOMS = re.compile(r"<!-- rooms of (?P<package>\w+) -->")
 ORDER = (
-    *("api", "capture", "first_surface", "environment", "geometry", "selection", "trust", "reconstruct", "export"),
+    *("api", "capture", "first_surface", "environment", "geometry", "alignment", "selection"),
+    *("trust", "reconstruct", "export"),
     *("core", "io", "scene", "blender", "generate", "dataset", "release", "prediction", "oracle"),
     *("metrics", "evaluation", "comparison", "report", "stability", "numeric", "kernels", "config", "presets"),
 )

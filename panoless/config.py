@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import tyro
 from msgspec import Meta
 
+from panoless.alignment.options import PoseOptions
 from panoless.environment.options import FootprintMapOptions
 from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.geometry.free_form.options import FreeFormOptions
@@ -197,6 +198,7 @@ class FitConfig:
     revolution: Tuned[RevolutionOptions] = field(default_factory=RevolutionOptions)
     free_form: Tuned[FreeFormOptions] = field(default_factory=FreeFormOptions)
     footprint_map: Tuned[FootprintMapOptions] = field(default_factory=FootprintMapOptions)
+    poses: Tuned[PoseOptions] = field(default_factory=PoseOptions)
     selection: Tuned[SelectionOptions] = field(default_factory=SelectionOptions)
     trust: Tuned[TrustOptions] = field(default_factory=TrustOptions)
 

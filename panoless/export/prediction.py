@@ -98,6 +98,7 @@ def export_prediction(
         parameter_counts={
             f"{state.geometry.kind} parameters": state.geometry.num_parameters,
             "environment parameters": state.environment.numel(),
+            **({} if state.geometry.poses is None else {"pose parameters": state.geometry.poses.stacked.size}),
         },
         peak_memory_bytes=state.peak_memory_bytes,
         curves=state.curves,
@@ -203,6 +204,7 @@ def _model_selection(selection: Selection) -> ModelSelection:
             verdict=str(each.verdict),
             reason=each.reason,
             alternative_error=each.surfels_error,
+            camera_turn_deg=each.camera_turn_deg,
         )
         for each in selection.candidates
     )

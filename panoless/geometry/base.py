@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
+from typing import Any, ClassVar, Protocol, TypeVar, get_args, runtime_checkable
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.object_frame import ObjectFrame
+from panoless.capture.poses import Poses
 from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints
@@ -95,8 +96,17 @@ class Geometry(Protocol):
         """Of how many primitives it consists."""
         ...
 
+    @property
+    def poses(self) -> Poses | None:
+        """How the training views are turned and shifted against what is said of them; None: they are believed."""
+        ...
+
+    def with_poses(self, poses: Poses | None) -> "Geometry":
+        """The same surface with the cameras there."""
+        ...
+
     def corrected(self, views: Views) -> Views:
-        """The views with their cameras where the geometry found them; as they are where it believes them."""
+        """The views with their cameras where the poses have them; as they are where they are believed."""
         ...
 
     def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
@@ -181,6 +191,12 @@ class Family(Protocol):
         """
         ...
 
+    def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry | None:
+        """A proposal as a geometry whose outlines tell where the cameras are; None for a kind whose fit finds that
+        itself, or which explains any outlines.
+        """
+        ...
+
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """The geometry that explains silhouettes and photographs best; of an iterative kind, its start."""
         ...
@@ -229,8 +245,9 @@ def from_plain(cls: type[Numbers], content: dict[str, Any]) -> Numbers:
     values: dict[str, Any] = {}
     for item in fields(cls):  # type: ignore[arg-type]
         value = content[item.name]
-        if is_dataclass(item.type):
-            value = from_plain(item.type, value)  # type: ignore[arg-type]
+        nested = [kind for kind in (item.type, *get_args(item.type)) if is_dataclass(kind)]
+        if nested and value is not None:
+            value = from_plain(nested[0], value)  # type: ignore[arg-type]
         values[item.name] = np.array(value) if isinstance(value, list) else value
     return cls(**values)
 

@@ -1,5 +1,6 @@
 """What kinds in closed form share: exact rays, one map, no steps of optimization."""
 
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, cast
 
 import torch
@@ -7,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.encoding import encoding_of
+from panoless.capture.poses import Poses
 from panoless.capture.rays import unit_rays_camera
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
@@ -20,17 +22,25 @@ from panoless.kernels.rasterize import RasterCamera
 from panoless.kernels.reference.objective import reflection_directions_world
 
 
+@dataclass(frozen=True)
 class ExactGeometry:
     """A surface that rays meet exactly: one primitive, whose map is solved from all rays at once."""
+
+    poses: Poses | None = field(default=None, kw_only=True)
+    """Of the training views, where these were unknowns."""
 
     @property
     def num_primitives(self) -> int:
         """One."""
         return 1
 
+    def with_poses(self, poses: Poses | None) -> Any:
+        """The same surface with the cameras there."""
+        return replace(self, poses=poses)
+
     def corrected(self, views: Views) -> Views:
-        """The views as they are: their cameras are believed."""
-        return views
+        """With their cameras where the fit found them."""
+        return views if self.poses is None else self.poses.moved(views)
 
     def footprints(self, views: Views) -> Footprints | None:
         """None: a pixel is its center."""

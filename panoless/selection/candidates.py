@@ -30,6 +30,8 @@ class Candidate:
     """Mean of ‖e‖²/(‖e‖² + s²) over rays of held-out views, in [0, 1]."""
     surfels_error: float | None = None
     """The same of surfels that started on the candidate."""
+    camera_turn_deg: float | None = None
+    """By how much the cameras were turned, median over views; None where they were believed."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,8 @@ def describe(candidate: Candidate) -> str:
         if candidate.surfels_error is not None:
             text += f", {candidate.surfels_error:.4f} with surfels"
         parts.append(text)
+    if candidate.camera_turn_deg is not None:
+        parts.append(f"cameras turned by {candidate.camera_turn_deg:.2g}°")
     return "; ".join(parts)
 
 

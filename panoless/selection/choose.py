@@ -4,6 +4,9 @@ A kind that is not needed costs accuracy, too: tilting a flat mirror and turning
 every picture as it was, so surfels drift.
 """
 
+from collections.abc import Sequence
+
+from panoless.alignment.search import PosedProposal, align_proposal, fit_with_poses
 from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.geometry.base import Family, Geometry, Proposal, usable_views
@@ -25,18 +28,16 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
     if config.model != ANY:
         return _fit_asked(views, config)
     *families, last = FAMILIES.values()
-    table, refused, starts = list[Candidate](), dict[str, Proposal](), list[tuple[float, Geometry]]()
+    table, refused, starts = list[Candidate](), dict[str, list[PosedProposal]](), list[tuple[float, Geometry]]()
     for family in families:
-        if family.refines is None:
-            proposal = family.propose(views, config, asked=False)
-        else:
-            proposal = refused.get(family.refines)
-        candidate, geometry = _examine(family, proposal, views, config, trial)
+        source = _source(family)
+        proposals = refused.get(source.kind, []) if family.refines else _proposals(source, views, config, asked=False)
+        candidate, geometry = _examine(family, proposals, views, config, trial)
         table.append(candidate)
-        if geometry is not None and proposal is not None:
+        refused[family.kind] = [each for each in proposals if _is_near(each, config)]
+        if geometry is not None:
             if candidate.verdict == Verdict.CHOSEN:
                 return geometry, Selection(family.kind, tuple(table))
-            refused[family.kind] = proposal
             starts.append((candidate.surfels_error or 0.0, geometry))
     start = min(reversed(starts), key=lambda each: each[0])[1] if starts else None
     geometry = last.fit(views, Proposal(start, 0.0, 1.0), config)
@@ -44,28 +45,59 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
     return geometry, Selection(last.kind, tuple(table))
 
 
+def _source(family: Family) -> Family:
+    """The kind that makes the proposals."""
+    return family if family.refines is None else FAMILIES[family.refines]
+
+
+def _proposals(source: Family, views: Views, config: FitConfig, *, asked: bool) -> list[PosedProposal]:
+    """With the cameras turned so that outlines agree, where that helps, and with the cameras as they are said to be."""
+    proposal = source.propose(views, config, asked=asked)
+    if proposal is None:
+        return []
+    aligned = align_proposal(source, views, proposal, config)
+    return [PosedProposal(proposal)] if aligned is None else [aligned, PosedProposal(proposal)]
+
+
+def _is_near(start: PosedProposal, config: FitConfig) -> bool:
+    """Whether a proposal explains the silhouettes."""
+    options, proposal = config.selection, start.proposal
+    return proposal.silhouette_px <= options.largest_silhouette_px and proposal.overlap >= options.least_overlap
+
+
+def _first_fit(
+    family: Family, proposals: Sequence[PosedProposal], views: Views, config: FitConfig
+) -> tuple[Geometry, PosedProposal] | None:
+    """The geometry from the first of the proposals whose poses held-out views ask for, or that believes them."""
+    for start in proposals:
+        geometry = fit_with_poses(family, _source(family), views, start, config)
+        if geometry is not None:
+            return geometry, start
+    return None
+
+
 def _fit_asked(views: Views, config: FitConfig) -> tuple[Geometry, Selection]:
     family = FAMILIES[config.model]
-    source = family if family.refines is None else FAMILIES[family.refines]
-    proposal = source.propose(views, config, asked=True)
-    assert proposal is not None
-    geometry = family.fit(views, proposal, config)
-    return geometry, Selection(family.kind, (Candidate(family.kind, Verdict.CHOSEN, "asked for"),))
+    fitted = _first_fit(family, _proposals(_source(family), views, config, asked=True), views, config)
+    assert fitted is not None, "a kind that is asked for is proposed"
+    asked_for = Candidate(family.kind, Verdict.CHOSEN, "asked for", camera_turn_deg=_turn_deg(fitted[0]))
+    return fitted[0], Selection(family.kind, (asked_for,))
 
 
 def _examine(
-    family: Family, proposal: Proposal | None, views: Views, config: FitConfig, trial: Trial
+    family: Family, proposals: Sequence[PosedProposal], views: Views, config: FitConfig, trial: Trial
 ) -> tuple[Candidate, Geometry | None]:
     """The evidence for one kind, and its geometry where the silhouettes do not refuse it."""
-    if proposal is None:
+    if not proposals:
         reason = "silhouettes determine none" if family.refines is None else f"no {family.refines} to start from"
         return Candidate(family.kind, Verdict.NOT_PROPOSED, reason), None
-    options, evidence = config.selection, (proposal.silhouette_px, proposal.overlap)
-    near = proposal.silhouette_px <= options.largest_silhouette_px
-    if not (near and proposal.overlap >= options.least_overlap):
-        verdict = Verdict.REFUSED_BY_SILHOUETTES
-        return Candidate(family.kind, verdict, "misses the silhouettes", *evidence), None
-    geometry = family.fit(views, proposal, config)
+    fitted = _first_fit(family, [each for each in proposals if _is_near(each, config)], views, config)
+    if fitted is None:
+        said = proposals[-1].proposal
+        evidence = said.silhouette_px, said.overlap
+        return Candidate(family.kind, Verdict.REFUSED_BY_SILHOUETTES, "misses the silhouettes", *evidence), None
+    geometry, start = fitted
+    options, evidence = config.selection, (start.proposal.silhouette_px, start.proposal.overlap)
     own, free = held_out_errors(usable_views(views, geometry), config, geometry, trial)
     refinable = family.kind in {other.refines for other in FAMILIES.values()}
     unexplained = refinable and float(own.mean()) > options.largest_error
@@ -74,4 +106,9 @@ def _examine(
     reason = "surfels are clearly better" if better else "surfels are no better"
     if unexplained and not better:
         reason = "leaves too much unexplained"
-    return Candidate(family.kind, verdict, reason, *evidence, float(own.mean()), float(free.mean())), geometry
+    errors = float(own.mean()), float(free.mean())
+    return Candidate(family.kind, verdict, reason, *evidence, *errors, _turn_deg(geometry)), geometry
+
+
+def _turn_deg(geometry: Geometry) -> float | None:
+    return None if geometry.poses is None else geometry.poses.turn_deg

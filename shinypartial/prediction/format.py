@@ -46,8 +46,8 @@ class Candidate:
 
     `silhouette_px` is its distance from the silhouettes, `overlap` the intersection over union with the masks,
     `held_out_error` its error on views that were left out of the fit, `alternative_error` that of the
-    freer kind that it was compared with. `verdict` is a word such as "chosen" or
-    "rejected", `reason` says why.
+    freer kind that it was compared with, `camera_turn_deg` by how much it turned the cameras in the median, where their
+    poses were unknowns. `verdict` is a word such as "chosen" or "rejected", `reason` says why.
     """
 
     kind: Text
@@ -57,6 +57,7 @@ class Candidate:
     verdict: Text
     reason: str = ""
     alternative_error: NonNegative | None = None
+    camera_turn_deg: NonNegative | None = None
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from panoless.capture.poses import Poses
 from panoless.capture.rays import pose_of
 from panoless.capture.views import Views, split_held_out
 from panoless.environment.rays import Rays
@@ -17,7 +18,6 @@ from panoless.geometry.free_form.concave import concave_start
 from panoless.geometry.free_form.observations import outline_rays, solid_pixels
 from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions, FreeFormRound, Outlines
 from panoless.geometry.free_form.photometric import Sights, Solution, Task
-from panoless.geometry.free_form.poses import Poses
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import Trust, full_trust
 from panoless.numeric.conjugate_gradients import solve_by_products

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from panoless.capture.object_frame import ObjectFrame
+from panoless.capture.poses import Poses
 from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
@@ -22,7 +23,6 @@ from panoless.geometry.free_form.fit import fit_free_form
 from panoless.geometry.free_form.observations import PixelRays, inner_distance_px
 from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions
 from panoless.geometry.free_form.photometric import Sights
-from panoless.geometry.free_form.poses import Poses
 from panoless.geometry.free_form.rendering import free_form_buffers, free_form_light
 from panoless.geometry.free_form.surface import LevelSet, level_set_of
 from panoless.geometry.free_form.trust import Trust
@@ -39,21 +39,14 @@ class FreeFormMirror(ExactGeometry):
     kind: ClassVar[str] = "free_form"
     surface: LevelSet
     trust: Trust
-    poses: Poses | None = None
-    """Of the training views, where these were unknowns."""
     occlusion_test: bool = True
     """Whether pixels that see the object again are left out."""
     options: FreeFormOptions = DEFAULTS
 
     @property
     def num_parameters(self) -> int:
-        """The coefficients whose support meets the surface, and the poses."""
-        poses = 0 if self.poses is None else self.poses.stacked.size
-        return int((np.abs(self.surface.at_nodes()) < self.options.band_cells).sum()) + poses
-
-    def corrected(self, views: Views) -> Views:
-        """With their cameras where the fit found them."""
-        return views if self.poses is None else self.poses.moved(views)
+        """The coefficients whose support meets the surface."""
+        return int((np.abs(self.surface.at_nodes()) < self.options.band_cells).sum())
 
     def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
         """Solid pixels that see the surroundings by way of the surface, but for the outermost ones."""
@@ -142,7 +135,7 @@ class FreeFormMirror(ExactGeometry):
         options = read_record(FreeFormOptions, content["options"], "the options of a free-form surface")
         surface, trust = from_plain(LevelSet, content["surface"]), from_plain(Trust, content["trust"])
         poses = None if content["poses"] is None else from_plain(Poses, content["poses"])
-        return cls(surface, trust, poses, content["occlusion_test"], options)
+        return cls(surface, trust, content["occlusion_test"], options, poses=poses)
 
 
 class FreeFormFamily(ExactFamily):
@@ -164,7 +157,11 @@ class FreeFormFamily(ExactFamily):
         surface = level_set_of(first, config.free_form.start_cells, config.free_form.margin)
         return Proposal(surface, 0.0, 1.0)
 
+    def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry | None:
+        """None: the fit finds poses itself."""
+        return None
+
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """All coefficients by outlines and photographs together."""
         surface, trust, poses = fit_free_form(views, proposal.shape, config.free_form)
-        return FreeFormMirror(surface, trust, poses, config.environment.trace, config.free_form)
+        return FreeFormMirror(surface, trust, config.environment.trace, config.free_form, poses=poses)

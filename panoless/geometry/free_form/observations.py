@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
+from panoless.capture.poses import Poses
 from panoless.capture.rays import pose_of
 from panoless.capture.silhouettes import mask_contours
 from panoless.capture.views import TrainView, Views, concatenated, every_kth_pixel
-from panoless.geometry.free_form.poses import Poses
 from panoless.kernels.rasterize import RasterCamera
 from shinypartial.core.conventions import PIXEL_CENTER, SOLID_ALPHA
 

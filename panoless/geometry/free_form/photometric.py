@@ -8,13 +8,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from panoless.capture.poses import Poses
 from panoless.environment.cubemap import resample
 from panoless.environment.footprints import PixelFootprints
 from panoless.geometry.free_form.equations import Rows, gauge_rows, joined_rows, silhouette_rows
 from panoless.geometry.free_form.map import sharpened_map, splatted_map
 from panoless.geometry.free_form.observations import PixelRays, Pixels
 from panoless.geometry.free_form.options import FreeFormOptions, FreeFormRound
-from panoless.geometry.free_form.poses import PoseRows, Poses, pixel_pose_rows
+from panoless.geometry.free_form.poses import PoseRows, pixel_pose_rows
 from panoless.geometry.free_form.surface import Hits, LevelSet
 from panoless.geometry.free_form.trust import Trust
 from panoless.kernels.level_set import mirror_rows, mirrored, seen_with_slopes, third_differences, without_means

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from panoless.capture.poses import Similarity
 from panoless.first_surface.mesh import TriangleMesh
-from panoless.geometry.free_form.poses import Similarity
 from panoless.kernels.level_set import evaluate, first_hits, nearest_approach
 
 NEAREST = 6

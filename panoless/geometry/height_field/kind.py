@@ -16,6 +16,7 @@ from panoless.geometry.exact import ExactFamily, ExactGeometry
 from panoless.geometry.height_field.fit import fit_height_field
 from panoless.geometry.height_field.model import (
     HeightField,
+    flat_height_field,
     height_field_buffers,
     height_field_rays,
     visible_reflections,
@@ -89,6 +90,10 @@ class HeightFieldFamily(ExactFamily):
                 remedy="Take --model auto or --model surfels.",
             )
         return None
+
+    def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
+        """The plane that it bends, flat as yet."""
+        return HeightFieldMirror(flat_height_field(proposal.shape, config.height_field.cells))
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """Heights, plane and boundary by silhouettes and photographs together."""

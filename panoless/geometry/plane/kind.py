@@ -86,6 +86,10 @@ class PlaneFamily(ExactFamily):
             return None
         return Proposal(found.plane, float(np.median(found.median_px)), float(np.median(found.iou)))
 
+    def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
+        """The plane within its boundary."""
+        return PlaneMirror(proposal.shape, config.environment.trace)
+
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """The proposal itself: silhouettes tell a plane to the end."""
-        return PlaneMirror(proposal.shape, config.environment.trace)
+        return self.as_proposed(proposal, config)

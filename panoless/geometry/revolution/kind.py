@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.object_frame import ObjectFrame
+from panoless.capture.poses import Poses
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints
@@ -87,14 +88,16 @@ class RevolutionMirror(ExactGeometry):
 
     def state_dict(self) -> dict[str, Any]:
         """All numbers as lists and plain values."""
-        surface, options = to_plain(self.surface), write_record(self.options)
-        return {"surface": surface, "occlusion_test": self.occlusion_test, "options": options}
+        surface, options, poses = to_plain(self.surface), write_record(self.options), to_plain(self.poses)
+        return {"surface": surface, "occlusion_test": self.occlusion_test, "options": options, "poses": poses}
 
     @classmethod
     def from_state_dict(cls, content: dict[str, Any]) -> "RevolutionMirror":
         """The geometry that `state_dict` was taken from."""
         options = read_record(RevolutionOptions, content["options"], "the options of a surface of revolution")
-        return cls(from_plain(SurfaceOfRevolution, content["surface"]), content["occlusion_test"], options)
+        surface, poses = from_plain(SurfaceOfRevolution, content["surface"]), content["poses"]
+        found = None if poses is None else from_plain(Poses, poses)
+        return cls(surface, content["occlusion_test"], options, poses=found)
 
     def mesh(self, frame: ObjectFrame) -> Mesh:
         """Quadrilaterals between 128 meridians."""
@@ -125,6 +128,10 @@ class RevolutionFamily(ExactFamily):
                 remedy="Take --model auto or --model surfels.",
             )
         return None
+
+    def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
+        """The outside, closed flat at both ends."""
+        return RevolutionMirror(proposal.shape, config.environment.trace, config.revolution)
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """Profile and axis by what is reflected."""

@@ -28,10 +28,14 @@ class SurfelFamily:
         """Surfels explain any silhouettes."""
         return Proposal(None, 0.0, 1.0)
 
+    def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry | None:
+        """None: they explain any outlines."""
+        return None
+
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """Those that the steps begin with: on a geometry that was proposed, else on the first surface."""
         if proposal.shape is not None:
-            start: Geometry = proposal.shape.to_surfels(config)
+            start: Geometry = proposal.shape.to_surfels(config).with_poses(proposal.shape.poses)
             return start.to(views.train[0].mask.device)
         surfels = initial_surfels(views, config.surfels, config.seed, config.first_surface)
         return SurfelMirror.of(surfels, config)

@@ -11,13 +11,14 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from panoless.capture.object_frame import ObjectFrame
+from panoless.capture.poses import Poses
 from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints
 from panoless.environment.rays import Rays
 from panoless.environment.resolution import finest_resolution
 from panoless.environment.solve import solve_environment
-from panoless.geometry.base import SOLID_SURFACE_ALPHA, Geometry, Mesh, SurfaceBuffers
+from panoless.geometry.base import SOLID_SURFACE_ALPHA, Geometry, Mesh, SurfaceBuffers, from_plain, to_plain
 from panoless.geometry.exact import reflections, shade_centers
 from panoless.geometry.surfels.model import Surfels
 from panoless.geometry.surfels.rendering import ALPHA_FLOOR, rasterize_surfels, surface_buffers, tiles_of
@@ -51,6 +52,8 @@ class SurfelMirror:
     """λ_d of Eq. 3."""
     started_on: Geometry | None = None
     """The geometry that the surfels were placed on, if what it occludes stays occluded: the mirror in a frame."""
+    poses: Poses | None = None
+    """Of the training views, as the geometry has them that the surfels were placed on."""
 
     @classmethod
     def of(cls, surfels: Surfels, config: FitConfig, started_on: Geometry | None = None) -> "SurfelMirror":
@@ -68,9 +71,13 @@ class SurfelMirror:
         """The number of surfels."""
         return self.surfels.count
 
+    def with_poses(self, poses: Poses | None) -> "SurfelMirror":
+        """The same surfels with the cameras there."""
+        return replace(self, poses=poses)
+
     def corrected(self, views: Views) -> Views:
-        """As the geometry has them on which the surfels started."""
-        return views if self.started_on is None else self.started_on.corrected(views)
+        """With their cameras where the geometry had them on which the surfels started."""
+        return views if self.poses is None else self.poses.moved(views)
 
     def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
         """Those that the geometry it started on calls usable; all solid ones where there is none."""
@@ -168,6 +175,7 @@ class SurfelMirror:
             **vars(self),
             "surfels": self.surfels.detached().named(),
             "started_on": None if start is None else (start.kind, start.state_dict()),
+            "poses": None if self.poses is None else to_plain(self.poses),
         }
 
     @classmethod
@@ -177,7 +185,9 @@ class SurfelMirror:
 
         start = content["started_on"]
         started_on = None if start is None else FAMILIES[start[0]].geometry.from_state_dict(start[1])
-        return cls(**{**content, "surfels": Surfels(**content["surfels"]), "started_on": started_on})
+        poses = None if content["poses"] is None else from_plain(Poses, content["poses"])
+        surfels = Surfels(**content["surfels"])
+        return cls(**{**content, "surfels": surfels, "started_on": started_on, "poses": poses})
 
 
 def _columns(names: Sequence[str], matrix: Tensor) -> dict[str, Tensor]:

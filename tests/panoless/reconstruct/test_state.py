@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from panoless.capture.object_frame import ObjectFrame
+from panoless.capture.poses import Poses
 from panoless.geometry.base import Geometry, Training
 from panoless.geometry.height_field.kind import HeightFieldMirror
 from panoless.geometry.plane.kind import PlaneMirror
@@ -101,10 +102,14 @@ def exact_kinds() -> list[Geometry]:
 def test_every_exact_kind_survives_the_disk(tmp_path: Path, geometry: Geometry) -> None:
     """To the last bit, and what a camera sees of it; also as what surfels started on."""
     camera = around(3, 24)[2]
-    started = SurfelMirror(sphere_surfels(7), started_on=geometry)
+    poses = Poses(np.full((3, 3), 0.01), np.full((3, 3), 1 / 3))
+    geometry = geometry.with_poses(poses)
+    started = SurfelMirror(sphere_surfels(7), started_on=geometry, poses=poses)
     for name, each in (("itself", geometry), ("start", started)):
         (tmp_path / name).mkdir()
         loaded = reloaded(tmp_path / name, some_state(True, each)).geometry
+        assert loaded.poses is not None
+        assert np.array_equal(loaded.poses.stacked, poses.stacked)
         again = getattr(loaded, "started_on", loaded)
         assert type(again) is type(geometry)
         assert again.state_dict() == geometry.state_dict()

@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from panoless.capture.poses import Poses, Similarity
 from panoless.capture.rays import pose_of
 from panoless.capture.views import TrainView, Views, views_of
 from panoless.config import FitConfig
@@ -14,7 +15,6 @@ from panoless.geometry.free_form.fit import fit_free_form, gauss_newton_step, ma
 from panoless.geometry.free_form.kind import FreeFormFamily, FreeFormMirror
 from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.photometric import Sights, Solution
-from panoless.geometry.free_form.poses import Poses, Similarity
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import full_trust
 from panoless.kernels.level_set import seen_with_slopes

@@ -1,0 +1,149 @@
+"""Poses beside the shape of one kind: first by silhouettes, then by what is mirrored, where held-out views gain by it.
+
+Shape and poses are found in turn. A geometry of few numbers averages over many views, so a few rounds are enough.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Int
+
+from panoless.alignment.align import Alignment, Scene, known_map
+from panoless.capture.poses import Poses
+from panoless.capture.views import Views, split_held_out
+from panoless.config import FitConfig
+from panoless.environment.resolution import prediction_error
+from panoless.geometry.base import Family, Geometry, Proposal, observe_views, usable_views
+
+
+@dataclass(frozen=True)
+class PosedProposal:
+    """A proposal, and the poses under which it was made."""
+
+    proposal: Proposal
+    poses: Poses | None = None
+
+
+def align_proposal(family: Family, views: Views, proposal: Proposal, config: FitConfig) -> PosedProposal | None:
+    """The proposal of a kind after its outlines turned the cameras, and it followed them, in turn; None where that does
+    not bring it clearly nearer to the masks.
+
+    Outlines hardly tell a shift across the line of sight from a turn, so cameras are only turned.
+    """
+    options, outline = config.poses, family.as_proposed(proposal, config)
+    if options.mode == "off" or outline is None or not np.isfinite(proposal.silhouette_px):
+        return None
+    alignment = Alignment(views, options)
+    if options.mode == "auto" and alignment.left_by_turns(outline) > options.largest_share_left:
+        return None
+    found = poses = Poses.none(len(views.train))
+    nearest = proposal
+    for _ in range(options.silhouette_rounds):
+        poses = alignment.without_motion_of_object(alignment.aligned(Scene(outline), poses))
+        again = family.propose(poses.moved(views), config, asked=False)
+        outline = None if again is None else family.as_proposed(again, config)
+        settled = again is None or again.silhouette_px > (1 - options.least_fall) * nearest.silhouette_px
+        if again is None or outline is None or settled:
+            break
+        nearest, found = again, poses
+    is_nearer = nearest.silhouette_px <= options.largest_share_left * proposal.silhouette_px
+    return PosedProposal(nearest, found) if options.mode == "on" or is_nearer else None
+
+
+def fit_with_poses(
+    family: Family, source: Family, views: Views, start: PosedProposal, config: FitConfig
+) -> Geometry | None:
+    """The geometry of a kind with the poses of the views, from the proposal that `source` made of them; None where
+    held-out views do not ask for poses.
+
+    Each round finds the poses anew by outlines and colors, and then the shape by both.
+    """
+    options = config.poses
+    if start.poses is None:
+        return family.fit(views, start.proposal, config)
+    first = geometry = _fit(family, views, start, config)
+    if options.mode == "auto" and not _is_asked_for(views, geometry, config):
+        return None
+    for _ in range(options.rounds):
+        again = _next_round(source, views, geometry, config)
+        if again is None:
+            break
+        before, geometry = geometry, _fit(family, views, again, config)
+        if _turned_deg(before, geometry) < options.settled_deg:
+            break
+    errors = [_held_out_error(views, each, config) for each in (first, geometry)]
+    return geometry if errors[1] <= (1 + options.largest_rise) * errors[0] else first
+
+
+def _fit(family: Family, views: Views, start: PosedProposal, config: FitConfig) -> Geometry:
+    assert start.poses is not None
+    return family.fit(start.poses.moved(views), start.proposal, config).with_poses(start.poses)
+
+
+def _next_round(source: Family, views: Views, geometry: Geometry, config: FitConfig) -> PosedProposal | None:
+    """Poses under a geometry and its map, and the proposal that follows from them."""
+    alignment, poses = Alignment(views, config.poses), geometry.poses
+    assert poses is not None
+    for _ in range(config.poses.maps):
+        environment = known_map(views, geometry.with_poses(poses), config.poses)
+        poses = alignment.adjusted(geometry, poses, environment)
+    poses = alignment.without_common(poses)
+    proposal = source.propose(poses.moved(views), config, asked=False)
+    return None if proposal is None else PosedProposal(proposal, poses)
+
+
+def _turned_deg(before: Geometry, after: Geometry) -> float:
+    """By how much one has the cameras turned against the other: median over views, to first order."""
+    assert before.poses is not None
+    assert after.poses is not None
+    return float(np.degrees(np.median(np.linalg.norm(after.poses.turns - before.poses.turns, axis=1))))
+
+
+def _is_asked_for(views: Views, geometry: Geometry, config: FitConfig) -> bool:
+    """Whether held-out views, under the map of the others, are explained better where their outlines have put them than
+    where they are said to be: by the share `least_pose_gain` of the error.
+
+    Their colors have told nothing of where that is. True where there are too few views to hold any out.
+    """
+    solved, tested = _parts(views)
+    if not len(solved) or not len(tested) or geometry.poses is None:
+        return True
+    environment = known_map(_chosen(views, solved), _with_part(geometry, solved), config.poses)
+    part, found = _chosen(views, tested), _with_part(geometry, tested)
+    said = found.with_poses(Poses.none(len(tested)))
+    errors = [_error(part, each, environment, config) for each in (said, found)]
+    return errors[1] < (1 - config.poses.least_pose_gain) * errors[0]
+
+
+def _held_out_error(views: Views, geometry: Geometry, config: FitConfig) -> float:
+    """Mean of ‖e‖²/(‖e‖² + s²) over rays of views that the map has not seen, their poses found under it."""
+    solved, tested = _parts(views)
+    if not len(solved) or not len(tested):
+        return 0.0
+    assert geometry.poses is not None
+    environment = known_map(_chosen(views, solved), _with_part(geometry, solved), config.poses)
+    scene = Scene(geometry, environment)
+    poses = Alignment(views, config.poses).aligned(scene, geometry.poses, tested.tolist())
+    return _error(_chosen(views, tested), _with_part(geometry.with_poses(poses), tested), environment, config)
+
+
+def _parts(views: Views) -> tuple[Int[np.ndarray, "S"], Int[np.ndarray, "T"]]:
+    """Numbers of the views that are kept and held out."""
+    kept, held_out = split_held_out(range(len(views.train)))
+    return np.array(kept, dtype=np.int64), np.array(held_out, dtype=np.int64)
+
+
+def _chosen(views: Views, numbers: Int[np.ndarray, "N"]) -> Views:
+    return replace(views, train=tuple(views.train[number] for number in numbers))
+
+
+def _with_part(geometry: Geometry, numbers: Int[np.ndarray, "N"]) -> Geometry:
+    assert geometry.poses is not None
+    return geometry.with_poses(Poses(geometry.poses.turns[numbers], geometry.poses.shifts[numbers]))
+
+
+def _error(views: Views, geometry: Geometry, environment: torch.Tensor, config: FitConfig) -> float:
+    with torch.no_grad():
+        seen = usable_views(views, geometry)
+        return prediction_error(list(observe_views(seen, geometry, config.poses.map_rays)), environment)

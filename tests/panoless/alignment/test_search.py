@@ -1,0 +1,123 @@
+"""Cameras that are turned are found beside a shape; those that are where they are said to be stay there."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from panoless.alignment.align import Alignment
+from panoless.alignment.options import PoseOptions
+from panoless.alignment.search import PosedProposal, align_proposal, fit_with_poses
+from panoless.capture.poses import Poses
+from panoless.capture.rays import pose_of
+from panoless.capture.views import Views
+from panoless.config import FitConfig
+from panoless.geometry.base import Family
+from panoless.geometry.plane.kind import PlaneFamily
+from panoless.geometry.revolution.kind import RevolutionFamily
+from tests.support.mirror_plane import NORMAL, RECTANGLE, arc, plane_of, reflecting_views
+from tests.support.mirror_revolution import around, goblet, revolution_views
+
+CONFIG = replace(FitConfig(), poses=PoseOptions(silhouette_rounds=2, rounds=2, maps=2))
+TURN_DEG = 0.5
+
+
+def wrong_turns(views: Views, turn_deg: float = TURN_DEG) -> Poses:
+    """Of that angle, about axes at random."""
+    axes = np.random.default_rng(3).normal(size=(len(views.train), 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    return Poses(np.radians(turn_deg) * axes, np.zeros_like(axes))
+
+
+def left_deg(found: Poses, wrong: Poses) -> float:
+    """What is left of wrong turns but for a turn that all cameras share: median over views."""
+    left = Rotation.from_rotvec(found.turns) * Rotation.from_rotvec(wrong.turns)
+    return float(np.degrees(np.median((left.mean().inv() * left).magnitude())))
+
+
+def flat_views() -> Views:
+    return reflecting_views(plane_of(RECTANGLE), arc(15))
+
+
+def turned_world(views: Views) -> Views:
+    """The same scene after a turn by 40°: cameras move around the object."""
+    turn = Rotation.from_rotvec([0.3, -0.4, 0.5])
+    centers = np.array([pose_of(view.camera)[1] for view in views.train])
+    return Poses(np.tile(turn.as_rotvec(), (len(centers), 1)), turn.apply(centers) - centers).moved(views)
+
+
+@pytest.mark.parametrize(
+    ("family", "views"),
+    [
+        (PlaneFamily(), flat_views()),
+        (PlaneFamily(), turned_world(flat_views())),
+        (RevolutionFamily(), revolution_views(goblet(), around(12))),
+    ],
+)
+def test_true_cameras_are_left_alone(family: Family, views: Views) -> None:
+    """Also in a world that is turned as a whole: what all cameras share is no error."""
+    proposal = family.propose(views, CONFIG, asked=True)
+    assert proposal is not None
+    assert align_proposal(family, views, proposal, CONFIG) is None
+
+
+def test_turned_cameras_of_a_flat_mirror_are_found() -> None:
+    """By outlines alone to a tenth of their error, and better by what is mirrored; the normal comes out right."""
+    views, family = flat_views(), PlaneFamily()
+    wrong = wrong_turns(views)
+    turned = wrong.moved(views)
+    proposal = family.propose(turned, CONFIG, asked=False)
+    assert proposal is not None
+    start = align_proposal(family, turned, proposal, CONFIG)
+    assert start is not None
+    assert start.poses is not None
+    assert start.proposal.silhouette_px < 0.2 * proposal.silhouette_px
+    assert left_deg(start.poses, wrong) < 0.2
+    geometry = fit_with_poses(family, family, turned, start, CONFIG)
+    assert geometry is not None
+    assert geometry.poses is not None
+    assert left_deg(geometry.poses, wrong) < 0.05
+    assert geometry.state_dict()["plane"]["normal"] @ NORMAL > np.cos(np.radians(0.3))
+
+
+def test_outlines_of_a_surface_of_revolution_turn_cameras_back() -> None:
+    """To less than half of their error, without a look at colors."""
+    views, family = revolution_views(goblet(), around(12)), RevolutionFamily()
+    wrong = wrong_turns(views)
+    turned = wrong.moved(views)
+    proposal = family.propose(turned, CONFIG, asked=True)
+    assert proposal is not None
+    start = align_proposal(family, turned, proposal, CONFIG)
+    assert start is not None
+    assert start.poses is not None
+    assert left_deg(start.poses, wrong) < 0.2
+    assert start.proposal.silhouette_px < 0.3 * proposal.silhouette_px
+
+
+def test_poses_that_held_out_views_do_not_ask_for_are_refused() -> None:
+    """Turns that nothing asked for, of cameras that were where they are said to be."""
+    views, family = flat_views(), PlaneFamily()
+    proposal = family.propose(views, CONFIG, asked=True)
+    assert proposal is not None
+    start = PosedProposal(proposal, wrong_turns(views, 2.0))
+    assert fit_with_poses(family, family, views, start, CONFIG) is None
+    assert fit_with_poses(family, family, views, PosedProposal(proposal), CONFIG) is not None
+
+
+def test_off_means_off() -> None:
+    views, family = flat_views(), PlaneFamily()
+    turned, config = wrong_turns(views).moved(views), replace(CONFIG, poses=replace(CONFIG.poses, mode="off"))
+    proposal = family.propose(turned, config, asked=False)
+    assert proposal is not None
+    assert align_proposal(family, turned, proposal, config) is None
+
+
+def test_a_motion_that_all_cameras_share_is_taken_back() -> None:
+    views = flat_views()
+    centers = np.array([pose_of(view.camera)[1] for view in views.train])
+    turn = Rotation.from_rotvec([0.004, -0.008, 0.005])
+    common = Poses(np.tile(turn.as_rotvec(), (len(centers), 1)), turn.apply(centers) - centers + 0.01)
+    found = Alignment(views, CONFIG.poses).without_common(common)
+    # Least squares are those of small turns: squares of 0.01 rad are left.
+    np.testing.assert_allclose(found.stacked, 0, atol=5e-4)
