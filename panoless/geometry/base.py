@@ -1,7 +1,7 @@
 """What any mirror can do, and how a kind of mirror is proposed from silhouettes and fitted."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from typing import Any, ClassVar, Protocol, TypeVar, get_args, runtime_checkable
 
 import numpy as np
@@ -241,9 +241,11 @@ def to_plain(value: Any) -> Any:
 
 
 def from_plain(cls: type[Numbers], content: dict[str, Any]) -> Numbers:
-    """The dataclass of that class from `to_plain`; lists become arrays."""
+    """The dataclass of that class from `to_plain`; lists become arrays, and what is missing has its default."""
     values: dict[str, Any] = {}
     for item in fields(cls):  # type: ignore[arg-type]
+        if item.name not in content and item.default is not MISSING:
+            continue
         value = content[item.name]
         nested = [kind for kind in (item.type, *get_args(item.type)) if is_dataclass(kind)]
         if nested and value is not None:

@@ -134,7 +134,7 @@ class FreeFormMirror(ExactGeometry):
         """The geometry that `state_dict` was taken from."""
         options = read_record(FreeFormOptions, content["options"], "the options of a free-form surface")
         surface, trust = from_plain(LevelSet, content["surface"]), from_plain(Trust, content["trust"])
-        poses = None if content["poses"] is None else from_plain(Poses, content["poses"])
+        poses = None if content.get("poses") is None else from_plain(Poses, content["poses"])
         return cls(surface, trust, content["occlusion_test"], options, poses=poses)
 
 

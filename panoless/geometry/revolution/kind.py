@@ -95,7 +95,7 @@ class RevolutionMirror(ExactGeometry):
     def from_state_dict(cls, content: dict[str, Any]) -> "RevolutionMirror":
         """The geometry that `state_dict` was taken from."""
         options = read_record(RevolutionOptions, content["options"], "the options of a surface of revolution")
-        surface, poses = from_plain(SurfaceOfRevolution, content["surface"]), content["poses"]
+        surface, poses = from_plain(SurfaceOfRevolution, content["surface"]), content.get("poses")
         found = None if poses is None else from_plain(Poses, poses)
         return cls(surface, content["occlusion_test"], options, poses=found)
 

@@ -185,7 +185,7 @@ class SurfelMirror:
 
         start = content["started_on"]
         started_on = None if start is None else FAMILIES[start[0]].geometry.from_state_dict(start[1])
-        poses = None if content["poses"] is None else from_plain(Poses, content["poses"])
+        poses = None if content.get("poses") is None else from_plain(Poses, content["poses"])
         surfels = Surfels(**content["surfels"])
         return cls(**{**content, "surfels": surfels, "started_on": started_on, "poses": poses})
 

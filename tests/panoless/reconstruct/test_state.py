@@ -117,6 +117,16 @@ def test_every_exact_kind_survives_the_disk(tmp_path: Path, geometry: Geometry) 
             assert torch.equal(getattr(again.buffers(camera), field), values), field
 
 
+def test_what_an_earlier_version_did_not_know_has_its_default() -> None:
+    plain = RevolutionMirror(funnel(1 / 3)).state_dict()
+    del plain["poses"]
+    assert RevolutionMirror.from_state_dict(plain).poses is None
+    for kind in exact_kinds()[:2]:
+        content = kind.state_dict()
+        assert content.pop("poses") is None
+        assert type(kind).from_state_dict(content).poses is None
+
+
 def test_a_surface_of_revolution_that_was_used_is_saved_like_a_new_one(tmp_path: Path) -> None:
     """What it computed about itself meanwhile is no part of it."""
     new, used = RevolutionMirror(goblet()), RevolutionMirror(goblet())
