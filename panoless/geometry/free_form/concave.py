@@ -18,6 +18,7 @@ from panoless.geometry.free_form.spread import FinalRays, disagreement
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.numeric.evolution import evolve
 from panoless.numeric.robust import bounded_error
+from shinypartial.io.progress import Progress
 
 FIRST_STEPS = np.array([0.08] * 2 + [0.06] + [0.05] * 4 + [0.08] + [0.08] * 3 + [0.08] * 2)
 """Standard deviations of a hollow's numbers at the first resolution; halved at each later one."""
@@ -208,14 +209,22 @@ def searched(patch: Patch, options: ConcaveOptions) -> Hollow | None:
     None where no guess makes them agree better, or the first descents gain too little.
     """
     first, before = options.resolutions[0], patch.scored(patch.relief.surface, options.resolutions[0])
+    guesses = first_guesses(patch, options)
+    evaluations = options.descents * options.evaluations[0] + sum(options.evaluations[1:])
+    progress = Progress("searching a hollow", len(guesses) + evaluations)
 
     def cost(values: Float[np.ndarray, "13"], resolution: int) -> float:
+        if progress.done < progress.total - 1:
+            progress.advance()
         return patch.scored(patch.relief.carved(Hollow.from_vector(values)), resolution)
 
-    guesses = first_guesses(patch, options)
+    def ended(found: Hollow | None) -> Hollow | None:
+        progress.advance(steps=progress.total - progress.done)
+        return found
+
     costs = np.array([cost(guess, first) for guess in guesses])
     if costs.min() >= before:
-        return None
+        return ended(None)
     best, least = min(
         (
             evolve(lambda x: cost(x, first), guesses[k], FIRST_STEPS, options.evaluations[0])
@@ -224,12 +233,12 @@ def searched(patch: Patch, options: ConcaveOptions) -> Hollow | None:
         key=lambda each: each[1],
     )
     if least >= (1 - options.least_gain / 2) * before:
-        return None
+        return ended(None)
     later = zip(options.resolutions[1:], options.evaluations[1:], strict=True)
     for number, (resolution, evaluations) in enumerate(later, 1):
         steps = FIRST_STEPS * 0.5**number
         best, _ = evolve(lambda x, r=resolution: cost(x, r), best, steps, evaluations, number)  # type: ignore[misc]
-    return Hollow.from_vector(best)
+    return ended(Hollow.from_vector(best))
 
 
 def first_guesses(patch: Patch, options: ConcaveOptions) -> list[Float[np.ndarray, "13"]]:
