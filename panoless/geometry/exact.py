@@ -114,7 +114,7 @@ def shade_centers(
     normals_camera: Float[Tensor, "3 P"],
 ) -> Float[Tensor, "P 3"]:
     """E(ω) of the rays through pixel centers, reflected at the given normals (of any length)."""
-    rays = unit_rays_camera(camera).flatten(1)[:, pixels]
+    rays = unit_rays_camera(camera).to(normals_camera.device).flatten(1)[:, pixels]
     directions = reflection_directions_world(normals_camera, rays, camera.world_to_camera[:3, :3].T)
     return sample_cubemap(environment, directions)
 

@@ -17,7 +17,17 @@ from shinypartial.dataset.schema import Dataset
 from shinypartial.io.records import write_record
 from shinypartial.prediction.format import read_info
 
-TUNED = ("first_surface", "plane", "height_field", "revolution", "free_form", "footprint_map", "selection", "trust")
+TUNED = (
+    "first_surface",
+    "plane",
+    "height_field",
+    "revolution",
+    "free_form",
+    "footprint_map",
+    "poses",
+    "selection",
+    "trust",
+)
 TINY = ["--config.iterations", "4", "--config.surfels.count", "40", "--config.surfels.hull-resolution", "24"]
 MODELS = get_args(get_args(get_type_hints(FitConfig, include_extras=True)["model"])[0])
 

@@ -25,6 +25,14 @@ ROUNDING = 2e-6
 
 
 @pytest.fixture(scope="module")
+def sphere_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """With texels that three pixels see."""
+    from tests.support.synthetic_dataset import make_sphere_dataset
+
+    return make_sphere_dataset(tmp_path_factory.mktemp("datasets") / "sphere")
+
+
+@pytest.fixture(scope="module")
 def prediction(sphere_dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the example makes of the synthetic sphere, in a process that can't import shinypartial."""
     root = tmp_path_factory.mktemp("predictions") / "unit-sphere"

@@ -206,8 +206,19 @@ def take_round(
 
 def stage_task(views: Views, stage: FitStage, settings: FreeFormRound, options: FreeFormOptions) -> Task:
     """The task of a round that follows a stage."""
-    task = make_task(views, settings, options.believing(stage.outlines))
+    task = make_task(views, settings, believing(options, stage.outlines))
     return replace(task, outline_offset_px=stage.outline_offset_px)
+
+
+def believing(options: FreeFormOptions, outlines: Outlines) -> FreeFormOptions:
+    """The options with outlines that are believed so far."""
+    if outlines == "tight":
+        return options
+    sigma, scale = {
+        "loose": (options.loose_sigma_px, options.loose_scale_px),
+        "offset": (options.offset_sigma_px, options.outline_scale_px),
+    }[outlines]
+    return replace(options, outline_sigma_px=sigma, outline_scale_px=scale, offset_outlines=True)
 
 
 def make_task(views: Views, settings: FreeFormRound, options: FreeFormOptions) -> Task:

@@ -1,6 +1,6 @@
 """The tuned numbers of a free-form surface's fit."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 Outlines = Literal["tight", "loose", "offset"]
@@ -238,16 +238,6 @@ class FreeFormOptions:
     """Texels along a face side of the map that predicts them."""
     least_gain: float = 3e-3
     """A round ends when a step lowers the cost by less than this share."""
-
-    def believing(self, outlines: Outlines) -> "FreeFormOptions":
-        """The same, with outlines that are believed less."""
-        if outlines == "tight":
-            return self
-        sigma, scale = {
-            "loose": (self.loose_sigma_px, self.loose_scale_px),
-            "offset": (self.offset_sigma_px, self.outline_scale_px),
-        }[outlines]
-        return replace(self, outline_sigma_px=sigma, outline_scale_px=scale, offset_outlines=True)
 
 
 DEFAULTS = FreeFormOptions()

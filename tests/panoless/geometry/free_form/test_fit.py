@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 from panoless.capture.poses import Poses, Similarity
 from panoless.capture.rays import pose_of
 from panoless.capture.views import TrainView, Views, views_of
-from panoless.config import FitConfig
-from panoless.geometry.free_form.fit import fit_free_form, gauss_newton_step, make_task
+from panoless.config import FitConfig, SurfelConfig
+from panoless.geometry.free_form.fit import believing, fit_free_form, gauss_newton_step, make_task
 from panoless.geometry.free_form.kind import FreeFormFamily, FreeFormMirror
-from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions, FreeFormRound
+from panoless.geometry.free_form.options import DEFAULTS, ConcaveOptions, FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.photometric import Sights, Solution
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import full_trust
@@ -36,9 +36,14 @@ from tests.support.mirror_body import (
 )
 
 OPTIONS = FreeFormOptions(
-    rounds=tuple(replace(settings, rays=settings.rays // 2) for settings in DEFAULTS.rounds), finer=(), poses="off"
+    rounds=tuple(replace(settings, rays=settings.rays // 2) for settings in DEFAULTS.rounds),
+    finer=(),
+    concave=ConcaveOptions(search=False),
+    loosen=False,
+    poses="off",
 )
-CONFIG = replace(FitConfig(), free_form=OPTIONS)
+COARSE = replace(OPTIONS.rounds[0], rays=5_000)
+CONFIG = replace(FitConfig(), free_form=OPTIONS, surfels=SurfelConfig(hull_resolution=56))
 VIEWS, SIZE_PX = 20, 64
 
 
@@ -166,8 +171,8 @@ def test_the_matrix_is_symmetric_and_positive(solution: Solution) -> None:
 
 def test_held_out_views_refuse_cells_that_a_ball_does_not_need() -> None:
     """Two more rounds are offered, and the one with a rough surface is not taken."""
-    rough = FreeFormRound(34, 32, 0.15, 1, 20_000, 1e-6, 2)
-    options = replace(OPTIONS, rounds=OPTIONS.rounds[:2], finer=(rough,))
+    rough = FreeFormRound(34, 32, 0.15, 1, 10_000, 1e-6, 2)
+    options = replace(OPTIONS, rounds=(COARSE, replace(OPTIONS.rounds[1], rays=5_000)), finer=(rough,))
     views = body_views(sphere(), 10, 40)
     surface = fitted(views, options)
     assert max(surface.shape) < 34
@@ -176,7 +181,7 @@ def test_held_out_views_refuse_cells_that_a_ball_does_not_need() -> None:
 def test_the_same_views_give_the_same_surface() -> None:
     """A killed fit in closed form starts again, so it ends where the other would have."""
     views = body_views(sphere(), 10, 40)
-    options = replace(OPTIONS, rounds=OPTIONS.rounds[:1])
+    options = replace(OPTIONS, rounds=(COARSE,))
     np.testing.assert_array_equal(fitted(views, options).coefficients, fitted(views, options).coefficients)
 
 
@@ -299,7 +304,7 @@ def test_the_offset_of_outlines_is_what_masks_lost() -> None:
     whole, shrunk = body_views(sphere(), 10, 40), shrunk_views(sphere(), 10, 40, 2.0)
     surface = fitted(whole, options)
     for views, offset in ((whole, 0.0), (replace(whole, train=_with_masks(whole, shrunk)), -2.0)):
-        task = make_task(views, options.rounds[0], options.believing("loose"))
+        task = make_task(views, options.rounds[0], believing(options, "loose"))
         solution = Solution.at(task, surface, full_trust(surface, 10), None, 1)
         assert solution.outline_offset_px == pytest.approx(offset, abs=0.15)
         again = replace(solution, task=replace(task, outline_offset_px=offset))
