@@ -254,6 +254,12 @@ def from_plain(cls: type[Numbers], content: dict[str, Any]) -> Numbers:
     return cls(**values)
 
 
+def poses_from_plain(content: dict[str, Any]) -> Poses | None:
+    """The poses in what a `state_dict` became; None where there are none, or a version before knew of none."""
+    found = content.get("poses")
+    return None if found is None else from_plain(Poses, found)
+
+
 def usable_views(views: Views, geometry: Geometry) -> Views:
     """The views with their cameras as a geometry has them, and its usable pixels as their solid ones."""
     views = geometry.corrected(views)

@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from panoless.capture.object_frame import ObjectFrame
-from panoless.capture.poses import Poses
 from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
@@ -17,7 +16,7 @@ from panoless.environment.rays import Rays
 from panoless.environment.resolution import finest_resolution
 from panoless.first_surface.completion import complete_surface
 from panoless.first_surface.visual_hull import carve_hull
-from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, to_plain
+from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, poses_from_plain, to_plain
 from panoless.geometry.exact import ExactFamily, ExactGeometry
 from panoless.geometry.free_form.fit import fit_free_form
 from panoless.geometry.free_form.observations import PixelRays, inner_distance_px
@@ -134,8 +133,7 @@ class FreeFormMirror(ExactGeometry):
         """The geometry that `state_dict` was taken from."""
         options = read_record(FreeFormOptions, content["options"], "the options of a free-form surface")
         surface, trust = from_plain(LevelSet, content["surface"]), from_plain(Trust, content["trust"])
-        poses = None if content.get("poses") is None else from_plain(Poses, content["poses"])
-        return cls(surface, trust, content["occlusion_test"], options, poses=poses)
+        return cls(surface, trust, content["occlusion_test"], options, poses=poses_from_plain(content))
 
 
 class FreeFormFamily(ExactFamily):

@@ -9,12 +9,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.object_frame import ObjectFrame
-from panoless.capture.poses import Poses
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints
 from panoless.environment.rays import Rays
-from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, to_plain
+from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, poses_from_plain, to_plain
 from panoless.geometry.exact import ExactFamily, ExactGeometry
 from panoless.geometry.revolution.deblurred_map import pixel_footprints
 from panoless.geometry.revolution.fit import propose_revolution, refine_revolution
@@ -95,9 +94,8 @@ class RevolutionMirror(ExactGeometry):
     def from_state_dict(cls, content: dict[str, Any]) -> "RevolutionMirror":
         """The geometry that `state_dict` was taken from."""
         options = read_record(RevolutionOptions, content["options"], "the options of a surface of revolution")
-        surface, poses = from_plain(SurfaceOfRevolution, content["surface"]), content.get("poses")
-        found = None if poses is None else from_plain(Poses, poses)
-        return cls(surface, content["occlusion_test"], options, poses=found)
+        surface = from_plain(SurfaceOfRevolution, content["surface"])
+        return cls(surface, content["occlusion_test"], options, poses=poses_from_plain(content))
 
     def mesh(self, frame: ObjectFrame) -> Mesh:
         """Quadrilaterals between 128 meridians."""

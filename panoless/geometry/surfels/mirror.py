@@ -18,7 +18,14 @@ from panoless.environment.footprints import Footprints
 from panoless.environment.rays import Rays
 from panoless.environment.resolution import finest_resolution
 from panoless.environment.solve import solve_environment
-from panoless.geometry.base import SOLID_SURFACE_ALPHA, Geometry, Mesh, SurfaceBuffers, from_plain, to_plain
+from panoless.geometry.base import (
+    SOLID_SURFACE_ALPHA,
+    Geometry,
+    Mesh,
+    SurfaceBuffers,
+    poses_from_plain,
+    to_plain,
+)
 from panoless.geometry.exact import reflections, shade_centers
 from panoless.geometry.surfels.model import Surfels
 from panoless.geometry.surfels.rendering import ALPHA_FLOOR, rasterize_surfels, surface_buffers, tiles_of
@@ -185,7 +192,7 @@ class SurfelMirror:
 
         start = content["started_on"]
         started_on = None if start is None else FAMILIES[start[0]].geometry.from_state_dict(start[1])
-        poses = None if content.get("poses") is None else from_plain(Poses, content["poses"])
+        poses = poses_from_plain(content)
         surfels = Surfels(**content["surfels"])
         return cls(**{**content, "surfels": surfels, "started_on": started_on, "poses": poses})
 
