@@ -14,7 +14,7 @@ import tyro
 from msgspec import Meta
 
 from panoless.alignment.options import PoseOptions
-from panoless.environment.options import FootprintMapOptions
+from panoless.environment.options import FootprintMapOptions, SurroundingsOptions
 from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.geometry.free_form.options import FreeFormOptions
 from panoless.geometry.height_field.options import HeightFieldOptions
@@ -199,6 +199,7 @@ class FitConfig:
     free_form: Tuned[FreeFormOptions] = field(default_factory=FreeFormOptions)
     footprint_map: Tuned[FootprintMapOptions] = field(default_factory=FootprintMapOptions)
     poses: Tuned[PoseOptions] = field(default_factory=PoseOptions)
+    surroundings: Tuned[SurroundingsOptions] = field(default_factory=SurroundingsOptions)
     selection: Tuned[SelectionOptions] = field(default_factory=SelectionOptions)
     trust: Tuned[TrustOptions] = field(default_factory=TrustOptions)
 

@@ -139,7 +139,8 @@ class _SeenView:
         surface = scene.geometry.buffers(view.camera)
         rows = [outline_rows(view, self.distance_px, surface)]
         if scene.environment is not None:
-            rows.append(light_rows(view, self.pixels, surface, scene.environment, self.options))
+            around = scene.geometry.surroundings
+            rows.append(light_rows(view, self.pixels, surface, scene.environment, self.options, around))
         return rows
 
     def solved(

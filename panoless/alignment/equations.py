@@ -20,8 +20,9 @@ from panoless.alignment.options import PoseOptions
 from panoless.capture.masks import MASK_LEVEL
 from panoless.capture.rays import camera_rays, pose_of, reflect
 from panoless.capture.views import TrainView
+from panoless.environment.nearness import light_and_slopes
+from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import SOLID_SURFACE_ALPHA, SurfaceBuffers
-from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.rasterize import RasterCamera
 from panoless.numeric.robust import bounded_error, robust_weight
 from shinypartial.core.conventions import PIXEL_CENTER
@@ -96,6 +97,7 @@ def light_rows(
     surface: SurfaceBuffers,
     environment: Float[Tensor, "6 3 L L"],
     options: PoseOptions,
+    surroundings: Surroundings = FAR,
 ) -> PoseRows:
     """E(r) − c of those of the pixels (flat indices) around which the surface is smooth.
 
@@ -119,8 +121,10 @@ def light_rows(
     along = np.einsum("pc,pci->pi", n, by_ray) + np.einsum("pc,pci->pi", d, by_normal)
     facing = (d * n).sum(1)[:, None, None]
     turned = by_ray - 2 * n[:, :, None] * along[:, None] - 2 * facing * by_normal
-    outgoing = reflect(d, n)
-    shown, slopes = _light(environment, outgoing)
+    mirrored, points = reflect(d, n), pose_of(camera)[1] + rays * depth[:, None] @ rotation
+    outgoing = surroundings.looked_up(points, mirrored)
+    shown, slopes = light_and_slopes(environment, outgoing)
+    slopes = surroundings.slopes_by_mirrored(slopes, points, mirrored)
     seen = view.radiance.flatten(1)[:, torch.from_numpy(pixels).to(view.radiance.device)].T.cpu().numpy()
     return PoseRows(shown - seen, np.einsum("pkc,pci->pki", slopes, turned), outgoing)
 
@@ -138,24 +142,3 @@ def _normals(
     )
     bend = np.stack(np.gradient(image, axis=(1, 0)), 2)
     return image, bend, smooth & (np.linalg.norm(bend, axis=3).max(2) < largest_bend)
-
-
-def _light(
-    environment: Float[Tensor, "6 3 L L"], directions: Float[np.ndarray, "P 3"]
-) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3 3"]]:
-    """E(r) of unit directions, and its slopes across r (channel, axis): differences over a texel."""
-    step = np.pi / 4 / environment.shape[-1]
-    least = np.eye(3)[np.abs(directions).argmin(1)]
-    first = np.cross(directions, least)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    tangents = first, np.cross(directions, first)
-
-    def look_up(where: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
-        found: np.ndarray = sample_cubemap(environment, torch.from_numpy(where).to(environment)).cpu().numpy()
-        return found.astype(np.float64)
-
-    slopes = np.zeros((len(directions), 3, 3))
-    for tangent in tangents:
-        change = (look_up(directions + step * tangent) - look_up(directions - step * tangent)) / (2 * step)
-        slopes += change[:, :, None] * tangent[:, None]
-    return look_up(directions), slopes

@@ -14,6 +14,7 @@ from panoless.capture.poses import Poses
 from panoless.capture.views import Views, split_held_out
 from panoless.config import FitConfig
 from panoless.environment.resolution import prediction_error
+from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import Family, Geometry, Proposal, observe_views, usable_views
 
 
@@ -24,6 +25,10 @@ class PosedProposal:
     proposal: Proposal
     poses: Poses | None = None
 
+    def in_surroundings(self, surroundings: Surroundings) -> "PosedProposal":
+        """The same there."""
+        return replace(self, proposal=self.proposal.in_surroundings(surroundings))
+
 
 def align_proposal(family: Family, views: Views, proposal: Proposal, config: FitConfig) -> PosedProposal | None:
     """The proposal of a kind after its outlines turned the cameras, and it followed them, in turn; None where that does
@@ -32,7 +37,7 @@ def align_proposal(family: Family, views: Views, proposal: Proposal, config: Fit
     Outlines hardly tell a shift across the line of sight from a turn, so cameras are only turned.
     """
     options, outline = config.poses, family.as_proposed(proposal, config)
-    if options.mode == "off" or outline is None or not np.isfinite(proposal.silhouette_px):
+    if options.mode == "off" or family.finds_poses or outline is None or not np.isfinite(proposal.silhouette_px):
         return None
     alignment = Alignment(views, options)
     if options.mode == "auto" and alignment.left_by_turns(outline) > options.largest_share_left:
@@ -90,7 +95,9 @@ def _next_round(source: Family, views: Views, geometry: Geometry, config: FitCon
         poses = alignment.adjusted(geometry, poses, environment)
     poses = alignment.without_common(poses)
     proposal = source.propose(poses.moved(views), config, asked=False)
-    return None if proposal is None else PosedProposal(proposal, poses)
+    if proposal is None:
+        return None
+    return PosedProposal(proposal.in_surroundings(geometry.surroundings), poses)
 
 
 def _turned_deg(before: Geometry, after: Geometry) -> float:

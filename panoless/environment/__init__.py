@@ -1,1 +1,3 @@
-"""Rays to an environment map and its confidence; knows no geometry. Imports capture, numeric and kernels."""
+"""Rays to an environment map, its confidence and its distance; knows no geometry.
+Imports capture, numeric and kernels.
+"""

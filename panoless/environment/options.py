@@ -1,6 +1,7 @@
-"""The tuned numbers of the map from pixel footprints."""
+"""The tuned numbers of the map from pixel footprints, and of the distance of what it shows."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -32,3 +33,41 @@ class FootprintMapOptions:
 
 
 DEFAULTS = FootprintMapOptions()
+
+
+@dataclass(frozen=True)
+class SurroundingsOptions:
+    """When the surroundings are taken to be near, and how their distance is found.
+
+    "Rooms" are spheres about vase and sculpture at 5 and 10 radii of the object, 160 px; "not tuned" is what only has
+    to be large or small enough.
+    """
+
+    mode: Literal["auto", "off", "on"] = "auto"
+    """Whether their distance is an unknown: where held-out views gain by it, never, or always."""
+    degree: Literal[0, 1, 2] = 0
+    """Of the harmonics that 1/D is made of where it is near: 0 is a sphere, 1 one about another point, 2 walls that
+    differ."""
+    checked_views: int = 10
+    """So many views tell whether to look closer…"""
+    checked_rays: int = 20_000
+    """…by about so many pixels. Not tuned."""
+    rays: int = 60_000
+    """About so many pixels of all views tell how near they are."""
+    robust_scale: float = 0.15
+    """Residual (linear radiance) beyond which a ray loses its vote. Not tuned."""
+    checked_resolution: int = 8
+    """Texels along a face side of the map under which a first step tells whether to look closer."""
+    least_pull: float = 0.0003
+    """Share of the cost that this step has to promise. It is 0.024 and 0.017 in rooms of vase at 5 and 10 radii, 0.063
+    and 0.028 in those of sculpture, 0.0005 in one of mirror at 20 radii, and up to 0.0001 in their far worlds."""
+    resolutions: tuple[int, ...] = (8, 8, 16, 16, 16, 32, 32, 32, 64, 64, 64)
+    """Texels along a face side of the maps of all steps."""
+    stretch: float = 1.7
+    """Factor of a step: it lets each texel follow by the mean of its rays, as a map does not quite."""
+    least_share: float = 1e-3
+    """Share of the mean diagonal that is added to the diagonal, for walls that no ray tells. Not tuned."""
+    judged_rays: int = 400_000
+    """About so many pixels of all views tell whether a fit in near surroundings explains more than a far one."""
+    judged_resolution: int = 64
+    """Texels along a face side of the map that predicts held-out views."""

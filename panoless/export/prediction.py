@@ -15,9 +15,11 @@ from torch import Tensor
 
 from panoless import __version__
 from panoless.capture.encoding import encoding_of
+from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import raster_camera
 from panoless.capture.views import load_views
 from panoless.config import FitConfig
+from panoless.environment.surroundings import FAR, Surroundings
 from panoless.export.mesh_files import write_ply
 from panoless.export.pictures import crop_to_object, decomposition_pictures
 from panoless.export.render import Decomposition, render
@@ -40,15 +42,18 @@ from shinypartial.prediction.format import (
     DECOMPOSITION,
     DESCRIPTION,
     ENVIRONMENT,
+    INVERSE_DISTANCE,
     SNAPSHOTS,
     Candidate,
     ModelSelection,
+    NearSurroundings,
     PredictionInfo,
     acquire_prediction,
     dataset_hash,
     read_info,
     write_environment_map,
     write_info,
+    write_inverse_distance,
     write_test_view,
     write_visibility,
 )
@@ -74,8 +79,14 @@ def export_prediction(
     (folder / DESCRIPTION).unlink(missing_ok=True)
     remove_partial_files(folder)
     height = 2 * state.environment.shape[-1]
-    write_environment_map(folder, cube_to_latlong(state.environment, height))
-    write_visibility(folder, cube_to_latlong(state.visibility[:, None], height)[..., 0].clip(0, 1))
+    around, viewpoint = state.geometry.surroundings, viewpoint_of(state.frame)
+    write_environment_map(folder, cube_to_latlong(state.environment, height, around, viewpoint))
+    visibility = cube_to_latlong(state.visibility[:, None], height, around, viewpoint)
+    write_visibility(folder, visibility[..., 0].clip(0, 1))
+    (folder / INVERSE_DISTANCE).unlink(missing_ok=True)
+    if not around.is_far:
+        directions = latlong_directions(height)
+        write_inverse_distance(folder, around.inverse_distance_from(viewpoint, directions) / state.frame.radius)
     for kind in (*FAMILIES, *FORMER_KINDS):
         (folder / f"{kind}.ply").unlink(missing_ok=True)
     mesh_file = f"{state.geometry.kind}.ply"
@@ -107,6 +118,7 @@ def export_prediction(
         model=state.selection.sentence,
         model_selection=_model_selection(state.selection),
         verdict=state.verdict,
+        surroundings=_near_surroundings(around, state.frame),
         iteration=state.iteration if snapshot else None,
     )
     write_info(folder, info)
@@ -185,9 +197,35 @@ def _render_frame(frame: Frame, state: FitState, config: FitConfig) -> Decomposi
     return render(state.geometry, state.environment, camera, state.frame, config)
 
 
-def cube_to_latlong(cube: Float[Tensor, "6 C L L"], height: int) -> Float[np.ndarray, "H 2*H C"]:
-    """Area-averaged lat-long map of a cubemap: seamless lookups at 2×2 points a texel."""
+def viewpoint_of(frame: ObjectFrame) -> Float[np.ndarray, "3"]:
+    """From where maps are exported, in the object frame: the world's origin if it lies within the object's ball, as
+    the prediction format has it, else the object's center. It matters in near surroundings only.
+    """
+    origin = -frame.center / frame.radius
+    return origin if np.linalg.norm(origin) < 1 else np.zeros(3)
+
+
+def _near_surroundings(surroundings: Surroundings, frame: ObjectFrame) -> NearSurroundings | None:
+    """What the prediction states of surroundings that are not far."""
+    if surroundings.is_far:
+        return None
+    radii = 1 / float(surroundings.coefficients[0])
+    return NearSurroundings(surroundings.kind, radii * frame.radius, radii, surroundings.coefficients.tolist())
+
+
+def cube_to_latlong(
+    cube: Float[Tensor, "6 C L L"],
+    height: int,
+    surroundings: Surroundings = FAR,
+    viewpoint: Float[np.ndarray, "3"] | None = None,
+) -> Float[np.ndarray, "H 2*H C"]:
+    """Area-averaged lat-long map of a cubemap: seamless lookups at 2×2 points a texel.
+
+    In near surroundings it is what is seen from a viewpoint in the object frame, the center unless it is given.
+    """
     fine = latlong_directions(height * SUPERSAMPLING).reshape(-1, 3)
+    if viewpoint is not None:
+        fine = surroundings.looked_up(np.broadcast_to(viewpoint, fine.shape), fine)
     values = sample_cubemap(cube, torch.from_numpy(fine).to(torch.float32)).numpy()
     blocks = values.reshape(height, SUPERSAMPLING, 2 * height, SUPERSAMPLING, -1)
     return blocks.mean((1, 3))

@@ -15,6 +15,7 @@ from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints
 from panoless.environment.rays import Rays
+from panoless.environment.surroundings import Surroundings
 from panoless.kernels.rasterize import RasterCamera
 
 Numbers = TypeVar("Numbers")
@@ -109,6 +110,15 @@ class Geometry(Protocol):
         """The views with their cameras where the poses have them; as they are where they are believed."""
         ...
 
+    @property
+    def surroundings(self) -> Surroundings:
+        """How far away it takes what it mirrors to be."""
+        ...
+
+    def in_surroundings(self, surroundings: Surroundings) -> "Geometry":
+        """The same surface there; itself where the kind knows only far ones."""
+        ...
+
     def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
         """Those of the solid pixels of a view (flat indices) that show the surroundings, not the object again."""
         ...
@@ -172,6 +182,10 @@ class Proposal:
     overlap: float
     """Intersection of shape and mask over their union, in [0, 1]."""
 
+    def in_surroundings(self, surroundings: Surroundings) -> "Proposal":
+        """The same shape there, for a kind that knows near surroundings."""
+        return replace(self, shape=replace(self.shape, surroundings=surroundings))
+
 
 @runtime_checkable
 class Family(Protocol):
@@ -181,6 +195,8 @@ class Family(Protocol):
     geometry: ClassVar[type[Geometry]]
     label: ClassVar[str]
     """With its article, as sentences name it."""
+    finds_poses: ClassVar[bool]
+    """Whether its fit finds the poses of views itself, or it explains any outlines."""
     refines: ClassVar[str | None]
     """The kind whose proposal it takes on where that one is not chosen; None: it makes its own."""
 
@@ -192,8 +208,8 @@ class Family(Protocol):
         ...
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry | None:
-        """A proposal as a geometry whose outlines tell where the cameras are; None for a kind whose fit finds that
-        itself, or which explains any outlines.
+        """A proposal as a geometry, which tells where the cameras are and how near the surroundings; None for a kind
+        that has none to show.
         """
         ...
 

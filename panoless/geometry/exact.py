@@ -3,19 +3,21 @@
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, cast
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.encoding import encoding_of
 from panoless.capture.poses import Poses
-from panoless.capture.rays import unit_rays_camera
+from panoless.capture.rays import pixel_rays, unit_rays_camera
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, deblur_map
 from panoless.environment.rays import Rays, normalize_confidence
 from panoless.environment.resolution import densest_resolution
 from panoless.environment.solve import solve_environment
+from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import Geometry, Training, TrainingObserver, from_plain, observe_views, to_plain
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.rasterize import RasterCamera
@@ -74,7 +76,12 @@ class ExactGeometry:
         normals_camera: Float[Tensor, "3 P"],
     ) -> Float[Tensor, "P 3"]:
         """The map where the normals mirror the pixels' centers to."""
-        return shade_centers(environment, camera, pixels, normals_camera)
+        mirror = cast(Geometry, self)
+        if mirror.surroundings.is_far:
+            return shade_centers(environment, camera, pixels, normals_camera)
+        directions = mirrored_directions(camera, pixels, normals_camera)
+        depth = mirror.buffers(camera).depth
+        return sample_cubemap(environment, looked_up(mirror.surroundings, camera, depth, pixels, directions))
 
     def to(self, device: torch.device) -> Any:
         """Itself: its numbers are arrays in main memory."""
@@ -94,6 +101,7 @@ class ExactGeometry:
 class ExactFamily:
     """A kind whose `fit` does everything."""
 
+    finds_poses: ClassVar[bool] = False
     refines: ClassVar[str | None] = None
 
     def begin(self, views: Views, geometry: Geometry, config: FitConfig) -> Training | None:
@@ -114,9 +122,32 @@ def shade_centers(
     normals_camera: Float[Tensor, "3 P"],
 ) -> Float[Tensor, "P 3"]:
     """E(ω) of the rays through pixel centers, reflected at the given normals (of any length)."""
+    return sample_cubemap(environment, mirrored_directions(camera, pixels, normals_camera))
+
+
+def mirrored_directions(
+    camera: RasterCamera, pixels: Int[Tensor, "P"], normals_camera: Float[Tensor, "3 P"]
+) -> Float[Tensor, "P 3"]:
+    """World directions of the rays through pixel centers (flat indices), reflected at normals of any length."""
     rays = unit_rays_camera(camera).to(normals_camera.device).flatten(1)[:, pixels]
-    directions = reflection_directions_world(normals_camera, rays, camera.world_to_camera[:3, :3].T)
-    return sample_cubemap(environment, directions)
+    return reflection_directions_world(normals_camera, rays, camera.world_to_camera[:3, :3].T)
+
+
+def looked_up(
+    surroundings: Surroundings,
+    camera: RasterCamera,
+    depth: Float[Tensor, "H W"],
+    pixels: Int[Tensor, "P"],
+    directions: Float[Tensor, "P 3"],
+) -> Float[Tensor, "P 3"]:
+    """Where in the map the mirrored directions of pixels (flat indices) look, by the depth of the surface there."""
+    if surroundings.is_far:
+        return directions
+    origins, rays = pixel_rays(camera, pixels.cpu().numpy())
+    points = origins + depth.flatten()[pixels].cpu().numpy().astype(np.float64)[:, None] * rays
+    unit = directions.cpu().numpy().astype(np.float64)
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    return torch.from_numpy(surroundings.looked_up(points, unit)).to(directions)
 
 
 def reflections(view: TrainView, normals_camera: Float[Tensor, "3 H W"], pixels: Tensor) -> Float[Tensor, "P 3"]:

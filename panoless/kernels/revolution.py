@@ -34,9 +34,9 @@ def follow(
     max_bounces: int,
     *,
     backend: ArrayBackend = "cpu",
-) -> tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, "P"]]:
-    """Unit directions in which rays leave the surface for good, and after how many reflections; zeros for those that
-    have not after `max_bounces`.
+) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"], Int[np.ndarray, "P"]]:
+    """Where rays leave the surface for good, in which unit directions, and after how many reflections; zeros for those
+    that have not after `max_bounces`.
 
     Rays come in `directions` and meet the surface at `points`, on that side and place of it; each next one starts
     `epsilon` from its point. `angles` are the profile's directions at both ends of every side (rad), between which

@@ -1,1 +1,3 @@
-"""Which kind of geometry a scene needs: candidates, their evidence and the verdict. Imports geometry and below."""
+"""Which kind of geometry a scene needs, and how near its surroundings are: candidates, their evidence and the verdict.
+Imports geometry and below.
+"""

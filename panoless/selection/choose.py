@@ -5,6 +5,7 @@ every picture as it was, so surfels drift.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from panoless.alignment.search import PosedProposal, align_proposal, fit_with_poses
 from panoless.capture.views import Views
@@ -13,8 +14,10 @@ from panoless.geometry.base import Family, Geometry, Proposal, usable_views
 from panoless.geometry.registry import FAMILIES
 from panoless.selection.candidates import Candidate, Selection, Verdict
 from panoless.selection.held_out import Trial, held_out_errors, is_clearly_lower, train_briefly
+from panoless.selection.surroundings import explains_clearly_more, proposed_surroundings
 
 ANY = "auto"
+BENT = "a bend explains more than near surroundings do"
 
 
 def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefly) -> tuple[Geometry, Selection]:
@@ -37,7 +40,10 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
         refused[family.kind] = [each for each in proposals if _is_near(each, config)]
         if geometry is not None:
             if candidate.verdict == Verdict.CHOSEN:
-                return geometry, Selection(family.kind, tuple(table))
+                if not _bends_rather(family, geometry, proposals, views, config):
+                    return geometry, Selection(family.kind, tuple(table))
+                table[-1] = replace(candidate, verdict=Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason=BENT)
+                continue
             starts.append((candidate.surfels_error or 0.0, geometry))
     start = min(reversed(starts), key=lambda each: each[0])[1] if starts else None
     geometry = last.fit(views, Proposal(start, 0.0, 1.0), config)
@@ -70,10 +76,42 @@ def _first_fit(
 ) -> tuple[Geometry, PosedProposal] | None:
     """The geometry from the first of the proposals whose poses held-out views ask for, or that believes them."""
     for start in proposals:
-        geometry = fit_with_poses(family, _source(family), views, start, config)
+        geometry = _fit_around(family, views, start, config)
         if geometry is not None:
             return geometry, start
     return None
+
+
+def _fit_around(family: Family, views: Views, start: PosedProposal, config: FitConfig) -> Geometry | None:
+    """A fit in the surroundings that the proposal asks for, if it explains clearly more than one in a far world."""
+    source, posed = _source(family), views if start.poses is None else start.poses.moved(views)
+    around = proposed_surroundings(source, posed, start.proposal, config)
+    if around.is_far:
+        return fit_with_poses(family, source, views, start, config)
+    near = fit_with_poses(family, source, views, start.in_surroundings(around), config)
+    if config.surroundings.mode == "on":
+        return near
+    far = fit_with_poses(family, source, views, start, config)
+    if near is None or far is None:
+        return near or far
+    return near if explains_clearly_more(views, near, far, config) else far
+
+
+def _bends_rather(
+    family: Family, geometry: Geometry, proposals: Sequence[PosedProposal], views: Views, config: FitConfig
+) -> bool:
+    """Whether a kind that refines this one explains held-out views clearly better in a far world than this one does in
+    near surroundings: a slight bend of a flat mirror shows much of what a near room shows.
+    """
+    if geometry.surroundings.is_far:
+        return False
+    far = replace(config, surroundings=replace(config.surroundings, mode="off"))
+    for other in FAMILIES.values():
+        near = [each for each in proposals if _is_near(each, config)]
+        fitted = _first_fit(other, near, views, far) if other.refines == family.kind else None
+        if fitted is not None and explains_clearly_more(views, fitted[0], geometry, config):
+            return True
+    return False
 
 
 def _fit_asked(views: Views, config: FitConfig) -> tuple[Geometry, Selection]:

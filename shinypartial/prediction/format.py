@@ -99,6 +99,20 @@ class Trust:
 
 
 @dataclass(frozen=True)
+class NearSurroundings:
+    """How far away the method found what the object mirrors, where that is not infinitely far."""
+
+    kind: Text
+    """What the walls are taken for, such as "sphere"."""
+    distance: NonNegative
+    """From the object's center to the walls in world units: of the mean of 1/D, if it varies."""
+    distance_radii: NonNegative
+    """The same in radii of the object."""
+    inverse_distances: list[float] = field(default_factory=list)
+    """What the method describes 1/D by, in inverse radii of the object: of spheres that number alone."""
+
+
+@dataclass(frozen=True)
 class PredictionInfo:
     """Who made the prediction and at what cost; `curves` are per-iteration training series, for the report only.
 
@@ -106,7 +120,8 @@ class PredictionInfo:
     `device` what the model was fitted on: "cpu", or the name of the GPU. `primitives` is the number of surfels,
     Gaussians, voxels or vertices, `model_bytes` the size of the files that a renderer needs, `iteration` the number of
     finished steps of a snapshot, `model_selection` how the kind of model was chosen; `model` says the same in free
-    words; `verdict` is what the method says of its result. Each is None where it is unknown or has no meaning.
+    words; `verdict` is what the method says of its result; `surroundings` how near it found them. Each is None where it
+    is unknown or has no meaning.
     """
 
     method: str
@@ -124,6 +139,7 @@ class PredictionInfo:
     primitives: int | None = None
     model_bytes: int | None = None
     iteration: int | None = None
+    surroundings: NearSurroundings | None = None
 
     @property
     def hardware_text(self) -> str:

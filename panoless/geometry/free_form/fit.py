@@ -46,6 +46,15 @@ class FitStage:
     """How far outside the surface these lie all in all."""
 
 
+@dataclass(frozen=True)
+class Change:
+    """A step of everything that is unknown: coefficients in cells, poses of views, coefficients of the surroundings."""
+
+    coefficients: Float[np.ndarray, "A B C"]
+    poses: Float[np.ndarray, "V 6"] | None = None
+    surroundings: Float[np.ndarray, "K"] | None = None
+
+
 def fit_free_form(
     views: Views, start: LevelSet, options: FreeFormOptions = DEFAULTS
 ) -> tuple[LevelSet, Trust, Poses | None]:
@@ -97,7 +106,7 @@ def outline_pull(views: Views, stage: FitStage, options: FreeFormOptions) -> flo
     for outlines in ("loose", "tight"):
         task = stage_task(views, replace(stage, outlines=outlines), stage.settings, options)
         solution = Solution.at(task, stage.surface, stage.trust, stage.environment, 0, stage.poses)
-        step, _ = _step(solution, options.damping, still=False)
+        step = _step(solution, options.damping, still=False).coefficients
         promises.append(-float((solution.gradient() * step).sum()) / 2 / solution.cost(solution))
     return promises[0] - promises[1]
 
@@ -232,12 +241,12 @@ def make_task(views: Views, settings: FreeFormRound, options: FreeFormOptions) -
     return Task(pixels, chosen, share, density / options.outline_sigma_px**2, settings, options, centers)
 
 
-def _step(
-    solution: Solution, damping: float, still: bool
-) -> tuple[Float[np.ndarray, "A B C"], Float[np.ndarray, "V 6"] | None]:
-    if solution.poses is None:
-        return gauss_newton_step(solution, damping), None
-    return gauss_newton_step_with_poses(solution, damping, still=still)
+def _step(solution: Solution, damping: float, still: bool) -> Change:
+    if solution.poses is not None:
+        return gauss_newton_step_with_poses(solution, damping, still=still)
+    if not solution.surface.surroundings.is_far:
+        return gauss_newton_step_with_surroundings(solution, damping)
+    return Change(gauss_newton_step(solution, damping))
 
 
 def take_steps(
@@ -249,7 +258,7 @@ def take_steps(
         if not still:
             solution = replace(solution, trust=measured_trust(solution), task=remeasured_task(solution))
         before = solution
-        solution, length = _accepted(solution, *_step(solution, damping, still))
+        solution, length = _accepted(solution, _step(solution, damping, still))
         factor = options.damping_less if length == 1 else options.damping_more
         damping = float(np.clip(damping * factor, *options.damping_range))
         gain = 1 - solution.cost(before) / before.cost(before)
@@ -267,17 +276,18 @@ def remeasured_task(solution: Solution) -> Task:
     return replace(task, outline_offset_px=solution.outline_offset_px) if task.options.offset_outlines else task
 
 
-def _accepted(
-    solution: Solution, step: Float[np.ndarray, "A B C"], poses: Float[np.ndarray, "V 6"] | None = None
-) -> tuple[Solution, float]:
+def _accepted(solution: Solution, step: Change) -> tuple[Solution, float]:
     """The solution after the longest of the tried lengths of a step that lowers the cost, and that length; the same
     solution after none.
     """
     options, length, before = solution.task.options, 1.0, solution.cost(solution)
     for _ in range(options.trials):
-        coefficients = solution.surface.coefficients + length * step
-        surface = replace(solution.surface, coefficients=coefficients)
-        posed = solution.poses if poses is None or solution.poses is None else solution.poses.after(length * poses)
+        surface = replace(solution.surface, coefficients=solution.surface.coefficients + length * step.coefficients)
+        if step.surroundings is not None:
+            surface = replace(surface, surroundings=surface.surroundings.after(length * step.surroundings))
+        posed = solution.poses
+        if step.poses is not None and posed is not None:
+            posed = posed.after(length * step.poses)
         moved = Solution.at(solution.task, surface, solution.trust, solution.environment, options.map_rounds, posed)
         if moved.cost(solution) < before:
             return moved, length
@@ -303,9 +313,7 @@ def gauss_newton_step(solution: Solution, damping: float) -> Float[np.ndarray, "
     return np.clip(step, -options.largest_step_cells, options.largest_step_cells)
 
 
-def gauss_newton_step_with_poses(
-    solution: Solution, damping: float, *, still: bool = False
-) -> tuple[Float[np.ndarray, "A B C"], Float[np.ndarray, "V 6"]]:
+def gauss_newton_step_with_poses(solution: Solution, damping: float, *, still: bool = False) -> Change:
     """The same with the poses of the views as further unknowns; of a `still` surface, those alone.
 
     Poses are preconditioned by their blocks: with H = L Lᵀ of a view its unknowns are y = Lᵀ x.
@@ -339,7 +347,32 @@ def gauss_newton_step_with_poses(
             options.solver_tolerance,
         )
     )
-    return np.clip(step, -options.largest_step_cells, options.largest_step_cells), poses
+    return Change(np.clip(step, -options.largest_step_cells, options.largest_step_cells), poses)
+
+
+def gauss_newton_step_with_surroundings(solution: Solution, damping: float) -> Change:
+    """The same with the coefficients of the surroundings as further unknowns y = Lᵀ k, H = L Lᵀ their own matrix."""
+    options, shape = solution.task.options, solution.surface.shape
+    diagonal, size = solution.diagonal(THIRD_DIFFERENCE_DIAGONAL), int(np.prod(shape))
+    matrix = solution.surroundings_matrix()
+    least = options.least_surroundings_share * max(float(np.trace(matrix)), 1e-30)
+    back = np.linalg.inv(np.linalg.cholesky(matrix + least * np.eye(len(matrix)))).T
+
+    def product(values: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
+        change, moved = values[:size].reshape(shape), back @ values[size:]
+        by_change, by_moved = solution.product_with_surroundings(change, moved)
+        by_moved = back.T @ (by_moved + least * moved)
+        return np.concatenate([(by_change + damping * diagonal * change).ravel(), by_moved])
+
+    found = solve_by_products(
+        product,
+        np.concatenate([-solution.gradient().ravel(), -back.T @ solution.surroundings_gradient()]),
+        np.concatenate([(solution.active / (diagonal * (1 + damping))).ravel(), np.ones(len(matrix))]),
+        options.solver_steps,
+        options.solver_tolerance,
+    )
+    step = np.clip(found[:size].reshape(shape), -options.largest_step_cells, options.largest_step_cells)
+    return Change(step, surroundings=back @ found[size:])
 
 
 def measured_trust(solution: Solution) -> Trust:

@@ -1,6 +1,6 @@
 """The free-form surface as a kind of geometry."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,6 +14,7 @@ from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays
 from panoless.environment.resolution import finest_resolution
+from panoless.environment.surroundings import Surroundings
 from panoless.first_surface.completion import complete_surface
 from panoless.first_surface.visual_hull import carve_hull
 from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, poses_from_plain, to_plain
@@ -24,7 +25,7 @@ from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions
 from panoless.geometry.free_form.photometric import Sights
 from panoless.geometry.free_form.rendering import free_form_buffers, free_form_light
 from panoless.geometry.free_form.surface import LevelSet, level_set_of
-from panoless.geometry.free_form.trust import Trust
+from panoless.geometry.free_form.trust import Trust, full_trust
 from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.geometry.surfels.placement import surfels_on_mesh
 from panoless.kernels.rasterize import RasterCamera
@@ -41,6 +42,15 @@ class FreeFormMirror(ExactGeometry):
     occlusion_test: bool = True
     """Whether pixels that see the object again are left out."""
     options: FreeFormOptions = DEFAULTS
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """Those of the surface."""
+        return self.surface.surroundings
+
+    def in_surroundings(self, surroundings: Surroundings) -> "FreeFormMirror":
+        """The same surface there."""
+        return replace(self, surface=replace(self.surface, surroundings=surroundings))
 
     @property
     def num_parameters(self) -> int:
@@ -142,6 +152,7 @@ class FreeFormFamily(ExactFamily):
     kind: ClassVar[str] = "free_form"
     geometry: ClassVar[type[Geometry]] = FreeFormMirror
     label: ClassVar[str] = "a free-form surface"
+    finds_poses: ClassVar[bool] = True
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """The first surface as a level set; one that is closed explains any silhouettes in the end.
@@ -155,9 +166,10 @@ class FreeFormFamily(ExactFamily):
         surface = level_set_of(first, config.free_form.start_cells, config.free_form.margin)
         return Proposal(surface, 0.0, 1.0)
 
-    def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry | None:
-        """None: the fit finds poses itself."""
-        return None
+    def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
+        """The first surface, trusted everywhere."""
+        trust = full_trust(proposal.shape, config.free_form.trust_cells)
+        return FreeFormMirror(proposal.shape, trust, config.environment.trace, config.free_form)
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """All coefficients by outlines and photographs together."""

@@ -217,6 +217,8 @@ class FreeFormOptions:
     2 px, and dilated by 2 px."""
     least_outline_gain: float = 0.02
     """Share of the held-out error by which loose outlines have to lower it."""
+    least_surroundings_share: float = 1e-3
+    """Share of the trace of the surroundings' matrix that is added to its diagonal. Not tuned."""
     poses: Literal["auto", "off", "on"] = "auto"
     """Whether the cameras' poses are unknowns, too: where held-out views gain by it, never, or always."""
     pose_turn_deg: float = 1.0

@@ -25,11 +25,13 @@ from panoless.numeric.robust import bounded_error, robust_weight
 
 @dataclass(frozen=True)
 class Sights:
-    """Where rays of pixels meet a surface and what they mirror: K directions over each pixel, how far these turn over
-    it (rad), and whether it sees the surroundings at a useful angle.
+    """Where rays of pixels meet a surface and what they mirror: the mean mirrored direction, not of unit length, K
+    directions over each pixel in which they look into the map, how far they turn over it (rad), and whether it sees the
+    surroundings at a useful angle.
     """
 
     hits: Hits
+    mirrored: Float[np.ndarray, "P 3"]
     outgoing: Float[np.ndarray, "P K 3"]
     turn: Float[np.ndarray, "P"]
     clear: Bool[np.ndarray, "P"]
@@ -47,7 +49,9 @@ class Sights:
         chosen = np.flatnonzero(clear & occlusion_test)
         middle = rays.directions[chosen] + 2 * facing[chosen, None] * normals[chosen]
         clear[chosen[surface.meets_again(hits.places[chosen], middle)]] = False
-        return cls(hits, outgoing, turn, clear)
+        points = np.broadcast_to(surface.points(hits.places)[:, None], outgoing.shape)
+        looked_up = surface.surroundings.looked_up(points, outgoing)
+        return cls(hits, outgoing.mean(1), looked_up, turn, clear)
 
 
 @dataclass(frozen=True)
@@ -133,9 +137,19 @@ class Solution:
         return self.task.photograph_weight * self.free * trusted
 
     @cached_property
+    def points(self) -> Float[np.ndarray, "P 3"]:
+        """Where the pixels see the surface."""
+        return self.surface.points(self.sights.hits.places)
+
+    @cached_property
+    def mirrored_slopes(self) -> Float[np.ndarray, "P 3 3"]:
+        """Of what is seen, by the mirrored direction."""
+        return self.surface.surroundings.slopes_by_mirrored(self.slopes, self.points, self.sights.mirrored)
+
+    @cached_property
     def photographs(self) -> Rows:
         """Pixels under the map."""
-        rows = mirror_rows(self.sights.hits.derivatives, self.rays.directions, self.slopes)
+        rows = mirror_rows(self.sights.hits.derivatives, self.rays.directions, self.mirrored_slopes)
         weights = self.weights * robust_weight(self.residual, self.task.settings.robust_scale)
         return Rows(self.sights.hits.places, rows, self.residual, weights)
 
@@ -150,7 +164,7 @@ class Solution:
         hits = self.sights.hits
         distance = np.where(hits.met, hits.distance, 0.0) / self.surface.spacing
         rows = pixel_pose_rows(
-            hits.derivatives, self.rays.directions, distance, self.slopes, self.photographs.rows[..., 1:]
+            hits.derivatives, self.rays.directions, distance, self.mirrored_slopes, self.photographs.rows[..., 1:]
         )
         rows[..., 3:] /= self.surface.spacing
         return PoseRows(self.rays.view, rows, self.photographs.weights), self._silhouettes[1]
@@ -276,6 +290,38 @@ class Solution:
         total += self.smoothing * third_differences(change, self.active)
         by_pose = photographs.backward(seen, count) + silhouettes.backward(outlined, count)
         return total * self.active, by_pose + self.pose_prior * moved
+
+    @cached_property
+    def surroundings_rows(self) -> Float[np.ndarray, "P 3 K"]:
+        """What pixels change by with the coefficients of the surroundings."""
+        chosen, rows = (
+            self.photographs.weights > 0,
+            self.surface.surroundings.rows(self.slopes, self.points, self.sights.mirrored),
+        )
+        return rows * chosen[:, None, None]
+
+    def surroundings_gradient(self) -> Float[np.ndarray, "K"]:
+        """Of the cost, by the coefficients of the surroundings."""
+        weighted = self.photographs.weights[:, None] * self._unexplained
+        return np.einsum("pck,pc->k", self.surroundings_rows, weighted)
+
+    def surroundings_matrix(self) -> Float[np.ndarray, "K K"]:
+        """The Gauss–Newton matrix of these, the surface being still."""
+        rows = self.surroundings_rows
+        beyond = np.stack([self.beyond_map(np.ascontiguousarray(column)) for column in np.moveaxis(rows, 2, 0)], 2)
+        return np.einsum("pck,p,pcl->kl", rows, self.photographs.weights, beyond)
+
+    def product_with_surroundings(
+        self, change: Float[np.ndarray, "A B C"], moved: Float[np.ndarray, "K"]
+    ) -> tuple[Float[np.ndarray, "A B C"], Float[np.ndarray, "K"]]:
+        """The Gauss–Newton matrix over coefficients of the surface and of its surroundings times a change of both."""
+        shape = self.surface.shape
+        seen = self.beyond_map(self.photographs.forward(change) + self.surroundings_rows @ moved)
+        total = self.photographs.backward(seen, shape)
+        total += self.constraints.backward(self.constraints.forward(change), shape)
+        total += self.smoothing * third_differences(change, self.active)
+        by_surroundings = np.einsum("pck,pc->k", self.surroundings_rows, self.photographs.weights[:, None] * seen)
+        return total * self.active, by_surroundings
 
     def pose_blocks(self) -> Float[np.ndarray, "V 6 6"]:
         """The matrix's diagonal blocks of the views, but for what the map takes over."""

@@ -88,15 +88,16 @@ def free_form_light(
 
 
 def _followed(surface: LevelSet, sights: Sights, rays: PixelRays) -> Float[np.ndarray, "P 3"]:
-    """Where the rays of pixels that see the object again go in the end; the others' entries mean nothing."""
+    """Where in the map the rays of pixels that see the object again look in the end; the others' mean nothing."""
     directions = rays.directions.copy()
     going = np.flatnonzero(sights.hits.met & ~sights.clear)
     normals, points = sights.hits.normals[going], surface.points(sights.hits.places[going])
+    last = np.zeros_like(directions)
     for _ in range(BOUNCES):
-        directions[going] = reflect(directions[going], normals)
+        directions[going], last[going] = reflect(directions[going], normals), points
         hits = surface.hits(points, directions[going], leaving=True)
         going, normals = going[hits.met], hits.normals[hits.met]
         points = surface.points(hits.places[hits.met])
         if not len(going):
             break
-    return directions
+    return surface.surroundings.looked_up(last, directions)

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from panoless.capture.poses import Similarity
+from panoless.environment.surroundings import FAR, Surroundings
 from panoless.first_surface.mesh import TriangleMesh
 from panoless.kernels.level_set import evaluate, first_hits, nearest_approach
 
@@ -50,6 +51,8 @@ class LevelSet:
     low: Float[np.ndarray, "3"]
     spacing: float
     coefficients: Float[np.ndarray, "A B C"]
+    surroundings: Surroundings = FAR
+    """What it stands in."""
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -116,7 +119,7 @@ class LevelSet:
         """The same function on a grid of so many cells along the longest side of the box."""
         spacing = float(self.extent.max()) / cells
         shape = np.ceil(self.extent / spacing - 1e-9).astype(int) + 3
-        empty = LevelSet(self.low, spacing, np.zeros(shape))
+        empty = replace(self, spacing=spacing, coefficients=np.zeros(shape))
         points = empty.points(empty.nodes().reshape(-1, 3))
         places = np.clip(self.places(points), 0, np.array(self.shape) - 3.0)
         value = evaluate(self.coefficients, places)[:, 0] * (self.spacing / spacing)

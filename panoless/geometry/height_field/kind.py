@@ -1,6 +1,6 @@
 """The height field as a kind of geometry."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -11,6 +11,7 @@ from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.rays import Rays
+from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers
 from panoless.geometry.exact import ExactFamily, ExactGeometry
 from panoless.geometry.height_field.fit import fit_height_field
@@ -33,6 +34,16 @@ class HeightFieldMirror(ExactGeometry):
 
     kind: ClassVar[str] = "height_field"
     height_field: HeightField
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """Those of the plane below it."""
+        return self.height_field.plane.surroundings
+
+    def in_surroundings(self, surroundings: Surroundings) -> "HeightFieldMirror":
+        """The same heights there."""
+        plane = replace(self.height_field.plane, surroundings=surroundings)
+        return replace(self, height_field=replace(self.height_field, plane=plane))
 
     @property
     def num_parameters(self) -> int:

@@ -140,7 +140,7 @@ class VisibleReflections:
     """Of camera depth 1, in the normalized frame."""
     hits: HeightFieldHits
     outgoing: Float[np.ndarray, "P 3"]
-    """Unit, in the normalized frame."""
+    """Where they look in the map: unit, in the normalized frame."""
 
 
 def visible_reflections(
@@ -164,12 +164,13 @@ def visible_reflections(
         kept &= depth_inside(passed, plane.boundary) > options.clear_px * pixel
     chosen = HeightFieldHits(*(values[kept] for values in vars(hits).values()))
     outgoing = outgoing[kept] / np.linalg.norm(outgoing[kept], axis=1, keepdims=True)
+    points = origins[kept] + chosen.distance[:, None] * directions[kept]
     return VisibleReflections(
         pixels[torch.from_numpy(kept).to(pixels.device)],
         origins[kept],
         directions[kept],
         chosen,
-        outgoing @ height_field.frame,
+        plane.surroundings.looked_up(points, outgoing @ height_field.frame),
     )
 
 

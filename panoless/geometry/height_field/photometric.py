@@ -82,7 +82,7 @@ class Photographs:
     ) -> "Photographs":
         """Weights (1 + ‖r‖²/s²)⁻²/σ² and texels of observations at the height field that they were made with."""
         radiance = observed.rays.radiance.cpu().numpy()
-        residual = _look_up(environment, height_field, observed.directions, observed.hits) - radiance
+        residual = _look_up(environment, height_field, observed, observed.hits) - radiance
         weights = robust_weight(residual, robust_scale) / radiance_sigma**2
         texel = _texels(observed.rays.directions, environment.shape[-1])
         return cls(height_field, observed, environment, residual, weights, texel)
@@ -118,7 +118,7 @@ class Photographs:
         residual = self.residual
         if candidate is not self.height_field:
             hits = candidate.hits(self.observed.origins, self.observed.directions)
-            shown = _look_up(self.environment, candidate, self.observed.directions, hits)
+            shown = _look_up(self.environment, candidate, self.observed, hits)
             residual = np.where(hits.met[:, None], shown - self.observed.rays.radiance.cpu().numpy(), 1.0)
         explained = self.gather @ residual
         return float((self.weights @ residual**2).sum() - (explained**2).sum()) / 2
@@ -139,7 +139,7 @@ class Photographs:
 
         def shifted(shift: Float[np.ndarray, "2"]) -> Float[np.ndarray, "P 3"]:
             turned = HeightFieldHits(hits.distance, hits.places, hits.slopes + shift)
-            return _look_up(self.environment, self.height_field, self.observed.directions, turned)
+            return _look_up(self.environment, self.height_field, self.observed, turned)
 
         return np.stack([(shifted(step * axis) - shifted(-step * axis)) / (2 * step) for axis in np.eye(2)])
 
@@ -147,10 +147,15 @@ class Photographs:
 def _look_up(
     environment: Float[Tensor, "6 3 L L"],
     height_field: HeightField,
-    directions: Float[np.ndarray, "P 3"],
+    observed: Observations,
     hits: HeightFieldHits,
 ) -> Float[np.ndarray, "P 3"]:
-    mirrored = reflect(directions, hits.normals @ height_field.frame)
+    mirrored = reflect(observed.directions, hits.normals @ height_field.frame)
+    surroundings = height_field.plane.surroundings
+    if not surroundings.is_far:
+        mirrored /= np.linalg.norm(mirrored, axis=1, keepdims=True)
+        distance = np.where(hits.met, hits.distance, 0.0)[:, None]
+        mirrored = surroundings.looked_up(observed.origins + distance * observed.directions, mirrored)
     return sample_cubemap(environment, torch.from_numpy(mirrored).to(environment)).cpu().numpy().astype(np.float64)
 
 

@@ -1,6 +1,6 @@
 """The plane as a kind of geometry."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -11,8 +11,9 @@ from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.rays import Rays
+from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import SOLID_SURFACE_ALPHA, Geometry, Mesh, Proposal, SurfaceBuffers
-from panoless.geometry.exact import ExactFamily, ExactGeometry, reflections
+from panoless.geometry.exact import ExactFamily, ExactGeometry, looked_up, reflections
 from panoless.geometry.plane.fit import fit_plane
 from panoless.geometry.plane.model import Plane, plane_buffers, unoccluded_share
 from panoless.geometry.surfels.mirror import SurfelMirror
@@ -33,6 +34,15 @@ class PlaneMirror(ExactGeometry):
     """Whether pixels that show the frame in the mirror are left out."""
 
     @property
+    def surroundings(self) -> Surroundings:
+        """Those of the plane."""
+        return self.plane.surroundings
+
+    def in_surroundings(self, surroundings: Surroundings) -> "PlaneMirror":
+        """The same plane there."""
+        return replace(self, plane=replace(self.plane, surroundings=surroundings))
+
+    @property
     def num_parameters(self) -> int:
         """Normal and offset, the boundary's vertices, the frame's height."""
         return self.plane.num_parameters
@@ -49,6 +59,7 @@ class PlaneMirror(ExactGeometry):
         buffers = plane_buffers(self.plane, view.camera)
         pixels = pixels[buffers.alpha.flatten()[pixels] > SOLID_SURFACE_ALPHA]
         directions = reflections(view, buffers.normals_camera, pixels)
+        directions = looked_up(self.surroundings, view.camera, buffers.depth, pixels, directions)
         return Rays(directions, view.radiance.flatten(1)[:, pixels].T.contiguous())
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from panoless.capture.rays import camera_rays, pose_of
+from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import SurfaceBuffers, buffers_from_arrays
 from panoless.kernels.rasterize import RasterCamera
 from panoless.numeric.polygon import projected_coverage
@@ -34,6 +35,8 @@ class Plane:
     """How far the frame stands out in front of the mirror: it hides what the boundary, moved by this along the normal,
     does not let through. Zero: no frame, or a flat one.
     """
+    surroundings: Surroundings = FAR
+    """What it stands in."""
 
     @property
     def num_parameters(self) -> int:

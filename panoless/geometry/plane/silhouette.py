@@ -163,4 +163,5 @@ def apply_plane_step(plane: Plane, step: Float[np.ndarray, "D"]) -> Plane:
     tangent_v = np.cross(normal, tangent_u)
     boundary = np.stack([points @ tangent_u, points @ tangent_v], 1)
     frame_height = max(plane.frame_height + float(step[3]), 0.0)
-    return Plane(normal, float((plane.offset + step[2]) / length), tangent_u, tangent_v, boundary, frame_height)
+    offset = float((plane.offset + step[2]) / length)
+    return Plane(normal, offset, tangent_u, tangent_v, boundary, frame_height, plane.surroundings)

@@ -1,6 +1,6 @@
 """The surface of revolution as a kind of geometry."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,6 +13,7 @@ from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints
 from panoless.environment.rays import Rays
+from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, poses_from_plain, to_plain
 from panoless.geometry.exact import ExactFamily, ExactGeometry
 from panoless.geometry.revolution.deblurred_map import pixel_footprints
@@ -39,6 +40,15 @@ class RevolutionMirror(ExactGeometry):
     occlusion_test: bool = True
     """Whether pixels that see the object again are left out."""
     options: RevolutionOptions = DEFAULTS
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """Those of the surface."""
+        return self.surface.surroundings
+
+    def in_surroundings(self, surroundings: Surroundings) -> "RevolutionMirror":
+        """The same surface there."""
+        return replace(self, surface=replace(self.surface, surroundings=surroundings))
 
     @property
     def num_parameters(self) -> int:

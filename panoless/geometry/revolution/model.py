@@ -4,7 +4,7 @@ Like a plane, it needs no blending: rays are intersected with the surface itself
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +15,7 @@ from torch import Tensor
 from panoless.capture.rays import pixel_rays, pose_of, project, reflect
 from panoless.capture.views import TrainView
 from panoless.environment.rays import Rays
+from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import SurfaceBuffers, buffers_from_arrays
 from panoless.geometry.revolution.options import DEFAULTS, MapOptions
 from panoless.kernels.rasterize import RasterCamera
@@ -64,6 +65,8 @@ class SurfaceOfRevolution:
     axis: Float[np.ndarray, "3"]
     profile: Float[np.ndarray, "N 2"]
     lip: int
+    surroundings: Surroundings = FAR
+    """What it stands in."""
 
     @cached_property
     def frame(self) -> Float[np.ndarray, "3 3"]:
@@ -97,7 +100,7 @@ class SurfaceOfRevolution:
         """The same outside with the axis the other way round, closed flat at both ends."""
         outer = self.profile[1 : self.lip + 1][::-1] * [1.0, -1.0]
         profile = np.concatenate([[[0.0, outer[0, 1]]], outer, [[0.0, outer[-1, 1]]]])
-        return SurfaceOfRevolution(self.origin, -self.axis, profile, len(outer))
+        return replace(self, axis=-self.axis, profile=profile, lip=len(outer))
 
     @cached_property
     def arc_lengths(self) -> Float[np.ndarray, "N"]:
@@ -204,7 +207,7 @@ def _facing(normals: Float[np.ndarray, "P 3"], rays: Float[np.ndarray, "P 3"]) -
 
 @dataclass(frozen=True)
 class ReflectionPaths:
-    """Where mirrored rays go when they meet nothing more. Directions are unit; zero where they never leave."""
+    """Where in the map mirrored rays look that meet nothing more. Directions are unit; zero where they never leave."""
 
     directions: Float[np.ndarray, "P 3"]
     bounces: Int[np.ndarray, "P"]
@@ -231,16 +234,17 @@ def trace_reflections(
     if occlusion_test:
         points = (first.points[met] - surface.origin) @ surface.frame.T
         places = first.side[met], first.along[met]
-        leaving, times = follow(
+        last, leaving, times = follow(
             points, directions[met] @ surface.frame.T, places, surface.profile, surface.angles, RAY_EPSILON, max_bounces
         )
-        final[met], bounces[met] = leaving @ surface.frame, times
+        looked_up = surface.surroundings.looked_up(last @ surface.frame + surface.origin, leaving @ surface.frame)
+        final[met], bounces[met] = np.where(times[:, None] > 0, looked_up, 0.0), times
         return ReflectionPaths(final, bounces, first)
     hits, incoming = first.of(met), directions[met]
     for _ in range(max_bounces):
         outgoing = reflect(incoming, hits.normals)
         outgoing /= np.linalg.norm(outgoing, axis=1, keepdims=True)
-        final[met] = outgoing
+        final[met] = surface.surroundings.looked_up(hits.points, outgoing)
         bounces[met] += 1
         hits = surface.hits(hits.points + RAY_EPSILON * outgoing, outgoing)
         met, incoming, hits = met[hits.met], outgoing[hits.met], hits.of(hits.met)

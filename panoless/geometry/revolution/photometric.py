@@ -121,6 +121,8 @@ class NormalMotion:
     """Which of all rays these are."""
     rays: Float[np.ndarray, "Q 3"]
     normals: Float[np.ndarray, "Q 3"]
+    points: Float[np.ndarray, "Q 3"]
+    """In the normalized frame."""
     along_profile: Float[np.ndarray, "Q 3"]
     along_azimuth: Float[np.ndarray, "Q 3"]
     turn_profile: Float[np.ndarray, "Q 8"]
@@ -135,7 +137,8 @@ class NormalMotion:
     ) -> Float[np.ndarray, "Q 3"]:
         """What rays see of a map by other normals, which need not be unit."""
         normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        return look_up(environment, reflect(self.rays, normals) @ surface.frame)
+        mirrored = reflect(self.rays, normals) @ surface.frame
+        return look_up(environment, surface.surroundings.looked_up(self.points, mirrored))
 
     def radiance_by_parameters(
         self, environment: Float[Tensor, "6 3 L L"], surface: SurfaceOfRevolution
@@ -187,6 +190,7 @@ def normal_motion(
         kept=kept,
         rays=rays,
         normals=normals,
+        points=hits.points[kept],
         along_profile=profile_direction,
         along_azimuth=azimuth,
         turn_profile=np.concatenate([axis_profile, spline_profile], 1),

@@ -134,9 +134,4 @@ def apply_step(
     profile[0] = 0.0, profile[1, 1]
     if surface.profile[-1, 0] < 1e-9:
         profile[-1, 0] = 0.0
-    return SurfaceOfRevolution(
-        surface.origin + shift,
-        axis / np.linalg.norm(axis),
-        profile,
-        surface.lip,
-    )
+    return replace(surface, origin=surface.origin + shift, axis=axis / np.linalg.norm(axis), profile=profile)

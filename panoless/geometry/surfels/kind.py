@@ -22,6 +22,7 @@ class SurfelFamily:
     kind: ClassVar[str] = "surfels"
     geometry: ClassVar[type[Geometry]] = SurfelMirror
     label: ClassVar[str] = "surfels"
+    finds_poses: ClassVar[bool] = True
     refines: ClassVar[str | None] = None
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
@@ -29,7 +30,7 @@ class SurfelFamily:
         return Proposal(None, 0.0, 1.0)
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry | None:
-        """None: they explain any outlines."""
+        """None: they begin on another geometry, or on the first surface."""
         return None
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:

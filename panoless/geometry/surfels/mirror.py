@@ -18,6 +18,7 @@ from panoless.environment.footprints import Footprints
 from panoless.environment.rays import Rays
 from panoless.environment.resolution import finest_resolution
 from panoless.environment.solve import solve_environment
+from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import (
     SOLID_SURFACE_ALPHA,
     Geometry,
@@ -85,6 +86,15 @@ class SurfelMirror:
     def corrected(self, views: Views) -> Views:
         """With their cameras where the geometry had them on which the surfels started."""
         return views if self.poses is None else self.poses.moved(views)
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """Far."""
+        return FAR
+
+    def in_surroundings(self, surroundings: Surroundings) -> "SurfelMirror":
+        """Itself: surfels know only a far world."""
+        return self
 
     def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
         """Those that the geometry it started on calls usable; all solid ones where there is none."""

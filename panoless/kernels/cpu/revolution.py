@@ -41,13 +41,13 @@ def follow(
     angles: Float[np.ndarray, "S 2"],
     epsilon: float,
     max_bounces: int,
-) -> tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, "P"]]:
+) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"], Int[np.ndarray, "P"]]:
     """See `panoless.kernels.revolution`."""
-    final, bounces = np.zeros((len(points), 3)), np.zeros(len(points), dtype=np.int64)
+    (last, final), bounces = np.zeros((2, len(points), 3)), np.zeros(len(points), dtype=np.int64)
     rays = np.ascontiguousarray(points, dtype=np.float64), np.ascontiguousarray(directions, dtype=np.float64)
     profile = np.ascontiguousarray(profile, dtype=np.float64)
-    run_shared(_follow, *rays, places, profile, _tree(profile), angles, epsilon, max_bounces, final, bounces)
-    return final, bounces
+    run_shared(_follow, *rays, places, profile, _tree(profile), angles, epsilon, max_bounces, last, final, bounces)
+    return last, final, bounces
 
 
 @njit(**PLAIN_LOOPS)
@@ -167,7 +167,7 @@ def _trace(counter, origins, directions, profile, tree, distance, side, along):
 
 
 @njit(**PLAIN_LOOPS)
-def _follow(counter, points, directions, places, profile, tree, angles, epsilon, max_bounces, final, bounces):
+def _follow(counter, points, directions, places, profile, tree, angles, epsilon, max_bounces, last, final, bounces):
     """Mirror rays that lie on the surface on, from their first side and the place on it."""
     side, along = places
     stack = np.empty(STACK_SIZE, dtype=np.int64)
@@ -194,5 +194,6 @@ def _follow(counter, points, directions, places, profile, tree, angles, epsilon,
                 if i >= 0:
                     x, y, h = x + t * dx, y + t * dy, h + t * dh
             if i < 0:
+                last[ray, 0], last[ray, 1], last[ray, 2] = x, y, h
                 final[ray, 0], final[ray, 1], final[ray, 2] = dx, dy, dh
                 bounces[ray] = bounce

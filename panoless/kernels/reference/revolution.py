@@ -42,9 +42,9 @@ def follow(
     angles: Float[np.ndarray, "S 2"],
     epsilon: float,
     max_bounces: int,
-) -> tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, "P"]]:
+) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"], Int[np.ndarray, "P"]]:
     """See `panoless.kernels.revolution`."""
-    final, bounces = np.zeros((len(points), 3)), np.zeros(len(points), dtype=np.int64)
+    (last, final), bounces = np.zeros((2, len(points), 3)), np.zeros(len(points), dtype=np.int64)
     (side, along), ray = places, np.arange(len(points))
     for bounce in range(1, max_bounces + 1):
         angle = angles[side, 0] + along * (angles[side, 1] - angles[side, 0])
@@ -55,10 +55,10 @@ def follow(
         starts = points + epsilon * directions
         distance, side, along = first_hits(starts, directions, profile)
         left, on = side < 0, side >= 0
-        final[ray[left]], bounces[ray[left]] = directions[left], bounce
+        last[ray[left]], final[ray[left]], bounces[ray[left]] = starts[left], directions[left], bounce
         points = starts[on] + distance[on, None] * directions[on]
         ray, directions, side, along = ray[on], directions[on], side[on], along[on]
-    return final, bounces
+    return last, final, bounces
 
 
 def envelope(

@@ -11,9 +11,10 @@ from plyfile import PlyData
 
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import raster_camera
+from panoless.environment.surroundings import Surroundings
 from panoless.export.mesh_files import write_ply
 from panoless.export.pictures import crop_to_object
-from panoless.export.prediction import PICTURES, cube_to_latlong, export_prediction
+from panoless.export.prediction import PICTURES, cube_to_latlong, export_prediction, viewpoint_of
 from panoless.export.render import render
 from panoless.geometry.base import Geometry
 from panoless.geometry.height_field.kind import HeightFieldMirror
@@ -411,3 +412,17 @@ def test_the_ply_of_a_height_field_is_its_mesh_in_world_units(tmp_path: Path) ->
     table = read_ply(tmp_path / "h.ply")
     np.testing.assert_allclose((vertices_of(table) - frame.center) / frame.radius, points, atol=1e-7)
     np.testing.assert_array_equal(table["faces"], faces)
+
+
+def test_a_map_of_a_near_room_is_that_of_the_world_s_origin() -> None:
+    """A smooth light on a sphere about the object's center, seen from beside it: within the blur of a coarse map."""
+    around, frame = Surroundings(np.array([0.25])), ObjectFrame(np.array([0.0, -0.6, 0.3]), 2.0)
+    assert viewpoint_of(ObjectFrame(np.array([5.0, 0.0, 0.0]), 2.0)).tolist() == [0, 0, 0]
+    viewpoint = viewpoint_of(frame)
+    cube = cubemap_directions(32).movedim(-1, 1)
+    found = cube_to_latlong(cube, 16, around, viewpoint)
+    directions = latlong_directions(16)
+    half = directions @ viewpoint
+    walls = viewpoint + (np.sqrt(half**2 - viewpoint @ viewpoint + 16) - half)[..., None] * directions
+    np.testing.assert_allclose(found, walls / 4, atol=0.01)
+    assert np.abs(found - cube_to_latlong(cube, 16)).max() > 0.05

@@ -35,6 +35,8 @@ def coarse_config() -> FitConfig:
         config,
         model="auto",
         selection=replace(config.selection, trial_resolution=32),
+        # The traced dome has flat edges, so it looks like a flat mirror in a near room.
+        surroundings=replace(config.surroundings, mode="off"),
         height_field=replace(config.height_field, rounds=config.height_field.rounds[:3]),
         revolution=replace(
             config.revolution,

@@ -1,0 +1,112 @@
+"""How near the surroundings are, by what is mirrored: Gauss–Newton on 1/D with the map eliminated.
+
+Two points of the object that look in one direction see the same of a far world, and shifted parts of a near one. With
+the rows B of `Surroundings.rows` and the residuals e under the map that explains the rays best, each texel takes the
+mean of what its rays ask for, and only the rest moves the walls: k ← k − (Bᵀ W (1 − Π) B)⁻¹ Bᵀ W (1 − Π) e.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from panoless.environment.options import SurroundingsOptions
+from panoless.environment.rays import Rays
+from panoless.environment.solve import solve_environment
+from panoless.environment.surroundings import Surroundings
+from panoless.kernels.cubemap import sample_cubemap
+from panoless.numeric.robust import bounded_error, robust_weight
+from shinypartial.core.sphere import directions_to_cube
+
+
+@dataclass(frozen=True)
+class LeavingRays:
+    """Where rays leave the object, in the normalized frame, in which unit directions, and what was seen along them."""
+
+    points: Float[np.ndarray, "P 3"]
+    directions: Float[np.ndarray, "P 3"]
+    radiance: Float[np.ndarray, "P 3"]
+
+    def rays(self, surroundings: Surroundings) -> Rays:
+        """As rays into the map of those surroundings."""
+        looked_up = surroundings.looked_up(self.points, self.directions)
+        return Rays(torch.from_numpy(looked_up).float(), torch.from_numpy(self.radiance).float())
+
+
+@dataclass(frozen=True)
+class Linearized:
+    """The cost of rays in some surroundings, Σ w ‖(1 − Π) e‖²/2, its gradient and matrix over the coefficients."""
+
+    cost: float
+    gradient: Float[np.ndarray, "K"]
+    matrix: Float[np.ndarray, "K K"]
+
+    @classmethod
+    def at(
+        cls, seen: LeavingRays, surroundings: Surroundings, resolution: int, options: SurroundingsOptions
+    ) -> "Linearized":
+        """With the map solved there."""
+        rays = seen.rays(surroundings)
+        environment = solve_environment([rays], resolution)
+        shown, slopes = light_and_slopes(environment, rays.directions.numpy().astype(np.float64))
+        residual = shown - seen.radiance
+        weights = robust_weight(residual, options.robust_scale)
+        rows = surroundings.rows(slopes, seen.points, seen.directions)
+        face, st = directions_to_cube(rays.directions.numpy().astype(np.float64))
+        column, line = np.clip((st + 1) * resolution / 2, 0, resolution - 1).astype(np.int64).T
+        texels = (face * resolution + line) * resolution + column
+        total = np.bincount(texels, weights, 6 * resolution**2)
+
+        def beyond(values: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
+            means = np.bincount(texels, weights * values, len(total)) / np.maximum(total, 1e-12)
+            return values - means[texels]
+
+        count = rows.shape[2]
+        gradient, matrix = np.zeros(count), np.zeros((count, count))
+        for channel in range(3):
+            left = np.stack([beyond(rows[:, channel, k]) for k in range(count)], 1)
+            gradient += left.T @ (weights * residual[:, channel])
+            matrix += left.T @ (weights[:, None] * left)
+        cost = options.robust_scale**2 * float(bounded_error(residual, options.robust_scale).sum()) / 2
+        return cls(cost, gradient, matrix)
+
+    def step(self, least_share: float) -> Float[np.ndarray, "K"]:
+        """−(H + λ)⁻¹ g, λ that share of the mean diagonal."""
+        least = least_share * float(np.trace(self.matrix)) / len(self.matrix)
+        found: np.ndarray = -np.linalg.solve(self.matrix + least * np.eye(len(self.matrix)), self.gradient)
+        return found
+
+    def pull(self, least_share: float) -> float:
+        """The share of the cost that a step promises: ½ gᵀ(H + λ)⁻¹g over it."""
+        return float(-self.gradient @ self.step(least_share)) / 2 / max(self.cost, 1e-30)
+
+
+def found_surroundings(seen: LeavingRays, start: Surroundings, options: SurroundingsOptions) -> Surroundings:
+    """After a step under a map of each of the resolutions."""
+    for resolution in options.resolutions:
+        step = Linearized.at(seen, start, resolution, options).step(options.least_share)
+        start = start.after(options.stretch * step)
+    return start
+
+
+def light_and_slopes(
+    environment: Float[Tensor, "6 3 L L"], directions: Float[np.ndarray, "P 3"]
+) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3 3"]]:
+    """E(r) of unit directions, and its slopes across r (channel, axis): differences over a texel."""
+    step = np.pi / 4 / environment.shape[-1]
+    least = np.eye(3)[np.abs(directions).argmin(1)]
+    first = np.cross(directions, least)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    tangents = first, np.cross(directions, first)
+
+    def look_up(where: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+        found: np.ndarray = sample_cubemap(environment, torch.from_numpy(where).to(environment)).cpu().numpy()
+        return found.astype(np.float64)
+
+    slopes = np.zeros((len(directions), 3, 3))
+    for tangent in tangents:
+        change = (look_up(directions + step * tangent) - look_up(directions - step * tangent)) / (2 * step)
+        slopes += change[:, :, None] * tangent[:, None]
+    return look_up(directions), slopes

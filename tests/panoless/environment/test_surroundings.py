@@ -1,0 +1,120 @@
+"""In near surroundings rays look where they meet the walls, and what they see there tells how near these are."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from jaxtyping import Float
+
+from panoless.environment.nearness import LeavingRays, Linearized, found_surroundings
+from panoless.environment.options import SurroundingsOptions
+from panoless.environment.surroundings import FAR, Surroundings, harmonics
+from panoless.geometry.base import from_plain, to_plain
+from panoless.geometry.revolution.model import SurfaceOfRevolution
+from tests.support.mirror_revolution import goblet
+from tests.support.synthetic_dataset import environment_radiance
+
+SPHERE = Surroundings(np.array([0.2]))
+WALLS = Surroundings(np.array([0.2, 0.01, -0.02, 0.015, 0.01, -0.005, 0.01, 0.005, 0.02]))
+OPTIONS = SurroundingsOptions()
+
+
+def unit(count: int, seed: int = 0) -> Float[np.ndarray, "P 3"]:
+    vectors = np.random.default_rng(seed).normal(size=(count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def inside(count: int, seed: int = 1) -> Float[np.ndarray, "P 3"]:
+    return unit(count, seed) * np.random.default_rng(seed).uniform(0, 1, (count, 1)) ** (1 / 3)
+
+
+def met_sphere(
+    points: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"], radius: float
+) -> Float[np.ndarray, "P 3"]:
+    """Where rays from within meet a sphere about the origin, by the quadratic equation."""
+    half = (points * directions).sum(1)
+    distance = -half + np.sqrt(half**2 - (points**2).sum(1) + radius**2)
+    return points + distance[:, None] * directions
+
+
+def test_a_sphere_is_looked_up_where_rays_meet_it() -> None:
+    points, directions = inside(500), unit(500)
+    hits = met_sphere(points, directions, 5.0)
+    np.testing.assert_allclose(SPHERE.looked_up(points, directions), hits / 5.0, atol=1e-12)
+    found = SPHERE.inverse_distance_from(points[0], directions)
+    expected = np.linalg.norm(met_sphere(np.tile(points[0], (500, 1)), directions, 5.0) - points[0], axis=1)
+    np.testing.assert_allclose(1 / found, expected, rtol=1e-12)
+
+
+def test_walls_are_looked_up_where_rays_meet_them() -> None:
+    """The wall's point in the direction ω′ lies on the ray, to the error of the fixed point."""
+    points, directions = inside(500), unit(500)
+    found = WALLS.looked_up(points, directions)
+    way = found / WALLS.inverse_distance(found)[:, None] - points
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    np.testing.assert_allclose(way, directions, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-12)
+
+
+def test_a_far_world_is_looked_up_as_it_is_mirrored() -> None:
+    directions = unit(10)
+    assert FAR.looked_up(inside(10), directions) is directions
+    assert Surroundings(np.zeros(4)).is_far
+    assert not FAR.inverse_distance(directions).any()
+
+
+def test_harmonics_have_a_mean_square_of_one() -> None:
+    """And are orthogonal: over many directions, the error of whose means is about 1 %."""
+    basis = harmonics(unit(40_000), 9)
+    np.testing.assert_allclose(basis.T @ basis / len(basis), np.eye(9), atol=0.04)
+
+
+def test_light_changes_with_direction_and_distance_as_rows_say() -> None:
+    """Of linear light a·ω′ differences are derivatives: by mirrored directions for a sphere, by its distance, too."""
+    points, directions, slope = inside(50), unit(50), np.array([0.3, -0.5, 0.7])
+    looked_up = SPHERE.looked_up(points, directions)
+    across = slope - (looked_up @ slope)[:, None] * looked_up
+    turned = np.cross(unit(50, 5), directions)
+    step = 1e-5
+
+    def moved(sign: int) -> Float[np.ndarray, "P 3"]:
+        way = directions + sign * step * turned
+        return SPHERE.looked_up(points, way / np.linalg.norm(way, axis=1, keepdims=True))
+
+    expected = ((moved(1) - moved(-1)) / (2 * step) * across).sum(1)
+    found = (SPHERE.slopes_by_mirrored(across[:, None], points, directions)[:, 0] * turned).sum(1)
+    np.testing.assert_allclose(found, expected, atol=1e-8)
+    nearer, farther = (SPHERE.after(np.array([sign * step])).looked_up(points, directions) for sign in (1, -1))
+    expected = ((nearer - farther) / (2 * step) * across).sum(1)
+    np.testing.assert_allclose(SPHERE.rows(across[:, None], points, directions)[:, 0, 0], expected, atol=1e-8)
+
+
+def seen_in(radius: float | None, count: int = 10_000) -> LeavingRays:
+    """What rays from all over a ball see of the synthetic environment, painted on a sphere or infinitely far."""
+    points, directions = inside(count), unit(count)
+    looked_up = directions if radius is None else met_sphere(points, directions, radius) / radius
+    return LeavingRays(points, directions, environment_radiance(looked_up).clip(0, 1))
+
+
+@pytest.mark.parametrize("radius", [4.0, 12.0])
+def test_the_distance_of_a_sphere_is_found(radius: float) -> None:
+    """Within 5 %: maps of 32 texels a side are still sharpened by further steps."""
+    options = replace(OPTIONS, resolutions=(8, 8, 16, 16, 16, 32, 32, 32))
+    found = found_surroundings(seen_in(radius), FAR.with_degree(0), options)
+    assert found.coefficients[0] == pytest.approx(1 / radius, rel=0.05)
+
+
+def test_only_a_near_world_pulls() -> None:
+    near, far = (
+        Linearized.at(seen_in(radius, 40_000), FAR.with_degree(0), 8, OPTIONS).pull(1e-3) for radius in (8.0, None)
+    )
+    assert far < OPTIONS.least_pull < near
+
+
+def test_a_surface_keeps_its_surroundings_on_disk_and_older_ones_are_far() -> None:
+    content = to_plain(replace(goblet(), surroundings=WALLS))
+    np.testing.assert_array_equal(
+        from_plain(SurfaceOfRevolution, content).surroundings.coefficients, WALLS.coefficients
+    )
+    del content["surroundings"]
+    assert from_plain(SurfaceOfRevolution, content).surroundings.is_far
