@@ -5,6 +5,8 @@ has a wedge in front, with normals up to 35° wrong, and a flat mirror has a roo
 contact with the outlines and replaced by the smoothest surface that continues the parts that are right.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float
 
@@ -26,24 +28,47 @@ def hull_surface(hull: Hull) -> TriangleMesh:
     return TriangleMesh(vertices * hull.voxel - hull.half_side, triangles.astype(np.int64))
 
 
-def complete_surface(hull: Hull, views: Views, options: FirstSurfaceOptions = DEFAULTS) -> TriangleMesh:
-    """The hull where outlines touch the object, continued as a thin plate that stays inside the hull.
+@dataclass(frozen=True)
+class TrustedHull:
+    """A hull's surface, how far each vertex is trusted to be the object's own, and what a pixel is there."""
 
-    The plate is an obstacle problem: vertices that it would lift out of the hull are put on the hull, and held there
-    while it is solved again; what is left outside is moved onto the hull.
-    """
+    hull: Hull
+    surface: TriangleMesh
+    trust: Float[np.ndarray, "V"]
+    pixel: float
+
+
+def trusted_hull(hull: Hull, views: Views, options: FirstSurfaceOptions = DEFAULTS) -> TrustedHull:
+    """By the contact of silhouettes."""
     surface = hull_surface(hull)
     pixel = max(hull.pixel, hull.voxel / options.pixels_a_voxel)
     contact = outline_contact(surface, views, options)
     trust = contact.trust(options.contact_px * pixel, options.least_trust) + options.trust_floor
-    target, inside = surface.vertices, surface.vertices
-    for _ in range(options.obstacle_rounds):
-        plate = thin_plate(surface, trust, options.plate_length_px * pixel, target)
-        inside = _move_inside(hull, plate.vertices, options)
-        out = np.linalg.norm(inside - plate.vertices, axis=1) > options.obstacle_px * hull.pixel
+    return TrustedHull(hull, surface, trust, pixel)
+
+
+def complete_surface(hull: Hull, views: Views, options: FirstSurfaceOptions = DEFAULTS) -> TriangleMesh:
+    """The hull where outlines touch the object, continued as a thin plate that stays inside the hull."""
+    return completed(trusted_hull(hull, views, options), options)
+
+
+def completed(
+    known: TrustedHull, options: FirstSurfaceOptions = DEFAULTS, tension: float = 0.0, rounds: int | None = None
+) -> TriangleMesh:
+    """What is trusted, continued as a thin plate under tension that stays inside the hull.
+
+    The plate is an obstacle problem: vertices that it would lift out of the hull are put on the hull, and held there
+    while it is solved again, `obstacle_rounds` times if `rounds` does not say how often; what is left outside is moved
+    onto the hull.
+    """
+    trust, target, inside = known.trust, known.surface.vertices, known.surface.vertices
+    for _ in range(options.obstacle_rounds if rounds is None else rounds):
+        plate = thin_plate(known.surface, trust, options.plate_length_px * known.pixel, target, tension)
+        inside = _move_inside(known.hull, plate.vertices, options)
+        out = np.linalg.norm(inside - plate.vertices, axis=1) > options.obstacle_px * known.hull.pixel
         trust = np.where(out, np.maximum(trust, options.obstacle_trust), trust)
         target = np.where(out[:, None], inside, target)
-    return TriangleMesh(inside, surface.triangles)
+    return TriangleMesh(inside, known.surface.triangles)
 
 
 def _move_inside(
@@ -62,12 +87,14 @@ def thin_plate(
     trust: Float[np.ndarray, "V"],
     length: float,
     target: Float[np.ndarray, "V 3"] | None = None,
+    tension: float = 0.0,
 ) -> TriangleMesh:
-    """Vertices x that minimize Σ A t ‖x − x₀‖² + ℓ⁴ Σ A ‖Δx‖², the bending of a plate through the trusted ones.
+    """Vertices x that minimize Σ A t ‖x − x₀‖² + ℓ⁴ (Σ A ‖Δx‖² + τ ∫‖∇x‖²), a plate through the trusted ones.
 
     x₀ are the targets, or else the given vertices; A are vertex areas, t the trust, Δ the intrinsic Delaunay Laplacian
     of the given mesh (Sharp & Crane 2020), which slivers don't harm. Where t is 1, details shorter than ℓ are smoothed;
-    where it is 0, the plate continues its surroundings' position and slope.
+    where it is 0, the plate continues its surroundings' position and slope. Tension τ (1/length²) draws parts longer
+    than 1/√τ straight: without any a plate bulges between the edges of a flat face.
     """
     from robust_laplacian import mesh_laplacian
     from scipy import sparse
@@ -77,7 +104,8 @@ def thin_plate(
     areas = np.maximum(mass.diagonal(), LEAST_AREA * mass.diagonal().mean())
     data = areas * trust
     goals = surface.vertices if target is None else target
-    system = length**4 * (laplacian.T @ sparse.diags(1 / areas) @ laplacian) + sparse.diags(data)
+    bending = laplacian.T @ sparse.diags(1 / areas) @ laplacian
+    system = length**4 * (bending + tension * laplacian) + sparse.diags(data)
     # Positive definite: an ordering for symmetric matrices and pivots on the diagonal fill in less.
     factors = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     moved = np.stack([factors.solve(data * column) for column in goals.T.astype(np.float64)], 1)

@@ -26,6 +26,8 @@ from shinypartial.io.progress import Progress
 
 THIRD_DIFFERENCE_DIAGONAL = 3 * 20 + 6 * 3 * 12 + 6 * 8
 """Of DᵀD: Σ over the kinds of how often one counts in |D³c|² times its squared factors."""
+LEAST_BRIGHTNESS = 1e-6
+"""Photographs that are black count as this bright (linear radiance)."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +85,11 @@ def fit_free_form(
             deeper = coarse_stage(solved, hollowed, options.concave.rounds, options)
             stage = better(stage, deeper, options.concave.least_held_out_gain) if held_out else deeper
         if held_out and options.loosen and outline_pull(solved, stage, options) > options.least_outline_pull:
-            stage = better(stage, _with_loose_outlines(solved, stage, options), options.least_outline_gain)
+            settled = _settled(solved, stage, options.loose_steps, options)
+            stage = better(settled, _with_loose_outlines(solved, stage, options), options.least_outline_gain)
         if held_out and options.poses == "auto" and pose_pull(solved, stage, options) > options.least_pose_pull:
-            stage = better(stage, _with_poses(solved, stage, options), options.least_pose_gain)
+            settled = _settled(solved, stage, options.pose_steps, options)
+            stage = better(settled, _with_poses(solved, stage, options), options.least_pose_gain)
         if held_out and options.finer:
             stage = keep_if_better(_stages(solved, stage, options, progress), error, options.least_held_out_gain)
         assert stage.settings is not None, "a fit has rounds"
@@ -101,30 +105,36 @@ def fit_free_form(
 
 def outline_pull(views: Views, stage: FitStage, options: FreeFormOptions) -> float:
     """The share of the cost that a step promises, −½ gᵀΔ, with loose outlines, beyond what it does with tight ones."""
-    assert stage.settings is not None, "a round was taken"
     promises = []
     for outlines in ("loose", "tight"):
-        task = stage_task(views, replace(stage, outlines=outlines), stage.settings, options)
+        task = stage_task(views, replace(stage, outlines=outlines), _freed(stage), options)
         solution = Solution.at(task, stage.surface, stage.trust, stage.environment, 0, stage.poses)
         step = _step(solution, options.damping, still=False).coefficients
         promises.append(-float((solution.gradient() * step).sum()) / 2 / solution.cost(solution))
     return promises[0] - promises[1]
 
 
+def _settled(views: Views, stage: FitStage, steps: int, options: FreeFormOptions) -> FitStage:
+    """A stage after its round was taken again as it is: what more freedom is compared with, after as many steps."""
+    return replace(take_round(views, stage, _freed(stage, steps), options), settings=stage.settings)
+
+
+def _freed(stage: FitStage, steps: int | None = None) -> FreeFormRound:
+    """The round that led to a stage as one in which outlines or poses are free."""
+    assert stage.settings is not None, "a round was taken"
+    return replace(stage.settings, photon_share=0.0, steps=stage.settings.steps if steps is None else steps)
+
+
 def _with_loose_outlines(views: Views, stage: FitStage, options: FreeFormOptions) -> FitStage:
     """A stage after its round was taken again with loose outlines, and then with their offset."""
-    assert stage.settings is not None, "a round was taken"
-    settings = replace(stage.settings, steps=options.loose_steps)
-    found = take_round(views, replace(stage, outlines="loose"), settings, options)
-    settings = replace(stage.settings, steps=options.offset_steps)
-    found = take_round(views, replace(found, outlines="offset"), settings, options)
+    found = take_round(views, replace(stage, outlines="loose"), _freed(stage, options.loose_steps), options)
+    found = take_round(views, replace(found, outlines="offset"), _freed(stage, options.offset_steps), options)
     return replace(found, settings=stage.settings)
 
 
 def pose_pull(views: Views, stage: FitStage, options: FreeFormOptions) -> float:
     """The share of the cost that one step of the poses alone would take: Σ ½ gᵀH⁻¹g of the views, over the cost."""
-    assert stage.settings is not None, "a round was taken"
-    task, poses = stage_task(views, stage, stage.settings, options), Poses.none(len(views.train))
+    task, poses = stage_task(views, stage, _freed(stage), options), Poses.none(len(views.train))
     solution = Solution.at(task, stage.surface, stage.trust, stage.environment, 0, poses)
     gradient = solution.pose_gradient()
     steps = np.linalg.solve(solution.pose_blocks(), gradient[..., None])[..., 0]
@@ -148,9 +158,8 @@ def coarse_stage(
 
 def _with_poses(views: Views, stage: FitStage, options: FreeFormOptions) -> FitStage:
     """A stage after its round was taken again with free poses."""
-    assert stage.settings is not None, "a round was taken"
     free = replace(stage, poses=Poses.none(len(views.train)))
-    found = take_round(views, free, replace(stage.settings, steps=options.pose_steps), options)
+    found = take_round(views, free, _freed(stage, options.pose_steps), options)
     return replace(found, settings=stage.settings)
 
 
@@ -163,13 +172,12 @@ def _joined(solved: Poses, tested: Poses) -> Poses:
 
 def found_poses(solved: Views, views: Views, stage: FitStage, options: FreeFormOptions) -> Poses:
     """Poses of views that took no part, under the surface and the map of those that did, which stay as they are."""
-    assert stage.settings is not None, "a round was taken"
-    known = stage_task(solved, stage, stage.settings, options)
+    known = stage_task(solved, stage, _freed(stage), options)
     environment = Solution.at(
         known, stage.surface, stage.trust, None, options.first_map_rounds, stage.poses
     ).environment
     still = replace(options, map_rounds=0, texel_prior=1e9)
-    task = stage_task(views, stage, replace(stage.settings, steps=options.pose_steps), still)
+    task = stage_task(views, stage, _freed(stage, options.pose_steps), still)
     poses = Poses.none(len(views.train))
     solution = Solution.at(task, stage.surface, stage.trust, environment, 0, poses)
     moved = take_steps(solution, stage.damping, still=True)[0].poses
@@ -238,7 +246,8 @@ def make_task(views: Views, settings: FreeFormRound, options: FreeFormOptions) -
     share = options.counted_rays / options.radiance_sigma**2 / max(len(pixels.inner_px), 1)
     density = options.counted_rays / total * len(outlines.size) / max(len(chosen.size), 1)
     centers = np.array([pose_of(view.camera)[1] for view in views.train])
-    return Task(pixels, chosen, share, density / options.outline_sigma_px**2, settings, options, centers)
+    outlined, brightness = density / options.outline_sigma_px**2, max(float(pixels.radiance.mean()), LEAST_BRIGHTNESS)
+    return Task(pixels, chosen, share, outlined, settings, options, centers, brightness)
 
 
 def _step(solution: Solution, damping: float, still: bool) -> Change:

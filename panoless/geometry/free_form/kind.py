@@ -15,8 +15,6 @@ from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays
 from panoless.environment.resolution import finest_resolution
 from panoless.environment.surroundings import Surroundings
-from panoless.first_surface.completion import complete_surface
-from panoless.first_surface.visual_hull import carve_hull
 from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, poses_from_plain, to_plain
 from panoless.geometry.exact import ExactFamily, ExactGeometry
 from panoless.geometry.free_form.fit import fit_free_form
@@ -24,7 +22,8 @@ from panoless.geometry.free_form.observations import PixelRays, inner_distance_p
 from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions
 from panoless.geometry.free_form.photometric import Sights
 from panoless.geometry.free_form.rendering import free_form_buffers, free_form_light
-from panoless.geometry.free_form.surface import LevelSet, level_set_of
+from panoless.geometry.free_form.start import first_level_set
+from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import Trust, full_trust
 from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.geometry.surfels.placement import surfels_on_mesh
@@ -161,10 +160,7 @@ class FreeFormFamily(ExactFamily):
         """
         if len(views.train) < config.free_form.least_views and not asked:
             return None
-        hull = carve_hull(views, config.surfels.hull_resolution, config.surfels.hull_votes, config.first_surface)
-        first = complete_surface(hull, views, config.first_surface)
-        surface = level_set_of(first, config.free_form.start_cells, config.free_form.margin)
-        return Proposal(surface, 0.0, 1.0)
+        return Proposal(first_level_set(views, config), 0.0, 1.0)
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The first surface, trusted everywhere."""

@@ -68,8 +68,20 @@ class Task:
     options: FreeFormOptions
     centers: Float[np.ndarray, "V 3"]
     """Of the cameras of all views."""
+    brightness: float
+    """Mean over all pixels and channels (linear radiance)."""
     outline_offset_px: float = 0.0
     """By which outlines are outside the surface."""
+
+
+def photon_gain(seen: Float[np.ndarray, "P 3"], brightness: float, share: float) -> Float[np.ndarray, "P"]:
+    """By how much a residual counts more than at the mean brightness m: 1/√(1 − s + s E/m), with E what is seen.
+
+    The share s of the variance grows with the light, as that of photons does and that of what a map gets wrong: so a
+    dark ground under a bright sky has a say, too. E is the prediction, not the pixel, whose own error would weigh it.
+    """
+    gain: Float[np.ndarray, "P"] = 1 / np.sqrt(1 - share + share * np.maximum(seen.mean(1), 0.0) / brightness)
+    return gain
 
 
 @dataclass(frozen=True)
@@ -81,8 +93,11 @@ class Solution:
     sights: Sights
     trust: Trust
     environment: Float[Tensor, "6 3 L L"]
+    gain: Float[np.ndarray, "P"]
     residual: Float[np.ndarray, "P 3"]
+    """What is seen less what was, times the gain."""
     slopes: Float[np.ndarray, "P 3 3"]
+    """Of the residual, by the mirrored direction."""
     texels: Int[np.ndarray, "P"]
     free: Float[np.ndarray, "P"]
     """Weights of the pixels without trust and robust weights."""
@@ -114,15 +129,22 @@ class Solution:
             environment = splatted_map(areas, torch.from_numpy(weights).float(), settings.resolution)
         else:
             environment = start if start.shape[-1] == settings.resolution else resample(start, settings.resolution)
+
+        def gain_of(seen: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
+            return photon_gain(seen, task.brightness, settings.photon_share)
+
         for _ in range(rounds):
-            error = areas.seen(environment) - areas.radiance
-            votes = torch.from_numpy(weights).float() * robust_weight(error, settings.robust_scale)
+            seen = areas.seen(environment)
+            gain = torch.from_numpy(gain_of(seen.double().numpy())).float()
+            agreed = robust_weight((seen - areas.radiance) * gain[:, None], settings.robust_scale)
+            votes = torch.from_numpy(weights).float() * gain**2 * agreed
             environment = sharpened_map(environment, areas, votes, options.map_smoothness, options.map_steps)
         length = settings.resolution + 2
         padded = padded_texels(environment).reshape(6, length, length, 3).double().numpy()
-        seen, slopes, texels = seen_with_slopes(padded, sights.outgoing)
-        residual = seen - task.pixels.radiance
-        return cls(task, surface, sights, trust, environment, residual, slopes, texels, free, poses)
+        light, slopes, texels = seen_with_slopes(padded, sights.outgoing)
+        counted = gain_of(light)
+        residual, slopes = (light - task.pixels.radiance) * counted[:, None], slopes * counted[:, None, None]
+        return cls(task, surface, sights, trust, environment, counted, residual, slopes, texels, free, poses)
 
     @cached_property
     def rays(self) -> PixelRays:
@@ -221,12 +243,13 @@ class Solution:
         return self.smoothing * third_differences(self.surface.coefficients, self.active)
 
     def cost(self, before: "Solution") -> float:
-        """Half the sum of all robust squares, pixels weighed as in a solution `before`.
+        """Half the sum of all robust squares, pixels weighed as in a solution `before`, and with its gain.
 
         A pixel that no longer sees the surroundings costs what it did before, so it is not lost for gain.
         """
         scale = self.task.settings.robust_scale
-        residual = np.where(self.sights.clear[:, None], self.residual, before.residual)
+        residual = self.residual * (before.gain / self.gain)[:, None]
+        residual = np.where(self.sights.clear[:, None], residual, before.residual)
         photographs = scale**2 * float((before.weights * bounded_error(residual, scale)).sum()) / 2
         prior = float((self.bent * self.surface.coefficients).sum()) / 2
         if self.poses is not None:

@@ -150,3 +150,15 @@ def test_the_completed_surface_has_the_normals_of_the_sphere_where_no_outline_to
         cosine = (outward * surface.vertex_normals()).sum(1)[front]
         errors.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
     assert errors[1] < 0.5 * errors[0]
+
+
+def test_a_taut_plate_is_flat_where_a_loose_one_bulges() -> None:
+    """Beside two sloping strips a plate goes on with their slope; under tension it is straight between them."""
+    flat = square(24)
+    x = flat.vertices[:, 0]
+    sloping = replace(flat, vertices=flat.vertices + np.outer(np.minimum(np.minimum(x, 1 - x), 0.25), [0, 0, 1]))
+    trust = ((x < 0.2) | (x > 0.8)).astype(float) + 1e-7
+    middle = np.abs(x - 0.5) < 1e-9
+    loose, taut = (thin_plate(sloping, trust, 0.02, tension=tension).vertices[middle, 2] for tension in (0.0, 1e3))
+    assert loose.min() > 0.25, "It rises above the strips, which end at 0.2."
+    assert taut.max() < 0.2

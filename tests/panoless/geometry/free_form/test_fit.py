@@ -230,7 +230,7 @@ def test_the_gradient_by_poses_is_that_of_finite_differences(solution: Solution)
         sights = Sights.of(solution.surface, side.rays, solution.task.settings.samples, options.least_cosine)
         clear = clear & sights.clear
         seen.append(seen_with_slopes(padded, sights.outgoing)[0])
-    expected = ((seen[0] - seen[1]) / 2)[clear]
+    expected = ((seen[0] - seen[1]) / 2 * moved.gain[:, None])[clear]
     found = photographs.forward(change)[clear & (photographs.weights > 0)]
     expected = expected[(photographs.weights > 0)[clear]]
     assert np.median(np.abs(found - expected)) < 0.01 * np.median(np.abs(expected))
