@@ -20,7 +20,7 @@ from panoless.geometry.free_form.options import FreeFormOptions
 from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.options import PlaneOptions
 from panoless.geometry.revolution.options import RevolutionOptions
-from panoless.selection.options import SelectionOptions
+from panoless.selection.options import CorrectionOptions, SelectionOptions
 from panoless.trust.options import TrustOptions
 from shinypartial.core.errors import InputError
 from shinypartial.io.records import Count, NonNegative, Positive, Share, check_record, read_record, write_record
@@ -201,6 +201,7 @@ class FitConfig:
     poses: Tuned[PoseOptions] = field(default_factory=PoseOptions)
     surroundings: Tuned[SurroundingsOptions] = field(default_factory=SurroundingsOptions)
     selection: Tuned[SelectionOptions] = field(default_factory=SelectionOptions)
+    corrections: Tuned[CorrectionOptions] = field(default_factory=CorrectionOptions)
     trust: Tuned[TrustOptions] = field(default_factory=TrustOptions)
 
 

@@ -8,13 +8,13 @@ slowly. In a joint step each texel takes the weighted mean of what its pixels as
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from panoless.alignment.equations import PoseRows
 from panoless.alignment.options import PoseOptions
+from panoless.environment.cubemap import texels_of
 from panoless.numeric.gauss_newton import jacobian_of_rows
 from panoless.numeric.robust import robust_weight
-from shinypartial.core.sphere import directions_to_cube
 
 TEXELS_AT_ONCE = 4096
 """For memory."""
@@ -56,7 +56,7 @@ def _texel_means(
     residual = np.concatenate([rows.residual for rows in light])
     jacobian = np.concatenate([rows.rows for rows in light])
     weights = robust_weight(residual, options.noise_multiple * sigma) / sigma**2
-    texel = _texels(np.concatenate([rows.directions for rows in light if rows.directions is not None]), resolution)
+    texel = texels_of(np.concatenate([rows.directions for rows in light if rows.directions is not None]), resolution)
     total = np.maximum(np.bincount(texel, weights), 1e-12)
     count = len(total)
     gather = sparse.csr_matrix((weights / np.sqrt(total)[texel], (texel, np.arange(len(texel)))), (count, len(texel)))
@@ -67,10 +67,3 @@ def _texel_means(
         for first in range(0, count, TEXELS_AT_ONCE):
             part = slice(first, first + TEXELS_AT_ONCE)
             yield means[part].toarray(), asked[part]
-
-
-def _texels(directions: Float[np.ndarray, "P 3"], resolution: int) -> Int[np.ndarray, "P"]:
-    """Which of the texels that are seen each direction falls into, numbered from zero."""
-    face, st = directions_to_cube(directions)
-    column, row = np.clip((st + 1) * resolution / 2, 0, resolution - 1).astype(np.int64).T
-    return np.unique((face * resolution + row) * resolution + column, return_inverse=True)[1].reshape(-1)

@@ -36,8 +36,11 @@ def align_proposal(family: Family, views: Views, proposal: Proposal, config: Fit
 
     Outlines hardly tell a shift across the line of sight from a turn, so cameras are only turned.
     """
-    options, outline = config.poses, family.as_proposed(proposal, config)
-    if options.mode == "off" or family.finds_poses or outline is None or not np.isfinite(proposal.silhouette_px):
+    options = config.poses
+    if options.mode == "off" or family.finds_poses or not np.isfinite(proposal.silhouette_px):
+        return None
+    outline = family.as_proposed(proposal, config)
+    if outline is None:
         return None
     alignment = Alignment(views, options)
     if options.mode == "auto" and alignment.left_by_turns(outline) > options.largest_share_left:

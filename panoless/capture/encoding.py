@@ -13,6 +13,8 @@ from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Frame, View
 
 NO_TINT = (1.0, 1.0, 1.0)
+SATURATED = 0.998
+"""Of the largest value, from which a pixel is saturated: below the last step of 8-bit sRGB, 0.991, none is."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,14 @@ class RadianceEncoding:
         if not self.high_dynamic_range:
             return radiance
         return np.where(radiance > 1, 1 + np.log(np.maximum(radiance, 1)), radiance)
+
+    def without_gain(self, encoded: Float[Tensor, "3 *S"], gain: float) -> Float[Tensor, "3 *S"]:
+        """c/(F g), at most 1/F, of a photograph c/F that was exposed g times as long as others, in a low dynamic range.
+
+        What is saturated stays so: it may be any brighter.
+        """
+        largest = self.saturation.to(encoded).reshape(3, *[1] * (encoded.ndim - 1))
+        return torch.where(encoded >= SATURATED * largest, largest, torch.minimum(encoded / gain, largest))
 
     @property
     def saturation(self) -> Float[Tensor, "3"]:

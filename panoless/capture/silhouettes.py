@@ -75,10 +75,10 @@ def mask_distance(view: TrainView) -> MaskDistance:
     return MaskDistance(view.camera, torch.from_numpy(mask_distance_px(mask)).to(view.mask.device), cut_sides(mask))
 
 
-def mask_distance_px(mask: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+def mask_distance_px(mask: Float[np.ndarray, "H W"], band_px: float = EXACT_BAND_PX) -> Float[np.ndarray, "H W"]:
     """Signed distance, positive outside, of pixel centers from the curve where the interpolated mask is one half.
 
-    Beyond `EXACT_BAND_PX` it is counted from pixel centers. A mask of one kind only is half its size away from a curve.
+    Beyond the band it is counted from pixel centers. A mask of one kind only is half its size away from a curve.
     """
     from scipy.ndimage import distance_transform_edt
     from scipy.spatial import cKDTree
@@ -93,7 +93,7 @@ def mask_distance_px(mask: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]
     for line, cut in zip(lines, cut_sides(mask), strict=True):
         line *= cut
     points = np.concatenate([_refined(curve - 1) for curve in find_contours(padded, MASK_LEVEL)])
-    near = np.nonzero(np.abs(distance) < EXACT_BAND_PX)
+    near = np.nonzero(np.abs(distance) < band_px)
     to_curve, _ = cKDTree(points).query(np.stack(near, 1).astype(np.float64))
     distance[near] = np.where(inside[near], -to_curve, to_curve)
     return distance.astype(np.float32)

@@ -1,11 +1,13 @@
 """The cubemap: its start, look-up and resampling."""
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.config import EnvironmentConfig
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap
+from shinypartial.core.sphere import directions_to_cube
 
 INITIAL_LOGIT = 5.0
 
@@ -31,3 +33,10 @@ def resample(environment: Float[Tensor, "6 C L L"], resolution: int) -> Float[Te
     directions = cubemap_directions(resolution, dtype=environment.dtype, device=environment.device).reshape(-1, 3)
     sampled = sample_cubemap(environment, directions)
     return sampled.view(6, resolution, resolution, -1).permute(0, 3, 1, 2).contiguous()
+
+
+def texels_of(directions: Float[np.ndarray, "P 3"], resolution: int) -> Int[np.ndarray, "P"]:
+    """Which of the texels that are seen each direction falls into, numbered from zero."""
+    face, st = directions_to_cube(directions)
+    column, row = np.clip((st + 1) * resolution / 2, 0, resolution - 1).astype(np.int64).T
+    return np.unique((face * resolution + row) * resolution + column, return_inverse=True)[1].reshape(-1)

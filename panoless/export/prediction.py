@@ -146,7 +146,8 @@ def export_snapshots(dataset: Dataset, run: Path, config: FitConfig, prediction:
             loaded = load_views(
                 dataset, config.crop_margin_px, config.downscale, encoding_of(config), config.least_object_px
             )
-            views = usable_views(loaded, state.geometry)
+            corrected = state.selection.corrections.applied(loaded, encoding_of(config))
+            views = usable_views(corrected, state.geometry)
         with timed(state.seconds, "solve environment"):
             complete(state, views, config)
         acquire_prediction(target)
@@ -243,6 +244,8 @@ def _model_selection(selection: Selection) -> ModelSelection:
             reason=each.reason,
             alternative_error=each.surfels_error,
             camera_turn_deg=each.camera_turn_deg,
+            mask_offset_px=each.corrections.mask_offset_px or None,
+            exposure_stops=each.corrections.exposure_stops,
         )
         for each in selection.candidates
     )

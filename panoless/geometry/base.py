@@ -208,8 +208,8 @@ class Family(Protocol):
         ...
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry | None:
-        """A proposal as a geometry, which tells where the cameras are and how near the surroundings; None for a kind
-        that has none to show.
+        """A proposal as a geometry, which tells what is wrong with cameras and masks and how near the surroundings are;
+        None for a kind that has none to show.
         """
         ...
 

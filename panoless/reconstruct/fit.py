@@ -58,8 +58,9 @@ def fit(
                 state = begin(views, config)
             state.seconds, state.device = seconds, device_name(device)
             print(f"Model: {state.selection.sentence}", file=sys.stderr)
-        state, photographs = state.to(device), views
-        views = usable_views(views, state.geometry)
+        state = state.to(device)
+        photographs = state.selection.corrections.applied(views, encoding_of(config))
+        views = usable_views(photographs, state.geometry)
         if state.training is not None:
             family, recorder = FAMILIES[state.geometry.kind], Recorder(folder, schedule, state)
             state.geometry, state.training = family.train(views, state.geometry, state.training, config, recorder)
@@ -75,15 +76,18 @@ def fit(
 def begin(views: Views, config: FitConfig) -> FitState:
     """The state before the first step: the geometry that the scene needs, and what its training starts from."""
     geometry, selection = choose_geometry(views, config)
-    training = FAMILIES[geometry.kind].begin(usable_views(views, geometry), geometry, config)
+    corrected = selection.corrections.applied(views, encoding_of(config))
+    training = FAMILIES[geometry.kind].begin(usable_views(corrected, geometry), geometry, config)
     return FitState(geometry, views.object_frame, selection, training)
 
 
 def assess(state: FitState, views: Views, config: FitConfig) -> Trust:
-    """How far a finished state is to be trusted, by the views that it was fitted to."""
+    """How far a finished state is to be trusted, by the corrected views that it was fitted to."""
     assert state.visibility is not None
+    corrections = state.selection.corrections
     with torch.no_grad():
-        return judge(gather_evidence(views, state.geometry, state.visibility, config.trust), config.trust)
+        found = gather_evidence(views, state.geometry, state.visibility, config.trust, corrections)
+    return judge(found, config.trust)
 
 
 def find_device(name: str) -> torch.device:

@@ -13,7 +13,7 @@ from panoless.capture.object_frame import ObjectFrame
 from panoless.config import FitConfig, config_from_dict
 from panoless.geometry.base import Geometry, Training, from_plain, to_plain
 from panoless.geometry.registry import FAMILIES
-from panoless.selection.candidates import Selection, selection_from_plain
+from panoless.selection.candidates import Selection, selection_from_plain, selection_to_plain
 from shinypartial.core.errors import InputError
 from shinypartial.io.files import PARTIAL_PREFIX, atomic_write, read_json, remove_partial_files, write_json
 from shinypartial.prediction.format import Trust
@@ -65,13 +65,10 @@ def save_state(folder: Path, state: FitState) -> None:
         "kind": state.geometry.kind,
         "geometry": state.geometry.state_dict(),
         "frame": to_plain(state.frame),
-        "selection": asdict(state.selection),
+        "selection": selection_to_plain(state.selection),
         "training": None if state.training is None else vars(state.training),
         "verdict": None if state.verdict is None else asdict(state.verdict),
     }
-    content["selection"]["candidates"] = [
-        {**each, "verdict": str(each["verdict"])} for each in content["selection"]["candidates"]
-    ]
     # Through memory, because torch reports a full disk as an internal error of its own.
     buffer = io.BytesIO()
     torch.save(content, buffer)

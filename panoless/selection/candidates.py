@@ -4,6 +4,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
+
+from panoless.capture.corrections import NO_CORRECTIONS, Corrections
+from panoless.geometry.base import from_plain, to_plain
 
 
 class Verdict(StrEnum):
@@ -32,6 +36,8 @@ class Candidate:
     """The same of surfels that started on the candidate."""
     camera_turn_deg: float | None = None
     """By how much the cameras were turned, median over views; None where they were believed."""
+    corrections: Corrections = NO_CORRECTIONS
+    """Of the photographs that it was fitted to."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +46,11 @@ class Selection:
 
     chosen: str
     candidates: tuple[Candidate, ...]
+
+    @property
+    def corrections(self) -> Corrections:
+        """Of the photographs, under the kind that was chosen."""
+        return self.candidates[-1].corrections if self.candidates else NO_CORRECTIONS
 
     @property
     def sentence(self) -> str:
@@ -63,13 +74,20 @@ def describe(candidate: Candidate) -> str:
         parts.append(text)
     if candidate.camera_turn_deg is not None:
         parts.append(f"cameras turned by {candidate.camera_turn_deg:.2g}°")
+    if candidate.corrections.mask_offset_px:
+        parts.append(f"masks moved outward by {candidate.corrections.mask_offset_px:.2g} px")
+    if candidate.corrections.exposure_stops is not None:
+        parts.append(f"exposures differ by {candidate.corrections.exposure_stops:.2g} stops")
     return "; ".join(parts)
 
 
-def selection_from_plain(chosen: str, candidates: Sequence[dict[str, object]]) -> Selection:
-    """The selection from dictionaries, as checkpoints hold it."""
-    listed = tuple(
-        Candidate(**{**each, "verdict": Verdict(str(each["verdict"]))})  # type: ignore[arg-type]
-        for each in candidates
-    )
-    return Selection(chosen, listed)
+def selection_to_plain(selection: Selection) -> dict[str, Any]:
+    """The selection as dictionaries, as checkpoints hold it."""
+    candidates = [{**to_plain(each), "verdict": str(each.verdict)} for each in selection.candidates]
+    return {"chosen": selection.chosen, "candidates": candidates}
+
+
+def selection_from_plain(chosen: str, candidates: Sequence[dict[str, Any]]) -> Selection:
+    """The selection from `selection_to_plain`."""
+    listed = (from_plain(Candidate, {**each, "verdict": Verdict(each["verdict"])}) for each in candidates)
+    return Selection(chosen, tuple(listed))

@@ -8,11 +8,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from panoless.alignment.search import PosedProposal, align_proposal, fit_with_poses
+from panoless.capture.corrections import NO_CORRECTIONS, Corrections
+from panoless.capture.encoding import encoding_of
 from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.geometry.base import Family, Geometry, Proposal, usable_views
 from panoless.geometry.registry import FAMILIES
 from panoless.selection.candidates import Candidate, Selection, Verdict
+from panoless.selection.corrections import Fitted, is_refined, with_corrections
 from panoless.selection.held_out import Trial, held_out_errors, is_clearly_lower, train_briefly
 from panoless.selection.surroundings import explains_clearly_more, proposed_surroundings
 
@@ -31,7 +34,9 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
     if config.model != ANY:
         return _fit_asked(views, config)
     *families, last = FAMILIES.values()
-    table, refused, starts = list[Candidate](), dict[str, list[PosedProposal]](), list[tuple[float, Geometry]]()
+    encoding = encoding_of(config)
+    table, refused = list[Candidate](), dict[str, list[PosedProposal]]()
+    starts = list[tuple[float, Geometry, Corrections]]()
     for family in families:
         source = _source(family)
         proposals = refused.get(source.kind, []) if family.refines else _proposals(source, views, config, asked=False)
@@ -40,14 +45,18 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
         refused[family.kind] = [each for each in proposals if _is_near(each, config)]
         if geometry is not None:
             if candidate.verdict == Verdict.CHOSEN:
-                if not _bends_rather(family, geometry, proposals, views, config):
+                if not _bends_rather(
+                    family, geometry, proposals, candidate.corrections.applied(views, encoding), config
+                ):
                     return geometry, Selection(family.kind, tuple(table))
                 table[-1] = replace(candidate, verdict=Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason=BENT)
                 continue
-            starts.append((candidate.surfels_error or 0.0, geometry))
-    start = min(reversed(starts), key=lambda each: each[0])[1] if starts else None
-    geometry = last.fit(views, Proposal(start, 0.0, 1.0), config)
-    table.append(Candidate(last.kind, Verdict.CHOSEN, "no simpler kind explains the views"))
+            starts.append((candidate.surfels_error or 0.0, geometry, candidate.corrections))
+    nothing: tuple[float, Geometry | None, Corrections] = (0.0, None, NO_CORRECTIONS)
+    _, start, corrections = min(reversed(starts), key=lambda each: each[0]) if starts else nothing
+    geometry = last.fit(corrections.applied(views, encoding), Proposal(start, 0.0, 1.0), config)
+    reason = "no simpler kind explains the views"
+    table.append(Candidate(last.kind, Verdict.CHOSEN, reason, corrections=corrections))
     return geometry, Selection(last.kind, tuple(table))
 
 
@@ -71,14 +80,28 @@ def _is_near(start: PosedProposal, config: FitConfig) -> bool:
     return proposal.silhouette_px <= options.largest_silhouette_px and proposal.overlap >= options.least_overlap
 
 
-def _first_fit(
-    family: Family, proposals: Sequence[PosedProposal], views: Views, config: FitConfig
-) -> tuple[Geometry, PosedProposal] | None:
+def _best_fit(
+    family: Family, proposals: Sequence[PosedProposal], views: Views, config: FitConfig, *, asked: bool
+) -> Fitted | None:
+    """The fit of a kind, to photographs that are corrected where held-out views ask for it."""
+    source = _source(family)
+
+    def near(proposals: Sequence[PosedProposal]) -> list[PosedProposal]:
+        return list(proposals) if asked else [each for each in proposals if _is_near(each, config)]
+
+    def refit(corrected: Views) -> Fitted | None:
+        return _first_fit(family, near(_proposals(source, corrected, config, asked=False)), corrected, config)
+
+    first = _first_fit(family, near(proposals), views, config)
+    return None if first is None else with_corrections(source, views, first, config, refit)
+
+
+def _first_fit(family: Family, proposals: Sequence[PosedProposal], views: Views, config: FitConfig) -> Fitted | None:
     """The geometry from the first of the proposals whose poses held-out views ask for, or that believes them."""
     for start in proposals:
         geometry = _fit_around(family, views, start, config)
         if geometry is not None:
-            return geometry, start
+            return Fitted(geometry, start)
     return None
 
 
@@ -109,17 +132,23 @@ def _bends_rather(
     for other in FAMILIES.values():
         near = [each for each in proposals if _is_near(each, config)]
         fitted = _first_fit(other, near, views, far) if other.refines == family.kind else None
-        if fitted is not None and explains_clearly_more(views, fitted[0], geometry, config):
+        if fitted is not None and explains_clearly_more(views, fitted.geometry, geometry, config):
             return True
     return False
 
 
 def _fit_asked(views: Views, config: FitConfig) -> tuple[Geometry, Selection]:
     family = FAMILIES[config.model]
-    fitted = _first_fit(family, _proposals(_source(family), views, config, asked=True), views, config)
+    fitted = _best_fit(family, _proposals(_source(family), views, config, asked=True), views, config, asked=True)
     assert fitted is not None, "a kind that is asked for is proposed"
-    asked_for = Candidate(family.kind, Verdict.CHOSEN, "asked for", camera_turn_deg=_turn_deg(fitted[0]))
-    return fitted[0], Selection(family.kind, (asked_for,))
+    asked_for = Candidate(
+        family.kind,
+        Verdict.CHOSEN,
+        "asked for",
+        camera_turn_deg=_turn_deg(fitted.geometry),
+        corrections=fitted.corrections,
+    )
+    return fitted.geometry, Selection(family.kind, (asked_for,))
 
 
 def _examine(
@@ -129,23 +158,24 @@ def _examine(
     if not proposals:
         reason = "silhouettes determine none" if family.refines is None else f"no {family.refines} to start from"
         return Candidate(family.kind, Verdict.NOT_PROPOSED, reason), None
-    fitted = _first_fit(family, [each for each in proposals if _is_near(each, config)], views, config)
+    fitted = _best_fit(family, proposals, views, config, asked=False)
     if fitted is None:
         said = proposals[-1].proposal
         evidence = said.silhouette_px, said.overlap
         return Candidate(family.kind, Verdict.REFUSED_BY_SILHOUETTES, "misses the silhouettes", *evidence), None
-    geometry, start = fitted
+    geometry, start = fitted.geometry, fitted.start
     options, evidence = config.selection, (start.proposal.silhouette_px, start.proposal.overlap)
+    views = fitted.corrections.applied(views, encoding_of(config))
     own, free = held_out_errors(usable_views(views, geometry), config, geometry, trial)
-    refinable = family.kind in {other.refines for other in FAMILIES.values()}
-    unexplained = refinable and float(own.mean()) > options.largest_error
+    unexplained = is_refined(family.kind) and float(own.mean()) > options.largest_error
     better = is_clearly_lower(free, own, options)
     verdict = Verdict.REFUSED_BY_HELD_OUT_VIEWS if unexplained or better else Verdict.CHOSEN
     reason = "surfels are clearly better" if better else "surfels are no better"
     if unexplained and not better:
         reason = "leaves too much unexplained"
     errors = float(own.mean()), float(free.mean())
-    return Candidate(family.kind, verdict, reason, *evidence, *errors, _turn_deg(geometry)), geometry
+    figures = (*evidence, *errors, _turn_deg(geometry), fitted.corrections)
+    return Candidate(family.kind, verdict, reason, *figures), geometry
 
 
 def _turn_deg(geometry: Geometry) -> float | None:

@@ -46,19 +46,30 @@ def held_out_errors(
 
     Every fifth view is held out from the map and from the surfels. Both arrays are [0] where there are too few views.
     """
+    parts = held_out_parts(views)
+    if parts is None:
+        return np.zeros(1), np.zeros(1)
+    start = candidate.to_surfels(config).to(views.train[0].mask.device)
+    geometries, options = (candidate, trial(parts[0], config, start)), config.selection
+    own, free = (
+        unexplained(*parts, geometry, options.compared_rays, options.trial_resolution) for geometry in geometries
+    )
+    return own, free
+
+
+def held_out_parts(views: Views) -> tuple[Views, Views] | None:
+    """Four fifths of the views, and the others; None where there are too few."""
     kept, held_out = split_held_out(views.train)
     if not kept or not held_out:
-        return np.zeros(1), np.zeros(1)
-    solved, tested = replace(views, train=tuple(kept)), replace(views, train=tuple(held_out))
-    start = candidate.to_surfels(config).to(views.train[0].mask.device)
-    options, errors = config.selection, []
-    for geometry in (candidate, trial(solved, config, start)):
-        with torch.no_grad():
-            rays = list(observe_views(solved, geometry, options.compared_rays))
-            environment = solve_environment(rays, options.trial_resolution)
-            batches = observe_views(tested, geometry, options.compared_rays)
-            errors.append(np.array([prediction_error([batch], environment) for batch in batches]))
-    return errors[0], errors[1]
+        return None
+    return replace(views, train=tuple(kept)), replace(views, train=tuple(held_out))
+
+
+def unexplained(solved: Views, tested: Views, geometry: Geometry, rays: int, resolution: int) -> Float[np.ndarray, "V"]:
+    """Mean ‖e‖²/(‖e‖² + s²) of each tested view under the map of the solved ones, at most `rays` of either."""
+    with torch.no_grad():
+        environment = solve_environment(list(observe_views(solved, geometry, rays)), resolution)
+        return np.array([prediction_error([batch], environment) for batch in observe_views(tested, geometry, rays)])
 
 
 def is_clearly_lower(errors: Float[np.ndarray, "V"], of: Float[np.ndarray, "V"], options: SelectionOptions) -> bool:

@@ -1,8 +1,9 @@
 """What decides which kind of geometry a scene needs."""
 
 from dataclasses import dataclass
+from typing import Literal
 
-from shinypartial.io.records import Count, NonNegative, Share
+from shinypartial.io.records import Count, NonNegative, Positive, Share
 
 
 @dataclass(frozen=True)
@@ -26,3 +27,44 @@ class SelectionOptions:
     """Share of the configured iterations that surfels are given for the comparison."""
     trial_resolution: Count = 128
     """Texels along a face side of the compared maps."""
+
+
+@dataclass(frozen=True)
+class CorrectionOptions:
+    """What is taken back of the photographs' own errors, where held-out views gain by it.
+
+    "Development scenes" are vase, mirror and sculpture at 160 px; "not tuned" is what only has to be large or small
+    enough.
+    """
+
+    masks: Literal["auto", "off"] = "auto"
+    """Whether all masks may be too small or too large by one distance."""
+    exposure: Literal["auto", "off"] = "auto"
+    """Whether views may be exposed differently; never in a high dynamic range."""
+    largest_error: Share = 0.08
+    """Held-out error of a fit above which masks are doubted. Right ones of development scenes leave at most 0.06, masks
+    that are off by 2 px at least 0.10."""
+    step_px: Positive = 2.0
+    """Offsets are tried this far apart. Not tuned."""
+    largest_px: Positive = 6.0
+    """Largest offset that is tried."""
+    doubted_pull_px: Positive = 0.05
+    """Masks are doubted, too, where outlines of a fit give way to photographs by more. On sculpture it is 0.08 and 0.11
+    with masks that are off by 1 px."""
+    pull_share: Positive = 0.17
+    """Share of a small offset by which outlines of a fit give way. On vase 0.18, on sculpture 0.16."""
+    least_pull_px: Positive = 0.02
+    """The fit to moved masks stays where its outlines lie nearer to them than this. With masks that are right it is
+    0.001 on vase and 0.004 on sculpture."""
+    examined_rays: Count = 100_000
+    """Most rays from which a fit is told to leave much unexplained, and gains to explain more. Not tuned."""
+    rays: Count = 60_000
+    """Most rays of a map, and most that test it, in these trials. Not tuned."""
+    resolution: Count = 64
+    """Texels along a face side of that map. Not tuned."""
+    least_stops: NonNegative = 0.02
+    """Standard deviation of the gains, in stops, below which they are not believed."""
+    rounds: Count = 4
+    """Rounds of map and gains. Not tuned."""
+    gain_scale: Positive = 0.1
+    """Residual (linear radiance) beyond which a pixel loses its vote on the gain of its view. Not tuned."""

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from panoless.capture.corrections import NO_CORRECTIONS, Corrections
 from panoless.capture.masks import MASK_LEVEL
 from panoless.capture.silhouettes import mask_distance_px
 from panoless.capture.views import TrainView, Views, at_most_pixels, split_held_out
@@ -63,12 +64,22 @@ class Evidence:
     """By which the fit turned the cameras: median over views."""
     views: int
     """Number of views in which the object is seen."""
+    mask_offset_px: float = 0.0
+    """By which the fit moved the outlines of all masks outward."""
+    exposure_stops: float = 0.0
+    """Standard deviation of the exposures of the views, as far as the fit took it back."""
 
 
 def gather_evidence(
-    views: Views, geometry: Geometry, visibility: Float[Tensor, "6 L L"], options: TrustOptions
+    views: Views,
+    geometry: Geometry,
+    visibility: Float[Tensor, "6 L L"],
+    options: TrustOptions,
+    corrections: Corrections = NO_CORRECTIONS,
 ) -> Evidence:
-    """The evidence for a geometry in the views that it was fitted to; `visibility` is that of the final map."""
+    """The evidence for a geometry in the views that it was fitted to, after their corrections, which are told along;
+    `visibility` is that of the final map.
+    """
     found = usable_views(views, geometry).train
     used = [index for index, view in enumerate(views.train) if len(view.solid)]
     seen = tuple(views.train[index] for index in used)
@@ -91,6 +102,8 @@ def gather_evidence(
         coverage=float((visibility > 0).float().mean()),
         camera_turn_deg=_median(np.array([_turn_deg(*each) for each in zip(seen, usable.train, strict=True)])),
         views=len(seen),
+        mask_offset_px=corrections.mask_offset_px,
+        exposure_stops=corrections.exposure_stops or 0.0,
     )
 
 

@@ -47,7 +47,9 @@ class Candidate:
     `silhouette_px` is its distance from the silhouettes, `overlap` the intersection over union with the masks,
     `held_out_error` its error on views that were left out of the fit, `alternative_error` that of the
     freer kind that it was compared with, `camera_turn_deg` by how much it turned the cameras in the median, where their
-    poses were unknowns. `verdict` is a word such as "chosen" or "rejected", `reason` says why.
+    poses were unknowns, `mask_offset_px` by how much it moved the outlines of all masks outward, and `exposure_stops`
+    the standard deviation of the views' exposures where it found them. `verdict` is a word such as "chosen" or
+    "rejected", `reason` says why.
     """
 
     kind: Text
@@ -58,6 +60,8 @@ class Candidate:
     reason: str = ""
     alternative_error: NonNegative | None = None
     camera_turn_deg: NonNegative | None = None
+    mask_offset_px: float | None = None
+    exposure_stops: NonNegative | None = None
 
 
 @dataclass(frozen=True)

@@ -52,23 +52,22 @@ def silhouette_rows(
     outline_weight: float,
     miss_weight: float,
     options: FreeFormOptions,
-    outline_offset_px: float = 0.0,
 ) -> tuple[Rows, PoseRows]:
     """Outlines, along whose rays the least φ should be zero, and pixels on the object that miss it, for which it
     should be negative.
 
-    The residual is φ/(‖∇φ‖ a t) where φ is least, in pixels, with a the pixel's angle and t the distance; of outlines,
-    less their offset. It changes with the pose of its view, too.
+    The residual is φ/(‖∇φ‖ a t) where φ is least, in pixels, with a the pixel's angle and t the distance. It
+    changes with the pose of its view, too.
     """
     parts = []
-    for rays, weight, scale, offset in (
-        (outlines, outline_weight, options.outline_scale_px, outline_offset_px),
-        (missed, miss_weight * options.miss_weight, options.miss_scale_px, 0.0),
+    for rays, weight, scale in (
+        (outlines, outline_weight, options.outline_scale_px),
+        (missed, miss_weight * options.miss_weight, options.miss_scale_px),
     ):
         near = surface.nearest(rays.origins, rays.directions)
         slope = np.maximum(np.linalg.norm(near.derivatives[:, 1:4], axis=1), LEAST_SLOPE)
         by_value = near.met / (slope * rays.size * np.where(near.met, near.distance / surface.spacing, 1.0))
-        residual = near.derivatives[:, 0] * by_value - offset * near.met
+        residual = near.derivatives[:, 0] * by_value
         weights = weight * near.met * robust_weight(residual, scale)
         cost = weight * scale**2 * float((near.met * bounded_error(residual, scale)).sum())
         distance = np.where(near.met, near.distance, 0.0) / surface.spacing

@@ -16,7 +16,7 @@ from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
 from panoless.geometry.free_form.concave import concave_start
 from panoless.geometry.free_form.observations import outline_rays, solid_pixels
-from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions, FreeFormRound, Outlines
+from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.photometric import Sights, Solution, Task
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import Trust, full_trust
@@ -42,10 +42,6 @@ class FitStage:
     """Of the round that led here."""
     poses: Poses | None = None
     """Of the views, where they are unknowns."""
-    outlines: Outlines = "tight"
-    """How far these are believed."""
-    outline_offset_px: float = 0.0
-    """How far outside the surface these lie all in all."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +60,7 @@ def fit_free_form(
     poses of the views where these are unknowns.
 
     Rounds are taken with four fifths of the views as long as the others gain by them, and the last of those once more
-    with all. After the rounds that are always taken, outlines are loosened and poses set free, if held-out views gain.
+    with all. After the rounds that are always taken, poses are set free, if held-out views gain.
     """
     kept, held_out = split_held_out(views.train)
     solved = replace(views, train=tuple(kept)) if kept and held_out else views
@@ -84,16 +80,13 @@ def fit_free_form(
         if hollowed is not None:
             deeper = coarse_stage(solved, hollowed, options.concave.rounds, options)
             stage = better(stage, deeper, options.concave.least_held_out_gain) if held_out else deeper
-        if held_out and options.loosen and outline_pull(solved, stage, options) > options.least_outline_pull:
-            settled = _settled(solved, stage, options.loose_steps, options)
-            stage = better(settled, _with_loose_outlines(solved, stage, options), options.least_outline_gain)
         if held_out and options.poses == "auto" and pose_pull(solved, stage, options) > options.least_pose_pull:
             settled = _settled(solved, stage, options.pose_steps, options)
             stage = better(settled, _with_poses(solved, stage, options), options.least_pose_gain)
         if held_out and options.finer:
             stage = keep_if_better(_stages(solved, stage, options, progress), error, options.least_held_out_gain)
         assert stage.settings is not None, "a fit has rounds"
-        last = stage.settings
+        last = stage.settings if stage.poses is None else _freed(stage)
         skipped = progress.total - progress.done - last.steps
         if skipped > 0:
             progress.advance(steps=skipped)
@@ -101,17 +94,6 @@ def fit_free_form(
             stage = replace(stage, poses=_joined(stage.poses, found_poses(solved, tested, stage, options)))
         stage = take_round(views, stage, last, options, progress)
     return stage.surface, stage.trust, stage.poses
-
-
-def outline_pull(views: Views, stage: FitStage, options: FreeFormOptions) -> float:
-    """The share of the cost that a step promises, −½ gᵀΔ, with loose outlines, beyond what it does with tight ones."""
-    promises = []
-    for outlines in ("loose", "tight"):
-        task = stage_task(views, replace(stage, outlines=outlines), _freed(stage), options)
-        solution = Solution.at(task, stage.surface, stage.trust, stage.environment, 0, stage.poses)
-        step = _step(solution, options.damping, still=False).coefficients
-        promises.append(-float((solution.gradient() * step).sum()) / 2 / solution.cost(solution))
-    return promises[0] - promises[1]
 
 
 def _settled(views: Views, stage: FitStage, steps: int, options: FreeFormOptions) -> FitStage:
@@ -125,16 +107,9 @@ def _freed(stage: FitStage, steps: int | None = None) -> FreeFormRound:
     return replace(stage.settings, photon_share=0.0, steps=stage.settings.steps if steps is None else steps)
 
 
-def _with_loose_outlines(views: Views, stage: FitStage, options: FreeFormOptions) -> FitStage:
-    """A stage after its round was taken again with loose outlines, and then with their offset."""
-    found = take_round(views, replace(stage, outlines="loose"), _freed(stage, options.loose_steps), options)
-    found = take_round(views, replace(found, outlines="offset"), _freed(stage, options.offset_steps), options)
-    return replace(found, settings=stage.settings)
-
-
 def pose_pull(views: Views, stage: FitStage, options: FreeFormOptions) -> float:
     """The share of the cost that one step of the poses alone would take: Σ ½ gᵀH⁻¹g of the views, over the cost."""
-    task, poses = stage_task(views, stage, _freed(stage), options), Poses.none(len(views.train))
+    task, poses = make_task(views, _freed(stage), options), Poses.none(len(views.train))
     solution = Solution.at(task, stage.surface, stage.trust, stage.environment, 0, poses)
     gradient = solution.pose_gradient()
     steps = np.linalg.solve(solution.pose_blocks(), gradient[..., None])[..., 0]
@@ -172,12 +147,12 @@ def _joined(solved: Poses, tested: Poses) -> Poses:
 
 def found_poses(solved: Views, views: Views, stage: FitStage, options: FreeFormOptions) -> Poses:
     """Poses of views that took no part, under the surface and the map of those that did, which stay as they are."""
-    known = stage_task(solved, stage, _freed(stage), options)
+    known = make_task(solved, _freed(stage), options)
     environment = Solution.at(
         known, stage.surface, stage.trust, None, options.first_map_rounds, stage.poses
     ).environment
     still = replace(options, map_rounds=0, texel_prior=1e9)
-    task = stage_task(views, stage, _freed(stage, options.pose_steps), still)
+    task = make_task(views, _freed(stage, options.pose_steps), still)
     poses = Poses.none(len(views.train))
     solution = Solution.at(task, stage.surface, stage.trust, environment, 0, poses)
     moved = take_steps(solution, stage.damping, still=True)[0].poses
@@ -200,7 +175,7 @@ def take_round(
     surface = stage.surface
     if stage.settings is None or stage.settings.cells != settings.cells:
         surface = surface.resampled(settings.cells)
-    task = stage_task(views, stage, settings, options)
+    task = make_task(views, settings, options)
     solution = Solution.at(task, surface, stage.trust, stage.environment, options.first_map_rounds, stage.poses)
     solution, damping = take_steps(solution, stage.damping, progress)
     found = replace(
@@ -211,7 +186,6 @@ def take_round(
         damping=damping,
         settings=settings,
         poses=solution.poses,
-        outline_offset_px=solution.task.outline_offset_px,
     )
     if solution.poses is None:
         return found
@@ -219,23 +193,6 @@ def take_round(
     common = solution.poses.common(task.centers, solution.pose_prior)
     poses = solution.poses.without(common, task.centers)
     return replace(found, surface=solution.surface.taken_back(common), poses=poses, environment=None)
-
-
-def stage_task(views: Views, stage: FitStage, settings: FreeFormRound, options: FreeFormOptions) -> Task:
-    """The task of a round that follows a stage."""
-    task = make_task(views, settings, believing(options, stage.outlines))
-    return replace(task, outline_offset_px=stage.outline_offset_px)
-
-
-def believing(options: FreeFormOptions, outlines: Outlines) -> FreeFormOptions:
-    """The options with outlines that are believed so far."""
-    if outlines == "tight":
-        return options
-    sigma, scale = {
-        "loose": (options.loose_sigma_px, options.loose_scale_px),
-        "offset": (options.offset_sigma_px, options.outline_scale_px),
-    }[outlines]
-    return replace(options, outline_sigma_px=sigma, outline_scale_px=scale, offset_outlines=True)
 
 
 def make_task(views: Views, settings: FreeFormRound, options: FreeFormOptions) -> Task:
@@ -265,7 +222,7 @@ def take_steps(
     options, settings = solution.task.options, solution.task.settings
     for index in range(settings.steps):
         if not still:
-            solution = replace(solution, trust=measured_trust(solution), task=remeasured_task(solution))
+            solution = replace(solution, trust=measured_trust(solution))
         before = solution
         solution, length = _accepted(solution, _step(solution, damping, still))
         factor = options.damping_less if length == 1 else options.damping_more
@@ -277,12 +234,6 @@ def take_steps(
         if last:
             break
     return solution, damping
-
-
-def remeasured_task(solution: Solution) -> Task:
-    """The task of a solution, with the offset of its outlines where these are loose."""
-    task = solution.task
-    return replace(task, outline_offset_px=solution.outline_offset_px) if task.options.offset_outlines else task
 
 
 def _accepted(solution: Solution, step: Change) -> tuple[Solution, float]:

@@ -140,7 +140,9 @@ class FreeFormMirror(ExactGeometry):
     @classmethod
     def from_state_dict(cls, content: dict[str, Any]) -> "FreeFormMirror":
         """The geometry that `state_dict` was taken from."""
-        options = read_record(FreeFormOptions, content["options"], "the options of a free-form surface")
+        options = read_record(
+            FreeFormOptions, content["options"], "the options of a free-form surface", allow_unknown=True
+        )
         surface, trust = from_plain(LevelSet, content["surface"]), from_plain(Trust, content["trust"])
         return cls(surface, trust, content["occlusion_test"], options, poses=poses_from_plain(content))
 

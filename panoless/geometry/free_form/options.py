@@ -3,9 +3,6 @@
 from dataclasses import dataclass
 from typing import Literal
 
-Outlines = Literal["tight", "loose", "offset"]
-"""Outlines are where the surface ends; somewhere near; or that, but for one distance in all views."""
-
 
 @dataclass(frozen=True)
 class FreeFormRound:
@@ -207,26 +204,6 @@ class FreeFormOptions:
     """They end when the preconditioned residual's energy has fallen to this share."""
     largest_step_cells: float = 1.0
     """No coefficient moves by more in one step."""
-    loosen: bool = True
-    """Whether outlines give way to photographs where held-out views gain by it."""
-    offset_outlines: bool = False
-    """Whether outlines may be off by one distance in all views, as those of masks that were grown or shrunk are."""
-    loose_sigma_px: float = 1.5
-    """Standard deviation of an outline's point where they do…"""
-    loose_scale_px: float = 6.0
-    """…and their robust scale."""
-    loose_steps: int = 16
-    """Most steps of the round in which they are loosened."""
-    offset_sigma_px: float = 0.3
-    """Standard deviation of an outline's point once its offset is found."""
-    offset_steps: int = 6
-    """Most steps of the round in which it is."""
-    least_outline_pull: float = 0.015
-    """Share of the cost that a step has to promise with loose outlines, beyond that with tight ones, for them to be
-    tried. On sculpture at 160 px it is 0.004 with true masks, and 0.10, 0.07 and 0.05 with masks eroded by 1 px, by
-    2 px, and dilated by 2 px."""
-    least_outline_gain: float = 0.02
-    """Share of the held-out error by which loose outlines have to lower it."""
     least_surroundings_share: float = 1e-3
     """Share of the trace of the surroundings' matrix that is added to its diagonal. Not tuned."""
     poses: Literal["auto", "off", "on"] = "auto"

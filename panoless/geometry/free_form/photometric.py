@@ -70,8 +70,6 @@ class Task:
     """Of the cameras of all views."""
     brightness: float
     """Mean over all pixels and channels (linear radiance)."""
-    outline_offset_px: float = 0.0
-    """By which outlines are outside the surface."""
 
 
 def photon_gain(seen: Float[np.ndarray, "P 3"], brightness: float, share: float) -> Float[np.ndarray, "P"]:
@@ -198,19 +196,11 @@ class Solution:
         return silhouette_rows(
             self.surface,
             outlines if self.poses is None else outlines.moved(self.poses),
-            self.rays.chosen(~self.sights.hits.met & (self.task.pixels.inner_px > self.task.outline_offset_px)),
+            self.rays.chosen(~self.sights.hits.met),
             self.task.outline_weight,
             self.task.photograph_weight * sigmas**2,
             self.task.options,
-            self.task.outline_offset_px,
         )
-
-    @property
-    def outline_offset_px(self) -> float:
-        """The median by which outlines are outside the surface now."""
-        rows, count = self.silhouettes, len(self.task.outlines.size)
-        residual, used = rows.residual[:count, 0], rows.weights[:count] > 0
-        return self.task.outline_offset_px + (float(np.median(residual[used])) if used.any() else 0.0)
 
     @cached_property
     def gauge(self) -> Rows:

@@ -87,6 +87,8 @@ class ProfileSplines:
         inner = (side >= self.surface.lip).astype(np.int64)
         start, knot = np.array(self.starts)[inner], np.array(self.knots)[inner]
         pieces = np.array(self.counts)[inner] - 3
+        # A part without length has only its beginning.
+        knot = np.where(knot > 0, knot, 1.0)
         first, basis = cubic_bsplines_at(np.clip((place - start) / knot, 0, pieces), pieces + 3, 1)
         values = basis[1] / knot[:, None] if derivative else basis[0]
         values = np.where((side == 0)[:, None], 0.0, values)

@@ -18,6 +18,7 @@ from panoless.reconstruct.fit import begin, fit
 from panoless.reconstruct.snapshots import SnapshotSchedule
 from panoless.selection.candidates import Selection, Verdict
 from panoless.selection.choose import choose_geometry
+from panoless.selection.options import CorrectionOptions
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
 from tests.support.mirror_plane import NORMAL, RECTANGLE, arc, make_plane_dataset, plane_of, reflecting_views
@@ -37,6 +38,7 @@ def coarse_config() -> FitConfig:
         selection=replace(config.selection, trial_resolution=32),
         # The traced dome has flat edges, so it looks like a flat mirror in a near room.
         surroundings=replace(config.surroundings, mode="off"),
+        corrections=CorrectionOptions(masks="off", exposure="off"),
         height_field=replace(config.height_field, rounds=config.height_field.rounds[:3]),
         revolution=replace(
             config.revolution,
@@ -48,7 +50,6 @@ def coarse_config() -> FitConfig:
             rounds=tuple(replace(each, rays=5000) for each in config.free_form.rounds[:2]),
             finer=(),
             concave=replace(config.free_form.concave, search=False),
-            loosen=False,
         ),
     )
 

@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
 from panoless.capture.poses import Poses, Similarity
 from panoless.capture.rays import pose_of
-from panoless.capture.views import TrainView, Views, views_of
+from panoless.capture.views import Views, views_of
 from panoless.config import FitConfig, SurfelConfig
-from panoless.geometry.free_form.fit import believing, fit_free_form, gauss_newton_step, make_task
+from panoless.geometry.free_form.fit import fit_free_form, gauss_newton_step, make_task
 from panoless.geometry.free_form.kind import FreeFormFamily, FreeFormMirror
 from panoless.geometry.free_form.options import DEFAULTS, ConcaveOptions, FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.photometric import Sights, Solution
@@ -20,7 +19,6 @@ from panoless.geometry.free_form.trust import full_trust
 from panoless.kernels.level_set import seen_with_slopes
 from panoless.kernels.reference.cubemap import padded_texels
 from shinypartial.core.camera import Camera
-from shinypartial.dataset.perturb.masks import eroded
 from tests.support.mirror_body import (
     Body,
     body_views,
@@ -39,7 +37,6 @@ OPTIONS = FreeFormOptions(
     rounds=tuple(replace(settings, rays=settings.rays // 2) for settings in DEFAULTS.rounds),
     finer=(),
     concave=ConcaveOptions(search=False),
-    loosen=False,
     poses="off",
 )
 COARSE = replace(OPTIONS.rounds[0], rays=5_000)
@@ -285,47 +282,3 @@ def test_cameras_that_are_turned_by_half_a_degree_are_found() -> None:
     errors = normal_errors_deg(surface, body, views, cameras_around(7, 60)[1::2])
     assert np.median(errors) < 0.2
     assert fit_free_form(views, proposal.shape, options)[2] is None
-
-
-def shrunk_views(body: Body, count: int, resolution: int, by_px: float) -> Views:
-    """With masks that lose their outermost pixels, and the photographs with them."""
-    photographs = []
-    for camera in cameras_around(count, resolution):
-        whole = photograph(body, camera)
-        mask = torch.from_numpy(eroded(whole.mask.numpy(), by_px).astype(np.float32))
-        kept = mask / whole.mask.clamp(min=1e-6)
-        photographs.append(replace(whole, mask=mask, radiance=whole.radiance * kept.clamp(max=1)))
-    return views_of(photographs)
-
-
-def test_the_offset_of_outlines_is_what_masks_lost() -> None:
-    """Under the surface of whole masks, those that are shrunk by 2 px end that much inside."""
-    options = replace(OPTIONS, rounds=OPTIONS.rounds[:1])
-    whole, shrunk = body_views(sphere(), 10, 40), shrunk_views(sphere(), 10, 40, 2.0)
-    surface = fitted(whole, options)
-    for views, offset in ((whole, 0.0), (replace(whole, train=_with_masks(whole, shrunk)), -2.0)):
-        task = make_task(views, options.rounds[0], believing(options, "loose"))
-        solution = Solution.at(task, surface, full_trust(surface, 10), None, 1)
-        assert solution.outline_offset_px == pytest.approx(offset, abs=0.15)
-        again = replace(solution, task=replace(task, outline_offset_px=offset))
-        assert again.outline_offset_px == pytest.approx(offset, abs=0.15)
-        assert abs(np.median(again.silhouettes.residual[: len(task.outlines.size)])) < 0.15
-
-
-def _with_masks(views: Views, other: Views) -> tuple[TrainView, ...]:
-    """Cameras of views in their own frame, with masks cropped alike."""
-    return tuple(replace(view, mask=given.mask) for view, given in zip(views.train, other.train, strict=True))
-
-
-@pytest.mark.slow
-def test_photographs_outweigh_masks_that_are_shrunk() -> None:
-    """By two of about fifty pixels across: held-out views ask for it, and the surface is nearly as good."""
-    body = wavy_ball()
-    views, shrunk = body_views(body, 25, 80), shrunk_views(body, 25, 80, 2.0)
-    cameras = cameras_around(7, 60)[1::2]
-    tight, loose = (
-        normal_errors_deg(fitted(shrunk, replace(OPTIONS, loosen=loosen)), body, shrunk, cameras)
-        for loosen in (False, True)
-    )
-    assert np.median(loose) < 0.4 < np.median(tight) / 2
-    assert np.median(normal_errors_deg(fitted(views), body, views, cameras)) < 0.2

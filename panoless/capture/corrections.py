@@ -1,0 +1,62 @@
+"""What photographs get wrong, taken back: masks too small or too large in all views, and exposures that differ.
+
+Views are corrected when they are loaded; what a fit found about them is a few numbers.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from panoless.capture.encoding import RadianceEncoding
+from panoless.capture.masks import MASK_LEVEL
+from panoless.capture.silhouettes import mask_distance_px
+from panoless.capture.views import TrainView, Views
+from shinypartial.core.conventions import SOLID_ALPHA
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """How photographs are corrected before anything else is made of them."""
+
+    mask_offset_px: float = 0.0
+    """How far the outlines of all masks are moved outward, in pixels of the views."""
+    gains: Float[np.ndarray, "V"] | None = None
+    """Exposure of each view against the mean; None: they are all alike."""
+
+    @property
+    def exposure_stops(self) -> float | None:
+        """Standard deviation of log₂ of the gains; None where they are all alike."""
+        return None if self.gains is None else float(np.log2(self.gains).std())
+
+    def applied(self, views: Views, encoding: RadianceEncoding) -> Views:
+        """The views as they would be without these errors; themselves where there are none."""
+        train = views.train
+        if self.mask_offset_px:
+            train = tuple(with_outline_moved(view, self.mask_offset_px) for view in train)
+        if self.gains is not None:
+            exposed = zip(train, self.gains.tolist(), strict=True)
+            train = tuple(replace(view, radiance=encoding.without_gain(view.radiance, gain)) for view, gain in exposed)
+        return replace(views, train=train)
+
+
+NO_CORRECTIONS = Corrections()
+
+
+def with_outline_moved(view: TrainView, offset_px: float) -> TrainView:
+    """A view with the contour of its mask moved outward by so many pixels, inward where that is negative.
+
+    With the signed distance d from the contour, positive outside, alpha is clip(½ − d + δ, 0, 1): the share of a pixel
+    inside a straight outline. What the photograph did not show whole does not become solid. A mask of which nothing
+    would be left stays.
+    """
+    alpha = view.mask.cpu().numpy()
+    distance = mask_distance_px(alpha, band_px=abs(offset_px) + 1.5)
+    moved = np.clip(0.5 - distance + offset_px, 0, 1)
+    moved = np.where(alpha > SOLID_ALPHA, moved, np.minimum(moved, SOLID_ALPHA)).astype(np.float32)
+    if not (moved >= MASK_LEVEL).any():
+        return view
+    mask: Tensor = torch.from_numpy(moved).to(view.mask.device)
+    return replace(view, mask=mask, solid=torch.nonzero(mask.flatten() > SOLID_ALPHA)[:, 0])

@@ -1,0 +1,110 @@
+"""What photographs get wrong is found by what a geometry explains of them, and only where there is something wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from panoless.alignment.search import PosedProposal
+from panoless.capture.corrections import NO_CORRECTIONS, Corrections
+from panoless.capture.views import Views
+from panoless.geometry.base import Proposal
+from panoless.geometry.plane.kind import PlaneMirror
+from panoless.geometry.registry import FAMILIES
+from panoless.presets import PRESETS
+from panoless.selection.candidates import Candidate, Selection, Verdict, selection_from_plain, selection_to_plain
+from panoless.selection.choose import choose_geometry
+from panoless.selection.corrections import Fitted, outline_pull_px, with_corrections
+from panoless.selection.options import CorrectionOptions
+from shinypartial.core.conventions import SOLID_ALPHA
+from shinypartial.dataset.perturb.masks import dilated, eroded
+from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
+from tests.support.mirror_revolution import around, goblet, revolution_views
+
+CONFIG = replace(PRESETS["fast"], corrections=CorrectionOptions(rays=10_000, resolution=32))
+GAINS = np.exp2(np.random.default_rng(4).normal(size=10) * 0.3)
+GAINS /= np.exp(np.log(GAINS).mean())
+MIRROR = PlaneMirror(plane_of(RECTANGLE))
+
+
+def unsaturated() -> Views:
+    """A flat mirror in half of the light."""
+    views = reflecting_views(MIRROR.plane, arc(10, 15.0, size=64))
+    return replace(views, train=tuple(replace(view, radiance=view.radiance / 2) for view in views.train))
+
+
+def exposed(views: Views) -> Views:
+    seen = zip(views.train, GAINS.tolist(), strict=True)
+    return replace(
+        views, train=tuple(replace(view, radiance=(view.radiance * gain).clamp(max=1)) for view, gain in seen)
+    )
+
+
+def as_found(views: Views) -> Fitted:
+    proposal = Proposal(MIRROR.plane, 0.0, 1.0)
+    return with_corrections(
+        FAMILIES["plane"],
+        views,
+        Fitted(MIRROR, PosedProposal(proposal)),
+        CONFIG,
+        lambda _: Fitted(MIRROR, PosedProposal(proposal)),
+    )
+
+
+def test_exposures_are_corrected_only_where_they_differ() -> None:
+    """Then the corrected views are those that were exposed alike."""
+    views = unsaturated()
+    assert as_found(views).corrections is NO_CORRECTIONS
+    corrections = as_found(exposed(views)).corrections
+    assert corrections.mask_offset_px == 0
+    assert corrections.exposure_stops == pytest.approx(np.log2(GAINS).std(), rel=0.05)
+    # Few pixels of a view share a texel with other views.
+    assert corrections.gains == pytest.approx(GAINS, rel=0.04)
+
+
+def with_masks(views: Views, offset_px: float) -> Views:
+    """Masks that another program has moved, and black where there is no object."""
+    train = []
+    for view in views.train:
+        alpha = view.mask.double().numpy()
+        mask = torch.from_numpy(eroded(alpha, -offset_px) if offset_px < 0 else dilated(alpha, offset_px)).float()
+        radiance = view.radiance * (mask / view.mask.clamp(min=1e-3)).clamp(max=1)
+        solid = torch.nonzero(mask.flatten() > SOLID_ALPHA)[:, 0]
+        train.append(replace(view, mask=mask, radiance=radiance, solid=solid))
+    return replace(views, train=tuple(train))
+
+
+@pytest.mark.parametrize("offset_px", [-1.5, 0.0, 1.0])
+def test_outlines_of_the_true_surface_lie_where_masks_were(offset_px: float) -> None:
+    """Outside of masks that were shrunk, inside of those that were grown."""
+    views = with_masks(reflecting_views(MIRROR.plane, arc(6, size=64)), offset_px)
+    assert outline_pull_px(views, MIRROR) == pytest.approx(-offset_px, abs=0.1)
+
+
+@pytest.mark.slow
+def test_masks_with_a_black_rim_are_shrunk() -> None:
+    """A plane is the same for any offset, so only the rim tells; to a pixel, which is what it matters to."""
+    views = with_masks(reflecting_views(MIRROR.plane, arc(10, size=64)), 2.0)
+    _, corrected = choose_geometry(views, replace(PRESETS["fast"], model="plane"))
+    assert corrected.corrections.mask_offset_px == pytest.approx(-2.0, abs=1.0)
+    assert "masks moved outward by -" in corrected.sentence
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("offset_px", [-2.0, 1.5])
+def test_a_surface_of_revolution_is_found_under_wrong_masks(offset_px: float) -> None:
+    """Whose profile is what outlines tell: its offset comes back to a third of a pixel, of 80 px."""
+    views = with_masks(revolution_views(goblet(), around(12, 80)), offset_px)
+    _, selection = choose_geometry(views, replace(PRESETS["fast"], model="revolution"))
+    assert selection.corrections.mask_offset_px == pytest.approx(-offset_px, abs=0.33)
+
+
+def test_corrections_survive_a_checkpoint_and_earlier_ones_have_none() -> None:
+    candidate = Candidate("plane", Verdict.CHOSEN, "asked for", corrections=Corrections(-1.5, GAINS))
+    plain = selection_to_plain(Selection("plane", (candidate,)))
+    again = selection_from_plain(**plain).corrections
+    assert again.mask_offset_px == -1.5
+    assert again.gains == pytest.approx(GAINS)
+    del plain["candidates"][0]["corrections"]
+    assert selection_from_plain(**plain).corrections == NO_CORRECTIONS
