@@ -20,6 +20,9 @@ from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.robust import bounded_error, robust_weight
 from shinypartial.core.sphere import directions_to_cube
 
+LEAST_CURVATURE = 1e-12
+"""Added at least to the diagonal of the matrix over the coefficients, so that it can be inverted."""
+
 
 @dataclass(frozen=True)
 class LeavingRays:
@@ -73,8 +76,8 @@ class Linearized:
         return cls(cost, gradient, matrix)
 
     def step(self, least_share: float) -> Float[np.ndarray, "K"]:
-        """−(H + λ)⁻¹ g, λ that share of the mean diagonal."""
-        least = least_share * float(np.trace(self.matrix)) / len(self.matrix)
+        """−(H + λ)⁻¹ g, λ that share of the mean diagonal; none where no ray tells anything."""
+        least = max(least_share * float(np.trace(self.matrix)) / len(self.matrix), LEAST_CURVATURE)
         found: np.ndarray = -np.linalg.solve(self.matrix + least * np.eye(len(self.matrix)), self.gradient)
         return found
 
