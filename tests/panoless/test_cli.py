@@ -142,9 +142,9 @@ def test_a_model_that_is_asked_for_is_taken_and_saved(
     """Even a plane for a sphere, which is a surface of revolution; the run says so, and so does the prediction."""
     monkeypatch.chdir(tmp_path)
     tables = {"plane": "plane.ply", "revolution": "revolution.ply", "surfels": "surfels.ply"}
-    coarse = ["--config.environment.resolution", "16", "--config.environment.solve-resolution", "16"]
+    coarse = ["--config.environment.resolution", "16", "--config.environment.solve-resolution", "16", *AS_TOLD]
     for model in tables:
-        assert main(["fit", str(many_views_dataset.root), *TINY, *coarse, *AS_TOLD, "--model", model, "--output", model]) == 0
+        assert main(["fit", str(many_views_dataset.root), *TINY, *coarse, "--model", model, "--output", model]) == 0
         assert f"Model: {model} (asked for" in capsys.readouterr().err
         content = json.loads((tmp_path / model / "prediction.json").read_text())
         assert content["config"]["model"] == model

@@ -23,9 +23,9 @@ class FreeFormRound:
     steps: int
     """Most steps."""
     photon_share: float = 0.75
-    """Share of a pixel's variance that grows with what it shows, in [0, 1). It takes normals from 0.43° to 0.22° on a
-    block over a dark ground, and from 0.11° to 0.09° on sculpture. Where outlines or poses are set free it is 0: on
-    sculpture with cameras turned by 0.5° it would take the mean from 3.8° to 6.4°."""
+    """Share of a pixel's variance that grows with what it shows, in [0, 1). It takes normals from 0.43° to 0.22° on
+    chrome-block over a ground that is darkened to a tenth, and from 0.11° to 0.09° on sculpture. Where poses are set free
+    it is 0: on sculpture with cameras turned by 0.5° it would take the mean from 3.8° to 6.4°."""
 
 
 @dataclass(frozen=True)
@@ -117,9 +117,9 @@ class FreeFormOptions:
     start_cells: int = 40
     """Cells along the longest side of the first surface, before its first round. Not tuned."""
     start_tensions: tuple[float, ...] = (0.0, 10.0, 30.0, 100.0)
-    """Tensions τ of the plate between contacts (1/length² in the normalized frame) among which the pixels choose. On a
-    block with rounded edges the normals of the start are wrong by 9.6°, 6.5°, 3.0° and 4.5° in the median, and by 9.1°,
-    3.8°, 0.5° and 1.1° after the first rounds; sculpture ends within 0.02° from all of them."""
+    """Tensions τ of the plate between contacts (1/length² in the normalized frame) among which the pixels choose. On
+    chrome-block over a dark ground the normals of the start are wrong by 9.6°, 6.5°, 3.0° and 4.5° in the median, and
+    by 9.1°, 3.8°, 0.5° and 1.1° after the first rounds; sculpture ends within 0.02° from all of them."""
     start_pixels: int = 8000
     """Of all views, by which they choose."""
     margin: float = 0.175
@@ -216,8 +216,8 @@ class FreeFormOptions:
     """Most steps of the round in which poses are set free, and of finding those of other views."""
     least_pose_pull: float = 0.03
     """Share of the cost that a step of the poses alone has to promise for them to be tried. On sculpture at 160 px it
-    is 0.003 with true cameras, and 0.20, 0.22 and 0.07 with cameras turned by 0.1°, 0.25° and 0.5°; on a block with
-    rounded edges 0.02 with true ones."""
+    is 0.003 with true cameras, and 0.20, 0.22 and 0.07 with cameras turned by 0.1°, 0.25° and 0.5°; on
+    chrome-block over a dark ground 0.02 with true ones."""
     least_pose_gain: float = 0.05
     """Share of the held-out error by which poses as unknowns have to lower it. On the block true cameras gain 0.04 when
     they are set free, and normals lose 0.3°."""
