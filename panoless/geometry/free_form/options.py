@@ -24,8 +24,8 @@ class FreeFormRound:
     """Most steps."""
     photon_share: float = 0.75
     """Share of a pixel's variance that grows with what it shows, in [0, 1). It takes normals from 0.43° to 0.22° on
-    chrome-block over a ground that is darkened to a tenth, and from 0.11° to 0.09° on sculpture. Where poses are set free
-    it is 0: on sculpture with cameras turned by 0.5° it would take the mean from 3.8° to 6.4°."""
+    chrome-block over a ground darkened to a tenth, and from 0.11° to 0.09° on sculpture. Where poses are free it
+    is 0: on sculpture with cameras turned by 0.5° it would take the mean from 3.8° to 6.4°."""
 
 
 @dataclass(frozen=True)
