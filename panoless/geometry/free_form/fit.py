@@ -102,7 +102,7 @@ def _settled(views: Views, stage: FitStage, steps: int, options: FreeFormOptions
 
 
 def _freed(stage: FitStage, steps: int | None = None) -> FreeFormRound:
-    """The round that led to a stage as one in which outlines or poses are free."""
+    """The round that led to a stage as one in which poses are free."""
     assert stage.settings is not None, "a round was taken"
     return replace(stage.settings, photon_share=0.0, steps=stage.settings.steps if steps is None else steps)
 

@@ -14,7 +14,7 @@ def first_level_set(views: Views, config: FitConfig) -> LevelSet:
     """The first surface as a level set, under the tension of the plate that leaves least disagreement.
 
     Outlines don't tell how far an object bulges between their contacts: a stone does, a box does not. Candidates are
-    solved without the hull as an obstacle, which hardly changes their disagreement.
+    solved once, without what holds them inside the hull, which hardly changes their disagreement.
     """
     options, first = config.free_form, config.first_surface
     known = trusted_hull(
