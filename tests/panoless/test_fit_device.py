@@ -70,6 +70,8 @@ def test_the_same_kind_is_chosen_on_another_device(tmp_path: Path, definition_on
         model="auto",
         selection=replace(config.selection, trial_resolution=8),
         height_field=replace(config.height_field, cells=8, rounds=rounds),
+        corrections=replace(config.corrections, masks="off", exposure="off"),
+        surroundings=replace(config.surroundings, mode="off"),
     )
     here = fit(dataset, config, tmp_path / "here")
     with second_device() as device:
