@@ -166,6 +166,7 @@ def test_the_matrix_is_symmetric_and_positive(solution: Solution) -> None:
     assert (one * solution.product(one)).sum() > 0
 
 
+@pytest.mark.slow
 def test_held_out_views_refuse_cells_that_a_ball_does_not_need() -> None:
     """Two more rounds are offered, and the one with a rough surface is not taken."""
     rough = FreeFormRound(34, 32, 0.15, 1, 10_000, 1e-6, 2)
