@@ -3,10 +3,12 @@
 import os
 from pathlib import Path
 
-# Read when torch and OpenMP start: several test processes on few cores are slower with more.
-os.environ.setdefault(
-    "OMP_NUM_THREADS", "1" if "PYTEST_XDIST_WORKER" in os.environ else str(min(4, os.cpu_count() or 1))
-)
+# Read when torch and OpenMP start: several test processes on few cores wait for each other's threads. Set, not only by
+# default, because workers inherit the environment of the process that starts them.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ["OMP_NUM_THREADS"] = "1"
+else:
+    os.environ.setdefault("OMP_NUM_THREADS", str(min(4, os.cpu_count() or 1)))
 os.environ.setdefault("MPLBACKEND", "Agg")
 
 import pytest
