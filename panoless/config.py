@@ -14,7 +14,7 @@ import tyro
 from msgspec import Meta
 
 from panoless.alignment.options import PoseOptions
-from panoless.environment.options import FootprintMapOptions, SurroundingsOptions
+from panoless.environment.options import FootprintMapOptions, MaterialOptions, SurroundingsOptions
 from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.geometry.free_form.options import FreeFormOptions
 from panoless.geometry.height_field.options import HeightFieldOptions
@@ -200,6 +200,7 @@ class FitConfig:
     footprint_map: Tuned[FootprintMapOptions] = field(default_factory=FootprintMapOptions)
     poses: Tuned[PoseOptions] = field(default_factory=PoseOptions)
     surroundings: Tuned[SurroundingsOptions] = field(default_factory=SurroundingsOptions)
+    material: Tuned[MaterialOptions] = field(default_factory=MaterialOptions)
     selection: Tuned[SelectionOptions] = field(default_factory=SelectionOptions)
     corrections: Tuned[CorrectionOptions] = field(default_factory=CorrectionOptions)
     trust: Tuned[TrustOptions] = field(default_factory=TrustOptions)

@@ -50,8 +50,9 @@ class RadianceEncoding:
             return radiance
         return np.where(radiance > 1, 1 + np.log(np.maximum(radiance, 1)), radiance)
 
-    def without_gain(self, encoded: Float[Tensor, "3 *S"], gain: float) -> Float[Tensor, "3 *S"]:
-        """c/(F g), at most 1/F, of a photograph c/F that was exposed g times as long as others, in a low dynamic range.
+    def without_gain(self, encoded: Float[Tensor, "3 *S"], gain: float | Tensor) -> Float[Tensor, "3 *S"]:
+        """c/(F g), at most 1/F, of a photograph c/F that was exposed g times as long as others, in a low dynamic range;
+        a gain may differ from pixel to pixel.
 
         What is saturated stays so: it may be any brighter.
         """

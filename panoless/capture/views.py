@@ -66,6 +66,10 @@ class TrainView:
         """Unit ray directions in the camera frame through pixel centers, made anew: a view is 16 bytes a pixel."""
         return unit_rays_camera(self.camera).to(self.mask.device)
 
+    def directions_world(self, pixels: Int[Tensor, "P"]) -> Float[Tensor, "P 3"]:
+        """Unit world directions of the rays through the centers of pixels (flat indices)."""
+        return (self.camera_to_world_rotation @ self.rays_camera.flatten(1)[:, pixels]).T.contiguous()
+
     @cached_property
     def mirror(self) -> MirrorView:
         """What the objective compares with."""

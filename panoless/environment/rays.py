@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 
@@ -12,12 +12,14 @@ from torch import Tensor
 class Rays:
     """Observations of the environment: unit world directions and the linear radiance seen along them.
 
-    `trust` says how far each is believed beforehand, in [0, 1]; None: all alike.
+    `trust` says how far each is believed beforehand, in [0, 1]; None: all alike. `incoming` are the unit world
+    directions of the cameras' rays, which tell the angles at which these met the mirror; None: nobody asks.
     """
 
     directions: Float[Tensor, "P 3"]
     radiance: Float[Tensor, "P 3"]
     trust: Float[Tensor, "P"] | None = None
+    incoming: Float[Tensor, "P 3"] | None = None
 
     def initial_weight(self) -> Float[Tensor, "P"]:
         """The trust, or ones."""
@@ -25,8 +27,23 @@ class Rays:
 
     def every(self, stride: int, first: int) -> "Rays":
         """Every stride-th ray from the first."""
-        part = slice(first, None, stride)
-        return Rays(self.directions[part], self.radiance[part], None if self.trust is None else self.trust[part])
+        return self.kept(slice(first, None, stride))
+
+    def kept(self, part: slice | Bool[Tensor, "P"]) -> "Rays":
+        """Those of the rays."""
+        trust, incoming = (None if each is None else each[part] for each in (self.trust, self.incoming))
+        return Rays(self.directions[part], self.radiance[part], trust, incoming)
+
+
+def joined_rays(parts: Sequence[Rays]) -> Rays:
+    """All rays in one, trusted as they are; all of them know where they came from, or none does."""
+    incoming = [part.incoming for part in parts if part.incoming is not None]
+    return Rays(
+        torch.cat([part.directions for part in parts]),
+        torch.cat([part.radiance for part in parts]),
+        torch.cat([part.initial_weight() for part in parts]),
+        torch.cat(incoming) if incoming else None,
+    )
 
 
 def normalize_confidence(rays: Sequence[Rays]) -> list[Rays]:

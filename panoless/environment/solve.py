@@ -8,7 +8,7 @@ from torch import Tensor
 
 from panoless.environment.cubemap import resample
 from panoless.environment.fill import fill_unobserved
-from panoless.environment.rays import Rays
+from panoless.environment.rays import Rays, joined_rays
 from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap
 from panoless.numeric.conjugate_gradients import conjugate_gradients
 from panoless.numeric.robust import robust_weight
@@ -58,15 +58,7 @@ def _merge(rays: Sequence[Rays]) -> list[Rays]:
         if sum(len(part.directions) for part in groups[-1]) >= MERGED_RAYS:
             groups.append([])
         groups[-1].append(batch)
-    return [
-        Rays(
-            torch.cat([batch.directions for batch in group]),
-            torch.cat([batch.radiance for batch in group]),
-            torch.cat([batch.initial_weight() for batch in group]),
-        )
-        for group in groups
-        if group
-    ]
+    return [joined_rays(group) for group in groups if group]
 
 
 def _right_side(

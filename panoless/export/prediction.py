@@ -23,7 +23,6 @@ from panoless.environment.surroundings import FAR, Surroundings
 from panoless.export.mesh_files import write_ply
 from panoless.export.pictures import crop_to_object, decomposition_pictures
 from panoless.export.render import Decomposition, render
-from panoless.geometry.base import usable_views
 from panoless.geometry.registry import FAMILIES
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.reconstruct.final_map import complete
@@ -119,6 +118,7 @@ def export_prediction(
         model_selection=_model_selection(state.selection),
         verdict=state.verdict,
         surroundings=_near_surroundings(around, state.frame),
+        reflectance=None if state.reflectance is None else state.reflectance.tint,
         iteration=state.iteration if snapshot else None,
     )
     write_info(folder, info)
@@ -146,8 +146,7 @@ def export_snapshots(dataset: Dataset, run: Path, config: FitConfig, prediction:
             loaded = load_views(
                 dataset, config.crop_margin_px, config.downscale, encoding_of(config), config.least_object_px
             )
-            corrected = state.selection.corrections.applied(loaded, encoding_of(config))
-            views = usable_views(corrected, state.geometry)
+            views = state.selection.corrections.applied(loaded, encoding_of(config))
         with timed(state.seconds, "solve environment"):
             complete(state, views, config)
         acquire_prediction(target)
@@ -195,7 +194,7 @@ def _render_frame(frame: Frame, state: FitState, config: FitConfig) -> Decomposi
     assert state.environment is not None
     distance = np.linalg.norm(frame.camera.position_world - state.frame.center) / state.frame.radius
     camera = raster_camera(frame.camera, state.frame, 0.1 * float(distance))
-    return render(state.geometry, state.environment, camera, state.frame, config)
+    return render(state.geometry, state.environment, camera, state.frame, config, state.reflectance)
 
 
 def viewpoint_of(frame: ObjectFrame) -> Float[np.ndarray, "3"]:

@@ -9,6 +9,7 @@ from torch.nn.functional import normalize
 
 from panoless.capture.object_frame import ObjectFrame
 from panoless.config import FitConfig
+from panoless.environment.reflectance import Reflectance
 from panoless.geometry.base import Geometry
 from panoless.kernels.constants import ALPHA_FLOOR
 from panoless.kernels.rasterize import RasterCamera
@@ -36,8 +37,11 @@ def render(
     camera: RasterCamera,
     frame: ObjectFrame,
     config: FitConfig,
+    reflectance: Reflectance | None = None,
 ) -> Decomposition:
-    """Render one camera with the final environment (radiance, not logits) in a mirror of the configured tint."""
+    """Render one camera with the final environment (radiance, not logits) in a mirror of that reflectance, else of the
+    configured tint.
+    """
     with torch.no_grad():
         buffers = geometry.buffers(camera)
         rotation = camera.world_to_camera[:3, :3].T
@@ -47,6 +51,8 @@ def render(
         specular.flatten(1)[:, pixels] = geometry.shade(environment, camera, pixels, normals_camera).T
         normals.flatten(1)[:, pixels] = rotation @ normalize(normals_camera, dim=0, eps=1e-8)
         tint = specular.new_tensor(config.tint)[:, None, None]
+        if reflectance is not None:
+            tint = reflectance.share(buffers.cosines(camera))
         return Decomposition(
             radiance=tint * compose(buffers.albedo, specular, buffers.alpha, config.alpha_applied),
             albedo=tint * buffers.albedo,

@@ -8,9 +8,11 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.poses import Poses
+from panoless.capture.rays import unit_rays_camera
 from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints
@@ -35,6 +37,12 @@ class SurfaceBuffers:
     normals_camera: Float[Tensor, "3 H W"]
     depth: Float[Tensor, "H W"]
     albedo: Float[Tensor, "3 H W"]
+
+    def cosines(self, camera: RasterCamera) -> Float[Tensor, "H W"]:
+        """cos θ of the angle of incidence at the pixels' centers, in [0, 1]; 1 where `camera` sees no surface."""
+        rays = unit_rays_camera(camera).to(self.alpha.device)
+        cosines = -(normalize(self.normals_camera, dim=0) * rays).sum(0)
+        return torch.where(self.alpha > 0, cosines.clamp(0, 1), 1.0)
 
 
 def buffers_from_arrays(

@@ -60,12 +60,12 @@ def fit(
             print(f"Model: {state.selection.sentence}", file=sys.stderr)
         state = state.to(device)
         photographs = state.selection.corrections.applied(views, encoding_of(config))
-        views = usable_views(photographs, state.geometry)
         if state.training is not None:
+            views = usable_views(photographs, state.geometry)
             family, recorder = FAMILIES[state.geometry.kind], Recorder(folder, schedule, state)
             state.geometry, state.training = family.train(views, state.geometry, state.training, config, recorder)
         with timed(state.seconds, "solve environment"):
-            complete(state, views, config)
+            photographs = complete(state, photographs, config)
         with timed(state.seconds, "judge"):
             state.verdict = assess(state, photographs, config)
         note_peak_memory(state)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from panoless.capture.object_frame import ObjectFrame
 from panoless.config import FitConfig, config_from_dict
+from panoless.environment.reflectance import Reflectance
 from panoless.geometry.base import Geometry, Training, from_plain, to_plain
 from panoless.geometry.registry import FAMILIES
 from panoless.selection.candidates import Selection, selection_from_plain, selection_to_plain
@@ -39,6 +40,8 @@ class FitState:
     peak_memory_bytes: int = 0
     device: str = "cpu"
     """The name of what computed it."""
+    reflectance: Reflectance | None = None
+    """Of the object, where held-out views ask for one; None: it mirrors all light."""
     verdict: Trust | None = None
     """How far it is to be trusted; None before the end, and in runs of an earlier version."""
 
@@ -67,6 +70,7 @@ def save_state(folder: Path, state: FitState) -> None:
         "frame": to_plain(state.frame),
         "selection": selection_to_plain(state.selection),
         "training": None if state.training is None else vars(state.training),
+        "reflectance": None if state.reflectance is None else to_plain(state.reflectance),
         "verdict": None if state.verdict is None else asdict(state.verdict),
     }
     # Through memory, because torch reports a full disk as an internal error of its own.
@@ -87,7 +91,8 @@ def load_state(folder: Path) -> FitState | None:
         content["frame"] = from_plain(ObjectFrame, content["frame"])
         content["selection"] = selection_from_plain(**content["selection"])
         content["training"] = None if content["training"] is None else Training(**content["training"])
-        verdict = content.pop("verdict", None)
+        reflectance, verdict = content.pop("reflectance", None), content.pop("verdict", None)
+        content["reflectance"] = None if reflectance is None else from_plain(Reflectance, reflectance)
         content["verdict"] = None if verdict is None else Trust(**verdict)
         return FitState(**content)
     except Exception as error:

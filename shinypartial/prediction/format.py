@@ -124,8 +124,9 @@ class PredictionInfo:
     `device` what the model was fitted on: "cpu", or the name of the GPU. `primitives` is the number of surfels,
     Gaussians, voxels or vertices, `model_bytes` the size of the files that a renderer needs, `iteration` the number of
     finished steps of a snapshot, `model_selection` how the kind of model was chosen; `model` says the same in free
-    words; `verdict` is what the method says of its result; `surroundings` how near it found them. Each is None where it
-    is unknown or has no meaning.
+    words; `verdict` is what the method says of its result; `surroundings` how near it found them; `reflectance` what
+    share of the light (linear red, green, blue) it found the object to mirror at normal incidence, where that is not
+    all of it. Each is None where it is unknown or has no meaning.
     """
 
     method: str
@@ -144,6 +145,7 @@ class PredictionInfo:
     model_bytes: int | None = None
     iteration: int | None = None
     surroundings: NearSurroundings | None = None
+    reflectance: tuple[Share, Share, Share] | None = None
 
     @property
     def hardware_text(self) -> str:

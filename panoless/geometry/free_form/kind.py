@@ -67,7 +67,8 @@ class FreeFormMirror(ExactGeometry):
         trust = self.trust.at(self.surface.points(sights.hits.places[seeing]))
         outgoing, trusted = (torch.from_numpy(each).float() for each in (sights.outgoing[seeing, 0], trust))
         radiance = view.radiance.flatten(1)[:, chosen].T.contiguous()
-        return Rays(outgoing.to(radiance.device), radiance, trusted.to(radiance.device))
+        incoming = view.directions_world(chosen)
+        return Rays(outgoing.to(radiance.device), radiance, trusted.to(radiance.device), incoming)
 
     def _sights(self, view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Sights, Bool[np.ndarray, "P"]]:
         index = pixels.cpu().numpy()

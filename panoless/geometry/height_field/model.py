@@ -178,7 +178,8 @@ def height_field_rays(height_field: HeightField, view: TrainView, pixels: Int[Te
     """What pixels of a view observed of the environment."""
     visible = visible_reflections(height_field, view, pixels)
     outgoing = torch.from_numpy(visible.outgoing).float().to(view.radiance.device)
-    return Rays(outgoing, view.radiance.flatten(1)[:, visible.pixels].T.contiguous())
+    radiance = view.radiance.flatten(1)[:, visible.pixels].T.contiguous()
+    return Rays(outgoing, radiance, incoming=view.directions_world(visible.pixels))
 
 
 def height_field_buffers(height_field: HeightField, camera: RasterCamera) -> SurfaceBuffers:

@@ -60,7 +60,8 @@ class PlaneMirror(ExactGeometry):
         pixels = pixels[buffers.alpha.flatten()[pixels] > SOLID_SURFACE_ALPHA]
         directions = reflections(view, buffers.normals_camera, pixels)
         directions = looked_up(self.surroundings, view.camera, buffers.depth, pixels, directions)
-        return Rays(directions, view.radiance.flatten(1)[:, pixels].T.contiguous())
+        radiance = view.radiance.flatten(1)[:, pixels].T.contiguous()
+        return Rays(directions, radiance, incoming=view.directions_world(pixels))
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
         """Exact coverage and depth."""

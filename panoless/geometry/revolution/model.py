@@ -280,4 +280,5 @@ def revolution_rays(
         image.reshape(-1, 3)[places], mask.ravel()[places] = paths.directions[left], True
         footprint_sr = pixel_footprint_sr(image, mask)[mask]
         trust = torch.from_numpy(1 / (1 + footprint_sr / options.confidence_texel_rad**2)).to(outgoing)
-    return Rays(outgoing, view.radiance.flatten(1)[:, kept].T.contiguous(), trust), paths.first.of(left)
+    radiance, incoming = view.radiance.flatten(1)[:, kept].T.contiguous(), view.directions_world(kept)
+    return Rays(outgoing, radiance, trust, incoming), paths.first.of(left)

@@ -116,7 +116,8 @@ class SurfelMirror:
         pixels = pixels[buffers.alpha.flatten()[pixels] > SOLID_SURFACE_ALPHA]
         diffuse = buffers.colors.flatten(1)[:, pixels]
         radiance = (view.radiance.flatten(1)[:, pixels] - diffuse).T.contiguous()
-        return Rays(reflections(view, buffers.normals_camera, pixels), radiance), pixels
+        directions = reflections(view, buffers.normals_camera, pixels)
+        return Rays(directions, radiance, incoming=view.directions_world(pixels)), pixels
 
     def footprints(self, views: Views) -> Footprints | None:
         """None: normals are not known well enough beside a pixel's center."""

@@ -11,6 +11,7 @@ import torch
 
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.poses import Poses
+from panoless.environment.reflectance import Reflectance
 from panoless.geometry.base import Geometry, Training
 from panoless.geometry.height_field.kind import HeightFieldMirror
 from panoless.geometry.plane.kind import PlaneMirror
@@ -87,6 +88,19 @@ def test_a_state_survives_the_disk(tmp_path: Path, final: bool) -> None:
     assert (loaded.environment is not None) == final
     if final:
         assert torch.equal(loaded.environment, state.environment)
+
+
+def test_a_reflectance_survives_the_disk_and_an_earlier_version_had_none(tmp_path: Path) -> None:
+    state = replace(some_state(True), reflectance=Reflectance(np.array([1.0, 0.77, 1 / 3])))
+    loaded = reloaded(tmp_path, state)
+    assert loaded.reflectance is not None
+    assert loaded.reflectance.tint == (1.0, 0.77, 1 / 3)
+    content = torch.load(tmp_path / CHECKPOINT, weights_only=True)
+    del content["reflectance"]
+    torch.save(content, tmp_path / CHECKPOINT)
+    earlier = load_state(tmp_path)
+    assert earlier is not None
+    assert earlier.reflectance is None
 
 
 def exact_kinds() -> list[Geometry]:

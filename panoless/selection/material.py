@@ -1,0 +1,79 @@
+"""What the mirror is made of, by what a finished geometry explains: a metal's color, which pales at grazing angles.
+
+It is taken for a perfect mirror until held-out views speak against it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from panoless.capture.encoding import NO_TINT, RadianceEncoding, encoding_of
+from panoless.capture.views import Views, split_held_out
+from panoless.config import FitConfig
+from panoless.environment.options import MaterialOptions
+from panoless.environment.rays import Rays, joined_rays
+from panoless.environment.reflectance import Reflectance, find_reflectance, left_unexplained, unsaturated
+from panoless.geometry.base import Geometry, observe_views
+from panoless.numeric.robust import bounded_error
+from panoless.selection.held_out import is_clearly_lower
+
+ERROR_SCALE = 0.1
+"""Of errors ‖e‖²/(‖e‖² + s²) of linear radiance, as elsewhere in model selection."""
+
+
+def earned_reflectance(views: Views, geometry: Geometry, config: FitConfig) -> Reflectance | None:
+    """The reflectance of the object, if held-out views are clearly better explained by it; else None. Views are those
+    of usable pixels.
+
+    Four fifths of the views tell it and the map by which the others are judged, then all views tell it anew. Nobody
+    asks where a tint is given, or in a high dynamic range.
+    """
+    options, encoding = config.material, encoding_of(config)
+    if options.reflectance == "off" or encoding.high_dynamic_range or config.tint != NO_TINT:
+        return None
+    with torch.no_grad():
+        seen = [unsaturated(rays, encoding.saturation) for rays in observe_views(views, geometry, options.rays)]
+        kept, held_out = split_held_out(seen)
+        if not kept or not held_out:
+            return None
+        found = find_reflectance(joined_rays(kept), options)
+        if min(found.tint) > options.largest_reflectance:
+            return None
+        metal, perfect = (_errors(kept, held_out, each, options) for each in (found, Reflectance(np.ones(3))))
+        if not is_clearly_lower(metal, perfect, replace(config.selection, least_gain=options.least_gain)):
+            return None
+        return find_reflectance(joined_rays(seen), options)
+
+
+def _errors(
+    known: Sequence[Rays], held_out: Sequence[Rays], reflectance: Reflectance, options: MaterialOptions
+) -> Float[np.ndarray, "V"]:
+    """Mean of ‖e‖²/(‖e‖² + s²) of each held-out view under the map of the others."""
+    unknown = [replace(rays, trust=torch.zeros_like(rays.radiance[:, 0])) for rays in held_out]
+    residual = left_unexplained(joined_rays([*known, *unknown]), reflectance, options)
+    ends = np.cumsum([len(rays.radiance) for rays in (*known, *unknown)])
+    parts = np.split(bounded_error(residual, ERROR_SCALE), ends[:-1])[len(known) :]
+    return np.array([np.average(part) if len(part) else 0.0 for part in parts])
+
+
+def _without(
+    radiance: Float[Tensor, "3 *S"], share: Float[Tensor, "3 *S"], found: Reflectance
+) -> Float[Tensor, "3 *S"]:
+    """c/F, at most 1/F₀, which what is saturated becomes: it may be any brighter."""
+    at_normal = torch.tensor(found.tint).to(radiance).reshape(3, *[1] * (radiance.ndim - 1))
+    return RadianceEncoding(tint=found.tint).without_gain(radiance / at_normal, share / at_normal)
+
+
+def as_perfect_mirror(views: Views, posed: Views, geometry: Geometry, reflectance: Reflectance) -> Views:
+    """The views as a perfect mirror would have shown them: c/F at every pixel, at most 1/F₀. `posed` are the same with
+    their cameras as the geometry has them.
+    """
+    train = []
+    for view, seen in zip(views.train, posed.train, strict=True):
+        share = reflectance.share(geometry.buffers(seen.camera).cosines(seen.camera))
+        train.append(replace(view, radiance=_without(view.radiance, share, reflectance)))
+    return replace(views, train=tuple(train))

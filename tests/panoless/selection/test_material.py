@@ -1,0 +1,69 @@
+"""A golden mirror is told from a perfect one by held-out views, and its views become those of a perfect one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from panoless.capture.views import TrainView, Views
+from panoless.config import FitConfig
+from panoless.environment.options import MaterialOptions
+from panoless.environment.reflectance import Reflectance
+from panoless.geometry.plane.kind import PlaneMirror
+from panoless.geometry.revolution.kind import RevolutionMirror
+from panoless.selection.material import as_perfect_mirror, earned_reflectance
+from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
+from tests.support.mirror_revolution import around, goblet, rays_of, revolution_views
+
+GOLD = np.array([1.0, 0.77, 0.34])
+MIRROR = RevolutionMirror(goblet(), occlusion_test=False)
+CONFIG = FitConfig(material=MaterialOptions(resolution=16))
+"""With texels as wide as the views are coarse."""
+PERFECT = revolution_views(MIRROR.surface, around(15, size=48))
+
+
+def golden(view: TrainView) -> TrainView:
+    """What gold shows of it, by the angles at which the surface is met."""
+    _, directions = rays_of(view.camera)
+    hits = MIRROR.surface.hits(*rays_of(view.camera))
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    cosine = np.abs((directions * hits.normals).sum(1))[:, None]
+    share = GOLD + (1 - GOLD) * (1 - cosine) ** 5
+    return replace(view, radiance=view.radiance * torch.from_numpy(share.T.reshape(view.radiance.shape)).float())
+
+
+@pytest.fixture(scope="module")
+def gold() -> Views:
+    return replace(PERFECT, train=tuple(golden(view) for view in PERFECT.train))
+
+
+def test_gold_is_found_where_held_out_views_gain(gold: Views) -> None:
+    """Within 3 % at 48 px; a perfect mirror stays one, and so does gold where nobody is to ask."""
+    found = earned_reflectance(gold, MIRROR, CONFIG)
+    assert found is not None
+    assert found.at_normal == pytest.approx(GOLD, abs=0.03)
+    assert earned_reflectance(PERFECT, MIRROR, CONFIG) is None
+    assert earned_reflectance(gold, MIRROR, replace(CONFIG, material=MaterialOptions(reflectance="off"))) is None
+    assert earned_reflectance(gold, MIRROR, replace(CONFIG, tint=(1.0, 0.77, 0.34))) is None
+
+
+def test_a_plane_does_not_tell_its_color() -> None:
+    """In a far world it shows each direction at one angle."""
+    plane = plane_of(RECTANGLE)
+    views = reflecting_views(plane, arc(10, size=48))
+    tinted = tuple(replace(view, radiance=view.radiance * torch.tensor(GOLD)[:, None, None]) for view in views.train)
+    assert earned_reflectance(replace(views, train=tinted), PlaneMirror(plane), CONFIG) is None
+
+
+def test_views_of_gold_become_those_of_a_perfect_mirror(gold: Views) -> None:
+    """At solid pixels; what is saturated has the largest value, for it may be any brighter."""
+    found = as_perfect_mirror(gold, gold, MIRROR, Reflectance(GOLD))
+    for view, true in zip(found.train, PERFECT.train, strict=True):
+        seen, truth = (each.radiance.flatten(1)[:, view.solid] for each in (view, true))
+        unsaturated = truth < 0.99
+        assert seen[unsaturated] == pytest.approx(truth[unsaturated].numpy(), abs=1e-4)
+    bright = tuple(replace(view, radiance=torch.ones_like(view.radiance)) for view in gold.train[:1])
+    one = replace(gold, train=bright)
+    largest = as_perfect_mirror(one, one, MIRROR, Reflectance(GOLD)).train[0].radiance.flatten(1)
+    assert largest[:, bright[0].solid[0]].numpy() == pytest.approx(1 / GOLD, rel=1e-5)
