@@ -1,4 +1,5 @@
-"""What photographs get wrong, taken back: masks too small or too large in all views, and exposures that differ.
+"""What photographs get wrong, taken back: masks too small or too large in all views, exposures that differ, and a focal
+length that is not what it is said to be.
 
 Views are corrected when they are loaded; what a fit found about them is a few numbers.
 """
@@ -25,6 +26,10 @@ class Corrections:
     """How far the outlines of all masks are moved outward, in pixels of the views."""
     gains: Float[np.ndarray, "V"] | None = None
     """Exposure of each view against the mean; None: they are all alike."""
+    focal_factor: float = 1.0
+    """The focal length of all views over what is said of it."""
+    focal_uncertainty: float | None = None
+    """Standard deviation of that factor; None where it was not found."""
 
     @property
     def exposure_stops(self) -> float | None:
@@ -34,6 +39,8 @@ class Corrections:
     def applied(self, views: Views, encoding: RadianceEncoding) -> Views:
         """The views as they would be without these errors; themselves where there are none."""
         train = views.train
+        if self.focal_factor != 1:
+            train = tuple(with_focal_factor(view, self.focal_factor) for view in train)
         if self.mask_offset_px:
             train = tuple(with_outline_moved(view, self.mask_offset_px) for view in train)
         if self.gains is not None:
@@ -43,6 +50,12 @@ class Corrections:
 
 
 NO_CORRECTIONS = Corrections()
+
+
+def with_focal_factor(view: TrainView, factor: float) -> TrainView:
+    """A view through a lens of so many times the focal length."""
+    camera = view.camera
+    return replace(view, camera=replace(camera, fx=factor * camera.fx, fy=factor * camera.fy))
 
 
 def with_outline_moved(view: TrainView, offset_px: float) -> TrainView:

@@ -107,6 +107,11 @@ def thin_plate(
     bending = laplacian.T @ sparse.diags(1 / areas) @ laplacian
     system = length**4 * (bending + tension * laplacian) + sparse.diags(data)
     # Positive definite: an ordering for symmetric matrices and pivots on the diagonal fill in less.
-    factors = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    symmetric = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+    try:
+        factors = splu(system.tocsc(), **symmetric)
+    except RuntimeError:
+        # Where next to nothing is trusted, rounding can leave no pivot on the diagonal.
+        factors = splu(system.tocsc())
     moved = np.stack([factors.solve(data * column) for column in goals.T.astype(np.float64)], 1)
     return TriangleMesh(moved, surface.triangles)

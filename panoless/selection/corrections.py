@@ -1,9 +1,10 @@
-"""What photographs get wrong, by what a geometry explains of them: exposures that differ, and masks that are off.
+"""What photographs get wrong, by what a geometry explains of them: exposures that differ, masks that are off, and a
+focal length that is.
 
 They are believed to be right until held-out views speak against it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +12,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from panoless.alignment.equations import outline_rows
+from panoless.alignment.equations import PoseRows, outline_rows
+from panoless.alignment.lens import FocalPull, focal_pull
 from panoless.alignment.search import PosedProposal
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
 from panoless.capture.encoding import SATURATED, encoding_of
@@ -22,11 +24,13 @@ from panoless.environment.exposure import exposure_gains
 from panoless.environment.rays import Rays
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
+from panoless.environment.surroundings import FAR
 from panoless.geometry.base import Family, Geometry, observe_views, usable_views
 from panoless.geometry.registry import FAMILIES
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.robust import robust_weight
 from panoless.selection.held_out import held_out_parts, is_clearly_lower, unexplained
+from panoless.selection.options import CorrectionOptions
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,7 @@ def with_corrections(source: Family, views: Views, first: Fitted, config: FitCon
     explains any outlines has only begun to be fitted, and tells nothing yet.
     """
     options, best = config.corrections, first
-    if options.masks == options.exposure == "off" or held_out_parts(views) is None:
+    if options.masks == options.exposure == options.lens == "off" or held_out_parts(views) is None:
         return first
     if source.as_proposed(first.start.proposal, config) is None:
         return first
@@ -62,6 +66,8 @@ def with_corrections(source: Family, views: Views, first: Fitted, config: FitCon
         best, errors = replace(first, corrections=equal[0]), equal[1]
     if options.masks == "auto" and _masks_are_doubted(views, best.geometry, errors, config):
         best = _with_moved_masks(source, views, best, config, refit)
+    if options.lens != "off" and not _another_takes_on(best.geometry, errors, config):
+        best = _with_focal_length(views, best, config, refit)
     if best.corrections.gains is None:
         return best
     if best.geometry is first.geometry:
@@ -156,12 +162,17 @@ def is_refined(kind: str) -> bool:
     return kind in {family.refines for family in FAMILIES.values()}
 
 
+def _another_takes_on(geometry: Geometry, errors: Float[np.ndarray, "V"], config: FitConfig) -> bool:
+    """Whether a geometry leaves so much unexplained that another kind is to take it on."""
+    return bool(is_refined(geometry.kind) and errors.mean() > config.selection.largest_error)
+
+
 def _masks_are_doubted(views: Views, geometry: Geometry, errors: Float[np.ndarray, "V"], config: FitConfig) -> bool:
-    """Whether a geometry leaves much unexplained, or photographs pull its outlines off those of the masks; not where it
-    leaves so much that another kind is to take it on.
+    """Whether a geometry leaves much unexplained, or photographs pull its outlines off those of the masks; not where
+    another kind takes it on.
     """
     options = config.corrections
-    if is_refined(geometry.kind) and errors.mean() > config.selection.largest_error:
+    if _another_takes_on(geometry, errors, config):
         return False
     return (
         bool(errors.mean() > options.largest_error) or abs(outline_pull_px(views, geometry)) > options.doubted_pull_px
@@ -189,19 +200,133 @@ def _with_moved_masks(source: Family, views: Views, fitted: Fitted, config: FitC
     return nearer if nearer is not None and _explains_more(views, found, nearer, config) else found
 
 
+@dataclass(frozen=True)
+class _FocalTrial:
+    """A fit to another focal length, the logarithm of that over the first, and what pull is left."""
+
+    change: float
+    fitted: Fitted
+    pull: FocalPull
+
+    @classmethod
+    def of(cls, views: Views, change: float, fitted: Fitted, config: FitConfig) -> "_FocalTrial":
+        """With the pull of the views as they are corrected for that fit."""
+        options, seen = config.corrections, fitted.corrections.applied(views, encoding_of(config))
+        numbers = options.focal_rays, options.focal_resolution, options.focal_scale
+        alike = _looks_like_a_focal_length(seen, fitted.geometry, options)
+        geometry = fitted.geometry.in_surroundings(FAR) if alike else fitted.geometry
+        return cls(change, fitted, focal_pull(seen, geometry, *numbers))
+
+
+def _with_focal_length(views: Views, fitted: Fitted, config: FitConfig, refit: Refit) -> Fitted:
+    """Fitted anew to other focal lengths until photographs pull no more, which is found by secants. Of the trials the
+    one nearest to the zero of a line through all pulls is kept, if held-out views are clearly better explained by it
+    and the factor is told better than it is known.
+    """
+    options, encoding = config.corrections, encoding_of(config)
+    trials = [_FocalTrial.of(views, 0.0, fitted, config)]
+    if abs(trials[0].pull.step) < options.least_focal_pull:
+        return fitted
+    following: float | None = _step_from(trials[0], options.focal_share, options.largest_focal_step)
+    for _ in range(options.focal_trials):
+        if following is None or any(abs(each.change - following) < options.settled_focal for each in trials):
+            break
+        factor = fitted.corrections.focal_factor * float(np.exp(following))
+        corrections = replace(fitted.corrections, focal_factor=factor)
+        again = refit(corrections.applied(views, encoding))
+        if again is None:
+            break
+        trials.append(_FocalTrial.of(views, following, replace(again, corrections=corrections), config))
+        following = _following(trials, options.largest_focal_step)
+    if len(trials) == 1:
+        return fitted
+    slope, offset = np.polyfit([each.change for each in trials], [each.pull.step for each in trials], 1)
+    share = -float(slope)
+    if share <= 0:
+        return fitted
+    found = min(trials, key=lambda each: abs(each.change - offset / share))
+    if found.fitted is fitted:
+        return fitted
+    # What is left where the focal length is right is no less than half of what raises doubt.
+    uncertainty = max(found.pull.sigma, options.least_focal_pull / 2) / share
+    if options.lens == "auto" and not (
+        uncertainty < options.focal_prior and _focal_length_is_earned(views, fitted, found.fitted, config)
+    ):
+        return fitted
+    factor = found.fitted.corrections.focal_factor
+    told = replace(found.fitted.corrections, focal_uncertainty=factor * uncertainty)
+    return replace(found.fitted, corrections=told)
+
+
+def _looks_like_a_focal_length(views: Views, geometry: Geometry, options: CorrectionOptions) -> bool:
+    """Whether surroundings are so little near that a focal length may show the same: a flat mirror at the distance d
+    from its cameras shows a sphere of the radius d/s as it shows a far world through a lens that is wrong by s.
+    """
+    coefficients, cameras = geometry.surroundings.coefficients, [np.linalg.norm(view.position) for view in views.train]
+    return len(coefficients) > 0 and bool(coefficients[0] * np.median(cameras) < 3 * options.focal_prior)
+
+
+def _step_from(trial: _FocalTrial, share: float, largest: float) -> float:
+    """Where nothing would pull if that were the share of a change that pulls."""
+    return trial.change + float(np.clip(trial.pull.step / share, -largest, largest))
+
+
+def _by_pull(trials: Sequence[_FocalTrial]) -> list[_FocalTrial]:
+    return sorted(trials, key=lambda each: abs(each.pull.step))
+
+
+def _share(one: _FocalTrial, other: _FocalTrial) -> float:
+    """By how much the pull falls with the change."""
+    return (other.pull.step - one.pull.step) / (one.change - other.change)
+
+
+def _following(trials: Sequence[_FocalTrial], largest: float) -> float | None:
+    """The zero of the secant through the two trials of least pull; None where the pull grows with the change."""
+    one, other = _by_pull(trials)[:2]
+    share = _share(one, other)
+    return _step_from(one, share, largest) if share > 0 else None
+
+
+def _focal_length_is_earned(views: Views, before: Fitted, after: Fitted, config: FitConfig) -> bool:
+    """Whether held-out views are clearly better explained; or, by a lens in place of near surroundings, no worse, and
+    outlines are.
+    """
+    errors = _errors_in_common(views, before, after, config)
+    limits = replace(config.selection, least_gain=config.corrections.least_focal_gain)
+    if is_clearly_lower(errors[1], errors[0], limits):
+        return True
+    in_place = after.geometry.surroundings.is_far and not before.geometry.surroundings.is_far
+    encoding = encoding_of(config)
+    distances = [
+        _outline_distance_px(each.corrections.applied(views, encoding), each.geometry) for each in (before, after)
+    ]
+    nearer = distances[1] <= (1 - config.corrections.least_outline_fall) * distances[0]
+    return bool(in_place and nearer and errors[1].mean() <= (1 + config.selection.least_gain) * errors[0].mean())
+
+
 def outline_pull_px(views: Views, geometry: Geometry) -> float:
     """How far outside the masks the outlines of a geometry lie: the median over views of the median.
 
     A fit weighs outlines against photographs, so its outlines give way a little where masks are off.
     """
-    found = []
+    found = [np.median(each.residual) for each in _outlines(views, geometry)]
+    return float(np.median(found)) if found else 0.0
+
+
+def _outline_distance_px(views: Views, geometry: Geometry) -> float:
+    """The same of distances without a sign."""
+    found = [each.typical for each in _outlines(views, geometry)]
+    return float(np.median(found)) if found else 0.0
+
+
+def _outlines(views: Views, geometry: Geometry) -> Iterator[PoseRows]:
+    """Of a geometry against the masks of a few views that see it."""
     train = geometry.corrected(views).train
     for view in train[:: -(-len(train) // PULLED_VIEWS)]:
         distance = mask_distance_px(view.mask.cpu().numpy()).astype(np.float64)
-        residual = outline_rows(view, distance, geometry.buffers(view.camera)).residual
-        if len(residual):
-            found.append(np.median(residual))
-    return float(np.median(found)) if found else 0.0
+        rows = outline_rows(view, distance, geometry.buffers(view.camera))
+        if len(rows.residual):
+            yield rows
 
 
 def find_mask_offset(source: Family, views: Views, fitted: Fitted, config: FitConfig) -> float:
@@ -284,5 +409,7 @@ def _errors_in_common(
     """What two fits leave unexplained of the pixels that are solid for both."""
     said, moved = (each.corrections.applied(views, encoding_of(config)) for each in (before, after))
     solid = [one.solid[torch.isin(one.solid, other.solid)] for one, other in zip(said.train, moved.train, strict=True)]
-    errors = [_error(_with_solid(said, solid), each.geometry, config) for each in (before, after)]
+    errors = [
+        _error(_with_solid(seen, solid), each.geometry, config) for seen, each in ((said, before), (moved, after))
+    ]
     return errors[0], errors[1]

@@ -68,6 +68,8 @@ class Evidence:
     """By which the fit moved the outlines of all masks outward."""
     exposure_stops: float = 0.0
     """Standard deviation of the exposures of the views, as far as the fit took it back."""
+    focal_factor: float = 1.0
+    """The focal length that the fit found over what is said of it."""
 
 
 def gather_evidence(
@@ -104,6 +106,7 @@ def gather_evidence(
         views=len(seen),
         mask_offset_px=corrections.mask_offset_px,
         exposure_stops=corrections.exposure_stops or 0.0,
+        focal_factor=corrections.focal_factor,
     )
 
 

@@ -32,7 +32,7 @@ TUNED = (
     "trust",
 )
 TINY = ["--config.iterations", "4", "--config.surfels.count", "40", "--config.surfels.hull-resolution", "24"]
-AS_TOLD = ["--set", "corrections.masks=off", "corrections.exposure=off"]
+AS_TOLD = ["--set", "corrections.masks=off", "corrections.exposure=off", "corrections.lens=off"]
 """Photographs of an object that the kind does not fit are not doubted."""
 MODELS = get_args(get_args(get_type_hints(FitConfig, include_extras=True)["model"])[0])
 

@@ -70,7 +70,7 @@ def test_the_same_kind_is_chosen_on_another_device(tmp_path: Path, definition_on
         model="auto",
         selection=replace(config.selection, trial_resolution=8),
         height_field=replace(config.height_field, cells=8, rounds=rounds),
-        corrections=replace(config.corrections, masks="off", exposure="off"),
+        corrections=replace(config.corrections, masks="off", exposure="off", lens="off"),
         surroundings=replace(config.surroundings, mode="off"),
     )
     here = fit(dataset, config, tmp_path / "here")

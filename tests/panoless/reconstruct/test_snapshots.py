@@ -264,7 +264,15 @@ def test_what_takes_no_steps_has_no_snapshots_and_the_command_says_why(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    options = ["--model", model, "--config.environment.solve-resolution", "16", "--set", "corrections.masks=off"]
+    options = [
+        "--model",
+        model,
+        "--config.environment.solve-resolution",
+        "16",
+        "--set",
+        "corrections.masks=off",
+        "corrections.lens=off",
+    ]
     assert main(["fit", str(many_views_dataset.root), "--output", "p", "--snapshots", "2", *options]) == 0
     assert f"No snapshots: this run took {name}" in capsys.readouterr().out
     assert main(["export", "runs/p", "--output", "p", "--snapshots"]) == 2

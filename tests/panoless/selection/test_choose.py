@@ -38,7 +38,7 @@ def coarse_config() -> FitConfig:
         selection=replace(config.selection, trial_resolution=32),
         # The traced dome has flat edges, so it looks like a flat mirror in a near room.
         surroundings=replace(config.surroundings, mode="off"),
-        corrections=CorrectionOptions(masks="off", exposure="off"),
+        corrections=CorrectionOptions(masks="off", exposure="off", lens="off"),
         height_field=replace(config.height_field, rounds=config.height_field.rounds[:3]),
         revolution=replace(
             config.revolution,
@@ -239,7 +239,7 @@ def plane_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.mark.parametrize("preset", ["default", "paper"])
 def test_a_plane_has_a_solved_map_whatever_the_preset(tmp_path: Path, plane_dataset: Dataset, preset: str) -> None:
     """No steps are taken with it, so what gradient descent left or accumulated online would say nothing."""
-    believed = CorrectionOptions(masks="off", exposure="off")
+    believed = CorrectionOptions(masks="off", exposure="off", lens="off")
     config = replace(tiny_config(preset, iterations=4, count=40), model="plane", corrections=believed)
     state = fit(plane_dataset, config, tmp_path / "run")
     assert state.geometry.kind == "plane"

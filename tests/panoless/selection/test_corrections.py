@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from panoless.alignment.search import PosedProposal
-from panoless.capture.corrections import NO_CORRECTIONS, Corrections
+from panoless.capture.corrections import NO_CORRECTIONS, Corrections, with_focal_factor
 from panoless.capture.views import Views
 from panoless.geometry.base import Proposal
 from panoless.geometry.plane.kind import PlaneMirror
@@ -23,6 +23,8 @@ from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_view
 from tests.support.mirror_revolution import around, goblet, revolution_views
 
 CONFIG = replace(PRESETS["fast"], corrections=CorrectionOptions(rays=10_000, resolution=32))
+FOCAL = replace(CONFIG.corrections, rays=20_000, focal_rays=10_000, focal_resolution=32, least_focal_pull=0.002)
+"""As few pixels tell it."""
 GAINS = np.exp2(np.random.default_rng(4).normal(size=10) * 0.3)
 GAINS /= np.exp(np.log(GAINS).mean())
 MIRROR = PlaneMirror(plane_of(RECTANGLE))
@@ -61,6 +63,30 @@ def test_exposures_are_corrected_only_where_they_differ() -> None:
     assert corrections.exposure_stops == pytest.approx(np.log2(GAINS).std(), rel=0.05)
     # Few pixels of a view share a texel with other views.
     assert corrections.gains == pytest.approx(GAINS, rel=0.04)
+
+
+def silhouettes_plane(views: Views) -> Fitted:
+    """What outlines tell of the mirror at a focal length that is believed: it shrinks as that grows."""
+    size = arc(1, size=64)[0].fx / views.train[0].camera.fx
+    plane = MIRROR.plane
+    scaled = replace(plane, offset=size * plane.offset, boundary=size * plane.boundary)
+    return Fitted(PlaneMirror(scaled), PosedProposal(Proposal(scaled, 0.0, 1.0)))
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.03])
+def test_a_wrong_focal_length_is_found_and_a_true_one_believed(factor: float) -> None:
+    """To a third of a percent with views of 64 px."""
+    views = reflecting_views(MIRROR.plane, arc(20, size=64))
+    views = replace(views, train=tuple(with_focal_factor(view, factor) for view in views.train))
+    options = replace(FOCAL, exposure="off", masks="off")
+    config = replace(CONFIG, corrections=options)
+    found = with_corrections(FAMILIES["plane"], views, silhouettes_plane(views), config, silhouettes_plane).corrections
+    assert found.focal_factor == pytest.approx(1 / factor, abs=0.003)
+    if factor == 1:
+        assert found is NO_CORRECTIONS
+    else:
+        assert found.focal_uncertainty is not None
+        assert 0 < found.focal_uncertainty < 0.003
 
 
 def with_masks(views: Views, offset_px: float) -> Views:
@@ -107,4 +133,10 @@ def test_corrections_survive_a_checkpoint_and_earlier_ones_have_none() -> None:
     assert again.mask_offset_px == -1.5
     assert again.gains == pytest.approx(GAINS)
     del plain["candidates"][0]["corrections"]
+    assert selection_from_plain(**plain).corrections == NO_CORRECTIONS
+    found = Candidate("plane", Verdict.CHOSEN, "asked for", corrections=Corrections(focal_factor=0.98))
+    plain = selection_to_plain(Selection("plane", (found,)))
+    assert selection_from_plain(**plain).corrections.focal_factor == 0.98
+    for name in ("focal_factor", "focal_uncertainty"):
+        del plain["candidates"][0]["corrections"][name]
     assert selection_from_plain(**plain).corrections == NO_CORRECTIONS
