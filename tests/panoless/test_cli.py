@@ -26,8 +26,8 @@ TUNED = (
     "footprint_map",
     "poses",
     "surroundings",
+    "material",
     "corrections",
-    "surroundings",
     "selection",
     "trust",
 )
