@@ -15,7 +15,8 @@ from panoless.config import FitConfig
 from panoless.geometry.base import Family, Geometry, Proposal, usable_views
 from panoless.geometry.registry import FAMILIES
 from panoless.selection.candidates import Candidate, Selection, Verdict
-from panoless.selection.corrections import Fitted, is_refined, with_corrections
+from panoless.selection.corrections import with_corrections
+from panoless.selection.fitted import Fitted, is_refined
 from panoless.selection.held_out import Trial, held_out_errors, is_clearly_lower, train_briefly
 from panoless.selection.surroundings import explains_clearly_more, proposed_surroundings
 

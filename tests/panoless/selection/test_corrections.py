@@ -15,7 +15,8 @@ from panoless.geometry.registry import FAMILIES
 from panoless.presets import PRESETS
 from panoless.selection.candidates import Candidate, Selection, Verdict, selection_from_plain, selection_to_plain
 from panoless.selection.choose import choose_geometry
-from panoless.selection.corrections import Fitted, outline_pull_px, with_corrections
+from panoless.selection.corrections import with_corrections
+from panoless.selection.fitted import Fitted, outline_pull_px
 from panoless.selection.options import CorrectionOptions
 from shinypartial.core.conventions import SOLID_ALPHA
 from shinypartial.dataset.perturb.masks import dilated, eroded

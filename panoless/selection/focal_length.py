@@ -1,0 +1,111 @@
+"""A focal length that is wrong by one factor, where held-out views ask for another."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from panoless.alignment.lens import FocalPull, focal_pull
+from panoless.capture.encoding import encoding_of
+from panoless.capture.views import Views
+from panoless.config import FitConfig
+from panoless.environment.surroundings import FAR
+from panoless.geometry.base import Geometry
+from panoless.selection.fitted import Fitted, Refit, errors_in_common, outline_distance_px
+from panoless.selection.held_out import is_clearly_lower
+from panoless.selection.options import CorrectionOptions
+
+
+@dataclass(frozen=True)
+class _FocalTrial:
+    """A fit to another focal length, the logarithm of that over the first, and what pull is left."""
+
+    change: float
+    fitted: Fitted
+    pull: FocalPull
+
+    @classmethod
+    def of(cls, views: Views, change: float, fitted: Fitted, config: FitConfig) -> "_FocalTrial":
+        """With the pull of the views as they are corrected for that fit."""
+        options, seen = config.corrections, fitted.corrections.applied(views, encoding_of(config))
+        numbers = options.focal_rays, options.focal_resolution, options.focal_scale
+        alike = _looks_like_a_focal_length(seen, fitted.geometry, options)
+        geometry = fitted.geometry.in_surroundings(FAR) if alike else fitted.geometry
+        return cls(change, fitted, focal_pull(seen, geometry, *numbers))
+
+
+def with_focal_length(views: Views, fitted: Fitted, config: FitConfig, refit: Refit) -> Fitted:
+    """Fitted anew to other focal lengths until photographs pull no more, which is found by secants. Of the trials the
+    one nearest to the zero of a line through all pulls is kept, if held-out views are clearly better explained by it
+    and the factor is told better than it is known.
+    """
+    options, encoding = config.corrections, encoding_of(config)
+    trials = [_FocalTrial.of(views, 0.0, fitted, config)]
+    if abs(trials[0].pull.step) < options.least_focal_pull:
+        return fitted
+    following: float | None = _step_from(trials[0], options.focal_share, options.largest_focal_step)
+    for _ in range(options.focal_trials):
+        if following is None or any(abs(each.change - following) < options.settled_focal for each in trials):
+            break
+        factor = fitted.corrections.focal_factor * float(np.exp(following))
+        corrections = replace(fitted.corrections, focal_factor=factor)
+        again = refit(corrections.applied(views, encoding))
+        if again is None:
+            break
+        trials.append(_FocalTrial.of(views, following, replace(again, corrections=corrections), config))
+        following = _following(trials, options.largest_focal_step)
+    if len(trials) == 1:
+        return fitted
+    slope, offset = np.polyfit([each.change for each in trials], [each.pull.step for each in trials], 1)
+    share = -float(slope)
+    if share <= 0:
+        return fitted
+    found = min(trials, key=lambda each: abs(each.change - offset / share))
+    if found.fitted is fitted:
+        return fitted
+    # What is left where the focal length is right is no less than half of what raises doubt.
+    uncertainty = max(found.pull.sigma, options.least_focal_pull / 2) / share
+    if options.lens == "auto" and not (
+        uncertainty < options.focal_prior and _focal_length_is_earned(views, fitted, found.fitted, config)
+    ):
+        return fitted
+    factor = found.fitted.corrections.focal_factor
+    told = replace(found.fitted.corrections, focal_uncertainty=factor * uncertainty)
+    return replace(found.fitted, corrections=told)
+
+
+def _looks_like_a_focal_length(views: Views, geometry: Geometry, options: CorrectionOptions) -> bool:
+    """Whether surroundings are so little near that a focal length may show the same: a flat mirror at the distance d
+    from its cameras shows a sphere of the radius d/s as it shows a far world through a lens that is wrong by s.
+    """
+    coefficients, cameras = geometry.surroundings.coefficients, [np.linalg.norm(view.position) for view in views.train]
+    return len(coefficients) > 0 and bool(coefficients[0] * np.median(cameras) < 3 * options.focal_prior)
+
+
+def _step_from(trial: _FocalTrial, share: float, largest: float) -> float:
+    """Where nothing would pull if that were the share of a change that pulls."""
+    return trial.change + float(np.clip(trial.pull.step / share, -largest, largest))
+
+
+def _following(trials: Sequence[_FocalTrial], largest: float) -> float | None:
+    """The zero of the secant through the two trials of least pull; None where the pull grows with the change."""
+    one, other = sorted(trials, key=lambda each: abs(each.pull.step))[:2]
+    share = (other.pull.step - one.pull.step) / (one.change - other.change)
+    return _step_from(one, share, largest) if share > 0 else None
+
+
+def _focal_length_is_earned(views: Views, before: Fitted, after: Fitted, config: FitConfig) -> bool:
+    """Whether held-out views are clearly better explained; or, by a lens in place of near surroundings, no worse, and
+    outlines are.
+    """
+    errors = errors_in_common(views, before, after, config)
+    limits = replace(config.selection, least_gain=config.corrections.least_focal_gain)
+    if is_clearly_lower(errors[1], errors[0], limits):
+        return True
+    in_place = after.geometry.surroundings.is_far and not before.geometry.surroundings.is_far
+    encoding = encoding_of(config)
+    distances = [
+        outline_distance_px(each.corrections.applied(views, encoding), each.geometry) for each in (before, after)
+    ]
+    nearer = distances[1] <= (1 - config.corrections.least_outline_fall) * distances[0]
+    return bool(in_place and nearer and errors[1].mean() <= (1 + config.selection.least_gain) * errors[0].mean())
