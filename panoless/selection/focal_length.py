@@ -41,7 +41,8 @@ def with_focal_length(views: Views, fitted: Fitted, config: FitConfig, refit: Re
     """
     options, encoding = config.corrections, encoding_of(config)
     trials = [_FocalTrial.of(views, 0.0, fitted, config)]
-    if abs(trials[0].pull.step) < options.least_focal_pull:
+    pull = trials[0].pull
+    if abs(pull.step) < max(options.least_focal_pull, options.focal_sigmas * pull.sigma):
         return fitted
     following: float | None = _step_from(trials[0], options.focal_share, options.largest_focal_step)
     for _ in range(options.focal_trials):
