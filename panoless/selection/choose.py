@@ -10,6 +10,7 @@ from dataclasses import replace
 from panoless.alignment.search import PosedProposal, align_proposal, fit_with_poses
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
 from panoless.capture.encoding import encoding_of
+from panoless.capture.poses import Poses
 from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.geometry.base import Family, Geometry, Proposal, usable_views
@@ -90,8 +91,13 @@ def _best_fit(
     def near(proposals: Sequence[PosedProposal]) -> list[PosedProposal]:
         return list(proposals) if asked else [each for each in proposals if _is_near(each, config)]
 
-    def refit(corrected: Views) -> Fitted | None:
-        return _first_fit(family, near(_proposals(source, corrected, config, asked=False)), corrected, config)
+    def refit(corrected: Views, poses: Poses | None) -> Fitted | None:
+        if poses is None or family.finds_poses:
+            again = _proposals(source, corrected, config, asked=False)
+        else:
+            proposal = source.propose(poses.moved(corrected), config, asked=False)
+            again = [] if proposal is None else [PosedProposal(proposal, poses)]
+        return _first_fit(family, near(again), corrected, config)
 
     first = _first_fit(family, near(proposals), views, config)
     return None if first is None else with_corrections(source, views, first, config, refit)

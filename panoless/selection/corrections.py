@@ -20,8 +20,9 @@ from panoless.selection.mask_offset import masks_are_doubted, with_moved_masks
 def with_corrections(source: Family, views: Views, first: Fitted, config: FitConfig, refit: Refit) -> Fitted:
     """A fit, or another of corrected photographs where held-out views are clearly better explained by it.
 
-    `source` makes the proposals of the kind. Exposures come first: they need no other geometry to be told. A kind that
-    explains any outlines has only begun to be fitted, and tells nothing yet.
+    `source` makes the proposals of the kind. Exposures come first: they need no other geometry to be told. The focal
+    length comes last, and only where masks and exposures are right: what is left of their errors pulls at it as well.
+    A kind that explains any outlines has only begun to be fitted, and tells nothing yet.
     """
     options, best = config.corrections, first
     if options.masks == options.exposure == options.lens == "off" or held_out_parts(views) is None:
@@ -35,7 +36,8 @@ def with_corrections(source: Family, views: Views, first: Fitted, config: FitCon
         best, errors = replace(first, corrections=equal[0]), equal[1]
     if options.masks == "auto" and masks_are_doubted(views, best.geometry, errors, config):
         best = with_moved_masks(source, views, best, config, refit)
-    if options.lens != "off" and not another_takes_on(best.geometry, errors, config):
+    is_as_said = best.corrections.gains is None and not best.corrections.mask_offset_px
+    if options.lens != "off" and is_as_said and not another_takes_on(best.geometry, errors, config):
         best = with_focal_length(views, best, config, refit)
     if best.corrections.gains is None:
         return best

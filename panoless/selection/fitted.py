@@ -12,6 +12,7 @@ from panoless.alignment.equations import PoseRows, outline_rows
 from panoless.alignment.search import PosedProposal
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
 from panoless.capture.encoding import encoding_of
+from panoless.capture.poses import Poses
 from panoless.capture.silhouettes import mask_distance_px
 from panoless.capture.views import Views, at_most_pixels
 from panoless.config import FitConfig
@@ -29,8 +30,8 @@ class Fitted:
     corrections: Corrections = NO_CORRECTIONS
 
 
-Refit = Callable[[Views], Fitted | None]
-"""Proposes and fits a kind anew to corrected views."""
+Refit = Callable[[Views, Poses | None], Fitted | None]
+"""Proposes and fits a kind anew to corrected views, from the poses that an earlier fit found."""
 PULLED_VIEWS = 8
 """From so many views at most the pull of photographs on outlines is told."""
 

@@ -15,6 +15,9 @@ from panoless.selection.fitted import Fitted, Refit, errors_in_common, outline_d
 from panoless.selection.held_out import is_clearly_lower
 from panoless.selection.options import CorrectionOptions
 
+FARTHEST = 3
+"""A focal length that is farther from what is said of it than so many expected errors is not believed."""
+
 
 @dataclass(frozen=True)
 class _FocalTrial:
@@ -50,7 +53,7 @@ def with_focal_length(views: Views, fitted: Fitted, config: FitConfig, refit: Re
             break
         factor = fitted.corrections.focal_factor * float(np.exp(following))
         corrections = replace(fitted.corrections, focal_factor=factor)
-        again = refit(corrections.applied(views, encoding))
+        again = refit(corrections.applied(views, encoding), fitted.geometry.poses)
         if again is None:
             break
         trials.append(_FocalTrial.of(views, following, replace(again, corrections=corrections), config))
@@ -66,9 +69,8 @@ def with_focal_length(views: Views, fitted: Fitted, config: FitConfig, refit: Re
         return fitted
     # What is left where the focal length is right is no less than half of what raises doubt.
     uncertainty = max(found.pull.sigma, options.least_focal_pull / 2) / share
-    if options.lens == "auto" and not (
-        uncertainty < options.focal_prior and _focal_length_is_earned(views, fitted, found.fitted, config)
-    ):
+    is_likely = uncertainty < options.focal_prior and abs(found.change) < FARTHEST * options.focal_prior
+    if options.lens == "auto" and not (is_likely and _focal_length_is_earned(views, fitted, found.fitted, config)):
         return fitted
     factor = found.fitted.corrections.focal_factor
     told = replace(found.fitted.corrections, focal_uncertainty=factor * uncertainty)
