@@ -21,7 +21,7 @@ from panoless.capture.corrections import with_focal_factor
 from panoless.capture.poses import moved_view
 from panoless.capture.rays import pose_of
 from panoless.capture.views import TrainView, Views, at_most_pixels
-from panoless.environment.cubemap import texels_of
+from panoless.environment.cubemap import beyond_texels, texels_of
 from panoless.environment.nearness import light_and_slopes
 from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
@@ -58,15 +58,11 @@ def focal_pull(views: Views, geometry: Geometry, rays: int, resolution: int, rob
     residual, rows = shown - radiance, np.matmul(slopes, turns[..., None])[..., 0]
     weights = robust_weight(residual, robust_scale) * robust_weight(turns, WIDEST_TURN)
     texels = texels_of(directions, resolution)
-    total = np.maximum(np.bincount(texels, weights), 1e-12)
-
-    def beyond(values: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
-        return values - (np.bincount(texels, weights * values) / total)[texels]
-
-    left = np.stack([beyond(column) for column in rows.T], 1)
+    left = beyond_texels(rows, weights, texels)
     gradient, curvature = (float((weights[:, None] * left * each).sum()) for each in (residual, left))
     votes = float(weights.sum())
-    counted = 3 * max(votes - len(total), votes * LEAST_COUNTED, 1.0)
+    taken_over = int(texels.max(initial=-1)) + 1
+    counted = 3 * max(votes - taken_over, votes * LEAST_COUNTED, 1.0)
     variance = float((weights[:, None] * residual**2).sum()) / counted
     return FocalPull(-gradient / max(curvature, 1e-12), (variance / max(curvature, 1e-12)) ** 0.5)
 

@@ -40,3 +40,12 @@ def texels_of(directions: Float[np.ndarray, "P 3"], resolution: int) -> Int[np.n
     face, st = directions_to_cube(directions)
     column, row = np.clip((st + 1) * resolution / 2, 0, resolution - 1).astype(np.int64).T
     return np.unique((face * resolution + row) * resolution + column, return_inverse=True)[1].reshape(-1)
+
+
+def beyond_texels(
+    values: Float[np.ndarray, "P K"], weights: Float[np.ndarray, "P"], texels: Int[np.ndarray, "P"]
+) -> Float[np.ndarray, "P K"]:
+    """(1 − Π) v: what is left of each column when the weighted mean over a texel takes over all that it can."""
+    total = np.maximum(np.bincount(texels, weights), 1e-12)
+    means = np.stack([np.bincount(texels, weights * column) / total for column in values.T], 1)
+    return values - means[texels]

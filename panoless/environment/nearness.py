@@ -12,13 +12,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from panoless.environment.cubemap import beyond_texels, texels_of
 from panoless.environment.options import SurroundingsOptions
 from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
 from panoless.environment.surroundings import Surroundings
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.robust import bounded_error, robust_weight
-from shinypartial.core.sphere import directions_to_cube
 
 LEAST_CURVATURE = 1e-12
 """Added at least to the diagonal of the matrix over the coefficients, so that it can be inverted."""
@@ -57,19 +57,11 @@ class Linearized:
         residual = shown - seen.radiance
         weights = robust_weight(residual, options.robust_scale)
         rows = surroundings.rows(slopes, seen.points, seen.directions)
-        face, st = directions_to_cube(rays.directions.numpy().astype(np.float64))
-        column, line = np.clip((st + 1) * resolution / 2, 0, resolution - 1).astype(np.int64).T
-        texels = (face * resolution + line) * resolution + column
-        total = np.bincount(texels, weights, 6 * resolution**2)
-
-        def beyond(values: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
-            means = np.bincount(texels, weights * values, len(total)) / np.maximum(total, 1e-12)
-            return values - means[texels]
-
+        texels = texels_of(rays.directions.numpy().astype(np.float64), resolution)
         count = rows.shape[2]
         gradient, matrix = np.zeros(count), np.zeros((count, count))
         for channel in range(3):
-            left = np.stack([beyond(rows[:, channel, k]) for k in range(count)], 1)
+            left = beyond_texels(rows[:, channel], weights, texels)
             gradient += left.T @ (weights * residual[:, channel])
             matrix += left.T @ (weights[:, None] * left)
         cost = options.robust_scale**2 * float(bounded_error(residual, options.robust_scale).sum()) / 2
