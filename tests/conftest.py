@@ -41,6 +41,14 @@ settings.register_profile("local", deadline=None, max_examples=50)
 settings.register_profile("ci", deadline=None, max_examples=20, derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "local")
 
+#: Folders and files whose few tests render or fit for long: with workers, who takes them last lets the others wait.
+FIRST = ("tests/integration/", "tests/shinypartial/test_generate.py")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """They come first, else files keep their order."""
+    items.sort(key=lambda item: not item.nodeid.startswith(FIRST))
+
 
 @pytest.fixture(scope="session")
 def sphere_dataset(tmp_path_factory: pytest.TempPathFactory):

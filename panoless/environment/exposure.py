@@ -7,12 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from panoless.capture.encoding import SATURATED
 from panoless.environment.cubemap import texels_of
 from panoless.environment.rays import Rays
 from panoless.numeric.robust import robust_weight
-
-SATURATED = 0.99
-"""Of the largest value, from which a pixel has no say: the last step of 8-bit sRGB begins there."""
 
 
 def exposure_gains(

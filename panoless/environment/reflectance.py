@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from panoless.capture.encoding import SATURATED
 from panoless.environment.cubemap import texels_of
-from panoless.environment.exposure import SATURATED
 from panoless.environment.options import MaterialOptions
 from panoless.environment.rays import Rays
 from panoless.numeric.robust import robust_weight

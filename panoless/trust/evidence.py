@@ -141,7 +141,10 @@ def _light(
     tested = replace(views, train=tuple(view for view, _ in held_out))
     rays = list(observe_views(solved, geometry, options.rays))
     environment = solve_environment(rays, min(options.resolution, visibility.shape[-1]))
-    places, parts = _Places.of(kept, options), _Parts.empty(options.part_cells, views.train[0].mask.device)
+    device = views.train[0].mask.device
+    places, parts = _Cells.empty(options.cells, 3, device), _Cells.empty(options.part_cells, 1, device)
+    for view, surface in kept:
+        places.add(view, surface, view.solid, view.radiance.flatten(1)[:, view.solid].T)
     errors, confidence, explained, plain = [], [], _Mean(), {"one_color": _Mean(), "matte": _Mean()}
     for (view, surface), (_, pixels) in zip(held_out, at_most_pixels(tested, options.rays), strict=True):
         batch = geometry.observe(view, pixels)
@@ -152,8 +155,8 @@ def _light(
         radiance = view.radiance.flatten(1)[:, pixels].T
         normals = surface.normals_camera.flatten(1)[:, pixels]
         shown = geometry.shade(environment, view.camera, pixels, normals) - radiance
-        parts.add(_cell_index(view, surface, pixels, parts.cells), bounded_error(shown, options.scale))
-        guesses = {"one_color": radiance.mean(0), "matte": places.colors(view, surface, pixels)}
+        parts.add(view, surface, pixels, bounded_error(shown, options.scale)[:, None])
+        guesses = {"one_color": radiance.mean(0), "matte": places.means(view, surface, pixels)}
         for name, guess in guesses.items():
             plain[name].add(bounded_error(guess - radiance, options.scale), torch.ones_like(radiance[:, 0]))
     if explained.weight <= 0:
@@ -190,62 +193,44 @@ class _Mean:
 
 
 @dataclass
-class _Parts:
-    """Summed errors and numbers of pixels by cells of a grid through which the surface passes."""
+class _Cells:
+    """Summed values of pixels, and their number, by the cells of a grid through which the surface passes."""
 
-    summed: Float[Tensor, "N"]
+    side: int
+    summed: Float[Tensor, "N C"]
     count: Float[Tensor, "N"]
-    cells: int
 
     @classmethod
-    def empty(cls, cells: int, device: torch.device) -> "_Parts":
+    def empty(cls, side: int, values: int, device: torch.device) -> "_Cells":
         """Before any pixel."""
-        return cls(torch.zeros(cells**3, device=device), torch.zeros(cells**3, device=device), cells)
+        return cls(side, torch.zeros(side**3, values, device=device), torch.zeros(side**3, device=device))
 
-    def add(self, index: Int[Tensor, "P"], errors: Float[Tensor, "P"]) -> None:
-        """Count pixels in."""
-        self.summed.index_add_(0, index, errors)
-        self.count.index_add_(0, index, torch.ones_like(errors))
+    def add(
+        self, view: TrainView, surface: SurfaceBuffers, pixels: Int[Tensor, "P"], values: Float[Tensor, "P C"]
+    ) -> None:
+        """Count pixels of a view in."""
+        index = self._index(view, surface, pixels)
+        self.summed.index_add_(0, index, values)
+        self.count.index_add_(0, index, torch.ones_like(values[:, 0]))
+
+    def means(self, view: TrainView, surface: SurfaceBuffers, pixels: Int[Tensor, "P"]) -> Float[Tensor, "P C"]:
+        """Of the cells that pixels see; that of all cells where nothing was added."""
+        index, overall = self._index(view, surface, pixels), self.summed.sum(0) / self.count.sum().clamp(min=1)
+        count = self.count[index][:, None]
+        return torch.where(count > 0, self.summed[index] / count.clamp(min=1), overall)
 
     def share_above(self, limit: float) -> float:
-        """The share of the pixels that lie in cells whose mean error is above a limit."""
-        above = self.summed > limit * self.count
+        """The share of the pixels that lie in cells whose mean is above a limit."""
+        above = self.summed[:, 0] > limit * self.count
         return float(self.count[above].sum() / self.count.sum().clamp(min=1))
 
-
-@dataclass(frozen=True)
-class _Places:
-    """The mean color of the cells of a grid through which the surface passes."""
-
-    colors_of_cells: Float[Tensor, "N 3"]
-    cells: int
-
-    @classmethod
-    def of(cls, seen: Sequence[tuple[TrainView, SurfaceBuffers]], options: TrustOptions) -> "_Places":
-        """From the solid pixels of views and what their cameras see of the surface."""
-        cells = options.cells
-        device = seen[0][0].mask.device
-        summed = torch.zeros(cells**3, 3, device=device)
-        count = torch.zeros(cells**3, device=device)
-        for view, surface in seen:
-            index = _cell_index(view, surface, view.solid, cells)
-            summed.index_add_(0, index, view.radiance.flatten(1)[:, view.solid].T)
-            count.index_add_(0, index, torch.ones_like(index, dtype=count.dtype))
-        overall = summed.sum(0) / count.sum().clamp(min=1)
-        return cls(torch.where(count[:, None] > 0, summed / count.clamp(min=1)[:, None], overall), cells)
-
-    def colors(self, view: TrainView, surface: SurfaceBuffers, pixels: Int[Tensor, "P"]) -> Float[Tensor, "P 3"]:
-        """Of the places that pixels see."""
-        return self.colors_of_cells[_cell_index(view, surface, pixels, self.cells)]
-
-
-def _cell_index(view: TrainView, surface: SurfaceBuffers, pixels: Int[Tensor, "P"], cells: int) -> Int[Tensor, "P"]:
-    """Cells of the grid over the cube of side 2 in which pixels see the surface; the nearest for what lies beyond."""
-    rays = view.rays_camera.flatten(1)[:, pixels]
-    points_camera = rays / rays[2] * surface.depth.flatten()[pixels]
-    points = view.camera_to_world_rotation @ (points_camera - view.camera.world_to_camera[:3, 3:])
-    grid = ((points + 1) / 2 * cells).long().clamp(0, cells - 1)
-    return (grid[0] * cells + grid[1]) * cells + grid[2]
+    def _index(self, view: TrainView, surface: SurfaceBuffers, pixels: Int[Tensor, "P"]) -> Int[Tensor, "P"]:
+        """Cells of the cube of side 2 in which pixels see the surface; the nearest for what lies beyond."""
+        rays = view.rays_camera.flatten(1)[:, pixels]
+        points_camera = rays / rays[2] * surface.depth.flatten()[pixels]
+        points = view.camera_to_world_rotation @ (points_camera - view.camera.world_to_camera[:3, 3:])
+        grid = ((points + 1) / 2 * self.side).long().clamp(0, self.side - 1)
+        return (grid[0] * self.side + grid[1]) * self.side + grid[2]
 
 
 def _silhouette(view: TrainView, surface: SurfaceBuffers) -> tuple[float, float, float]:

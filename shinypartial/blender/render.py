@@ -80,7 +80,6 @@ class Renderer:
     spec: CameraPath
     scratch: Path
     device: str
-    blender_version: str
     body_vertices_world: Float[np.ndarray, "P 3"]
     mirror: "_Mirror | None"
     """What a perfectly mirroring object is rendered with; None where every pixel is path traced."""
@@ -173,7 +172,7 @@ def open_renderer(
             if not path_traced and spec.render.samples <= MOST_SAMPLES_OF_MIRRORS and mirrors_enough(bpy, spec):
                 mirror = _prepare_mirror(bpy, spec, vertices, threads or os.cpu_count() or 1)
             set_threads(bpy, threads)
-        yield Renderer(bpy, spec.camera, Path(scratch), device, bpy.app.version_string, vertices, mirror)
+        yield Renderer(bpy, spec.camera, Path(scratch), device, vertices, mirror)
 
 
 def _prepare_mirror(bpy: Any, spec: SceneSpec, body: Float[np.ndarray, "P 3"], threads: int) -> _Mirror:

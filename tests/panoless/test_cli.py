@@ -143,7 +143,7 @@ def test_a_model_that_is_asked_for_is_taken_and_saved(
     monkeypatch.chdir(tmp_path)
     tables = {"plane": "plane.ply", "revolution": "revolution.ply", "surfels": "surfels.ply"}
     coarse = ["--config.environment.resolution", "16", "--config.environment.solve-resolution", "16", *AS_TOLD]
-    for model in tables:
+    for model in ("plane", "surfels"):
         assert main(["fit", str(many_views_dataset.root), *TINY, *coarse, "--model", model, "--output", model]) == 0
         assert f"Model: {model} (asked for" in capsys.readouterr().err
         content = json.loads((tmp_path / model / "prediction.json").read_text())

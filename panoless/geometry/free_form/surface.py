@@ -12,6 +12,8 @@ from panoless.kernels.level_set import evaluate, first_hits, nearest_approach
 
 NEAREST = 6
 """Vertices whose tangent planes tell the distance from a mesh."""
+LEAF = 64
+"""Vertices in a leaf of the tree that is searched; most nodes are far from all, where large leaves are faster."""
 LEAST_SLOPE = 0.3
 """Lower bound of ‖∇φ‖ where it is divided by."""
 NODE = 1.0
@@ -176,12 +178,14 @@ def level_set_of(surface: TriangleMesh, cells: int, margin: float) -> LevelSet:
     low = lowest + extent / 2 - shape * spacing / 2
     empty = LevelSet(low, spacing, np.zeros(shape + 3))
     points = empty.points(empty.nodes().reshape(-1, 3))
-    tree = cKDTree(vertices)
-    distance, index = tree.query(points, k=NEAREST)
+    tree = cKDTree(vertices, leafsize=LEAF)
+    distance, index = tree.query(points)
     usual = float(np.median(tree.query(vertices[:: max(len(vertices) // 1000, 1)], k=2)[0][:, 1]))
-    planes = ((points[:, None] - vertices[index]) * normals[index]).sum(2)
+    values = np.copysign(distance, ((points - vertices[index]) * normals[index]).sum(1))
+    near = distance < 4 * usual
+    distance, index = tree.query(points[near], k=NEAREST)
+    planes = ((points[near, None] - vertices[index]) * normals[index]).sum(2)
     weights = np.exp(-(distance - distance[:, :1]) / usual)
-    near = (planes * weights).sum(1) / weights.sum(1)
-    far = np.sign(planes[:, 0]) * distance[:, 0]
     share = np.clip((distance[:, 0] - 2 * usual) / (2 * usual), 0, 1)
-    return empty.interpolating(((share * far + (1 - share) * near) / spacing).reshape(empty.shape))
+    values[near] = share * values[near] + (1 - share) * (planes * weights).sum(1) / weights.sum(1)
+    return empty.interpolating((values / spacing).reshape(empty.shape))

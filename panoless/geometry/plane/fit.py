@@ -45,16 +45,8 @@ class PlaneFit:
     """
     median_px: Float[np.ndarray, "V"]
     """Median distance of the mask's contour from the projected boundary and frame; infinite for a view from behind."""
-    rms_px: Float[np.ndarray, "V"]
-    """Root mean square of the same distances, over all of the contour."""
     iou: Float[np.ndarray, "V"]
     """Σ min(alpha, mask) / Σ max(alpha, mask), with the frame."""
-    share_inside: float
-    """Share of contour points more than a pixel inside: something other than the frame stands in front of the
-    mirror.
-    """
-    share_outside: float
-    """Share of contour points more than a pixel outside: wrong masks or poses, or no plane."""
 
 
 def fit_plane(views: Views, *, thorough: bool = True, options: PlaneOptions = PlaneOptions()) -> PlaneFit:
@@ -316,20 +308,12 @@ def _score(views: Views, contours: MaskContours, plane: Plane, sigma_deg: float,
     residuals = boundary_residuals(contours, plane, options)
     size = np.where(residuals.valid, np.abs(residuals.pixels), np.inf)
     count = len(views.train)
-    median_px, rms_px, iou = np.full(count, np.inf), np.full(count, np.inf), np.zeros(count)
+    median_px, iou = np.full(count, np.inf), np.zeros(count)
     for index, view in enumerate(views.train):
         own = size[contours.view == index]
         if len(own):
-            median_px[index], rms_px[index] = np.median(own), np.sqrt((own**2).mean())
+            median_px[index] = np.median(own)
         alpha = plane_buffers(plane, view.camera).alpha
         both, either = alpha.minimum(view.mask).sum(), alpha.maximum(view.mask).sum()
         iou[index] = float(both / either) if either > 0 else 0.0
-    return PlaneFit(
-        plane=plane,
-        normal_sigma_deg=sigma_deg,
-        median_px=median_px,
-        rms_px=rms_px,
-        iou=iou,
-        share_inside=float((residuals.pixels[residuals.valid] < -1.0).sum() / len(size)),
-        share_outside=float((residuals.pixels[residuals.valid] > 1.0).sum() / len(size)),
-    )
+    return PlaneFit(plane, sigma_deg, median_px, iou)

@@ -332,8 +332,7 @@ def test_a_fit_loads_neither_metrics_nor_blender(tmp_path: Path, sphere_dataset:
     )
     options = ["--config.iterations", "3", "--config.surfels.count", "50", "--config.surfels.hull-resolution", "24"]
     options += ["--config.environment.resolution", "16", "--config.environment.solve-resolution", "16"]
-    believed = ["corrections.masks=off", "corrections.exposure=off", "corrections.lens=off"]
-    options += ["--set", "selection.trial_resolution=16", *believed]
+    options += ["--model", "surfels"]
     command = [sys.executable, "-c", program, "fit", str(sphere_dataset.root), "--output", "out", *options]
     environment = {
         "PYTHONPATH": str(ROOT),

@@ -254,7 +254,10 @@ def test_the_commands_take_and_export_snapshots(
     assert "snapshots" not in asdict(CONFIG)
 
 
-@pytest.mark.parametrize(("model", "name"), [("plane", "a plane"), ("revolution", "a surface of revolution")])
+@pytest.mark.parametrize(
+    ("model", "name"),
+    [("plane", "a plane"), pytest.param("revolution", "a surface of revolution", marks=pytest.mark.slow)],
+)
 def test_what_takes_no_steps_has_no_snapshots_and_the_command_says_why(
     model: str,
     name: str,

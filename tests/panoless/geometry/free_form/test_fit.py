@@ -179,7 +179,7 @@ def test_held_out_views_refuse_cells_that_a_ball_does_not_need() -> None:
 def test_the_same_views_give_the_same_surface() -> None:
     """A killed fit in closed form starts again, so it ends where the other would have."""
     views = body_views(sphere(), 10, 40)
-    options = replace(OPTIONS, rounds=(COARSE,))
+    options = replace(OPTIONS, rounds=(replace(COARSE, steps=2),), start_tensions=(0.0, 30.0))
     np.testing.assert_array_equal(fitted(views, options).coefficients, fitted(views, options).coefficients)
 
 

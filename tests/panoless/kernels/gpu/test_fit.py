@@ -20,7 +20,7 @@ def test_a_fit_ends_as_on_the_cpu(
     preset: str, tmp_path: Path, sphere_dataset: Dataset, device: torch.device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     dataset = replace(sphere_dataset, train=sphere_dataset.train[:2])
-    config = tiny_config(preset, iterations=3, count=30)
+    config = tiny_config(preset, iterations=2, count=30)
     config = replace(
         config,
         model="surfels",
