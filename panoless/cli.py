@@ -1,4 +1,4 @@
-"""The `panoless` command: fit a dataset, export a finished fit."""
+"""The `panoless` command: make a dataset of photographs, fit it, export a finished fit."""
 
 import sys
 from dataclasses import dataclass, field
@@ -9,8 +9,10 @@ from typing import Annotated, Literal
 import tyro
 
 from panoless.config import FitConfig, renamed_arguments, with_overrides
+from panoless.photographs.options import CaptureOptions
 from panoless.presets import PRESETS
 from shinypartial.core.errors import InputError, parse_and_run
+from shinypartial.io.records import check_record
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,84 @@ class Export:
             print(f"Then: shinypartial evaluate {prediction} --snapshots")
 
 
+@dataclass(frozen=True)
+class Capture:
+    """Make a dataset of photographs or a video: poses, masks and undistorted pictures; see docs/how-to/capture.md.
+
+    Poses come from a COLMAP model or a transforms.json that is there, from a printed board, or from what is seen around
+    the object. Run again to continue where an earlier run stopped.
+    """
+
+    source: Annotated[Path, tyro.conf.Positional]
+    """Folder of photographs, or a video."""
+    output: Path
+    """Dataset folder to write."""
+    colmap: Path | None = None
+    """Folder of a COLMAP model, text or binary, for these photographs; found where it is SOURCE/sparse/0."""
+    board: Literal["A4", "Letter", "A3"] | None = None
+    """The board of `panoless board` that lies under the object, by its paper."""
+    square_mm: float | None = None
+    """Side of a square of the board as measured on the print, in millimeters."""
+    masks: Path | None = None
+    """Folder of masks by the names of the photographs, white on the object."""
+    box: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="X0,Y0,X1,Y1")] = ()
+    """Without masks: a rectangle about the object, in pixels of the photograph that --box-in names. May be repeated."""
+    box_in: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME")] = ()
+    """Name of the photograph of each rectangle, without its suffix."""
+    upright: bool = True
+    """Turn pictures as their EXIF tag says; poses of other programs may be for pixels as they are stored."""
+    options: CaptureOptions = CaptureOptions()
+
+    def run(self) -> None:
+        """Make the dataset and say what was measured."""
+        from panoless.photographs.make import Request, capture
+
+        check_record(self.options, "--options", remedy="Correct that value.")
+        request = Request(
+            self.source,
+            self.output,
+            colmap=self.colmap,
+            board=self.board,
+            square_mm=self.square_mm,
+            masks=self.masks,
+            boxes=self._boxes(),
+            upright=self.upright,
+            options=self.options,
+        )
+        print("\n".join(capture(request).summary()))
+        print(f"Look at {self.output}/capture/masks.jpg. Next: panoless fit {self.output}")
+
+    def _boxes(self) -> dict[str, tuple[float, float, float, float]]:
+        try:
+            boxes = [tuple(float(value) for value in box.split(",")) for box in self.box]
+            return {name: (x0, y0, x1, y1) for name, (x0, y0, x1, y1) in zip(self.box_in, boxes, strict=True)}
+        except ValueError:
+            raise InputError(
+                expected="--box X0,Y0,X1,Y1 with four numbers, and --box-in NAME for each",
+                found=f"--box {' '.join(self.box) or 'nothing'}, --box-in {' '.join(self.box_in) or 'nothing'}",
+                remedy="Give both for each rectangle.",
+            ) from None
+
+
+@dataclass(frozen=True)
+class PrintBoard:
+    """Write the board that lies under the object while photographs are taken, at its true size."""
+
+    output: Path = Path("board.pdf")
+    """File to write: .pdf or .svg."""
+    paper: Literal["A4", "Letter", "A3"] = "A4"
+    """The larger, the better: the object must not hide most of it."""
+
+    def run(self) -> None:
+        """Write the file and say how to print it."""
+        from panoless.photographs.board import BOARDS, write_board
+
+        board = BOARDS[self.paper]
+        write_board(board, self.output)
+        print(f"Print {self.output} at 100 % and measure: five squares are {5 * board.square_mm:g} mm.")
+        print(f"Then: panoless capture FOLDER --output DATASET --board {self.paper}")
+
+
 def _preset_of(arguments: list[str]) -> str:
     """The preset chose the defaults of all other options, so it is read before the command line is derived."""
     for index, argument in enumerate(arguments):
@@ -141,9 +221,11 @@ def main(arguments: list[str] | None = None) -> int:
     kinds = (
         Annotated[Fit, tyro.conf.subcommand("fit", default=fit_default)]
         | Annotated[Export, tyro.conf.subcommand("export")]
+        | Annotated[Capture, tyro.conf.subcommand("capture")]
+        | Annotated[PrintBoard, tyro.conf.subcommand("board")]
     )
 
-    def parse() -> Fit | Export:
+    def parse() -> Fit | Export | Capture | PrintBoard:
         return tyro.cli(
             kinds,  # type: ignore[arg-type]
             args=arguments,

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import tyro
 
-from shinypartial.cli.datasets import Perturb, Release, Subset, Validate
+from shinypartial.cli.datasets import ExportCameras, Perturb, Release, Subset, Validate
 from shinypartial.cli.presenting import Chart, Leaderboard, Report
 from shinypartial.cli.scenes import Generate
 from shinypartial.cli.scoring import Compare, Evaluate, Oracle, Postprocess, Weights
@@ -15,6 +15,7 @@ Command = (
     Generate
     | Subset
     | Perturb
+    | ExportCameras
     | Validate
     | Evaluate
     | Oracle

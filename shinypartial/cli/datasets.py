@@ -83,6 +83,27 @@ class Perturb:
 
 
 @dataclass(frozen=True)
+class ExportCameras:
+    """Write the cameras of a dataset for other programs: a COLMAP model, or nerfstudio's transforms.json."""
+
+    dataset: tyro.conf.Positional[Path]
+    """Dataset folder, also a plain NeRF-synthetic one, or the name of a bundled one; it is only read."""
+    output: Path
+    """Folder to write; for COLMAP it is the model, such as sparse/0."""
+    to: Literal["colmap", "nerf"] = "colmap"
+    """Kind of the files."""
+
+    def run(self) -> None:
+        """Write the files and name them."""
+        from shinypartial.dataset.bundled import resolve_dataset
+        from shinypartial.dataset.export_cameras import export_cameras
+        from shinypartial.dataset.read import open_dataset
+
+        written = export_cameras(open_dataset(resolve_dataset(self.dataset)), self.output, self.to)
+        print("Cameras written to", *written)
+
+
+@dataclass(frozen=True)
 class Validate:
     """Check every promise of the dataset format; list each break with its file and its remedy."""
 

@@ -102,6 +102,8 @@ def _draw(axes: Any, view: PlotView, trajectory: Trajectory) -> None:
 def _draw_split(axes: Any, view: PlotView, cameras: Sequence[Camera], distance: float, label: str, color: str) -> None:
     from matplotlib.collections import LineCollection
 
+    if not cameras:
+        return
     positions = np.stack([camera.position_world for camera in cameras])
     forward = np.stack([camera.camera_to_world[:3, 2] for camera in cameras])
     ticks = view.project(np.stack([positions, positions + TICK_SHARE * distance * forward], 1))

@@ -56,7 +56,17 @@ def read_frames(root: Path, split: str) -> tuple[list[Frame], int, list[InputErr
     path = root / f"transforms_{split}.json"
     if split == "test" and not path.exists():
         return [], 0, []
-    content = read_json(path, f"the cameras of the {split} split")
+    if root.is_dir() and not path.exists():
+        raise InputError(
+            expected=f"the cameras of the {split} split at {path}",
+            found="no such file",
+            remedy="Check the path of the folder; `panoless capture` finds the cameras of photographs that have none.",
+        )
+    return frames_of(root, read_json(path, f"the cameras of the {split} split"), path)
+
+
+def frames_of(root: Path, content: Any, path: Path) -> tuple[list[Frame], int, list[InputError]]:
+    """What `read_frames` returns, of the content of a file of cameras; `path` names it in messages."""
     entries = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(entries, list) or not entries:
         raise InputError(
@@ -81,7 +91,7 @@ def _read_intrinsics(fields: dict[str, Any], where: str) -> _Intrinsics:
         raise InputError(
             expected=f"undistorted pinhole images in {where}",
             found=f"lens distortion ({', '.join(distorted)} not zero)",
-            remedy="Undistort the images (for example with COLMAP's image_undistorter) and remove these fields.",
+            remedy="Undistort the images (`panoless capture` and COLMAP's image_undistorter do); remove these fields.",
         )
     return read_record(_Intrinsics, fields, where, allow_unknown=True)
 

@@ -133,18 +133,20 @@ def encode_normals(normals: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H 
 
 
 def write_transforms(root: Path, split: str, frames: Sequence[Frame]) -> None:
-    """Write `transforms_SPLIT.json` with OpenGL poses, as NeRF-synthetic and nerfstudio readers expect."""
-    content = {
-        **intrinsics_of(frames[0].camera),
-        "frames": [
-            {
-                "file_path": f"./{split}/{frame.stem.name}",
-                "transform_matrix": opencv_to_opengl(frame.camera.camera_to_world).tolist(),
-            }
-            for frame in frames
-        ],
-    }
-    write_json(root / f"transforms_{split}.json", content)
+    """Write `transforms_SPLIT.json` with OpenGL poses, as NeRF-synthetic and nerfstudio readers expect.
+
+    Intrinsics of the first frame stand for all; frames that differ from it have their own.
+    """
+    shared = intrinsics_of(frames[0].camera)
+    entries = []
+    for frame in frames:
+        own = intrinsics_of(frame.camera)
+        entry = {
+            "file_path": f"./{split}/{frame.stem.name}",
+            "transform_matrix": opencv_to_opengl(frame.camera.camera_to_world).tolist(),
+        }
+        entries.append(entry if own == shared else {**entry, **own})
+    write_json(root / f"transforms_{split}.json", {**shared, "frames": entries})
 
 
 def intrinsics_of(camera: Camera) -> dict[str, float]:

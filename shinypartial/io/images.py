@@ -24,6 +24,18 @@ EXR = ".exr"
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".hdr")
 #: Channels that `read_picture` returns: gray, RGB, RGBA; gray with alpha becomes the last.
 CHANNEL_COUNTS = (1, 3, 4)
+#: What brings stored pixels upright, by the EXIF orientation: whether rows and columns change places, then which axes
+#: of the result run backward.
+UPRIGHT = {
+    1: (False, ()),
+    2: (False, (1,)),
+    3: (False, (0, 1)),
+    4: (False, (0,)),
+    5: (True, ()),
+    6: (True, (1,)),
+    7: (True, (0, 1)),
+    8: (True, (0,)),
+}
 
 
 def write_exr(path: Path, channels: Channels, *, y_up_environment: bool = False) -> None:
@@ -177,10 +189,34 @@ def read_picture(path: Path) -> Num[np.ndarray, "H W C"]:
     of an unknown format, for pictures whose EXIF tag says that they lie on their side, for integers that were
     premultiplied, and for other types and numbers of channels.
     """
+    pixels, orientation = _read_stored(path)
+    if orientation != 1:
+        raise InputError(
+            expected=f"an upright picture at {path}",
+            found=f"the EXIF orientation {orientation}, which some programs apply and others ignore",
+            remedy="Turn the pixels (`mogrify -auto-orient`) or remove the tag: whichever the camera poses are for.",
+        )
+    return pixels
+
+
+def read_upright(path: Path) -> Num[np.ndarray, "H W C"]:
+    """The picture as `read_picture` has it, its pixels turned as its EXIF tag says."""
+    pixels, orientation = _read_stored(path)
+    transposed, backward = UPRIGHT.get(orientation, UPRIGHT[1])
+    return np.flip(pixels.transpose(1, 0, 2) if transposed else pixels, backward)
+
+
+def read_as_stored(path: Path) -> Num[np.ndarray, "H W C"]:
+    """The picture as `read_picture` has it, whatever its EXIF tag says."""
+    return _read_stored(path)[0]
+
+
+def _read_stored(path: Path) -> tuple[Num[np.ndarray, "H W C"], int]:
+    """Pixels as they are stored, and the EXIF orientation: 1 where they are upright."""
     if path.suffix.lower() == EXR:
         channels = read_exr(path)
         names = ("Y",) if "Y" in channels else ("R", "G", "B", "A") if "A" in channels else ("R", "G", "B")
-        return stack_channels(channels, names, path)
+        return stack_channels(channels, names, path), 1
     with _open_picture(path) as (file, spec):
         orientation = spec.get_int_attribute("Orientation", 1)
         straight = spec.get_int_attribute("oiio:UnassociatedAlpha", 0) == 1 or spec.alpha_channel < 0
@@ -188,12 +224,6 @@ def read_picture(path: Path) -> Num[np.ndarray, "H W C"]:
         pixels = file.read_image(spec.format)
         if pixels is None:
             raise _damaged(path, file.geterror())
-    if orientation != 1:
-        raise InputError(
-            expected=f"an upright picture at {path}",
-            found=f"the EXIF orientation {orientation}, which some programs apply and others ignore",
-            remedy="Turn the pixels (`mogrify -auto-orient`) or remove the tag: whichever the camera poses are for.",
-        )
     if gray_alpha:
         pixels = pixels[..., [0, 0, 0, 1]]
     floating = pixels.dtype.kind == "f"
@@ -211,7 +241,7 @@ def read_picture(path: Path) -> Num[np.ndarray, "H W C"]:
         )
     if floating and straight and pixels.shape[2] == 4:
         pixels = np.concatenate([pixels[..., :3] * pixels[..., 3:], pixels[..., 3:]], -1)
-    return pixels.astype(np.float32) if floating else pixels
+    return pixels.astype(np.float32) if floating else pixels, orientation
 
 
 def unit_values(image: Num[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:

@@ -10,7 +10,7 @@ import pytest
 
 from tests.architecture.source import PACKAGES, ROOT, imported_names, source_files
 
-HEAVY = ("bpy", "torch", "numba", "matplotlib", "scipy", "skimage", "OpenEXR", "PIL")
+HEAVY = ("bpy", "torch", "numba", "matplotlib", "scipy", "skimage", "OpenEXR", "PIL", "cv2", "pycolmap")
 FREE_MODULES = ("shinypartial", "shinypartial.cli", "panoless", "panoless.cli")
 IMPORT_LIMIT_S = 0.3
 

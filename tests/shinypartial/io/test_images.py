@@ -8,15 +8,17 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 from shinypartial.core.errors import InputError
 from shinypartial.io.images import (
     picture_size,
+    read_as_stored,
     read_exr,
     read_exr_rgb,
     read_picture,
     read_png,
+    read_upright,
     stack_channels,
     unit_values,
     write_exr,
@@ -221,6 +223,17 @@ def test_a_picture_on_its_side_is_refused(tmp_path: Path, suffix: str, orientati
         return
     with pytest.raises(InputError, match=f"the EXIF orientation {orientation}"):
         read_picture(path)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pixels_are_turned_upright_as_pillow_turns_them(tmp_path: Path, orientation: int) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = tmp_path / "a.png"
+    codes = some_codes(np.uint8, 3)
+    Image.fromarray(codes).save(path, exif=exif)
+    np.testing.assert_array_equal(read_upright(path), np.asarray(ImageOps.exif_transpose(Image.open(path))))
+    np.testing.assert_array_equal(read_as_stored(path), codes)
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".tif", ".hdr", ".png"])

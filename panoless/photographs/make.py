@@ -1,0 +1,261 @@
+"""Photographs to a dataset folder, stage by stage: frames, poses, masks, cameras."""
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from panoless.photographs.board import BOARDS, Board, poses_from_board
+from panoless.photographs.frames import Frames, block_means, make_frames, source_files
+from panoless.photographs.hull import nearest_point
+from panoless.photographs.masks import Box, Masks, find_masks, given_mask, overlaps_of
+from panoless.photographs.models import find_model, find_transforms, read_colmap, read_transforms
+from panoless.photographs.options import CaptureOptions
+from panoless.photographs.posed import PosedView, Poses, without_the_rest
+from panoless.photographs.stage import stage
+from panoless.photographs.structure import REMEDY, poses_from_structure
+from shinypartial.core.errors import InputError
+from shinypartial.core.trajectory import Trajectory
+from shinypartial.dataset.camera_plot import plot_cameras
+from shinypartial.dataset.schema import Frame
+from shinypartial.dataset.write import write_transforms
+from shinypartial.io.files import folder_lock, sha256_of
+from shinypartial.io.images import read_as_stored, read_png, read_upright, unit_values, write_png
+from shinypartial.io.picture_sheet import write_picture_sheet
+from shinypartial.io.records import write_record
+
+#: What the stages found, beside the dataset proper.
+WORK = "capture"
+SHEET_PICTURES = 12
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is to be made of which photographs."""
+
+    source: Path
+    """A folder of photographs, or a video."""
+    output: Path
+    colmap: Path | None = None
+    board: str | None = None
+    square_mm: float | None = None
+    """As measured on the print; None for what was meant to be printed."""
+    masks: Path | None = None
+    boxes: Mapping[str, Box] = field(default_factory=dict)
+    """Rectangles about the object by name of the photograph: left, top, right, bottom in its pixels."""
+    upright: bool = True
+    options: CaptureOptions = CaptureOptions()
+
+
+@dataclass(frozen=True)
+class Captured:
+    """What was made."""
+
+    frames: Frames
+    poses: Poses
+    masks: Masks
+
+    def summary(self) -> list[str]:
+        """What was measured, in a line a stage."""
+        blurs = [one.blur for one in self.frames.photographs]
+        views, lens = self.poses.views, self.poses.views[0].lens
+        errors = [view.error_px for view in views if view.error_px is not None]
+        left_out = f", none for {', '.join(self.poses.left_out)}" if self.poses.left_out else ""
+        within = f", {np.median(errors):.2f} px off in the median view" if errors else ""
+        sure = f" ± {self.poses.focal_error:.2%}" if self.poses.focal_error is not None else ""
+        return [
+            f"Frames: {len(blurs)}, blur {np.median(blurs):.2f} in the median frame",
+            f"Poses: {len(views)} by {self.poses.origin}{within}{left_out}",
+            f"Lens: focal length {lens.fx:.1f} px{sure}, k1 {lens.k1:.4f}",
+            f"Masks: {self.masks.origin}, {np.median(self.masks.overlaps):.1%} overlap with their hull in the median",
+        ]
+
+
+def capture(request: Request) -> Captured:
+    """Make the dataset folder; stages that were done with the same input are not done again.
+
+    Raises InputError for whatever photographs, poses or masks lack, and for an output folder that holds other things.
+    """
+    files = source_files(request.source)
+    _check_output(request.output)
+    with folder_lock(request.output):
+        work = request.output / WORK
+        pictures = work / "frames"
+        frames = _frames(request, files, pictures, work)
+        poses, masks_of_frames = _poses(request, frames, pictures, work)
+        masks = _masks(request, frames, poses, masks_of_frames, work)
+        train = request.output / "train"
+        listed = [Frame(f"train/{view.name}", view.camera, train / view.name, ".png") for view in poses.views]
+        write_transforms(request.output, "train", listed)
+    return Captured(frames, poses, masks)
+
+
+def _check_output(output: Path) -> None:
+    if output.exists() and (not output.is_dir() or any(output.iterdir())) and not (output / WORK).is_dir():
+        raise InputError(
+            expected=f"a new or empty output folder at {output}, or one of an earlier capture",
+            found="other files",
+            remedy="Choose another --output.",
+        )
+
+
+def _frames(request: Request, files: list[Path], pictures: Path, work: Path) -> Frames:
+    stamps = [[str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
+    given = {"files": stamps, "upright": request.upright, "options": write_record(request.options)}
+
+    def work_on() -> Frames:
+        shutil.rmtree(pictures, ignore_errors=True)
+        found = make_frames(files, pictures, request.upright, request.options)
+        chosen = found.photographs[:: -(-len(found.photographs) // SHEET_PICTURES)]
+        sheet = {f"{one.name}  blur {one.blur:.2f}": read_png(pictures / f"{one.name}.png")[..., :3] for one in chosen}
+        write_picture_sheet(work / "frames.jpg", sheet)
+        return found
+
+    return stage(work, "frames", given, Frames, work_on)
+
+
+def _board(request: Request) -> Board | None:
+    if request.board is None:
+        return None
+    drawn = BOARDS[request.board]
+    return Board(drawn.columns, drawn.rows, drawn.paper_mm, request.square_mm or drawn.square_mm)
+
+
+def _poses(request: Request, frames: Frames, pictures: Path, work: Path) -> tuple[Poses, dict[str, Path]]:
+    """Poses, and the masks that come with the source, in the size of the frames: by `--masks` or by transforms.json."""
+    board = _board(request)
+    model = request.colmap or (None if board else find_model(request.source))
+    transforms = None if board or model else find_transforms(request.source)
+    named: dict[str, Path] = {}
+    read = None
+    if request.masks:
+        named = {one.name: given_mask(request.masks, one.name) for one in frames.photographs}
+    elif transforms:
+        read, named = read_transforms(transforms, frames)
+    masks = _masks_of_frames(request, frames, named, work / "given")
+    given = {
+        "frames": sha256_of(work / "frames.json"),
+        "board": write_record(board) if board else None,
+        "model": [[str(path), path.stat().st_mtime_ns] for path in _model_files(model)] if model else None,
+        "transforms": sha256_of(transforms) if transforms else None,
+        "masks": sorted(named),
+    }
+
+    def work_on() -> Poses:
+        if board:
+            found, remedy = poses_from_board(board, frames, pictures, request.options), "Show the board in each frame."
+        elif model:
+            found, remedy = read_colmap(model, frames), "Names of pictures must be those that the model knows."
+        elif transforms:
+            found = read or read_transforms(transforms, frames)[0]
+            remedy = "Names of pictures must be those of file_path."
+        else:
+            found, remedy = poses_from_structure(frames, pictures, masks, work / "structure", request.options), REMEDY
+        poses = without_the_rest(found, frames, request.options, remedy)
+        cameras = tuple(view.camera for view in poses.views)
+        target = nearest_point(cameras)
+        side = np.mean([camera.position_world for camera in cameras], axis=0) - target
+        axis = side / max(float(np.linalg.norm(side)), 1e-12)
+        plot_cameras(work / "poses.png", Trajectory(cameras, (), axis, target))
+        return poses
+
+    return stage(work, "poses", given, Poses, work_on), masks
+
+
+def _model_files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.glob("*") if path.suffix in (".txt", ".bin"))
+
+
+def _masks_of_frames(request: Request, frames: Frames, named: Mapping[str, Path], folder: Path) -> dict[str, Path]:
+    """Given masks, turned and averaged as their photographs were; InputError for other sizes."""
+    written = {}
+    for one in frames.photographs:
+        if one.name not in named:
+            continue
+        image = (read_upright if request.upright else read_as_stored)(named[one.name])
+        mask = np.rint(unit_values(image[..., -1] if image.shape[2] == 4 else image[..., 0]) * 255).astype(np.uint8)
+        if mask.shape != (one.full_height, one.full_width):
+            raise InputError(
+                expected=f"a mask of {one.full_width}×{one.full_height} pixels for {one.name}",
+                found=f"{mask.shape[1]}×{mask.shape[0]} in {named[one.name]}",
+                remedy="Make masks in the size of the photographs.",
+            )
+        written[one.name] = folder / f"{one.name}.png"
+        write_png(written[one.name], block_means(mask, one.side))
+    return written
+
+
+def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str, Path], work: Path) -> Masks:
+    train = request.output / "train"
+    given = {
+        "poses": sha256_of(work / "poses.json"),
+        "boxes": {name: list(box) for name, box in request.boxes.items()},
+        "masks": {name: sha256_of(path) for name, path in given_masks.items()},
+    }
+
+    def work_on() -> Masks:
+        shutil.rmtree(train, ignore_errors=True)
+        cameras = {view.name: view.camera for view in poses.views}
+        for view in poses.views:
+            picture = view.lens.undistorted(read_png(work / "frames" / f"{view.name}.png"))
+            # A mask of its own replaces an alpha channel.
+            own = not (given_masks or request.boxes)
+            write_png(train / f"{view.name}.png", picture if own else np.ascontiguousarray(picture[..., :3]))
+        if given_masks:
+            origin = "files"
+            for view in poses.views:
+                if view.name not in given_masks:
+                    raise _no_mask(view)
+                mask = view.lens.undistorted(read_png(given_masks[view.name])[..., 0])
+                write_png(train / f"{view.name}_alpha.png", mask)
+        elif request.boxes:
+            origin = f"rectangles in {', '.join(request.boxes)}"
+            sides = {one.name: one.side for one in frames.photographs}
+            boxes = {name: _scaled(box, sides.get(name, 1)) for name, box in request.boxes.items()}
+            for name, mask in find_masks(cameras, train, boxes, request.options).items():
+                write_png(train / f"{name}_alpha.png", mask)
+        else:
+            origin = "alpha channels"
+        masks = {view.name: _written_mask(train, view) for view in poses.views}
+        overlaps = overlaps_of([(cameras[name], mask) for name, mask in masks.items()], request.options)
+        _write_mask_sheet(work / "masks.jpg", train, masks, dict(zip(masks, overlaps, strict=True)))
+        return Masks(origin, tuple(masks), overlaps)
+
+    return stage(work, "masks", given, Masks, work_on)
+
+
+def _scaled(box: Box, side: int) -> Box:
+    left, top, right, bottom = box
+    return left / side, top / side, right / side, bottom / side
+
+
+def _no_mask(view: PosedView) -> InputError:
+    return InputError(
+        expected=f"a mask of the object in {view.name}",
+        found="none",
+        remedy="Give a folder of them (--masks), or a rectangle about the object in a frame or two "
+        "(--box X0,Y0,X1,Y1 --box-in NAME).",
+    )
+
+
+def _written_mask(train: Path, view: PosedView) -> np.ndarray:
+    companion = train / f"{view.name}_alpha.png"
+    if companion.exists():
+        return unit_values(read_png(companion)[..., 0])
+    picture = read_png(train / f"{view.name}.png")
+    if picture.shape[2] != 4:
+        raise _no_mask(view)
+    return unit_values(picture[..., 3])
+
+
+def _write_mask_sheet(path: Path, train: Path, masks: dict[str, np.ndarray], overlaps: dict[str, float]) -> None:
+    """Views that agree least with the others come first: the object as it is, what lies around it dark."""
+    worst = sorted(masks, key=lambda name: overlaps[name])[:SHEET_PICTURES]
+    sheet = {}
+    for name in worst:
+        shade = 0.25 + 0.75 * masks[name][..., None]
+        picture = read_png(train / f"{name}.png")[..., :3] * shade + 60 * (1 - masks[name][..., None])
+        sheet[f"{name}  overlap {overlaps[name]:.1%}"] = picture.astype(np.uint8)
+    write_picture_sheet(path, sheet)

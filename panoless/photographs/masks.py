@@ -1,0 +1,259 @@
+"""Masks of the object: those that are given, or found from a rectangle in one frame or a few.
+
+Within a rectangle GrabCut (Rother et al. 2004) parts the object from what lies around. A mask moves to the nearest
+view without one, as if painted on a plane, and GrabCut finds its edge there. Then each view and its neighbors vote, and
+edges are found anew. The visual hull of all masks judges them: it is as large as each of them only where they agree.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from panoless.capture.masks import MAIN_SHARE, MASK_LEVEL, cut_sides, estimate_object_frame, largest_pieces
+from panoless.photographs.frames import block_means
+from panoless.photographs.hull import carve, outline, overlap, sighted_ball
+from panoless.photographs.lens import opencv
+from panoless.photographs.options import CaptureOptions
+from shinypartial.core.camera import Camera, project
+from shinypartial.core.errors import InputError
+from shinypartial.io.images import read_png
+from shinypartial.io.progress import Progress
+
+Box = tuple[float, float, float, float]
+#: Blur of an edge that GrabCut leaves as a staircase, in pixels: the line at one half stays where it was.
+EDGE_PX = 0.7
+SEED_ITERATIONS, ITERATIONS = 5, 2
+
+
+@dataclass(frozen=True)
+class Masks:
+    """What the stage of masks found."""
+
+    origin: str
+    names: tuple[str, ...]
+    overlaps: tuple[float, ...]
+    """Of each mask with the outline of the hull of all."""
+
+
+def hull_of(
+    views: Sequence[tuple[Camera, Float[np.ndarray, "_ _"]]], options: CaptureOptions
+) -> tuple[Float[np.ndarray, "P 3"], float]:
+    """Points of the hull of masks, and their spacing; as few masks are left out as let it fill the others.
+
+    Raises InputError for masks of the background and for empty ones.
+    """
+    full = sum(sum(cut_sides(mask)) >= 3 for _, mask in views)
+    empty = sum(not (mask >= MASK_LEVEL).any() for _, mask in views)
+    if 2 * full > len(views) or empty:
+        raise InputError(
+            expected="masks that are white on the object and black around it",
+            found=f"{empty} of {len(views)} that are empty"
+            if empty
+            else f"{full} of {len(views)} that reach three borders of their picture",
+            remedy="Invert the masks, or mark the object alone.",
+        )
+    frame = estimate_object_frame(views)
+    half_side = options.hull_spare * frame.radius
+    inside = [(camera, mask >= MASK_LEVEL) for camera, mask in views]
+    spacing = 2 * half_side / options.hull_voxels
+    for wrong in range(int(options.tolerated * len(views)) + 1):
+        points = carve(inside, frame.center, half_side, options.hull_voxels, wrong)
+        filled = [
+            np.count_nonzero(outline(camera, points, spacing) & mask) / np.count_nonzero(mask)
+            for camera, mask in inside
+        ]
+        if np.median(filled) >= options.least_filled:
+            break
+    return points, spacing
+
+
+def overlaps_of(views: Sequence[tuple[Camera, Float[np.ndarray, "_ _"]]], options: CaptureOptions) -> tuple[float, ...]:
+    """Overlap of each mask with the hull of all; InputError where they contradict each other."""
+    points, spacing = hull_of(views, options)
+    found = tuple(overlap(mask >= MASK_LEVEL, outline(camera, points, spacing)) for camera, mask in views)
+    if np.median(found) < options.least_overlap:
+        raise InputError(
+            expected=f"masks and poses that agree on an object: overlap of at least {options.least_overlap:.0%}",
+            found=f"{np.median(found):.0%} in the median view",
+            remedy="Check that masks are white on the object, and that the poses are those of these photographs.",
+        )
+    return found
+
+
+def given_mask(folder: Path, name: str) -> Path:
+    """The file of a mask, by the name of its photograph; InputError where there is none."""
+    ends = (".png", ".png.png", ".jpg.png", "_mask.png", "_alpha.png", ".jpg", ".jpeg")
+    found = next((path for end in ends if (path := folder / f"{name}{end}").is_file()), None)
+    if found is None:
+        raise InputError(
+            expected=f"a mask for {name} in {folder}, such as {name}.png",
+            found="none",
+            remedy="Name masks as their photographs, or leave the photograph out.",
+        )
+    return found
+
+
+def find_masks(
+    whole: Mapping[str, Camera], folder: Path, boxes: Mapping[str, Box], options: CaptureOptions
+) -> dict[str, UInt8[np.ndarray, "_ _"]]:
+    """Masks of all views from rectangles in some. Raises InputError for names of no view and for empty rectangles."""
+    unknown = [name for name in boxes if name not in whole]
+    if unknown or not boxes:
+        raise InputError(
+            expected="the names of posed frames for --box-in, such as " + next(iter(whole)),
+            found=", ".join(unknown) or "none",
+            remedy="Take names of photographs without their suffix.",
+        )
+    names = list(whole)
+    longest = max(max(camera.width, camera.height) for camera in whole.values())
+    side = -(-longest // options.mask_side_px)
+    cameras = {name: camera.downscaled(side) for name, camera in whole.items()}
+    pictures = {name: block_means(read_png(folder / f"{name}.png")[..., :3], side) for name in names}
+    progress = Progress("masks", len(names) * (2 + options.rounds))
+    masks: dict[str, Bool[np.ndarray, "_ _"]] = {}
+    for name, box in boxes.items():
+        trimap = np.full((cameras[name].height, cameras[name].width), 0, np.uint8)
+        left, top, right, bottom = (round(value / side) for value in box)
+        trimap[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)] = 3
+        masks[name] = _cut(pictures[name], trimap, SEED_ITERATIONS)
+        if not masks[name].any():
+            raise InputError(
+                expected=f"the object within --box in {name}",
+                found="nothing that differs from what lies around",
+                remedy="Draw the rectangle some pixels larger than the object, or give --masks.",
+            )
+        progress.advance()
+    _spread(names, cameras, pictures, masks, options, progress)
+    for _ in range(options.rounds):
+        ball = _ball(cameras, masks)
+        voted = {name: _voted(name, cameras, masks, ball, options) for name in names}
+        masks = {name: _cut(pictures[name], _band(voted[name], options.band), ITERATIONS) for name in names}
+        progress.advance(steps=len(names))
+    found = {}
+    for name, camera in whole.items():
+        found[name] = smooth_edge(_enlarged(masks[name], camera, side, folder / f"{name}.png"))
+        progress.advance()
+    return found
+
+
+def _enlarged(mask: Bool[np.ndarray, "_ _"], camera: Camera, side: int, picture: Path) -> Bool[np.ndarray, "H W"]:
+    """The mask of blocks of pixels in those pixels themselves: its edge is found anew near by."""
+    if side == 1:
+        return mask
+    cv2 = opencv()
+    size = (mask.shape[1] * side, mask.shape[0] * side)
+    large = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5
+    beyond = ((0, camera.height - size[1]), (0, camera.width - size[0]))
+    trimap = _band(np.pad(large, beyond), 0.0, least_px=1.5 * side)
+    return _cut(read_png(picture)[..., :3], trimap, 1)
+
+
+def _spread(
+    names: Sequence[str],
+    cameras: Mapping[str, Camera],
+    pictures: Mapping[str, UInt8[np.ndarray, "_ _ 3"]],
+    masks: dict[str, Bool[np.ndarray, "_ _"]],
+    options: CaptureOptions,
+    progress: Progress,
+) -> None:
+    """A mask for each view, in the order in which they are near to one that has it."""
+    while len(masks) < len(names):
+        ball = _ball(cameras, masks)
+        rays = {name: _unit(cameras[name].position_world - ball[0]) for name in names}
+        pairs = [(float(rays[new] @ rays[old]), new, old) for new in names if new not in masks for old in masks]
+        cosine, name, neighbor = max(pairs)
+        moved = moved_mask(masks[neighbor], cameras[neighbor], cameras[name], ball)
+        trimap = _band(moved, options.band + options.band_of_turn * float(np.sqrt(max(1 - cosine**2, 0))))
+        masks[name] = _cut(pictures[name], trimap, ITERATIONS)
+        progress.advance()
+
+
+def _voted(
+    name: str,
+    cameras: Mapping[str, Camera],
+    masks: Mapping[str, Bool[np.ndarray, "_ _"]],
+    ball: tuple[Float[np.ndarray, "3"], float],
+    options: CaptureOptions,
+) -> Bool[np.ndarray, "_ _"]:
+    """What most of a view's own mask and those of its neighbors, moved into it, contain."""
+    center, _ = ball
+    ray = _unit(cameras[name].position_world - center)
+    near = sorted(masks, key=lambda other: -float(_unit(cameras[other].position_world - center) @ ray))
+    votes = [moved_mask(masks[other], cameras[other], cameras[name], ball) for other in near[: options.voters]]
+    return np.mean(votes, 0) > 0.5
+
+
+def moved_mask(
+    mask: Bool[np.ndarray, "H W"], old: Camera, new: Camera, ball: tuple[Float[np.ndarray, "3"], float]
+) -> Bool[np.ndarray, "_ _"]:
+    """The mask of a view as another would see it, were it painted on the plane through the center that faces both."""
+    cv2 = opencv()
+    center, radius = ball
+    normal = _unit(_unit(old.position_world - center) + _unit(new.position_world - center))
+    right = _unit(np.cross(normal, old.camera_to_world[:3, 1]))
+    down = np.cross(normal, right)
+    corners = center + radius * np.array([right + down, right - down, -right - down, down - right])
+    places = [(project(camera, corners)[:, :2] - 0.5).astype(np.float32) for camera in (old, new)]
+    moved = cv2.warpPerspective(mask.astype(np.uint8), cv2.getPerspectiveTransform(*places), (new.width, new.height))
+    return moved > 0
+
+
+def _ball(
+    cameras: Mapping[str, Camera], masks: Mapping[str, Bool[np.ndarray, "_ _"]]
+) -> tuple[Float[np.ndarray, "3"], float]:
+    """Where the object is, by the masks so far."""
+    seen = []
+    for name, mask in masks.items():
+        rows, columns = np.nonzero(mask)
+        if len(rows):
+            box = (float(columns.min()), float(rows.min()), float(columns.max() + 1), float(rows.max() + 1))
+            seen.append((cameras[name], box))
+    return sighted_ball(list(cameras.values()), seen)
+
+
+def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    return vector / np.linalg.norm(vector)
+
+
+def _band(shape: Bool[np.ndarray, "H W"], share: float, least_px: float = 2.0) -> UInt8[np.ndarray, "H W"]:
+    """GrabCut's trimap: 0 surely around, 1 surely the object, 3 perhaps, within a band about an outline."""
+    cv2 = opencv()
+    width = max(least_px, share * float(np.sqrt(np.count_nonzero(shape))))
+    inside = cv2.distanceTransform(np.pad(shape, 1, mode="edge").astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    outside = cv2.distanceTransform((~shape).astype(np.uint8), cv2.DIST_L2, 3)
+    trimap = np.full(shape.shape, 3, np.uint8)
+    trimap[inside > width], trimap[outside > width] = 1, 0
+    return trimap
+
+
+def _cut(
+    picture: UInt8[np.ndarray, "H W 3"], trimap: UInt8[np.ndarray, "H W"], iterations: int
+) -> Bool[np.ndarray, "H W"]:
+    """GrabCut from a trimap, in the part of the picture around it; the trimap itself where it leaves no choice."""
+    cv2 = opencv()
+    perhaps = trimap > 0
+    rows, columns = np.nonzero(perhaps.any(1))[0], np.nonzero(perhaps.any(0))[0]
+    if not len(rows):
+        return perhaps
+    margin = max(10, (rows[-1] - rows[0]) // 3)
+    window = (
+        slice(max(rows[0] - margin, 0), rows[-1] + margin),
+        slice(max(columns[0] - margin, 0), columns[-1] + margin),
+    )
+    part = trimap[window].copy()
+    if not (part == 0).any() or not (part == 3).any():
+        return perhaps
+    image = np.ascontiguousarray(picture[window])
+    cv2.setRNGSeed(0)
+    cv2.grabCut(image, part, None, np.zeros((1, 65)), np.zeros((1, 65)), iterations, cv2.GC_INIT_WITH_MASK)
+    cut = np.zeros(trimap.shape, bool)
+    cut[window] = (part == 1) | (part == 3)
+    return largest_pieces(cut, MAIN_SHARE) if cut.any() else cut
+
+
+def smooth_edge(mask: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
+    """The mask with an edge of about a pixel, whose line at one half is smooth."""
+    return opencv().GaussianBlur(mask.astype(np.uint8) * 255, (0, 0), EDGE_PX)

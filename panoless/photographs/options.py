@@ -1,0 +1,58 @@
+"""Tuned numbers of `panoless capture`."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from msgspec import Meta
+
+from shinypartial.io.records import Count, Positive, Share
+
+
+@dataclass(frozen=True)
+class CaptureOptions:
+    """What photographs must be like, and how masks are found."""
+
+    longest_side_px: Count = 1600
+    """Larger pictures are averaged over whole blocks of pixels until they are no longer than this, because a fit takes
+    time for every pixel."""
+    video_frames: Count = 100
+    """So many frames of a video: 50 to 100 views are plenty."""
+    least_views: Annotated[int, Meta(ge=3)] = 8
+    """A capture needs so many views with a pose."""
+    least_posed: Share = 0.5
+    """Share of the frames that must get a pose: with fewer, those that do are likely to be wrong."""
+    most_blur: Share = 0.75
+    """Blur (Crete et al. 2007, 0 to 1) of the median frame above which a capture is refused. *Vase*, *mirror* and
+    *sculpture* before their surroundings have 0.42, 0.67 after a Gaussian blur of 2 pixels, and 0.78 after 3."""
+    least_corners: Annotated[int, Meta(ge=6)] = 8
+    """Corners of the board that a frame must show; a pose needs four, and more make it certain."""
+    most_focal_error: Share = 0.02
+    """Standard deviation of the focal length, as a share of it, above which the frames do not determine it."""
+    exhaustive_frames: Count = 60
+    """Up to so many frames, each is matched with each; else with its neighbors in time."""
+    neighbors: Count = 12
+    """So many neighbors, where frames are matched with these."""
+    hull_voxels: Count = 96
+    """Voxels of the visual hull along a side."""
+    hull_spare: Positive = 1.3
+    """Half side of the hull's cube over the radius that rectangles or masks suggest."""
+    tolerated: Share = 0.1
+    """Share of the masks that may be left out of the hull, where the others contradict them."""
+    least_filled: Share = 0.95
+    """Share of the masks, in the median view, that the outline of their hull must fill. Those of *vase* have 0.99."""
+    band: Share = 0.03
+    """Half width of the band about an outline in which the edge is looked for, as a share of √area."""
+    band_of_turn: Share = 0.1
+    """So much more of √area, times the sine of the angle from the neighbor, where an outline is that of a neighboring
+    view."""
+    voters: Count = 5
+    """So many views, itself and its neighbors, decide on a mask before its edge is found anew."""
+    mask_side_px: Count = 240
+    """Masks are found in pictures averaged to no more than this, and only their edges in larger ones: GrabCut takes
+    seconds for a picture of 800 pixels."""
+    rounds: Count = 3
+    """Rounds of votes and edges."""
+    least_overlap: Share = 0.7
+    """Overlap (intersection over union) of a view's mask and the hull's outline, in the median, below which poses and
+    masks contradict each other: 0.99 with true masks of *vase*, 0.9 where those found of *mirror* are right to 0.98,
+    0.65 where those of *vase* are right to 0.9, and 0.1 where they are wrong (*sculpture*)."""

@@ -1,0 +1,80 @@
+"""What the stage of poses finds, whatever found it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from panoless.photographs.frames import Frames, Photograph
+from panoless.photographs.lens import Lens
+from panoless.photographs.options import CaptureOptions
+from shinypartial.core.camera import Camera
+from shinypartial.core.errors import InputError
+
+Rows = tuple[tuple[float, float, float, float], ...]
+
+
+@dataclass(frozen=True)
+class PosedView:
+    """A frame with its lens and its pose, OpenCV axes."""
+
+    name: str
+    lens: Lens
+    camera_to_world: Rows
+    error_px: float | None = None
+    """Root mean square of what the pose leaves of the points that it was found from; None where it was given."""
+
+    @property
+    def camera(self) -> Camera:
+        """That of the undistorted picture."""
+        return self.lens.pinhole(np.array(self.camera_to_world))
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Poses of the frames, and of which there are none."""
+
+    origin: str
+    """What they were found by."""
+    unit: str
+    """Of the world: `m`, or `unknown`."""
+    views: tuple[PosedView, ...]
+    left_out: tuple[str, ...] = ()
+    """Frames without a pose."""
+    focal_error: float | None = None
+    """Standard deviation of the focal length as a share of it, where it was estimated here."""
+
+
+def as_rows(pose: Float[np.ndarray, "4 4"]) -> Rows:
+    """A pose as the records have it."""
+    return tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in pose)
+
+
+def without_the_rest(poses: Poses, frames: Frames, options: CaptureOptions, remedy: str) -> Poses:
+    """The same with the frames that have none named; InputError when these are too many."""
+    named = {view.name for view in poses.views}
+    left_out = tuple(photograph.name for photograph in frames.photographs if photograph.name not in named)
+    count, total = len(poses.views), len(frames.photographs)
+    if count < max(options.least_views, options.least_posed * total):
+        raise InputError(
+            expected=f"poses for at least {options.least_views} frames and {options.least_posed:.0%} of them",
+            found=f"{count} of {total} by {poses.origin}",
+            remedy=remedy,
+        )
+    return Poses(poses.origin, poses.unit, poses.views, left_out, poses.focal_error)
+
+
+def lens_for(photograph: Photograph, lens: Lens) -> Lens:
+    """A lens of the full picture as one of the frame; InputError when it is for pictures of another size."""
+    full = photograph.full_width, photograph.full_height
+    if (lens.width, lens.height) != full:
+        turned = (lens.height, lens.width) == full
+        raise InputError(
+            expected=f"a camera for pictures of {full[0]}×{full[1]}, such as {photograph.source.name}",
+            found=f"one for {lens.width}×{lens.height}",
+            remedy="The pictures lie on their side by their EXIF tag, and the poses are for pixels as they are stored: "
+            "add --no-upright."
+            if turned
+            else "Give the pictures that the poses were found from.",
+        )
+    return lens.downscaled(photograph.side)

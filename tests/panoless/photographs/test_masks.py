@@ -1,0 +1,122 @@
+"""Masks: their hull judges them, and a rectangle is enough where the object stands out."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from panoless.photographs.hull import carve, nearest_point, outline, overlap
+from panoless.photographs.masks import find_masks, moved_mask, overlaps_of
+from panoless.photographs.options import CaptureOptions
+from shinypartial.core.camera import Camera, ray_directions_world
+from shinypartial.core.errors import InputError
+from shinypartial.io.images import write_png
+from tests.support.photographed_planes import arc
+
+CENTER, RADIUS = np.array([0.1, -0.05, 0.2]), 0.4
+CAMERAS = arc(9, 3.0, (96, 96), 200.0)
+OPTIONS = CaptureOptions(hull_voxels=48)
+
+
+def ball(camera: Camera, center=CENTER, radius: float = RADIUS) -> np.ndarray:
+    """Pixels whose ray meets a ball: the distance of the center from the ray is less than the radius."""
+    directions = ray_directions_world(camera)
+    away = center - camera.position_world
+    return (away @ away - (directions @ away) ** 2) < radius**2
+
+
+TRUTH = [ball(camera) for camera in CAMERAS]
+
+
+def test_the_hull_of_true_masks_has_their_outline() -> None:
+    overlaps = overlaps_of([(c, m.astype(float)) for c, m in zip(CAMERAS, TRUTH, strict=True)], OPTIONS)
+    assert min(overlaps) > 0.95  # A voxel is 1.5 pixels.
+
+
+def test_one_wrong_mask_of_many_is_left_out() -> None:
+    cameras = arc(12, 3.0, (96, 96), 200.0)
+    masks = [ball(camera) for camera in cameras]
+    masks[4] = np.roll(masks[4], 30, 1)
+    overlaps = overlaps_of([(c, m.astype(float)) for c, m in zip(cameras, masks, strict=True)], OPTIONS)
+    assert np.argmin(overlaps) == 4
+    assert np.median(overlaps) > 0.9
+
+
+def test_hull_points_are_those_that_all_masks_contain() -> None:
+    """In the middle of the ball all are, two radii away none, and a point that one mask lacks only by allowance."""
+    seen = list(zip(CAMERAS, TRUTH, strict=True))
+    points = carve(seen, CENTER, 2 * RADIUS, 32)
+    distances = np.linalg.norm(points - CENTER, axis=1)
+    grid = carve([], CENTER, 2 * RADIUS, 32)
+    within = np.linalg.norm(grid - CENTER, axis=1) < 0.9 * RADIUS
+    assert within.sum() == (distances < 0.9 * RADIUS).sum()
+    seen[0] = (seen[0][0], np.zeros_like(seen[0][1]))
+    left = carve(seen, CENTER, 2 * RADIUS, 32)
+    assert np.linalg.norm(left - CENTER, axis=1).min() > RADIUS  # Beyond that picture, where it tells nothing.
+    assert len(carve(seen, CENTER, 2 * RADIUS, 32, 1)) >= len(points)
+    spacing = 4 * RADIUS / 32
+    assert overlap(outline(CAMERAS[0], grid[within], spacing), ball(CAMERAS[0], radius=0.9 * RADIUS)) > 0.9
+
+
+def test_the_point_that_cameras_look_at() -> None:
+    np.testing.assert_allclose(nearest_point(CAMERAS), 0, atol=1e-9)
+
+
+def test_a_mask_moves_to_a_neighboring_view() -> None:
+    moved = moved_mask(TRUTH[2], CAMERAS[2], CAMERAS[4], (CENTER, RADIUS))
+    assert overlap(moved, TRUTH[4]) > 0.91
+    assert overlap(TRUTH[2], TRUTH[4]) < 0.9
+
+
+@pytest.mark.parametrize(
+    ("change", "message"), [(np.logical_not, "white on the object"), (np.zeros_like, "that are empty")]
+)
+def test_masks_of_the_background_and_empty_ones_are_refused(change, message: str) -> None:
+    masks = [(camera, change(mask).astype(float)) for camera, mask in zip(CAMERAS, TRUTH, strict=True)]
+    with pytest.raises(InputError, match=message):
+        overlaps_of(masks, OPTIONS)
+
+
+def test_masks_that_contradict_the_poses_are_refused() -> None:
+    masks = [np.roll(mask, (17 * i % 48 - 24, 29 * i % 48 - 24), (0, 1)) for i, mask in enumerate(TRUTH)]
+    with pytest.raises(InputError, match="agree on an object"):
+        overlaps_of([(camera, mask.astype(float)) for camera, mask in zip(CAMERAS, masks, strict=True)], OPTIONS)
+
+
+def write_pictures(folder: Path) -> None:
+    """A bright ball with bands before a dark ground, both with noise."""
+    random = np.random.default_rng(0)
+    for index, (camera, truth) in enumerate(zip(CAMERAS, TRUTH, strict=True)):
+        bands = 150 + 60 * np.sin(np.arange(96) / 4)[:, None, None]
+        image = np.where(truth[..., None], bands, 60) + random.normal(0, 6, (camera.height, camera.width, 3))
+        write_png(folder / f"p_{index}.png", np.clip(image, 0, 255).astype(np.uint8))
+
+
+def box_of(mask: np.ndarray, margin: int = 3) -> tuple[float, float, float, float]:
+    rows, columns = np.nonzero(mask)
+    return columns.min() - margin, rows.min() - margin, columns.max() + 1 + margin, rows.max() + 1 + margin
+
+
+def test_one_rectangle_gives_all_masks(tmp_path: Path) -> None:
+    """Where the object stands out. An overlap of 0.98 is a quarter of a pixel along the edge."""
+    write_pictures(tmp_path)
+    cameras = {f"p_{index}": camera for index, camera in enumerate(CAMERAS)}
+    box = tuple(float(value) for value in box_of(TRUTH[4]))
+    masks = find_masks(cameras, tmp_path, {"p_4": box}, OPTIONS)
+    assert list(masks) == list(cameras)
+    for mask, truth in zip(masks.values(), TRUTH, strict=True):
+        assert overlap(mask > 127, truth) > 0.98
+
+
+def test_rectangles_without_a_view_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--box-in"):
+        find_masks({"p_0": CAMERAS[0]}, tmp_path, {"other": (0.0, 0.0, 9.0, 9.0)}, OPTIONS)
+
+
+def test_masks_of_large_pictures_are_found_in_small_ones(tmp_path: Path) -> None:
+    write_pictures(tmp_path)
+    cameras = {f"p_{index}": camera for index, camera in enumerate(CAMERAS)}
+    box = tuple(float(value) for value in box_of(TRUTH[4]))
+    masks = find_masks(cameras, tmp_path, {"p_4": box}, CaptureOptions(mask_side_px=40, rounds=1))
+    for mask, truth in zip(masks.values(), TRUTH, strict=True):
+        assert overlap(mask > 127, truth) > 0.97
