@@ -29,6 +29,10 @@ class PosedProposal:
         """The same there."""
         return replace(self, proposal=self.proposal.in_surroundings(surroundings))
 
+    def after(self, fitted: Geometry) -> "PosedProposal":
+        """The same to go on from an earlier fit."""
+        return replace(self, proposal=replace(self.proposal, fitted=fitted))
+
 
 def align_proposal(family: Family, views: Views, proposal: Proposal, config: FitConfig) -> PosedProposal | None:
     """The proposal of a kind after its outlines turned the cameras, and it followed them, in turn; None where that does
@@ -65,42 +69,47 @@ def fit_with_poses(
     """The geometry of a kind with the poses of the views, from the proposal that `source` made of them; None where
     held-out views do not ask for poses.
 
-    Each round finds the poses anew by outlines and colors, and then the shape by both.
+    Each round finds the poses anew by outlines and colors, and then the shape by both, on from that before. In the end
+    the shape is fitted from the proposal that the found poses give.
     """
     options = config.poses
+    first = geometry = fit_at(family, views, start, config)
     if start.poses is None:
-        return family.fit(views, start.proposal, config)
-    first = geometry = _fit(family, views, start, config)
-    if options.mode == "auto" and not _is_asked_for(views, geometry, config):
+        return first
+    if options.mode == "auto" and start.proposal.fitted is None and not _is_asked_for(views, geometry, config):
         return None
     for _ in range(options.rounds):
-        again = _next_round(source, views, geometry, config)
-        if again is None:
-            break
-        before, geometry = geometry, _fit(family, views, again, config)
+        before, poses = geometry, _next_poses(views, geometry, config)
+        geometry = fit_at(family, views, replace(start, poses=poses).after(before), config)
         if _turned_deg(before, geometry) < options.settled_deg:
             break
     errors = [_held_out_error(views, each, config) for each in (first, geometry)]
-    return geometry if errors[1] <= (1 + options.largest_rise) * errors[0] else first
+    if errors[1] > (1 + options.largest_rise) * errors[0]:
+        if start.proposal.fitted is None:
+            return first
+        geometry = first
+    assert geometry.poses is not None
+    proposal = source.propose(geometry.poses.moved(views), config, asked=False)
+    if proposal is None:
+        return geometry
+    return fit_at(family, views, PosedProposal(proposal.in_surroundings(geometry.surroundings), geometry.poses), config)
 
 
-def _fit(family: Family, views: Views, start: PosedProposal, config: FitConfig) -> Geometry:
-    assert start.poses is not None
+def fit_at(family: Family, views: Views, start: PosedProposal, config: FitConfig) -> Geometry:
+    """The geometry of a kind by views at the poses of a proposal."""
+    if start.poses is None:
+        return family.fit(views, start.proposal, config)
     return family.fit(start.poses.moved(views), start.proposal, config).with_poses(start.poses)
 
 
-def _next_round(source: Family, views: Views, geometry: Geometry, config: FitConfig) -> PosedProposal | None:
-    """Poses under a geometry and its map, and the proposal that follows from them."""
+def _next_poses(views: Views, geometry: Geometry, config: FitConfig) -> Poses:
+    """Poses under a geometry and its map."""
     alignment, poses = Alignment(views, config.poses), geometry.poses
     assert poses is not None
     for _ in range(config.poses.maps):
         environment = known_map(views, geometry.with_poses(poses), config.poses)
         poses = alignment.adjusted(geometry, poses, environment)
-    poses = alignment.without_common(poses)
-    proposal = source.propose(poses.moved(views), config, asked=False)
-    if proposal is None:
-        return None
-    return PosedProposal(proposal.in_surroundings(geometry.surroundings), poses)
+    return alignment.without_common(poses)
 
 
 def _turned_deg(before: Geometry, after: Geometry) -> float:

@@ -189,10 +189,14 @@ class Proposal:
     """Distance of the mask's contour from that of the shape; infinite where no view sees it."""
     overlap: float
     """Intersection of shape and mask over their union, in [0, 1]."""
+    fitted: Any = None
+    """The geometry of an earlier fit to almost the same views. A kind whose fit is long goes on from it, in few steps.
+    """
 
     def in_surroundings(self, surroundings: Surroundings) -> "Proposal":
         """The same shape there, for a kind that knows near surroundings."""
-        return replace(self, shape=replace(self.shape, surroundings=surroundings))
+        fitted = None if self.fitted is None else self.fitted.in_surroundings(surroundings)
+        return replace(self, shape=replace(self.shape, surroundings=surroundings), fitted=fitted)
 
 
 @runtime_checkable
@@ -223,6 +227,12 @@ class Family(Protocol):
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """The geometry that explains silhouettes and photographs best; of an iterative kind, its start."""
+        ...
+
+    def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
+        """A fitted geometry with the focal length as an unknown beside it: the geometry by views through that lens, and
+        the logarithm of its focal length over what is said; None for a kind that does not find one.
+        """
         ...
 
     def begin(self, views: Views, geometry: Geometry, config: FitConfig) -> Training | None:

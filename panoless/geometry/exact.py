@@ -104,6 +104,10 @@ class ExactFamily:
     finds_poses: ClassVar[bool] = False
     refines: ClassVar[str | None] = None
 
+    def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
+        """None: it is told by how far photographs pull (see `panoless.alignment.lens`)."""
+        return None
+
     def begin(self, views: Views, geometry: Geometry, config: FitConfig) -> Training | None:
         """None: no steps are left to take."""
         return None

@@ -7,12 +7,12 @@ every picture as it was, so surfels drift.
 from collections.abc import Sequence
 from dataclasses import replace
 
-from panoless.alignment.search import PosedProposal, align_proposal, fit_with_poses
+from panoless.alignment.search import PosedProposal, align_proposal, fit_at, fit_with_poses
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
 from panoless.capture.encoding import encoding_of
-from panoless.capture.poses import Poses
 from panoless.capture.views import Views
 from panoless.config import FitConfig
+from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import Family, Geometry, Proposal, usable_views
 from panoless.geometry.registry import FAMILIES
 from panoless.selection.candidates import Candidate, Selection, Verdict
@@ -91,40 +91,77 @@ def _best_fit(
     def near(proposals: Sequence[PosedProposal]) -> list[PosedProposal]:
         return list(proposals) if asked else [each for each in proposals if _is_near(each, config)]
 
-    def refit(corrected: Views, poses: Poses | None) -> Fitted | None:
-        if poses is None or family.finds_poses:
-            again = _proposals(source, corrected, config, asked=False)
+    def refit(views: Views, before: Fitted, *, anew: bool) -> Fitted | None:
+        poses = before.geometry.poses
+        if family.finds_poses and not anew:
+            again = [before.start.after(before.geometry)]
+        elif family.finds_poses or poses is None:
+            again = _proposals(source, views, config, asked=False)
         else:
-            proposal = source.propose(poses.moved(corrected), config, asked=False)
-            again = [] if proposal is None else [PosedProposal(proposal, poses)]
-        return _first_fit(family, near(again), corrected, config)
+            proposal = source.propose(poses.moved(views), config, asked=False)
+            start = None if proposal is None else PosedProposal(proposal, poses)
+            again = [] if start is None else [start if anew else start.after(before.geometry)]
+        return _first_fit(family, near(again), views, config, before.geometry.surroundings)
 
     first = _first_fit(family, near(proposals), views, config)
     return None if first is None else with_corrections(source, views, first, config, refit)
 
 
-def _first_fit(family: Family, proposals: Sequence[PosedProposal], views: Views, config: FitConfig) -> Fitted | None:
+def _first_fit(
+    family: Family,
+    proposals: Sequence[PosedProposal],
+    views: Views,
+    config: FitConfig,
+    known: Surroundings = FAR,
+) -> Fitted | None:
     """The geometry from the first of the proposals whose poses held-out views ask for, or that believes them."""
     for start in proposals:
-        geometry = _fit_around(family, views, start, config)
+        geometry = _fit_around(family, views, start, config, known)
         if geometry is not None:
-            return Fitted(geometry, start)
+            found_poses = geometry.poses is not None and family.finds_poses and start.proposal.fitted is None
+            return Fitted(_fit_once_more(family, views, geometry, config) if found_poses else geometry, start)
     return None
 
 
-def _fit_around(family: Family, views: Views, start: PosedProposal, config: FitConfig) -> Geometry | None:
-    """A fit in the surroundings that the proposal asks for, if it explains clearly more than one in a far world."""
+def _fit_once_more(family: Family, views: Views, first: Geometry, config: FitConfig) -> Geometry:
+    """A fit by views at the poses that the first one found, unless that explains clearly more: turned cameras carve a
+    wrong hull, which tells neither how near surroundings are nor all of the poses.
+    """
+    assert first.poses is not None
+    there = first.poses.moved(views)
+    proposal = _source(family).propose(there, config, asked=False)
+    again = None if proposal is None else _fit_around(family, there, PosedProposal(proposal), config, FAR)
+    if again is None:
+        return first
+    poses = first.poses if again.poses is None else first.poses.after(again.poses.stacked)
+    second = again.with_poses(poses)
+    return first if explains_clearly_more(views, first, second, config) else second
+
+
+def _fit_around(
+    family: Family, views: Views, start: PosedProposal, config: FitConfig, known: Surroundings
+) -> Geometry | None:
+    """A fit in the surroundings that the proposal asks for, if it explains clearly more than one in a far world; or in
+    near ones that are `known` already.
+
+    The far world is tried on from the fit in a near one, and only where it does as well, from the beginning.
+    """
     source, posed = _source(family), views if start.poses is None else start.poses.moved(views)
     around = proposed_surroundings(source, posed, start.proposal, config)
     if around.is_far:
+        start = start if known.is_far else start.in_surroundings(FAR)
         return fit_with_poses(family, source, views, start, config)
+    around = around if known.is_far else known
     near = fit_with_poses(family, source, views, start.in_surroundings(around), config)
-    if config.surroundings.mode == "on":
+    if near is None or config.surroundings.mode == "on" or not known.is_far:
         return near
-    far = fit_with_poses(family, source, views, start, config)
-    if near is None or far is None:
-        return near or far
-    return near if explains_clearly_more(views, near, far, config) else far
+    start = start if family.finds_poses else replace(start, poses=near.poses)
+    far = fit_at(family, views, start.after(near).in_surroundings(FAR), config)
+    return (
+        near
+        if explains_clearly_more(views, near, far, config)
+        else fit_with_poses(family, source, views, start, config)
+    )
 
 
 def _bends_rather(

@@ -48,7 +48,7 @@ def earned_exposures(
 def fitted_to_equal_exposures(views: Views, fitted: Fitted, config: FitConfig, refit: Refit) -> Fitted:
     """Fitted anew to views of equal exposure, where these are better explained by that."""
     equal = fitted.corrections.applied(views, encoding_of(config))
-    again = refit(equal, fitted.geometry.poses)
+    again = refit(equal, fitted, anew=False)
     if (
         again is None
         or held_out_errors(equal, again.geometry, config).mean()

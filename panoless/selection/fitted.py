@@ -1,7 +1,8 @@
 """A fit of one kind, and what it leaves unexplained of held-out views and of outlines."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -12,7 +13,6 @@ from panoless.alignment.equations import PoseRows, outline_rows
 from panoless.alignment.search import PosedProposal
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
 from panoless.capture.encoding import encoding_of
-from panoless.capture.poses import Poses
 from panoless.capture.silhouettes import mask_distance_px
 from panoless.capture.views import Views, at_most_pixels
 from panoless.config import FitConfig
@@ -30,8 +30,17 @@ class Fitted:
     corrections: Corrections = NO_CORRECTIONS
 
 
-Refit = Callable[[Views, Poses | None], Fitted | None]
-"""Proposes and fits a kind anew to corrected views, from the poses that an earlier fit found."""
+@runtime_checkable
+class Refit(Protocol):
+    """Fits a kind to views that are corrected otherwise."""
+
+    def __call__(self, views: Views, before: Fitted, *, anew: bool) -> Fitted | None:
+        """From the poses of the fit before and in surroundings like its own. The shape goes on from it where that kind
+        can, or is fitted `anew`, as where outlines are other ones.
+        """
+        ...
+
+
 PULLED_VIEWS = 8
 """From so many views at most the pull of photographs on outlines is told."""
 

@@ -6,11 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from panoless.alignment.lens import FocalPull, focal_pull
+from panoless.capture.corrections import Corrections
 from panoless.capture.encoding import encoding_of
 from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.environment.surroundings import FAR
 from panoless.geometry.base import Geometry
+from panoless.geometry.registry import FAMILIES
 from panoless.selection.fitted import Fitted, Refit, errors_in_common, outline_distance_px
 from panoless.selection.held_out import is_clearly_lower
 from panoless.selection.options import CorrectionOptions
@@ -43,17 +45,24 @@ def with_focal_length(views: Views, fitted: Fitted, config: FitConfig, refit: Re
     and the factor is told better than it is known.
     """
     options, encoding = config.corrections, encoding_of(config)
+    jointly = FAMILIES[fitted.geometry.kind].with_focal_length(
+        fitted.corrections.applied(views, encoding), fitted.geometry, config
+    )
+    if jointly is not None:
+        geometry, change = jointly
+        told = replace(fitted, geometry=geometry, corrections=_corrected(fitted, change, options.focal_error))
+        return told if _is_believed(views, fitted, told, change, config) else fitted
     trials = [_FocalTrial.of(views, 0.0, fitted, config)]
     pull = trials[0].pull
-    if abs(pull.step) < max(options.least_focal_pull, options.focal_sigmas * pull.sigma):
+    least = options.least_focal_pull if fitted.geometry.poses is None else options.least_posed_focal_pull
+    if abs(pull.step) < max(least, options.focal_sigmas * pull.sigma):
         return fitted
     following: float | None = _step_from(trials[0], options.focal_share, options.largest_focal_step)
     for _ in range(options.focal_trials):
         if following is None or any(abs(each.change - following) < options.settled_focal for each in trials):
             break
-        factor = fitted.corrections.focal_factor * float(np.exp(following))
-        corrections = replace(fitted.corrections, focal_factor=factor)
-        again = refit(corrections.applied(views, encoding), fitted.geometry.poses)
+        corrections = _corrected(fitted, following, 0.0)
+        again = refit(corrections.applied(views, encoding), trials[-1].fitted, anew=False)
         if again is None:
             break
         trials.append(_FocalTrial.of(views, following, replace(again, corrections=corrections), config))
@@ -69,12 +78,23 @@ def with_focal_length(views: Views, fitted: Fitted, config: FitConfig, refit: Re
         return fitted
     # What is left where the focal length is right is no less than half of what raises doubt.
     uncertainty = max(found.pull.sigma, options.least_focal_pull / 2) / share
-    is_likely = uncertainty < options.focal_prior and abs(found.change) < FARTHEST * options.focal_prior
-    if options.lens == "auto" and not (is_likely and _focal_length_is_earned(views, fitted, found.fitted, config)):
-        return fitted
-    factor = found.fitted.corrections.focal_factor
-    told = replace(found.fitted.corrections, focal_uncertainty=factor * uncertainty)
-    return replace(found.fitted, corrections=told)
+    told = replace(found.fitted, corrections=_corrected(fitted, found.change, uncertainty))
+    return told if _is_believed(views, fitted, told, found.change, config) else fitted
+
+
+def _corrected(fitted: Fitted, change: float, uncertainty: float) -> Corrections:
+    """The corrections with another logarithm of the focal length."""
+    factor = fitted.corrections.focal_factor * float(np.exp(change))
+    return replace(fitted.corrections, focal_factor=factor, focal_uncertainty=factor * uncertainty)
+
+
+def _is_believed(views: Views, before: Fitted, after: Fitted, change: float, config: FitConfig) -> bool:
+    options, told = config.corrections, after.corrections
+    if options.lens == "on":
+        return True
+    uncertainty = (told.focal_uncertainty or 0.0) / told.focal_factor
+    is_likely = uncertainty < options.focal_prior and abs(change) < FARTHEST * options.focal_prior
+    return is_likely and abs(change) > uncertainty and _focal_length_is_earned(views, before, after, config)
 
 
 def _looks_like_a_focal_length(views: Views, geometry: Geometry, options: CorrectionOptions) -> bool:

@@ -45,7 +45,7 @@ def with_moved_masks(source: Family, views: Views, fitted: Fitted, config: FitCo
 
     def moved_by(offset: float) -> Fitted | None:
         corrections = replace(fitted.corrections, mask_offset_px=offset)
-        again = refit(corrections.applied(views, encoding), fitted.geometry.poses) if offset else None
+        again = refit(corrections.applied(views, encoding), fitted, anew=True) if offset else None
         return None if again is None else replace(again, corrections=corrections)
 
     found = moved_by(find_mask_offset(source, fitted.corrections.applied(views, encoding), fitted, config))

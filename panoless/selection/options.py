@@ -80,6 +80,9 @@ class CorrectionOptions:
     least_focal_pull: Positive = 0.0004
     """The focal length is doubted where the pull is larger. A true one pulls by 0.00002 on vase, 0.0002 on mirror and
     0.00014 on sculpture, one that is 2 % too long by 0.0046, 0.0126 and 0.0010."""
+    least_posed_focal_pull: Positive = 0.002
+    """The same where cameras are turned, too: what is left of that pulls as well, by 0.0008 on vase with turns of 0.5°.
+    """
     focal_sigmas: Positive = 3.0
     """And larger than so many of its standard deviations. On vase in a room at 5 radii a true one pulls by 0.0005, 2.3
     of them; on sculpture, one that is 2 % too long by 5."""
@@ -94,6 +97,9 @@ class CorrectionOptions:
     """Most fits to other focal lengths. Not tuned."""
     focal_prior: Positive = 0.02
     """Expected error of the focal length as a share of it. A factor that is not told better is not believed."""
+    focal_error: Share = 0.004
+    """Standard deviation of a factor that was found as an unknown beside the shape. On sculpture and chrome-block it is
+    off by 0.0003 to 0.0057."""
     least_focal_gain: Share = 0.003
     """Share of the held-out error by which another focal length has to lower it, and by `selection.standard_errors`."""
     least_outline_fall: Share = 0.15

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from panoless.geometry.free_form.beside import BlockRows, outline_pose_rows
 from panoless.geometry.free_form.observations import PixelRays
 from panoless.geometry.free_form.options import FreeFormOptions
-from panoless.geometry.free_form.poses import PoseRows, outline_pose_rows
 from panoless.geometry.free_form.surface import LEAST_SLOPE, LevelSet
 from panoless.kernels.level_set import add_rows, add_squares, apply_rows, evaluate
 from panoless.numeric.robust import bounded_error, robust_weight
@@ -52,7 +52,7 @@ def silhouette_rows(
     outline_weight: float,
     miss_weight: float,
     options: FreeFormOptions,
-) -> tuple[Rows, PoseRows]:
+) -> tuple[Rows, BlockRows]:
     """Outlines, along whose rays the least φ should be zero, and pixels on the object that miss it, for which it
     should be negative.
 
@@ -78,7 +78,7 @@ def silhouette_rows(
     rows = np.zeros((len(places), 1, 4))
     rows[:, 0, 0] = by_value
     cost = sum(part[6] for part in parts) / 2
-    return Rows(places, rows, residual[:, None], weights, cost), PoseRows(view, by_pose, weights)
+    return Rows(places, rows, residual[:, None], weights, cost), BlockRows(view, by_pose, weights)
 
 
 def gauge_rows(surface: LevelSet, near: Bool[np.ndarray, "A B C"], weight: float) -> Rows:

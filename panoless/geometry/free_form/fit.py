@@ -42,15 +42,16 @@ class FitStage:
     """Of the round that led here."""
     poses: Poses | None = None
     """Of the views, where they are unknowns."""
+    focal: float | None = None
+    """The focal length, where it is unknown (see `Solution`)."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """A step of everything that is unknown: coefficients in cells, poses of views, coefficients of the surroundings."""
+    """A step of everything that is unknown: coefficients in cells, and what is unknown beside them."""
 
     coefficients: Float[np.ndarray, "A B C"]
-    poses: Float[np.ndarray, "V 6"] | None = None
-    surroundings: Float[np.ndarray, "K"] | None = None
+    beside: list[Float[np.ndarray, "_ _"]]
 
 
 def fit_free_form(
@@ -96,6 +97,21 @@ def fit_free_form(
     return stage.surface, stage.trust, stage.poses
 
 
+def follow_views(views: Views, fitted: FitStage, options: FreeFormOptions = DEFAULTS) -> FitStage:
+    """What an earlier fit led to after its last round was taken again, with views that changed a little, or with the
+    focal length among the unknowns.
+    """
+    rounds = [*options.rounds, *options.finer]
+    last = next((each for each in reversed(rounds) if each.cells == fitted.surface.cells), rounds[-1])
+    stage = replace(fitted, settings=last)
+    settings = last if stage.poses is None else _freed(stage)
+    if stage.focal is not None:
+        settings = replace(settings, steps=options.focal_steps)
+        options = replace(options, least_gain=options.least_focal_gain)
+    with torch.no_grad():
+        return take_round(views, stage, settings, options, Progress("fitting on", settings.steps))
+
+
 def _settled(views: Views, stage: FitStage, steps: int, options: FreeFormOptions) -> FitStage:
     """A stage after its round was taken again as it is: what more freedom is compared with, after as many steps."""
     return replace(take_round(views, stage, _freed(stage, steps), options), settings=stage.settings)
@@ -111,8 +127,8 @@ def pose_pull(views: Views, stage: FitStage, options: FreeFormOptions) -> float:
     """The share of the cost that one step of the poses alone would take: Σ ½ gᵀH⁻¹g of the views, over the cost."""
     task, poses = make_task(views, _freed(stage), options), Poses.none(len(views.train))
     solution = Solution.at(task, stage.surface, stage.trust, stage.environment, 0, poses)
-    gradient = solution.pose_gradient()
-    steps = np.linalg.solve(solution.pose_blocks(), gradient[..., None])[..., 0]
+    gradient = solution.gradient()[1][0]
+    steps = np.linalg.solve(solution.beside[0].blocks, gradient[..., None])[..., 0]
     return float((gradient * steps).sum()) / 2 / solution.cost(solution)
 
 
@@ -176,7 +192,9 @@ def take_round(
     if stage.settings is None or stage.settings.cells != settings.cells:
         surface = surface.resampled(settings.cells)
     task = make_task(views, settings, options)
-    solution = Solution.at(task, surface, stage.trust, stage.environment, options.first_map_rounds, stage.poses)
+    solution = Solution.at(
+        task, surface, stage.trust, stage.environment, options.first_map_rounds, stage.poses, stage.focal
+    )
     solution, damping = take_steps(solution, stage.damping, progress)
     found = replace(
         stage,
@@ -186,6 +204,7 @@ def take_round(
         damping=damping,
         settings=settings,
         poses=solution.poses,
+        focal=solution.focal,
     )
     if solution.poses is None:
         return found
@@ -202,17 +221,9 @@ def make_task(views: Views, settings: FreeFormRound, options: FreeFormOptions) -
     chosen = outlines.chosen(slice(None, None, max(1, -(-len(outlines.size) // options.outline_points))))
     share = options.counted_rays / options.radiance_sigma**2 / max(len(pixels.inner_px), 1)
     density = options.counted_rays / total * len(outlines.size) / max(len(chosen.size), 1)
-    centers = np.array([pose_of(view.camera)[1] for view in views.train])
+    rotations, centers = (np.array(each) for each in zip(*(pose_of(view.camera) for view in views.train), strict=True))
     outlined, brightness = density / options.outline_sigma_px**2, max(float(pixels.radiance.mean()), LEAST_BRIGHTNESS)
-    return Task(pixels, chosen, share, outlined, settings, options, centers, brightness)
-
-
-def _step(solution: Solution, damping: float, still: bool) -> Change:
-    if solution.poses is not None:
-        return gauss_newton_step_with_poses(solution, damping, still=still)
-    if not solution.surface.surroundings.is_far:
-        return gauss_newton_step_with_surroundings(solution, damping)
-    return Change(gauss_newton_step(solution, damping))
+    return Task(pixels, chosen, share, outlined, settings, options, centers, rotations[:, 2], brightness)
 
 
 def take_steps(
@@ -224,7 +235,7 @@ def take_steps(
         if not still:
             solution = replace(solution, trust=measured_trust(solution))
         before = solution
-        solution, length = _accepted(solution, _step(solution, damping, still))
+        solution, length = _accepted(solution, gauss_newton_step(solution, damping, still=still))
         factor = options.damping_less if length == 1 else options.damping_more
         damping = float(np.clip(damping * factor, *options.damping_range))
         gain = 1 - solution.cost(before) / before.cost(before)
@@ -242,97 +253,56 @@ def _accepted(solution: Solution, step: Change) -> tuple[Solution, float]:
     """
     options, length, before = solution.task.options, 1.0, solution.cost(solution)
     for _ in range(options.trials):
-        surface = replace(solution.surface, coefficients=solution.surface.coefficients + length * step.coefficients)
-        if step.surroundings is not None:
-            surface = replace(surface, surroundings=surface.surroundings.after(length * step.surroundings))
-        posed = solution.poses
-        if step.poses is not None and posed is not None:
-            posed = posed.after(length * step.poses)
-        moved = Solution.at(solution.task, surface, solution.trust, solution.environment, options.map_rounds, posed)
+        moved = solution.after(length * step.coefficients, [length * each for each in step.beside])
         if moved.cost(solution) < before:
             return moved, length
         length *= options.shortening
     return solution, 0.0
 
 
-def gauss_newton_step(solution: Solution, damping: float) -> Float[np.ndarray, "A B C"]:
-    """−(H + μ diag H)⁻¹ g by conjugate gradients, nowhere longer than the longest step."""
-    options = solution.task.options
-    diagonal = solution.diagonal(THIRD_DIFFERENCE_DIAGONAL)
+def gauss_newton_step(solution: Solution, damping: float, *, still: bool = False) -> Change:
+    """−(H + μ diag H)⁻¹ g by conjugate gradients, nowhere longer than the longest step; in a `still` scene only
+    poses move.
 
-    def product(change: Float[np.ndarray, "A B C"]) -> Float[np.ndarray, "A B C"]:
-        return solution.product(change) + damping * diagonal * change
-
-    step = solve_by_products(
-        product,
-        -solution.gradient(),
-        solution.active / (diagonal * (1 + damping)),
-        options.solver_steps,
-        options.solver_tolerance,
-    )
-    return np.clip(step, -options.largest_step_cells, options.largest_step_cells)
-
-
-def gauss_newton_step_with_poses(solution: Solution, damping: float, *, still: bool = False) -> Change:
-    """The same with the poses of the views as further unknowns; of a `still` surface, those alone.
-
-    Poses are preconditioned by their blocks: with H = L Lᵀ of a view its unknowns are y = Lᵀ x.
+    That is preconditioned by its blocks: with H = L Lᵀ of a block its unknowns are y = Lᵀ x.
     """
     options, shape = solution.task.options, solution.surface.shape
-    diagonal, size = solution.diagonal(THIRD_DIFFERENCE_DIAGONAL), int(np.prod(solution.surface.shape))
-    blocks = solution.pose_blocks() * (1 + damping * np.eye(6))
-    back = np.linalg.inv(np.linalg.cholesky(blocks)).transpose(0, 2, 1)
+    diagonal, size = solution.diagonal(THIRD_DIFFERENCE_DIAGONAL), solution.surface.coefficients.size
+    damped = [each.blocks * (1 + damping * np.eye(each.blocks.shape[1])) for each in solution.beside]
+    back = [np.linalg.inv(np.linalg.cholesky(blocks)).transpose(0, 2, 1) for blocks in damped]
+    ends = np.cumsum([size, *(each.value.size for each in solution.beside)])
 
-    def unpacked(values: Float[np.ndarray, "N"]) -> tuple[Float[np.ndarray, "A B C"], Float[np.ndarray, "V 6"]]:
-        poses = np.matmul(back, values[size:].reshape(-1, 6, 1))[..., 0]
-        return values[:size].reshape(shape), poses
+    def unpacked(values: Float[np.ndarray, "N"]) -> Change:
+        parts = zip(back, ends[:-1], ends[1:], strict=True)
+        beside = [np.matmul(of, values[first:last].reshape(*of.shape[:2], 1))[..., 0] for of, first, last in parts]
+        return Change(values[:size].reshape(shape), beside)
 
-    def packed(change: Float[np.ndarray, "A B C"], poses: Float[np.ndarray, "V 6"]) -> Float[np.ndarray, "N"]:
-        return np.concatenate([change.ravel(), np.matmul(back.transpose(0, 2, 1), poses[..., None]).ravel()])
-
-    diagonals = np.einsum("vii->vi", blocks) * (damping / (1 + damping))
-
-    def product(values: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
-        change, poses = unpacked(values)
-        by_change, by_pose = solution.product_with_poses(change, poses)
-        return packed(by_change + damping * diagonal * change, by_pose + diagonals * poses)
-
-    free = np.zeros(shape) if still else solution.active / (diagonal * (1 + damping))
-    step, poses = unpacked(
-        solve_by_products(
-            product,
-            packed(-solution.gradient(), -solution.pose_gradient()),
-            np.concatenate([free.ravel(), np.ones(blocks.shape[0] * 6)]),
-            options.solver_steps,
-            options.solver_tolerance,
+    def packed(change: Float[np.ndarray, "A B C"], beside: Sequence[Float[np.ndarray, "_ _"]]) -> np.ndarray:
+        parts = zip(back, beside, strict=True)
+        return np.concatenate(
+            [change.ravel(), *(np.matmul(of.transpose(0, 2, 1), part[..., None]).ravel() for of, part in parts)]
         )
-    )
-    return Change(np.clip(step, -options.largest_step_cells, options.largest_step_cells), poses)
-
-
-def gauss_newton_step_with_surroundings(solution: Solution, damping: float) -> Change:
-    """The same with the coefficients of the surroundings as further unknowns y = Lᵀ k, H = L Lᵀ their own matrix."""
-    options, shape = solution.task.options, solution.surface.shape
-    diagonal, size = solution.diagonal(THIRD_DIFFERENCE_DIAGONAL), int(np.prod(shape))
-    matrix = solution.surroundings_matrix()
-    least = options.least_surroundings_share * max(float(np.trace(matrix)), 1e-30)
-    back = np.linalg.inv(np.linalg.cholesky(matrix + least * np.eye(len(matrix)))).T
 
     def product(values: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
-        change, moved = values[:size].reshape(shape), back @ values[size:]
-        by_change, by_moved = solution.product_with_surroundings(change, moved)
-        by_moved = back.T @ (by_moved + least * moved)
-        return np.concatenate([(by_change + damping * diagonal * change).ravel(), by_moved])
+        change = unpacked(values)
+        by_change, by_others = solution.product(change.coefficients, change.beside)
+        for each, moved, by_moved in zip(solution.beside, change.beside, by_others, strict=True):
+            by_moved += damping * np.einsum("bmm->bm", each.blocks) * moved
+        return packed(by_change + damping * diagonal * change.coefficients, by_others)
 
+    gradient, beside = solution.gradient()
+    free = np.zeros(shape) if still else solution.active / (diagonal * (1 + damping))
+    moving = [np.full(each.value.size, not still or index == 0) for index, each in enumerate(solution.beside)]
     found = solve_by_products(
         product,
-        np.concatenate([-solution.gradient().ravel(), -back.T @ solution.surroundings_gradient()]),
-        np.concatenate([(solution.active / (diagonal * (1 + damping))).ravel(), np.ones(len(matrix))]),
+        -packed(gradient, beside),
+        np.concatenate([free.ravel(), *moving]),
         options.solver_steps,
         options.solver_tolerance,
     )
-    step = np.clip(found[:size].reshape(shape), -options.largest_step_cells, options.largest_step_cells)
-    return Change(step, surroundings=back @ found[size:])
+    change = unpacked(found)
+    longest = options.largest_step_cells
+    return replace(change, coefficients=np.clip(change.coefficients, -longest, longest))
 
 
 def measured_trust(solution: Solution) -> Trust:

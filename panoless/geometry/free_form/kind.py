@@ -17,7 +17,7 @@ from panoless.environment.resolution import finest_resolution
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, poses_from_plain, to_plain
 from panoless.geometry.exact import ExactFamily, ExactGeometry
-from panoless.geometry.free_form.fit import fit_free_form
+from panoless.geometry.free_form.fit import FitStage, fit_free_form, follow_views
 from panoless.geometry.free_form.observations import PixelRays, inner_distance_px
 from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions
 from panoless.geometry.free_form.photometric import Sights
@@ -170,7 +170,23 @@ class FreeFormFamily(ExactFamily):
         trust = full_trust(proposal.shape, config.free_form.trust_cells)
         return FreeFormMirror(proposal.shape, trust, config.environment.trace, config.free_form)
 
+    def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
+        """On from a fit, in rounds with that logarithm among the unknowns."""
+        options = config.free_form
+        start = FitStage(fitted.surface, fitted.trust, None, options.damping, poses=fitted.poses, focal=0.0)
+        stage = follow_views(views, start, options)
+        assert stage.focal is not None, "the focal length was unknown"
+        factor = float(np.exp(-stage.focal))
+        surface, trust = stage.surface.scaled(factor), stage.trust.scaled(factor)
+        return FreeFormMirror(surface, trust, config.environment.trace, options, poses=stage.poses), stage.focal
+
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """All coefficients by outlines and photographs together."""
-        surface, trust, poses = fit_free_form(views, proposal.shape, config.free_form)
+        if proposal.fitted is None:
+            surface, trust, poses = fit_free_form(views, proposal.shape, config.free_form)
+        else:
+            fitted, options = proposal.fitted, config.free_form
+            start = FitStage(fitted.surface, fitted.trust, None, options.damping, poses=fitted.poses)
+            found = follow_views(views, start, options)
+            surface, trust, poses = found.surface, found.trust, found.poses
         return FreeFormMirror(surface, trust, config.environment.trace, config.free_form, poses=poses)

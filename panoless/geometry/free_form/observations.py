@@ -54,6 +54,14 @@ class PixelRays:
         steps = np.matmul(self.steps, turns.transpose(0, 2, 1))
         return PixelRays(self.origins + poses.shifts[self.view], directions, steps, self.size, self.view)
 
+    def zoomed(self, change: float, axes: Float[np.ndarray, "P 3"]) -> "PixelRays":
+        """With cameras eˢ as far from the origin, and eˢ times the focal length; `axes` are the optical ones."""
+        factor = float(np.exp(change))
+        cosines = (self.directions * axes).sum(1, keepdims=True)
+        directions = axes + (self.directions / cosines - axes) / factor
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        return PixelRays(self.origins * factor, directions, self.steps / factor, self.size / factor, self.view)
+
     @classmethod
     def centers(cls, camera: RasterCamera, pixels: Int[np.ndarray, "P"], view: int = 0) -> "PixelRays":
         """Through the centers of pixels, given by flat indices."""

@@ -212,6 +212,12 @@ class FreeFormOptions:
     """Expected error of a camera's rotation."""
     pose_shift: float = 0.02
     """Expected error of its position, in radii of the object."""
+    focal_prior: float = 0.02
+    """Expected error of the logarithm of the focal length, where it is unknown."""
+    focal_steps: int = 8
+    """Most steps in which it is found."""
+    least_focal_gain: float = 3e-4
+    """They end when one lowers the cost by less than this share."""
     pose_steps: int = 6
     """Most steps of the round in which poses are set free, and of finding those of other views."""
     least_pose_pull: float = 0.03

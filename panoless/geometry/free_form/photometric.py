@@ -1,6 +1,7 @@
 """What pixels see by way of a level set under a map that follows it, and what it costs."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -9,13 +10,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from panoless.capture.poses import Poses
+from panoless.capture.views import concatenated
 from panoless.environment.cubemap import resample
 from panoless.environment.footprints import PixelFootprints
+from panoless.geometry.free_form.beside import Beside, BlockRows, by_focal, pixel_pose_rows
 from panoless.geometry.free_form.equations import Rows, gauge_rows, joined_rows, silhouette_rows
 from panoless.geometry.free_form.map import sharpened_map, splatted_map
 from panoless.geometry.free_form.observations import PixelRays, Pixels
 from panoless.geometry.free_form.options import FreeFormOptions, FreeFormRound
-from panoless.geometry.free_form.poses import PoseRows, pixel_pose_rows
 from panoless.geometry.free_form.surface import Hits, LevelSet
 from panoless.geometry.free_form.trust import Trust
 from panoless.kernels.level_set import mirror_rows, mirrored, seen_with_slopes, third_differences, without_means
@@ -68,8 +70,15 @@ class Task:
     options: FreeFormOptions
     centers: Float[np.ndarray, "V 3"]
     """Of the cameras of all views."""
+    axes: Float[np.ndarray, "V 3"]
+    """Their optical axes."""
     brightness: float
     """Mean over all pixels and channels (linear radiance)."""
+
+    def seen_from(self, rays: PixelRays, poses: Poses | None, focal: float | None) -> PixelRays:
+        """Rays where their cameras are, through the lens that they have."""
+        rays = rays if focal is None else rays.zoomed(focal, self.axes[rays.view])
+        return rays if poses is None else rays.moved(poses)
 
 
 def photon_gain(seen: Float[np.ndarray, "P 3"], brightness: float, share: float) -> Float[np.ndarray, "P"]:
@@ -101,6 +110,10 @@ class Solution:
     """Weights of the pixels without trust and robust weights."""
     poses: Poses | None = None
     """Of the views; None: as they are said to be."""
+    focal: float | None = None
+    """s where a focal length that is e⁻ˢ of the true one is unknown: cameras are eˢ as far away and see through a lens
+    of eˢ times the focal length, so that outlines stay where they are. None: it is believed.
+    """
 
     @classmethod
     def at(
@@ -111,10 +124,11 @@ class Solution:
         start: Float[Tensor, "6 3 M M"] | None,
         rounds: int,
         poses: Poses | None = None,
+        focal: float | None = None,
     ) -> "Solution":
         """With the map solved in so many robust rounds from another one, or from nothing."""
         options, settings = task.options, task.settings
-        rays = task.pixels.rays if poses is None else task.pixels.rays.moved(poses)
+        rays = task.seen_from(task.pixels.rays, poses, focal)
         sights = Sights.of(surface, rays, settings.samples, options.least_cosine)
         clear = sights.clear & (task.pixels.inner_px > options.inner_px)
         texel = np.pi / 2 / settings.resolution
@@ -142,13 +156,12 @@ class Solution:
         light, slopes, texels = seen_with_slopes(padded, sights.outgoing)
         counted = gain_of(light)
         residual, slopes = (light - task.pixels.radiance) * counted[:, None], slopes * counted[:, None, None]
-        return cls(task, surface, sights, trust, environment, counted, residual, slopes, texels, free, poses)
+        return cls(task, surface, sights, trust, environment, counted, residual, slopes, texels, free, poses, focal)
 
     @cached_property
     def rays(self) -> PixelRays:
         """Of the pixels, from where their cameras are."""
-        rays = self.task.pixels.rays
-        return rays if self.poses is None else rays.moved(self.poses)
+        return self.task.seen_from(self.task.pixels.rays, self.poses, self.focal)
 
     @cached_property
     def weights(self) -> Float[np.ndarray, "P"]:
@@ -179,7 +192,7 @@ class Solution:
         return self._silhouettes[0]
 
     @cached_property
-    def pose_rows(self) -> tuple[PoseRows, PoseRows]:
+    def pose_rows(self) -> tuple[BlockRows, BlockRows]:
         """By the poses of views: of photographs, and of silhouettes."""
         hits = self.sights.hits
         distance = np.where(hits.met, hits.distance, 0.0) / self.surface.spacing
@@ -187,16 +200,20 @@ class Solution:
             hits.derivatives, self.rays.directions, distance, self.mirrored_slopes, self.photographs.rows[..., 1:]
         )
         rows[..., 3:] /= self.surface.spacing
-        return PoseRows(self.rays.view, rows, self.photographs.weights), self._silhouettes[1]
+        return BlockRows(self.rays.view, rows, self.photographs.weights), self._silhouettes[1]
 
     @cached_property
-    def _silhouettes(self) -> tuple[Rows, PoseRows]:
-        outlines = self.task.outlines
+    def _silhouette_rays(self) -> tuple[PixelRays, PixelRays]:
+        """Of outlines, and of pixels that miss the surface."""
+        outlines = self.task.seen_from(self.task.outlines, self.poses, self.focal)
+        return outlines, self.rays.chosen(~self.sights.hits.met)
+
+    @cached_property
+    def _silhouettes(self) -> tuple[Rows, BlockRows]:
         sigmas = self.task.options.radiance_sigma / self.task.options.outline_sigma_px
         return silhouette_rows(
             self.surface,
-            outlines if self.poses is None else outlines.moved(self.poses),
-            self.rays.chosen(~self.sights.hits.met),
+            *self._silhouette_rays,
             self.task.outline_weight,
             self.task.photograph_weight * sigmas**2,
             self.task.options,
@@ -244,6 +261,8 @@ class Solution:
         prior = float((self.bent * self.surface.coefficients).sum()) / 2
         if self.poses is not None:
             prior += float((self.pose_prior * self.poses.stacked**2).sum()) / 2
+        if self.focal is not None:
+            prior += (self.focal / self.task.options.focal_prior) ** 2 / 2
         return photographs + self.constraints.cost + prior
 
     @property
@@ -267,80 +286,82 @@ class Solution:
         """The photographs' residual beyond the map."""
         return self.beyond_map(self.photographs.residual)
 
-    def gradient(self) -> Float[np.ndarray, "A B C"]:
-        """Of the cost, over active coefficients."""
-        shape = self.surface.shape
-        total = self.photographs.backward(self._unexplained, shape)
-        total += self.constraints.backward(self.constraints.residual, shape)
-        return (total + self.bent) * self.active
-
-    def product(self, change: Float[np.ndarray, "A B C"]) -> Float[np.ndarray, "A B C"]:
-        """The Gauss–Newton matrix times a change of active coefficients."""
-        shape = self.surface.shape
-        total = self.photographs.backward(self.beyond_map(self.photographs.forward(change)), shape)
-        total += self.constraints.backward(self.constraints.forward(change), shape)
-        return (total + self.smoothing * third_differences(change, self.active)) * self.active
-
-    def pose_gradient(self) -> Float[np.ndarray, "V 6"]:
-        """Of the cost, by the poses of the views."""
-        assert self.poses is not None
-        photographs, silhouettes = self.pose_rows
-        count = len(self.poses.turns)
-        total = photographs.backward(self._unexplained, count)
-        total += silhouettes.backward(self.silhouettes.residual, count)
-        return total + self.pose_prior * self.poses.stacked
-
-    def product_with_poses(
-        self, change: Float[np.ndarray, "A B C"], moved: Float[np.ndarray, "V 6"]
-    ) -> tuple[Float[np.ndarray, "A B C"], Float[np.ndarray, "V 6"]]:
-        """The Gauss–Newton matrix over coefficients and poses times a change of both."""
-        shape, count = self.surface.shape, len(moved)
-        photographs, silhouettes = self.pose_rows
-        seen = self.beyond_map(self.photographs.forward(change) + photographs.forward(moved))
-        outlined = self.silhouettes.forward(change) + silhouettes.forward(moved)
-        total = self.photographs.backward(seen, shape) + self.silhouettes.backward(outlined, shape)
-        total += self.gauge.backward(self.gauge.forward(change), shape)
-        total += self.smoothing * third_differences(change, self.active)
-        by_pose = photographs.backward(seen, count) + silhouettes.backward(outlined, count)
-        return total * self.active, by_pose + self.pose_prior * moved
-
     @cached_property
-    def surroundings_rows(self) -> Float[np.ndarray, "P 3 K"]:
-        """What pixels change by with the coefficients of the surroundings."""
-        chosen, rows = (
-            self.photographs.weights > 0,
-            self.surface.surroundings.rows(self.slopes, self.points, self.sights.mirrored),
-        )
-        return rows * chosen[:, None, None]
+    def beside(self) -> tuple[Beside, ...]:
+        """What is unknown beside the surface: poses of the views, then what all views share."""
+        of_poses = () if self.poses is None else (self._beside_poses(self.poses),)
+        of_all = () if self.focal is None and self.surface.surroundings.is_far else (self._beside_shared(),)
+        return of_poses + of_all
 
-    def surroundings_gradient(self) -> Float[np.ndarray, "K"]:
-        """Of the cost, by the coefficients of the surroundings."""
-        weighted = self.photographs.weights[:, None] * self._unexplained
-        return np.einsum("pck,pc->k", self.surroundings_rows, weighted)
+    def _beside_poses(self, poses: Poses) -> Beside:
+        count = len(poses.turns)
+        blocks = sum(rows.blocks(count) for rows in self.pose_rows) + np.diag(self.pose_prior)
+        return Beside(*self.pose_rows, poses.stacked, self.pose_prior, blocks)
 
-    def surroundings_matrix(self) -> Float[np.ndarray, "K K"]:
-        """The Gauss–Newton matrix of these, the surface being still."""
-        rows = self.surroundings_rows
+    def _beside_shared(self) -> Beside:
+        """Coefficients of the surroundings, and then the logarithm of the focal length. The prior of the former only
+        damps.
+        """
+        around, options = self.surface.surroundings.coefficients, self.task.options
+        photographs, silhouettes = self.photographs, self.silhouettes
+        by_distance = self.surface.surroundings.rows(self.slopes, self.points, self.sights.mirrored)
+        seen = [by_distance[..., : len(around)]]
+        outlined = [np.zeros((*silhouettes.residual.shape, len(around)))]
+        if self.focal is not None:
+            rays = self.rays, concatenated(list(self._silhouette_rays))
+            for found, of, by_pose in zip((seen, outlined), rays, self.pose_rows, strict=True):
+                found.append(by_focal(of, by_pose.rows, self.task.axes[of.view]))
+        rows = np.concatenate(seen, 2) * (photographs.weights > 0)[:, None, None]
         beyond = np.stack([self.beyond_map(np.ascontiguousarray(column)) for column in np.moveaxis(rows, 2, 0)], 2)
-        return np.einsum("pck,p,pcl->kl", rows, self.photographs.weights, beyond)
+        of_silhouettes = BlockRows(
+            np.zeros(len(silhouettes.weights), int), np.concatenate(outlined, 2), silhouettes.weights
+        )
+        matrix = np.einsum("pck,p,pcl->kl", rows, photographs.weights, beyond) + of_silhouettes.blocks(1)[0]
+        least = options.least_surroundings_share * max(float(np.trace(matrix)), 1e-30)
+        known = [] if self.focal is None else [self.focal]
+        precision = np.array([least] * len(around) + [options.focal_prior**-2.0] * len(known))
+        value = np.array([0.0] * len(around) + known)
+        of_photographs = BlockRows(np.zeros(len(photographs.weights), int), rows, photographs.weights)
+        return Beside(of_photographs, of_silhouettes, value[None], precision, (matrix + np.diag(precision))[None])
 
-    def product_with_surroundings(
-        self, change: Float[np.ndarray, "A B C"], moved: Float[np.ndarray, "K"]
-    ) -> tuple[Float[np.ndarray, "A B C"], Float[np.ndarray, "K"]]:
-        """The Gauss–Newton matrix over coefficients of the surface and of its surroundings times a change of both."""
-        shape = self.surface.shape
-        seen = self.beyond_map(self.photographs.forward(change) + self.surroundings_rows @ moved)
+    def gradient(self) -> tuple[Float[np.ndarray, "A B C"], list[Float[np.ndarray, "_ _"]]]:
+        """Of the cost, over active coefficients and over what is unknown beside them."""
+        shape, constrained = self.surface.shape, self.constraints.residual
+        total = self.photographs.backward(self._unexplained, shape)
+        total += self.constraints.backward(constrained, shape)
+        outlined = self.silhouettes.residual
+        return (total + self.bent) * self.active, [
+            each.backward(self._unexplained, outlined, each.value) for each in self.beside
+        ]
+
+    def product(
+        self, change: Float[np.ndarray, "A B C"], beside: Sequence[Float[np.ndarray, "_ _"]] = ()
+    ) -> tuple[Float[np.ndarray, "A B C"], list[Float[np.ndarray, "_ _"]]]:
+        """The Gauss–Newton matrix times a change of active coefficients and of what is unknown beside them."""
+        shape, count = self.surface.shape, len(self.silhouettes.weights)
+        seen, constrained = self.photographs.forward(change), self.constraints.forward(change)
+        for each, moved in zip(self.beside, beside, strict=True):
+            seen += each.photographs.forward(moved)
+            constrained[:count] += each.silhouettes.forward(moved)
+        seen = self.beyond_map(seen)
         total = self.photographs.backward(seen, shape)
-        total += self.constraints.backward(self.constraints.forward(change), shape)
+        total += self.constraints.backward(constrained, shape)
         total += self.smoothing * third_differences(change, self.active)
-        by_surroundings = np.einsum("pck,pc->k", self.surroundings_rows, self.photographs.weights[:, None] * seen)
-        return total * self.active, by_surroundings
+        pulled = zip(self.beside, beside, strict=True)
+        return total * self.active, [each.backward(seen, constrained[:count], moved) for each, moved in pulled]
 
-    def pose_blocks(self) -> Float[np.ndarray, "V 6 6"]:
-        """The matrix's diagonal blocks of the views, but for what the map takes over."""
-        assert self.poses is not None
-        blocks = sum(rows.blocks(len(self.poses.turns)) for rows in self.pose_rows)
-        return blocks + np.diag(self.pose_prior)
+    def after(self, change: Float[np.ndarray, "A B C"], beside: Sequence[Float[np.ndarray, "_ _"]]) -> "Solution":
+        """Moved by a step, with hits, visibility and map made anew."""
+        surface, moved = self.surface, list(beside)
+        surface = replace(surface, coefficients=surface.coefficients + change)
+        poses = None if self.poses is None else self.poses.after(moved.pop(0))
+        shared = moved[0][0] if moved else np.zeros(0)
+        if not surface.surroundings.is_far:
+            around = surface.surroundings.after(shared[: len(surface.surroundings.coefficients)])
+            surface = replace(surface, surroundings=around)
+        focal = None if self.focal is None else self.focal + float(shared[-1])
+        rounds = self.task.options.map_rounds
+        return Solution.at(self.task, surface, self.trust, self.environment, rounds, poses, focal)
 
     def diagonal(self, smoothing_diagonal: float) -> Float[np.ndarray, "A B C"]:
         """The matrix's diagonal, but for what the map takes over; at least a millionth of its largest."""

@@ -67,6 +67,11 @@ class LevelSet:
         """Sides of the box, in the normalized frame."""
         return (np.array(self.shape) - 3) * self.spacing
 
+    @property
+    def cells(self) -> int:
+        """Along the longest side of the box."""
+        return max(self.shape) - 3
+
     def places(self, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
         """Points of the normalized frame, in cells."""
         return (points - self.low) / self.spacing
@@ -126,6 +131,11 @@ class LevelSet:
         places = np.clip(self.places(points), 0, np.array(self.shape) - 3.0)
         value = evaluate(self.coefficients, places)[:, 0] * (self.spacing / spacing)
         return empty.interpolating(value.reshape(empty.shape))
+
+    def scaled(self, factor: float) -> "LevelSet":
+        """The surface and what it stands in, so many times as large."""
+        around = Surroundings(self.surroundings.coefficients / factor)
+        return LevelSet(self.low * factor, self.spacing * factor, self.coefficients, around)
 
     def taken_back(self, common: Similarity) -> "LevelSet":
         """The surface in a world from which a similarity was taken back, on the same grid."""

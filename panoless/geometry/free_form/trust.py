@@ -22,6 +22,10 @@ class Trust:
         """Trust of points; those beyond the grid have that of its border."""
         return self.values.ravel()[self._index(points)]
 
+    def scaled(self, factor: float) -> "Trust":
+        """Of the surface that is so many times as large."""
+        return Trust(self.low * factor, self.cell * factor, self.values)
+
     def _index(self, points: Float[np.ndarray, "P 3"]) -> Int[np.ndarray, "P"]:
         place = np.floor((points - self.low) / self.cell).astype(np.int64)
         return np.ravel_multi_index(tuple(np.clip(place, 0, np.array(self.values.shape) - 1).T), self.values.shape)

@@ -19,20 +19,28 @@ from panoless.numeric.gauss_newton import accept_step, damped_step
 from shinypartial.io.progress import Progress
 
 
-def fit_height_field(views: Views, plane: Plane, options: HeightFieldOptions = HeightFieldOptions()) -> HeightField:
+def fit_height_field(
+    views: Views,
+    plane: Plane,
+    options: HeightFieldOptions = HeightFieldOptions(),
+    fitted: HeightField | None = None,
+) -> HeightField:
     """The heights over a plane, and the plane itself, that explain silhouettes and photographs best.
 
     The silhouettes alone give the plane of a frame that stands out, and the heights along the mirror's edge. From there
     on a step asks silhouettes and photographs together; the map is solved anew before each, and eliminated in it.
+    One that was `fitted` to almost the same views goes on in the last round.
     """
     contours = mask_contours(views)
     contours = contours.every(max(1, len(contours.view) // options.max_points))
-    height_field = flat_height_field(plane, options.cells)
-    for scale_px in options.edge_scales_px:
-        height_field = step_height_field(contours, height_field, scale_px, options.edge_bending, options)
-    progress = Progress("fitting a bent mirror", sum(settings.steps for settings in options.rounds))
+    height_field, rounds = fitted, options.rounds[-1:]
+    if height_field is None:
+        height_field, rounds = flat_height_field(plane, options.cells), options.rounds
+        for scale_px in options.edge_scales_px:
+            height_field = step_height_field(contours, height_field, scale_px, options.edge_bending, options)
+    progress = Progress("fitting a bent mirror", sum(settings.steps for settings in rounds))
     with torch.no_grad():
-        for settings in options.rounds:
+        for settings in rounds:
             for _ in range(settings.steps):
                 observed = observe(views, height_field, settings.rays, options)
                 environment = solve_environment([observed.rays], settings.resolution)

@@ -108,4 +108,5 @@ class HeightFieldFamily(ExactFamily):
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """Heights, plane and boundary by silhouettes and photographs together."""
-        return HeightFieldMirror(fit_height_field(views, proposal.shape, config.height_field))
+        fitted = None if proposal.fitted is None else proposal.fitted.height_field
+        return HeightFieldMirror(fit_height_field(views, proposal.shape, config.height_field, fitted))

@@ -103,5 +103,9 @@ class PlaneFamily(ExactFamily):
         return PlaneMirror(proposal.shape, config.environment.trace)
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
-        """The proposal itself: silhouettes tell a plane to the end."""
-        return self.as_proposed(proposal, config)
+        """The proposal itself: silhouettes tell a plane to the end. After an earlier fit, they are asked again."""
+        if proposal.fitted is None:
+            return self.as_proposed(proposal, config)
+        again = self.propose(views, config, asked=False)
+        there = proposal.fitted.surroundings
+        return proposal.fitted if again is None else self.as_proposed(again.in_surroundings(there), config)

@@ -109,6 +109,14 @@ def refine_revolution(
         return _Refinement(views, start, options).run()
 
 
+def follow_views(
+    views: Views, fitted: SurfaceOfRevolution, options: RevolutionOptions = DEFAULTS
+) -> SurfaceOfRevolution:
+    """A fitted surface after one more round on single rays, to views that changed a little."""
+    with torch.no_grad():
+        return _Refinement(views, fitted, options).refine_by_centers(fitted, options.photometric.fine[-1], None)[0]
+
+
 class _Refinement:
     """The data of a fit, and its steps."""
 

@@ -17,7 +17,7 @@ from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, poses_from_plain, to_plain
 from panoless.geometry.exact import ExactFamily, ExactGeometry
 from panoless.geometry.revolution.deblurred_map import pixel_footprints
-from panoless.geometry.revolution.fit import propose_revolution, refine_revolution
+from panoless.geometry.revolution.fit import follow_views, propose_revolution, refine_revolution
 from panoless.geometry.revolution.lip import beside_lip
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_buffers, revolution_rays
 from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
@@ -143,5 +143,8 @@ class RevolutionFamily(ExactFamily):
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """Profile and axis by what is reflected."""
-        surface = refine_revolution(views, proposal.shape, config.revolution)
+        if proposal.fitted is None:
+            surface = refine_revolution(views, proposal.shape, config.revolution)
+        else:
+            surface = follow_views(views, proposal.fitted.surface, config.revolution)
         return RevolutionMirror(surface, config.environment.trace, config.revolution)

@@ -1,6 +1,6 @@
 """Surfels as a kind of geometry: what fits when nothing simpler does, in steps of gradient descent."""
 
-from typing import ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import torch
 
@@ -40,6 +40,10 @@ class SurfelFamily:
             return start.to(views.train[0].mask.device)
         surfels = initial_surfels(views, config.surfels, config.seed, config.first_surface)
         return SurfelMirror.of(surfels, config)
+
+    def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
+        """None: what surfels are trained on is believed."""
+        return None
 
     def begin(self, views: Views, geometry: Geometry, config: FitConfig) -> Training:
         """The map that fits the first surfels best; the configured one where maps are not solved."""

@@ -8,7 +8,6 @@ import torch
 
 from panoless.alignment.search import PosedProposal
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections, with_focal_factor
-from panoless.capture.poses import Poses
 from panoless.capture.views import Views
 from panoless.geometry.base import Proposal
 from panoless.geometry.plane.kind import PlaneMirror
@@ -52,7 +51,7 @@ def as_found(views: Views) -> Fitted:
         views,
         Fitted(MIRROR, PosedProposal(proposal)),
         CONFIG,
-        lambda _, poses: Fitted(MIRROR, PosedProposal(proposal)),
+        lambda _, before, anew: Fitted(MIRROR, PosedProposal(proposal)),
     )
 
 
@@ -67,7 +66,7 @@ def test_exposures_are_corrected_only_where_they_differ() -> None:
     assert corrections.gains == pytest.approx(GAINS, rel=0.04)
 
 
-def silhouettes_plane(views: Views, poses: Poses | None = None) -> Fitted:
+def silhouettes_plane(views: Views, before: Fitted | None = None, *, anew: bool = False) -> Fitted:
     """What outlines tell of the mirror at a focal length that is believed: it shrinks as that grows."""
     size = arc(1, size=64)[0].fx / views.train[0].camera.fx
     plane = MIRROR.plane
