@@ -45,8 +45,8 @@ class CorrectionOptions:
     """Whether the focal length of all views may be wrong by one factor: where photographs pull a fit and held-out views
     gain by it, whenever it is found, or never."""
     largest_error: Share = 0.08
-    """Held-out error of a fit above which masks are doubted. Right ones of development scenes leave at most 0.06, masks
-    that are off by 2 px at least 0.10."""
+    """Held-out error of a fit above which masks are doubted, and focal lengths not asked for. Right ones of development
+    scenes leave at most 0.06, masks that are off by 2 px at least 0.10."""
     step_px: Positive = 2.0
     """Offsets are tried this far apart. Not tuned."""
     largest_px: Positive = 6.0
