@@ -21,7 +21,18 @@ ORDER = (
     *("api", "capture", "first_surface", "environment", "geometry", "alignment", "selection"),
     *("trust", "reconstruct", "export"),
     *("core", "io", "scene", "blender", "generate", "dataset", "release", "prediction", "oracle"),
-    *("metrics", "evaluation", "comparison", "report", "stability", "numeric", "kernels", "config", "presets"),
+    *(
+        "metrics",
+        "evaluation",
+        "comparison",
+        "conversion",
+        "report",
+        "stability",
+        "numeric",
+        "kernels",
+        "config",
+        "presets",
+    ),
 )
 """Rooms in the order of the data; others come after them."""
 ROOT = Path(__file__).resolve().parents[1]

@@ -54,6 +54,7 @@ class Fit:
             config=config,
         )
         print(f"Prediction written to {result.folder}\nNext: shinypartial evaluate {result.folder}")
+        print(f"For Blender and others: shinypartial convert {result.folder} --to blender")
         if self.snapshots or self.snapshot_seconds:
             from panoless.geometry.registry import FAMILIES
             from panoless.reconstruct.snapshots import snapshot_folders

@@ -71,6 +71,13 @@ class Mesh:
     """Indices of the vertices of every face, counterclockwise from outside; None for a cloud of points."""
     columns: dict[str, np.ndarray] = field(default_factory=dict)
 
+    @classmethod
+    def smooth(
+        cls, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F N"], normals_world: Float[np.ndarray, "V 3"]
+    ) -> "Mesh":
+        """A surface with the unit normals of its vertices as columns nx, ny, nz."""
+        return cls(vertices, faces, dict(zip(("nx", "ny", "nz"), normals_world.T, strict=True)))
+
 
 @dataclass
 class Training:

@@ -90,26 +90,44 @@ def _set_output(scene: Any, render: Render) -> None:
 
 def _surround(bpy: Any, scene: Any, spec: SceneSpec) -> None:
     """Light from infinitely far, or from the walls of a room that cameras see through."""
-    image = bpy.data.images.load(str(world_file(spec.world).resolve()))
-    image.colorspace_settings.name = "Non-Color"  # The numbers in the file are the radiance.
     scene.world = bpy.data.worlds.new("world")
-    nodes, links = scene.world.node_tree.nodes, scene.world.node_tree.links
-    nodes.clear()
-    background, output = nodes.new("ShaderNodeBackground"), nodes.new("ShaderNodeOutputWorld")
-    background.inputs["Strength"].default_value = spec.light_factor
-    links.new(background.outputs["Background"], output.inputs["Surface"])
     if spec.room is None:
-        links.new(environment_color(nodes, links, image), background.inputs["Color"])
-        # Light is sampled by a map as fine as the image; the automatic choice costs a second and gains nothing.
-        scene.world.cycles.sampling_method = "MANUAL"
-        scene.world.cycles.sample_map_resolution = min(image.size[0], 8192)
+        light_from_afar(bpy, scene.world, world_file(spec.world), spec.light_factor)
         return
-    background.inputs["Color"].default_value = (0, 0, 0, 1)
+    image = _radiance_image(bpy, world_file(spec.world))
+    _background(scene.world, spec.light_factor).inputs["Color"].default_value = (0, 0, 0, 1)
     mesh = _room_mesh(bpy, spec.room)
     mesh.materials.append(make_room_material(bpy, image, spec.light_factor))
     room = bpy.data.objects.new("room", mesh)
     room.visible_camera = False
     scene.collection.objects.link(room)
+
+
+def light_from_afar(bpy: Any, world: Any, path: Path, strength: float) -> Any:
+    """Make a world infinitely far that shows a lat-long file times the strength; return the image."""
+    image, background = _radiance_image(bpy, path), _background(world, strength)
+    nodes, links = world.node_tree.nodes, world.node_tree.links
+    links.new(environment_color(nodes, links, image), background.inputs["Color"])
+    # Light is sampled by a map as fine as the image; the automatic choice costs a second and gains nothing.
+    world.cycles.sampling_method = "MANUAL"
+    world.cycles.sample_map_resolution = min(image.size[0], 8192)
+    return image
+
+
+def _radiance_image(bpy: Any, path: Path) -> Any:
+    image = bpy.data.images.load(str(path.resolve()))
+    image.colorspace_settings.name = "Non-Color"  # The numbers in the file are the radiance.
+    return image
+
+
+def _background(world: Any, strength: float) -> Any:
+    """The only shader of a world, linked to its output."""
+    nodes, links = world.node_tree.nodes, world.node_tree.links
+    nodes.clear()
+    background, output = nodes.new("ShaderNodeBackground"), nodes.new("ShaderNodeOutputWorld")
+    background.inputs["Strength"].default_value = strength
+    links.new(background.outputs["Background"], output.inputs["Surface"])
+    return background
 
 
 def _room_mesh(bpy: Any, room: Room) -> Any:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import tyro
 
+from shinypartial.cli.converting import Convert
 from shinypartial.cli.datasets import ExportCameras, Perturb, Release, Subset, Validate
 from shinypartial.cli.presenting import Chart, Leaderboard, Report
 from shinypartial.cli.scenes import Generate
@@ -20,6 +21,7 @@ Command = (
     | Evaluate
     | Oracle
     | Postprocess
+    | Convert
     | Compare
     | Weights
     | Report

@@ -14,6 +14,9 @@ PIXEL_CENTER = 0.5
 #: Multiplies the columns of a camera-to-world matrix: OpenGL axes ⇄ OpenCV axes (its own inverse).
 OPENGL_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
+#: Columns are the Y-up axes x, y, z in the world: direction_world = Y_UP_TO_WORLD · direction, (x, y, z) ↦ (x, −z, y).
+Y_UP_TO_WORLD = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+
 #: For each face, the world-axis coefficients of (sc, tc, ma): direction = ma + s·sc + t·tc (OpenGL 4.6, table 8.19).
 FACE_AXES = np.array(
     [

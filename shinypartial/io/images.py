@@ -128,11 +128,18 @@ def write_jpeg(path: Path, image: UInt8[np.ndarray, "H W 3"], quality: int) -> N
     _write_picture(path, image, "jpeg", {"Compression": f"jpeg:{quality}"})
 
 
-def _write_picture(path: Path, image: UInt8[np.ndarray, "H W *C"], kind: str, attributes: dict[str, Any]) -> None:
+def write_hdr(path: Path, radiance: Float[np.ndarray, "H W 3"]) -> None:
+    """Write linear radiance ≥ 0 as Radiance RGBE, the first row on top; 8 bits a channel and an exponent a pixel."""
+    _write_picture(path, radiance.astype(np.float32), "hdr", {}, numbers="float")
+
+
+def _write_picture(
+    path: Path, image: Num[np.ndarray, "H W *C"], kind: str, attributes: dict[str, Any], numbers: str = "uint8"
+) -> None:
     import OpenImageIO as oiio
 
     pixels = np.ascontiguousarray(image if image.ndim == 3 else image[..., None])
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "uint8")
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], numbers)
     for name, value in attributes.items():
         spec.attribute(name, value)
     with atomic_write(path) as temporary:

@@ -23,6 +23,8 @@ COMMANDS = (
     "release",
     "leaderboard",
     "oracle",
+    "postprocess",
+    "convert",
     "compare",
     "weights",
     "stability",

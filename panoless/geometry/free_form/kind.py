@@ -127,9 +127,8 @@ class FreeFormMirror(ExactGeometry):
     def mesh(self, frame: ObjectFrame) -> Mesh:
         """Marching cubes, with the exact normals of the vertices and the trust there, `confidence` in [0, 1]."""
         mesh, normals = self.surface.mesh()
-        columns = dict(zip(("nx", "ny", "nz"), normals.T, strict=True))
-        columns["confidence"] = self.trust.at(mesh.vertices)
-        return Mesh(frame.to_world(mesh.vertices), mesh.triangles, columns)
+        smooth = Mesh.smooth(frame.to_world(mesh.vertices), mesh.triangles, normals)
+        return replace(smooth, columns={**smooth.columns, "confidence": self.trust.at(mesh.vertices)})
 
     def state_dict(self) -> dict[str, Any]:
         """All numbers as lists and plain values."""

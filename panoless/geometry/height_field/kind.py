@@ -79,9 +79,9 @@ class HeightFieldMirror(ExactGeometry):
         return SurfelMirror.of(surfels_at(points, frames, scales, curvatures), config, self)
 
     def mesh(self, frame: ObjectFrame) -> Mesh:
-        """Quadrilaterals within the boundary."""
+        """Quadrilaterals within the boundary, with the exact normals of the spline."""
         points, faces = self.height_field.quadrilaterals()
-        return Mesh(frame.to_world(points), faces)
+        return Mesh.smooth(frame.to_world(points), faces, self.height_field.normals_at(points))
 
 
 class HeightFieldFamily(ExactFamily):

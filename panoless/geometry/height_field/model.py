@@ -101,6 +101,12 @@ class HeightField:
         within = depth_inside(places[faces].mean(1), self.plane.boundary) > 0
         return self.plane.points(places) + self.heights(places, 0)[0][:, None] * self.plane.normal, faces[within]
 
+    def normals_at(self, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+        """Unit normals (−h_u, −h_v, 1)/‖·‖ at points of the height field, in the normalized frame."""
+        slopes = self.heights(points @ self.frame[:2].T, 1)[1:]
+        normals = np.stack([-slopes[0], -slopes[1], np.ones(len(points))], 1) @ self.frame
+        return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
     def bending(self) -> Float[np.ndarray, "D D"]:
         """B with cᵀ B c the sum of squared second differences of the coefficients c: Σ c_uu² + 2 c_uv² + c_vv²."""
         rows, columns = (np.eye(count) for count in self.coefficients.shape)

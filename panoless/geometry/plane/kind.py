@@ -76,9 +76,9 @@ class PlaneMirror(ExactGeometry):
         return SurfelMirror.of(surfels_at(self.plane.points(places), frames, scales, curvatures), config, self)
 
     def mesh(self, frame: ObjectFrame) -> Mesh:
-        """One polygon."""
+        """One polygon, with the normal of the plane at every vertex."""
         corners = frame.to_world(self.plane.points(self.plane.boundary))
-        return Mesh(corners, np.arange(len(corners))[None])
+        return Mesh.smooth(corners, np.arange(len(corners))[None], np.broadcast_to(self.plane.normal, corners.shape))
 
 
 class PlaneFamily(ExactFamily):

@@ -108,13 +108,12 @@ class RevolutionMirror(ExactGeometry):
         return cls(surface, content["occlusion_test"], options, poses=poses_from_plain(content))
 
     def mesh(self, frame: ObjectFrame) -> Mesh:
-        """Quadrilaterals between 128 meridians."""
-        rings = frame.to_world(self.surface.rings(MERIDIANS))
-        count, around = rings.shape[:2]
-        index = np.arange(count * around).reshape(count, around)
-        following = np.roll(index, -1, 1)
-        faces = np.stack([index[:-1], following[:-1], following[1:], index[1:]], -1).reshape(-1, 4)
-        return Mesh(rings.reshape(-1, 3), faces)
+        """Quadrilaterals between 128 meridians, with the normals of the surface; a crease has a ring for each side."""
+        rings = self.surface.rings(MERIDIANS)
+        index = np.arange(rings.points[..., 0].size).reshape(-1, MERIDIANS)
+        lower, upper = index[rings.sides[:, 0]], index[rings.sides[:, 1]]
+        faces = np.stack([lower, np.roll(lower, -1, 1), np.roll(upper, -1, 1), upper], -1).reshape(-1, 4)
+        return Mesh.smooth(frame.to_world(rings.points.reshape(-1, 3)), faces, rings.normals.reshape(-1, 3))
 
 
 class RevolutionFamily(ExactFamily):

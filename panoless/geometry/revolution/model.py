@@ -52,6 +52,18 @@ class Hits:
 
 
 @dataclass(frozen=True)
+class Rings:
+    """Circles of a surface of revolution, one for each vertex of the profile and two for a crease.
+
+    Points and unit normals are in the normalized frame; `sides` names the circles at both ends of each side.
+    """
+
+    points: Float[np.ndarray, "R A 3"]
+    normals: Float[np.ndarray, "R A 3"]
+    sides: Int[np.ndarray, "S 2"]
+
+
+@dataclass(frozen=True)
 class SurfaceOfRevolution:
     """A mirror of revolution: x = o + ρ cos φ e₁ + ρ sin φ e₂ + h e₃ for all φ and all (ρ, h) on the profile.
 
@@ -117,14 +129,19 @@ class SurfaceOfRevolution:
         """How many numbers it is made of: axis and origin across it, height of the frame, and the profile."""
         return 5 + self.profile.size
 
-    def rings(self, around: int) -> Float[np.ndarray, "N A 3"]:
-        """Points of the surface at equal steps of azimuth."""
+    def rings(self, around: int) -> Rings:
+        """The surface at equal steps of azimuth."""
+        ends, angle = np.stack([np.arange(len(self.angles)), np.arange(len(self.angles)) + 1], 1), self.angles
+        own = np.ones(angle.shape, bool)
+        own[1:, 0] = angle[1:, 0] != angle[:-1, 1]
         turn = 2 * np.pi * np.arange(around) / around
-        radius, height = (
-            self.profile[:, 0, None],
-            np.broadcast_to(self.profile[:, 1, None], (len(self.profile), around)),
-        )
-        return self.origin + np.stack([radius * np.cos(turn), radius * np.sin(turn), height], -1) @ self.frame
+        radius, height = self.profile[ends[own]].T[..., None]
+        across, along = np.sin(angle[own])[:, None], -np.cos(angle[own])[:, None]
+        wide = np.ones(around)
+        points = np.stack([radius * np.cos(turn), radius * np.sin(turn), height * wide], -1)
+        normals = np.stack([across * np.cos(turn), across * np.sin(turn), along * wide], -1)
+        rows = np.cumsum(own.ravel()).reshape(own.shape) - 1
+        return Rings(self.origin + points @ self.frame, normals @ self.frame, rows)
 
     def hits(self, origins: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"]) -> Hits:
         """The first hit of every ray."""
@@ -181,7 +198,7 @@ def revolution_buffers(surface: SurfaceOfRevolution, camera: RasterCamera, sampl
 def _hits_within(surface: SurfaceOfRevolution, camera: RasterCamera, pixels: Int[np.ndarray, "P"]) -> Hits:
     """Hits of the rays through pixels, traced only within the box of the projected rings."""
     rotation, center = pose_of(camera)
-    corners = (surface.rings(BOX_AROUND).reshape(-1, 3) - center) @ rotation.T
+    corners = (surface.rings(BOX_AROUND).points.reshape(-1, 3) - center) @ rotation.T
     row, column = np.divmod(pixels, camera.width)
     traced = np.ones(len(pixels), dtype=bool)
     if corners[:, 2].min() > camera.near:

@@ -414,6 +414,48 @@ def test_the_ply_of_a_height_field_is_its_mesh_in_world_units(tmp_path: Path) ->
     np.testing.assert_array_equal(table["faces"], faces)
 
 
+def normals_in(table: dict[str, np.ndarray]) -> np.ndarray:
+    return np.stack([table[name] for name in ("nx", "ny", "nz")], 1)
+
+
+def test_the_normals_of_a_plane_and_of_a_height_field_are_in_the_ply(tmp_path: Path) -> None:
+    """Those of the height field are perpendicular to differences of its heights."""
+    height_field, frame = bumpy(plane_of(RECTANGLE), 0.02), ObjectFrame(np.array([1.0, -2.0, 0.5]), 3.0)
+    write_ply(tmp_path / "p.ply", PlaneMirror(height_field.plane).mesh(frame))
+    np.testing.assert_allclose(normals_in(read_ply(tmp_path / "p.ply")), [height_field.plane.normal] * 4, atol=1e-12)
+    write_ply(tmp_path / "h.ply", HeightFieldMirror(height_field).mesh(frame))
+    table, plane, step = read_ply(tmp_path / "h.ply"), height_field.plane, 1e-5
+    points, normals = (vertices_of(table) - frame.center) / frame.radius, normals_in(table)
+    places = np.stack([points @ plane.tangent_u, points @ plane.tangent_v], 1)
+    inside = (np.abs(places - places.mean(0)) < 0.45 * np.ptp(places, axis=0)).all(1)
+    for axis, tangent in enumerate((plane.tangent_u, plane.tangent_v)):
+        shift = step * np.eye(2)[axis]
+        rise = height_field.heights(places + shift, 0)[0] - height_field.heights(places - shift, 0)[0]
+        along = (normals * (2 * step * tangent + rise[:, None] * plane.normal)).sum(1) / (2 * step)
+        np.testing.assert_allclose(along[inside], 0, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-12)
+    assert (normals @ plane.normal > 0).all()
+
+
+def test_the_normals_of_a_surface_of_revolution_are_in_the_ply_and_sharp_at_its_creases(tmp_path: Path) -> None:
+    """A cup of flat and straight walls: at every face all normals are perpendicular to its meridian and outward."""
+    profile = np.array([[0.0, 0], [0.5, 0], [0.5, 0.9], [0.4, 0.9], [0.4, 0.1], [0, 0.1]])
+    axis = np.array([0.36, -0.48, 0.8])
+    cup = SurfaceOfRevolution(np.array([0.1, 0.2, -0.3]), axis, profile, 2)
+    write_ply(tmp_path / "r.ply", RevolutionMirror(cup).mesh(ObjectFrame(np.array([1.0, -2.0, 0.5]), 3.0)))
+    table = read_ply(tmp_path / "r.ply")
+    vertices, normals, faces = vertices_of(table), normals_in(table), table["faces"]
+    corners = vertices[faces]
+    along = corners[:, 3] - corners[:, 0]
+    facing = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    # Quadrilaterals at the axis have two corners at one place; the diagonals span their plane all the same.
+    facing /= np.linalg.norm(facing, axis=1, keepdims=True)
+    np.testing.assert_allclose((normals[faces] * along[:, None]).sum(-1), 0, atol=1e-6)
+    # 128 meridians: a face turns by half a step against its vertices.
+    assert (normals[faces] * facing[:, None]).sum(-1).min() > np.cos(np.pi / 128) - 1e-6
+    assert len(faces) == 5 * 128
+
+
 def test_a_map_of_a_near_room_is_that_of_the_world_s_origin() -> None:
     """A smooth light on a sphere about the object's center, seen from beside it: within the blur of a coarse map."""
     around, frame = Surroundings(np.array([0.25])), ObjectFrame(np.array([0.0, -0.6, 0.3]), 2.0)

@@ -1,0 +1,40 @@
+"""The command that hands a prediction to other programs."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from shinypartial.cli.newest import announce_newest
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Write the light and the surface of a prediction as files for Blender, game engines and web pages."""
+
+    prediction: tyro.conf.Positional[Path | None] = None
+    """Prediction folder of any method; the newest one when not given."""
+    to: tuple[Literal["blender", "cubemap", "sh", "glb"], ...] = field(kw_only=True)
+    """What to write, one or more: `blender` world.exr and scene.blend; `cubemap` px.hdr to nz.hdr; `sh`
+    harmonics.json; `glb` surface.glb."""
+    output: Path | None = None
+    """Folder to write; PREDICTION-converted beside it when not given."""
+    confidence: Literal["keep", "darken", "fill"] = "keep"
+    """Directions that were not seen: `keep` what the prediction has there, `darken` by the visibility, or `fill`
+    smoothly from around where the visibility is 0. Maps of `panoless fit` are filled already."""
+    layout: Literal["three", "opengl"] = "three"
+    """Of cube maps: for three.js, whose lookups mirror x, or for lookups in the direction itself."""
+    degree: int = 4
+    """Of spherical harmonics, 0 to 4."""
+
+    def run(self) -> None:
+        """Write and say what."""
+        from shinypartial.conversion.convert import ConversionOptions, convert
+        from shinypartial.prediction.format import newest_prediction
+
+        prediction = self.prediction or announce_newest("prediction", newest_prediction())
+        output = self.output or prediction.resolve().with_name(f"{prediction.resolve().name}-converted")
+        options = ConversionOptions(self.confidence, self.layout, self.degree)
+        for path in convert(prediction, self.to, output, options):
+            print(f"Wrote {path}")

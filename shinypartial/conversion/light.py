@@ -1,0 +1,118 @@
+"""The light of a prediction: what to make of directions that were not seen, cube maps, spherical harmonics."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import scipy.sparse as sparse
+from jaxtyping import Bool, Float
+from scipy.sparse.linalg import splu
+
+from shinypartial.core.conventions import Y_UP_TO_WORLD
+from shinypartial.core.errors import InputError
+from shinypartial.core.harmonics import project_latlong
+from shinypartial.core.sphere import cube_directions, latlong_directions, sample_latlong
+from shinypartial.prediction.format import VISIBILITY, read_environment_map, read_visibility
+
+Confidence = Literal["keep", "darken", "fill"]
+Layout = Literal["opengl", "three"]
+
+#: Rows of the grid on which gaps are filled: a harmonic fill is smooth, so that a finer one shows no difference.
+FILL_ROWS = 128
+#: π A_l of Ramamoorthi and Hanrahan (2001), eq. 8, by degree: irradiance has the coefficients A_l c_lm.
+COSINE_FACTORS = (np.pi, 2 * np.pi / 3, np.pi / 4, 0.0, -np.pi / 24)
+#: From directions in which a cube map is looked up to those of the world.
+LAYOUTS = {"opengl": Y_UP_TO_WORLD, "three": Y_UP_TO_WORLD @ np.diag([-1.0, 1, 1])}
+
+
+def light_of(prediction: Path, confidence: Confidence) -> Float[np.ndarray, "H W 3"]:
+    """The predicted map E, as `confidence` has it: E, visibility · E, or E filled where the visibility is 0.
+
+    Raises InputError when visibility is needed and the prediction has none.
+    """
+    radiance = read_environment_map(prediction)
+    if confidence == "keep":
+        return radiance
+    visibility = read_visibility(prediction)
+    if visibility is None:
+        raise InputError(
+            expected=f"{VISIBILITY} in {prediction}, for --confidence {confidence}",
+            found="none",
+            remedy="Take --confidence keep.",
+        )
+    if len(visibility) != len(radiance):
+        visibility = sample_latlong(visibility[..., None], latlong_directions(len(radiance)))[..., 0]
+    if confidence == "darken":
+        return radiance * visibility[..., None]
+    return filled(radiance, visibility > 0)
+
+
+def filled(radiance: Float[np.ndarray, "H W 3"], seen: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W 3"]:
+    """A harmonic fill: Δ_S² u = 0 where nothing was seen and u = E elsewhere, which keeps its value to the bit.
+
+    On a lat-long grid of equal steps the neighbors of a texel weigh 1/sin θ to either side and sin θ at the edge above
+    and below, so that nothing passes through the poles. It is solved on at most `FILL_ROWS` rows, of means of what was
+    seen. A map of which all or nothing was seen is left as it is.
+    """
+    if seen.all() or not seen.any():
+        return radiance
+    step = 1
+    while len(radiance) // step > FILL_ROWS and len(radiance) % (2 * step) == 0:
+        step *= 2
+    rows = len(radiance) // step
+    blocks = np.concatenate([radiance * seen[..., None], seen[..., None]], -1).astype(np.float64)
+    *colors, number = np.moveaxis(blocks.reshape(rows, step, 2 * rows, step, 4).sum((1, 3)), -1, 0)
+    coarse = (np.stack(colors, -1) / np.maximum(number, 1)[..., None]).reshape(-1, 3)
+    known = number.ravel() > 0
+    if not known.all():
+        hidden = _laplacian(rows)[~known]
+        coarse[~known] = splu(hidden[:, ~known].tocsc()).solve(-(hidden[:, known] @ coarse[known]))
+    smooth = sample_latlong(coarse.reshape(rows, 2 * rows, 3), latlong_directions(len(radiance)))
+    return np.where(seen[..., None], radiance, smooth).astype(radiance.dtype)
+
+
+def _laplacian(rows: int) -> sparse.csr_matrix:
+    """The graph Laplacian of the texels of a lat-long map with the weights of the sphere."""
+    index = np.arange(rows * 2 * rows).reshape(rows, 2 * rows)
+    beside = np.broadcast_to(1 / np.sin(np.pi * (np.arange(rows) + 0.5) / rows)[:, None], index.shape)
+    below = np.broadcast_to(np.sin(np.pi * np.arange(1, rows) / rows)[:, None], index[1:].shape)
+    first = np.concatenate([index.ravel(), index[:-1].ravel()])
+    second = np.concatenate([np.roll(index, -1, 1).ravel(), index[1:].ravel()])
+    weights = sparse.coo_matrix((np.concatenate([beside.ravel(), below.ravel()]), (first, second)), (index.size,) * 2)
+    both = (weights + weights.T).tocsr()
+    return (sparse.diags(np.asarray(both.sum(1)).ravel()) - both).tocsr()
+
+
+def cube_faces(latlong: Float[np.ndarray, "H W 3"], layout: Layout) -> Float[np.ndarray, "6 L L 3"]:
+    """Six faces px, nx, py, ny, pz, nz of half the map's height, as OpenGL's table 8.19 has rows and columns, Y up.
+
+    `opengl`: a lookup in the right-handed direction (x, y, z) finds the light of the world's (x, −z, y). `three`: the
+    same for three.js, which looks up (−x, y, z) for the direction (x, y, z). Means of 2×2 points a texel.
+    """
+    resolution = max(len(latlong) // 2, 1)
+    fine = sample_latlong(latlong, cube_directions(2 * resolution) @ LAYOUTS[layout].T)
+    return fine.reshape(6, resolution, 2, resolution, 2, 3).mean((2, 4))
+
+
+def harmonics_of(latlong: Float[np.ndarray, "H W 3"], degree: int) -> dict[str, Any]:
+    """The content of harmonics.json: radiance in spherical harmonics about Y-up axes, and what the numbers mean.
+
+    Y-up directions (x, y, z) are (x, −z, y) in the world, as in the cube maps and the GLB.
+    """
+    if not 0 <= degree < len(COSINE_FACTORS):
+        raise InputError(
+            expected=f"--degree from 0 to {len(COSINE_FACTORS) - 1}",
+            found=str(degree),
+            remedy="Irradiance needs 2; 4 is the most.",
+        )
+    return {
+        "degree": degree,
+        "coefficients": project_latlong(latlong, degree, Y_UP_TO_WORLD).tolist(),
+        "order": "entry l*l + l + m is [R, G, B] of degree l and order m, m from -l to l",
+        "basis": "real, orthonormal over the sphere, no Condon-Shortley phase: Y(0,0) = 0.282095, "
+        "Y(1,-1) = 0.488603 y, Y(1,0) = 0.488603 z, Y(1,1) = 0.488603 x; m < 0 has sin, m > 0 cos",
+        "quantity": "linear radiance: L(d) = sum of coefficients times Y(d)",
+        "axes": "right-handed, +Y up, as in glTF; (x, y, z) is (x, -z, y) in the world of the dataset",
+        "irradiance_factors": list(COSINE_FACTORS[: degree + 1]),
+        "irradiance": "multiply the coefficients of degree l by irradiance_factors[l]; divide by pi for diffuse white",
+    }
