@@ -144,9 +144,12 @@ def _fit_around(
     """A fit in the surroundings that the proposal asks for, if it explains clearly more than one in a far world; or in
     near ones that are `known` already.
 
-    The far world is tried on from the fit in a near one, and only where it does as well, from the beginning.
+    The far world is tried on from the fit in a near one, and only where it does as well, from the beginning. A
+    kind that finds poses itself is not asked again: its proposal is of the cameras before.
     """
     source, posed = _source(family), views if start.poses is None else start.poses.moved(views)
+    if family.finds_poses and start.proposal.fitted is not None:
+        return fit_with_poses(family, source, views, start, config)
     around = proposed_surroundings(source, posed, start.proposal, config)
     if around.is_far:
         start = start if known.is_far else start.in_surroundings(FAR)

@@ -18,7 +18,9 @@ from panoless.selection.held_out import is_clearly_lower
 from panoless.selection.options import CorrectionOptions
 
 FARTHEST = 3
-"""A focal length that is farther from what is said of it than so many expected errors is not believed."""
+"""A focal length that is farther from what is said of it than so many expected errors is not believed…"""
+NEAREST = 2
+"""…nor a change that is no larger than so many of its own standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ def _is_believed(views: Views, before: Fitted, after: Fitted, change: float, con
         return True
     uncertainty = (told.focal_uncertainty or 0.0) / told.focal_factor
     is_likely = uncertainty < options.focal_prior and abs(change) < FARTHEST * options.focal_prior
-    return is_likely and abs(change) > uncertainty and _focal_length_is_earned(views, before, after, config)
+    return is_likely and abs(change) > NEAREST * uncertainty and _focal_length_is_earned(views, before, after, config)
 
 
 def _looks_like_a_focal_length(views: Views, geometry: Geometry, options: CorrectionOptions) -> bool:
