@@ -15,9 +15,12 @@ from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.rasterize import RasterCamera
 
 SAMPLES = 4
-"""Rays along a side of a pixel at an outline."""
+"""Rays along a side of a pixel at an outline, and where mirrored rays turn far or meet the surface again."""
 AREA_SAMPLES = 4
-"""Mirrored rays over a pixel."""
+"""Mirrored rays over the other pixels."""
+WIDEST_TURN_RAD = 0.15
+"""Pixels over which the mirrored ray turns by more are wide. On sculpture at 160 px, 0.05 gains 0.1 dB more, for 1.6
+times the time."""
 BOUNCES = 8
 """A ray that has not left after so many reflections shows where it goes then."""
 
@@ -69,30 +72,38 @@ def free_form_light(
     pixels: Int[Tensor, "P"],
     normals_camera: Float[Tensor, "3 P"],
 ) -> Float[Tensor, "P 3"]:
-    """Radiance of pixels (flat indices): the mean over four rays of each that sees the surroundings at once, else that
-    of the ray through its center, followed through its reflections.
+    """Radiance of pixels (flat indices): the mean over four rays that see the surroundings at once and turn little,
+    else over those of 4×4 rays that hit, followed through their reflections.
 
-    Pixels whose centers miss are shaded by the given normals.
+    Pixels that none of these hit are shaded by the given normals.
     """
-    rays = PixelRays.centers(camera, pixels.cpu().numpy())
-    sights = Sights.of(surface, rays, AREA_SAMPLES, 0.0)
+    index = pixels.cpu().numpy()
+    sights = Sights.of(surface, PixelRays.centers(camera, index), AREA_SAMPLES, 0.0)
     light = shade_centers(environment, camera, pixels, normals_camera)
-    for index, directions in (
-        (np.flatnonzero(sights.clear), sights.outgoing),
-        (np.flatnonzero(sights.hits.met & ~sights.clear), _followed(surface, sights, rays)[:, None]),
-    ):
-        looked_up = torch.from_numpy(directions[index].reshape(-1, 3)).to(environment)
-        mean = sample_cubemap(environment, looked_up).view(len(index), directions.shape[1], 3).mean(1)
-        light[torch.from_numpy(index).to(light.device)] = mean
+    narrow = sights.clear & (sights.turn < WIDEST_TURN_RAD)
+    directions = torch.from_numpy(sights.outgoing[narrow].reshape(-1, 3)).to(environment)
+    mean = sample_cubemap(environment, directions).view(-1, AREA_SAMPLES, 3).mean(1)
+    light[torch.from_numpy(np.flatnonzero(narrow)).to(light.device)] = mean
+    row, column = np.divmod(index[~narrow], camera.width)
+    total, count = torch.zeros(len(row), 3).to(light), torch.zeros(len(row)).to(light)
+    for across, down in np.ndindex(SAMPLES, SAMPLES):
+        rays = PixelRays.through(camera, column + (across + 0.5) / SAMPLES, row + (down + 0.5) / SAMPLES)
+        hit, outgoing = _followed(surface, rays)
+        found = torch.from_numpy(hit).to(light.device)
+        total[found] += sample_cubemap(environment, torch.from_numpy(outgoing).to(environment))
+        count[found] += 1
+    seen = count > 0
+    wide = torch.from_numpy(np.flatnonzero(~narrow)).to(light.device)
+    light[wide[seen]] = total[seen] / count[seen, None]
     return light
 
 
-def _followed(surface: LevelSet, sights: Sights, rays: PixelRays) -> Float[np.ndarray, "P 3"]:
-    """Where in the map the rays of pixels that see the object again look in the end; the others' mean nothing."""
-    directions = rays.directions.copy()
-    going = np.flatnonzero(sights.hits.met & ~sights.clear)
-    normals, points = sights.hits.normals[going], surface.points(sights.hits.places[going])
-    last = np.zeros_like(directions)
+def _followed(surface: LevelSet, rays: PixelRays) -> tuple[Int[np.ndarray, "M"], Float[np.ndarray, "M 3"]]:
+    """Which rays hit, and where in the map these look in the end."""
+    hits = surface.hits(rays.origins, rays.directions)
+    hit = going = np.flatnonzero(hits.met)
+    directions, last = rays.directions.copy(), np.zeros_like(rays.directions)
+    normals, points = hits.normals[hit], surface.points(hits.places[hit])
     for _ in range(BOUNCES):
         directions[going], last[going] = reflect(directions[going], normals), points
         hits = surface.hits(points, directions[going], leaving=True)
@@ -100,4 +111,4 @@ def _followed(surface: LevelSet, sights: Sights, rays: PixelRays) -> Float[np.nd
         points = surface.points(hits.places[hits.met])
         if not len(going):
             break
-    return surface.surroundings.looked_up(last, directions)
+    return hit, surface.surroundings.looked_up(last[hit], directions[hit])
