@@ -172,8 +172,7 @@ class FreeFormFamily(ExactFamily):
     def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
         """On from a fit, in rounds with that logarithm among the unknowns."""
         options = config.free_form
-        start = FitStage(fitted.surface, fitted.trust, None, options.damping, poses=fitted.poses, focal=0.0)
-        stage = follow_views(views, start, options)
+        stage = _followed(views, fitted, options, focal=0.0)
         assert stage.focal is not None, "the focal length was unknown"
         factor = float(np.exp(-stage.focal))
         surface, trust = stage.surface.scaled(factor), stage.trust.scaled(factor)
@@ -184,8 +183,14 @@ class FreeFormFamily(ExactFamily):
         if proposal.fitted is None:
             surface, trust, poses = fit_free_form(views, proposal.shape, config.free_form)
         else:
-            fitted, options = proposal.fitted, config.free_form
-            start = FitStage(fitted.surface, fitted.trust, None, options.damping, poses=fitted.poses)
-            found = follow_views(views, start, options)
+            found = _followed(views, proposal.fitted, config.free_form)
             surface, trust, poses = found.surface, found.trust, found.poses
         return FreeFormMirror(surface, trust, config.environment.trace, config.free_form, poses=poses)
+
+
+def _followed(
+    views: Views, fitted: FreeFormMirror, options: FreeFormOptions, *, focal: float | None = None
+) -> FitStage:
+    """What a fit leads to from where it ended (see `follow_views`)."""
+    start = FitStage(fitted.surface, fitted.trust, None, options.damping, poses=fitted.poses, focal=focal)
+    return follow_views(views, start, options)
