@@ -41,7 +41,7 @@ class _Balls:
 def blob_mesh(blob: Blob) -> Mesh:
     """Triangles of the level set, each vertex and normal exact, with the farthest vertex at the blob's radius."""
     balls = _balls_along_curve(blob)
-    return _level_set(balls, _farthest(balls), blob.resolution, blob.radius)
+    return _level_set(balls, _farthest(balls), blob.resolution, blob.radius, blob.refinements)
 
 
 def soft_balls_mesh(shape: SoftBalls) -> Mesh:
@@ -69,7 +69,7 @@ def _sampled(balls: _Balls, axis: Float[np.ndarray, "L"]) -> Float[np.ndarray, "
     return np.stack([balls.field(_layer(x, axis)).reshape(len(axis), len(axis)) for x in axis])
 
 
-def _level_set(balls: _Balls, reach: float, resolution: int, radius: float, refinements: int = 0) -> Mesh:
+def _level_set(balls: _Balls, reach: float, resolution: int, radius: float, refinements: int) -> Mesh:
     """Marching cubes, then Newton steps onto the level set; centered and scaled, with the gradient's normals."""
     from skimage.measure import marching_cubes
 

@@ -136,6 +136,8 @@ class Blob:
     """By which share the thickness varies along the curve."""
     resolution: Annotated[int, limits(8, 512)] = 96
     """Cells per side of the grid in which the surface is found."""
+    refinements: Annotated[int, limits(0, 3)] = 0
+    """How often each triangle is divided into four on the level set."""
 
     @property
     def extent(self) -> float:

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from shinypartial.blender.geometry import make_mesh, make_part, profile_outlines
 from shinypartial.blender.mesh import Mesh, deformed, displacement_field, polygon_normals
@@ -131,6 +132,24 @@ def test_faces_are_so_fine_that_interpolated_normals_are_exact(shape: RadialHarm
     exact = fine[1::2, 1::2] if is_ring else fine[2:-1:2, 1::2]
     # The error falls with the square of a face's size: below 0.02° on the faces of the defaults.
     assert angles_deg(means, exact).max() < 4 * 0.02
+
+
+def test_refinements_make_interpolated_normals_of_the_sculpture_exact() -> None:
+    """The mean of an edge's normals against the exact one where a refinement divides it, on coarse cells."""
+    recipe = load_scene("sculpture").object
+    assert isinstance(recipe, Blob)
+
+    def error(refinements: int) -> float:
+        mesh, finer = (make_mesh(replace(recipe, resolution=32, refinements=refinements + more)) for more in (0, 1))
+        faces = np.array(mesh.faces)
+        first, second = np.unique(np.sort(np.concatenate([faces[:, :2], faces[:, 1:]]), -1), axis=0).T
+        nearest = KDTree(finer.vertices).query((mesh.vertices[first] + mesh.vertices[second]) / 2)[1]
+        means = mesh.normals[first] + mesh.normals[second]
+        return float(np.median(angles_deg(means, finer.normals[nearest])))
+
+    coarse, refined = error(0), error(1)
+    assert refined == pytest.approx(coarse / 4, rel=0.3), "It falls with the square of a face's size."
+    assert refined * (32 / recipe.resolution) ** 2 / 4 ** (recipe.refinements - 1) < 0.01
 
 
 def test_closed_forms_have_the_volumes_of_their_formulas() -> None:
