@@ -66,6 +66,12 @@ def ellipsoid(axes: tuple[float, float, float] = (1.0, 0.8, 0.65)) -> Body:
     return Body(lambda x: (np.linalg.norm(x / axes, axis=1) - 1) * min(axes))
 
 
+def block(half: tuple[float, float, float] = (0.7, 0.8, 0.62), exponent: float = 6.0) -> Body:
+    """With flat faces and rounded edges, turned so that a corner faces the cameras at +X."""
+    turn = look_at(np.array([1.0, 0.7, 0.5]), np.zeros(3))[:3, :3]
+    return Body(lambda x: (np.linalg.norm(x @ turn / half, exponent, axis=1) - 1) * min(half))
+
+
 def torus(ring: float = 0.7, tube: float = 0.3) -> Body:
     """About the x axis, so that cameras there look through its hole."""
     return Body(lambda x: np.hypot(np.hypot(x[:, 1], x[:, 2]) - ring, x[:, 0]) - tube)

@@ -192,6 +192,8 @@ def take_round(
     if stage.settings is None or stage.settings.cells != settings.cells:
         surface = surface.resampled(settings.cells)
     task = make_task(views, settings, options)
+    if settings.anchored:
+        task = replace(task, anchor=surface.coefficients)
     solution = Solution.at(
         task, surface, stage.trust, stage.environment, options.first_map_rounds, stage.poses, stage.focal
     )

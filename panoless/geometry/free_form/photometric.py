@@ -74,6 +74,8 @@ class Task:
     """Their optical axes."""
     brightness: float
     """Mean over all pixels and channels (linear radiance)."""
+    anchor: Float[np.ndarray, "A B C"] | None = None
+    """Coefficients the change from which is to be smooth; None: the surface is."""
 
     def seen_from(self, rays: PixelRays, poses: Poses | None, focal: float | None) -> PixelRays:
         """Rays where their cameras are, through the lens that they have."""
@@ -247,7 +249,13 @@ class Solution:
     @cached_property
     def bent(self) -> Float[np.ndarray, "A B C"]:
         """The gradient of half the prior."""
-        return self.smoothing * third_differences(self.surface.coefficients, self.active)
+        return self.smoothing * third_differences(self._rough, self.active)
+
+    @property
+    def _rough(self) -> Float[np.ndarray, "A B C"]:
+        """What is to be smooth."""
+        anchor, coefficients = self.task.anchor, self.surface.coefficients
+        return coefficients if anchor is None else coefficients - anchor
 
     def cost(self, before: "Solution") -> float:
         """Half the sum of all robust squares, pixels weighed as in a solution `before`, and with its gain.
@@ -258,7 +266,7 @@ class Solution:
         residual = self.residual * (before.gain / self.gain)[:, None]
         residual = np.where(self.sights.clear[:, None], residual, before.residual)
         photographs = scale**2 * float((before.weights * bounded_error(residual, scale)).sum()) / 2
-        prior = float((self.bent * self.surface.coefficients).sum()) / 2
+        prior = float((self.bent * self._rough).sum()) / 2
         if self.poses is not None:
             prior += float((self.pose_prior * self.poses.stacked**2).sum()) / 2
         if self.focal is not None:

@@ -14,8 +14,9 @@ from panoless.config import FitConfig, SurfelConfig
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.free_form.fit import fit_free_form, gauss_newton_step, make_task
 from panoless.geometry.free_form.kind import FreeFormFamily, FreeFormMirror
-from panoless.geometry.free_form.options import DEFAULTS, ConcaveOptions, FreeFormOptions, FreeFormRound
+from panoless.geometry.free_form.options import DEFAULTS, ConcaveOptions, DescentOptions, FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.photometric import Sights, Solution
+from panoless.geometry.free_form.start import started
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import full_trust
 from panoless.kernels.level_set import seen_with_slopes
@@ -23,6 +24,7 @@ from panoless.kernels.reference.cubemap import padded_texels
 from shinypartial.core.camera import Camera
 from tests.support.mirror_body import (
     Body,
+    block,
     body_views,
     camera_rays_world,
     cameras_around,
@@ -39,6 +41,7 @@ OPTIONS = FreeFormOptions(
     rounds=tuple(replace(settings, rays=settings.rays // 2) for settings in DEFAULTS.rounds),
     finer=(),
     concave=ConcaveOptions(search=False),
+    descent=DescentOptions(rounds=()),
     poses="off",
 )
 COARSE = replace(OPTIONS.rounds[0], rays=5_000)
@@ -161,6 +164,30 @@ def test_the_gradient_is_that_of_finite_differences(solution: Solution) -> None:
     assert (costs[1] - costs[0]) / 2 == pytest.approx(float((gradient * change).sum()), rel=0.02)
 
 
+def test_smoothness_of_an_anchored_round_is_asked_of_the_change_alone(solution: Solution) -> None:
+    coefficients = solution.surface.coefficients
+    anchored = replace(solution, task=replace(solution.task, anchor=coefficients))
+    assert np.abs(anchored.bent).max() == 0
+    np.testing.assert_allclose(
+        solution.gradient()[0] - anchored.gradient()[0], solution.bent * solution.active, atol=1e-9
+    )
+    free = replace(solution, task=replace(solution.task, anchor=np.zeros_like(coefficients)))
+    np.testing.assert_array_equal(free.bent, solution.bent)
+    assert anchored.cost(anchored) < solution.cost(solution) == free.cost(free)
+
+
+def test_a_start_that_descended_is_taken_where_pixels_agree_better() -> None:
+    views = body_views(sphere(), 8, 32)
+    proposal = FreeFormFamily().propose(views, CONFIG, asked=True)
+    assert proposal is not None
+    plain, one = proposal.shape, FreeFormRound(12, 4, 0.5, 1, 500, 100.0, 1, anchored=True)
+    options = replace(OPTIONS, rounds=(replace(one, anchored=False),), descent=DescentOptions(rounds=(one,), tried=1))
+    assert started(views, plain, [plain], lambda surface: 1.0, options) is plain
+    falling = iter(np.linspace(1, 0, 10))
+    descended = started(views, plain, [plain], lambda surface: float(next(falling)), options)
+    assert descended.cells == 12 != plain.cells
+
+
 def test_the_matrix_is_symmetric_and_positive(solution: Solution) -> None:
     rng = np.random.default_rng(1)
     one, other = (rng.normal(size=solution.surface.shape) * solution.active for _ in range(2))
@@ -275,6 +302,17 @@ def test_a_wrong_focal_length_is_found_beside_the_shape() -> None:
     assert change == pytest.approx(-np.log(1.02), rel=0.2)
     before, after = (np.abs(wavy_ball().value(each.mesh(views.object_frame).vertices)) for each in (first, geometry))
     assert np.median(after) < 0.3 * np.median(before)
+
+
+@pytest.mark.slow
+def test_flat_faces_that_no_outline_shows_are_found_by_a_descent() -> None:
+    """The corner of a block faces the cameras: the first surface is wrong by 8° there, and first rounds alone stay."""
+    views = body_views(block(), VIEWS, SIZE_PX)
+
+    def error_deg(options: FreeFormOptions) -> float:
+        return float(np.median(normal_errors_deg(fitted(views, options), block(), views, cameras_around(7, 60)[1::2])))
+
+    assert error_deg(replace(OPTIONS, descent=DescentOptions())) < 1.0 < 3.0 < error_deg(OPTIONS)
 
 
 def test_what_all_cameras_share_is_taken_back() -> None:
