@@ -14,12 +14,13 @@ import tyro
 from msgspec import Meta
 
 from panoless.alignment.options import PoseOptions
-from panoless.environment.options import FootprintMapOptions, MaterialOptions, SurroundingsOptions
+from panoless.environment.options import ConfidenceOptions, FootprintMapOptions, MaterialOptions, SurroundingsOptions
 from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.geometry.free_form.options import FreeFormOptions
 from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.options import PlaneOptions
 from panoless.geometry.revolution.options import RevolutionOptions
+from panoless.geometry.surfels.options import SurfelOptions
 from panoless.selection.options import CorrectionOptions, SelectionOptions
 from panoless.trust.options import TrustOptions
 from shinypartial.core.errors import InputError
@@ -48,6 +49,7 @@ class SurfelConfig:
     """Voxels along a side of the cube in which the hull is carved; outlines count below the size of a voxel."""
     hull_votes: Share = 0.96
     """Least share of the views whose mask must keep a point of the hull; all views count unless they contradict."""
+    tuned: Tuned[SurfelOptions] = field(default_factory=SurfelOptions)
 
 
 @dataclass(frozen=True)
@@ -198,6 +200,7 @@ class FitConfig:
     revolution: Tuned[RevolutionOptions] = field(default_factory=RevolutionOptions)
     free_form: Tuned[FreeFormOptions] = field(default_factory=FreeFormOptions)
     footprint_map: Tuned[FootprintMapOptions] = field(default_factory=FootprintMapOptions)
+    confidence: Tuned[ConfidenceOptions] = field(default_factory=ConfidenceOptions)
     poses: Tuned[PoseOptions] = field(default_factory=PoseOptions)
     surroundings: Tuned[SurroundingsOptions] = field(default_factory=SurroundingsOptions)
     material: Tuned[MaterialOptions] = field(default_factory=MaterialOptions)

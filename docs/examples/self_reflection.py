@@ -2,15 +2,17 @@
 
     python docs/examples/self_reflection.py datasets/vase-400 runs/vase-400-default --output self-reflection.json
 
-A geometry that can trace its own reflections leaves such pixels out (`usable_pixels`); surfels can't. A fit never reads
-the mask; this example does, for every `--every`-th training view. Results of other datasets in the output are kept.
+A geometry that can trace its own reflections observes nothing through such pixels; surfels can't. A fit never reads the
+mask; this example does, for every `--every`-th training view. Results of other datasets in the output are kept.
 """
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from scipy.ndimage import binary_dilation
 
 from panoless.capture.views import load_views
@@ -56,10 +58,12 @@ def score(dataset: Dataset, geometry: Geometry, every: int) -> dict[str, object]
         rows, columns = np.nonzero(truth.alpha > 0)
         top, left = max(rows.min() - CROP_MARGIN_PX, 0), max(columns.min() - CROP_MARGIN_PX, 0)
         true = truth.self_reflection[top : top + view.camera.height, left : left + view.camera.width] > 0
-        solid, usable = np.zeros((2, view.mask.numel()), bool)
+        solid, observed = np.zeros((2, view.mask.numel()), bool)
         solid[view.solid.numpy()] = True
-        usable[geometry.usable_pixels(view).numpy()] = True
-        found, solid = (solid & ~usable).reshape(view.mask.shape), solid.reshape(view.mask.shape)
+        numbers = torch.arange(view.mask.numel(), dtype=torch.float32).view(1, *view.mask.shape).expand(3, -1, -1)
+        numbered = geometry.observe(replace(view, radiance=numbers), view.solid).radiance[:, 0]
+        observed[numbered.long().numpy()] = True
+        found, solid = (solid & ~observed).reshape(view.mask.shape), solid.reshape(view.mask.shape)
         solid_pixels += int(solid.sum())
         for margin in MARGINS_PX:
             marked = binary_dilation(found, np.ones((3, 3)), margin) if margin else found

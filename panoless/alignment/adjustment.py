@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from panoless.alignment.equations import PoseRows
 from panoless.alignment.options import PoseOptions
-from panoless.environment.cubemap import texels_of
+from panoless.environment.cubemap import gather_texels, texels_of
 from panoless.numeric.gauss_newton import jacobian_of_rows
 from panoless.numeric.robust import robust_weight
 
@@ -50,20 +50,16 @@ def _texel_means(
     light: Sequence[PoseRows], sigma: float, resolution: int, options: PoseOptions
 ) -> Iterator[tuple[Float[np.ndarray, "T D"], Float[np.ndarray, "T"]]]:
     """Σ w J/√Σw and Σ w e/√Σw of texels, some of them at a time, a channel after the other."""
-    from scipy import sparse
-
     view = np.repeat(np.arange(len(light)), [len(rows.residual) for rows in light])
     residual = np.concatenate([rows.residual for rows in light])
     jacobian = np.concatenate([rows.rows for rows in light])
     weights = robust_weight(residual, options.noise_multiple * sigma) / sigma**2
     texel = texels_of(np.concatenate([rows.directions for rows in light if rows.directions is not None]), resolution)
-    total = np.maximum(np.bincount(texel, weights), 1e-12)
-    count = len(total)
-    gather = sparse.csr_matrix((weights / np.sqrt(total)[texel], (texel, np.arange(len(texel)))), (count, len(texel)))
+    gather = gather_texels(weights, texel)
     columns = 6 * view[:, None] + np.arange(6)
     for channel in range(residual.shape[1]):
         rows = jacobian_of_rows(jacobian[:, channel], columns, 6 * len(light))
         means, asked = gather @ rows, gather @ residual[:, channel]
-        for first in range(0, count, TEXELS_AT_ONCE):
+        for first in range(0, len(asked), TEXELS_AT_ONCE):
             part = slice(first, first + TEXELS_AT_ONCE)
             yield means[part].toarray(), asked[part]

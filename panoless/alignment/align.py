@@ -14,16 +14,12 @@ from panoless.alignment.adjustment import adjusting_step
 from panoless.alignment.equations import PoseRows, light_rows, outline_rows
 from panoless.alignment.options import PoseOptions
 from panoless.capture.poses import Poses, moved_view
-from panoless.capture.rays import pose_of
 from panoless.capture.silhouettes import mask_distance_px
 from panoless.capture.views import TrainView, Views
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, observe_views, usable_views
 from panoless.numeric.gauss_newton import damped_step
-from panoless.numeric.robust import robust_scale
-
-NORMAL_MEDIAN = 0.6745
-"""The median of |x| of a normal x, in standard deviations."""
+from panoless.numeric.robust import NORMAL_MEDIAN, robust_scale
 
 
 @dataclass(frozen=True)
@@ -101,7 +97,7 @@ class Alignment:
         With v the line of sight, a shift t of the object across it looks like the turn v × t, and a turn θ of the
         object about it like the turn (v·θ) v.
         """
-        centers = np.array([pose_of(view.camera)[1] for view in self.views.train])
+        centers = np.array([view.position for view in self.views.train])
         sights = centers / np.linalg.norm(centers, axis=1, keepdims=True)
         shifted = np.cross(sights[:, None], np.eye(3))
         rolled = sights[:, :, None] * sights[:, None]
@@ -111,8 +107,8 @@ class Alignment:
 
     def without_common(self, poses: Poses) -> Poses:
         """The poses less what turns, shifts and scales all cameras alike."""
-        centers = np.array([pose_of(view.camera)[1] for view in self.views.train])
-        return poses.without(poses.common(centers, self.prior), centers)
+        centers = np.array([view.position for view in self.views.train])
+        return poses.without_common(centers, self.prior)[1]
 
 
 @dataclass(frozen=True)

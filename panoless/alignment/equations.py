@@ -19,6 +19,7 @@ from torch import Tensor
 from panoless.alignment.options import PoseOptions
 from panoless.capture.masks import MASK_LEVEL
 from panoless.capture.rays import camera_rays, pose_of, reflect
+from panoless.capture.silhouettes import BORDER_PX
 from panoless.capture.views import TrainView
 from panoless.environment.nearness import light_and_slopes
 from panoless.environment.surroundings import FAR, Surroundings
@@ -26,9 +27,6 @@ from panoless.geometry.base import SOLID_SURFACE_ALPHA, SurfaceBuffers
 from panoless.kernels.rasterize import RasterCamera
 from panoless.numeric.robust import bounded_error, robust_weight
 from shinypartial.core.conventions import PIXEL_CENTER
-
-BORDER_PX = 1.0
-"""Outline points nearer to the border of the picture are left out: the surface may go on beyond it."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,8 @@ def image_motion(camera: RasterCamera, points_camera: Float[np.ndarray, "P 3"]) 
 def outline_rows(view: TrainView, distance_px: Float[np.ndarray, "H W"], surface: SurfaceBuffers) -> PoseRows:
     """How far the outline of a surface lies outside that of the mask, in pixels, at points along the first.
 
-    `distance_px` is the signed distance from the mask's contour. No points where the surface is not seen.
+    `distance_px` is the signed distance from the mask's contour. No points where the surface is not seen, nor near the
+    border of the picture, beyond which it may go on.
     """
     from scipy.ndimage import map_coordinates
     from skimage.measure import find_contours
@@ -125,7 +124,7 @@ def light_rows(
     outgoing = surroundings.looked_up(points, mirrored)
     shown, slopes = light_and_slopes(environment, outgoing)
     slopes = surroundings.slopes_by_mirrored(slopes, points, mirrored)
-    seen = view.radiance.flatten(1)[:, torch.from_numpy(pixels).to(view.radiance.device)].T.cpu().numpy()
+    seen = view.radiance_at(torch.from_numpy(pixels)).cpu().numpy()
     return PoseRows(shown - seen, np.einsum("pkc,pci->pki", slopes, turned), outgoing)
 
 

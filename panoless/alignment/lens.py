@@ -17,10 +17,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from panoless.capture.corrections import with_focal_factor
-from panoless.capture.poses import moved_view
-from panoless.capture.rays import pose_of
 from panoless.capture.views import TrainView, Views, at_most_pixels
+from panoless.capture.zoom import farther
 from panoless.environment.cubemap import beyond_texels, texels_of
 from panoless.environment.nearness import light_and_slopes
 from panoless.environment.rays import Rays
@@ -78,16 +76,10 @@ def _seen(views: Views, geometry: Geometry, rays: int) -> list[tuple[np.ndarray,
             common, first, second = np.intersect1d(near, far, assume_unique=True, return_indices=True)
             mean = ahead[first] + behind[second]
             directions = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-            radiance = view.radiance.flatten(1)[:, torch.from_numpy(common).to(view.radiance.device)].T
+            radiance = view.radiance_at(torch.from_numpy(common))
             turns = (ahead[first] - behind[second]) / (2 * DIFFERENCE)
             found.append((directions, turns, radiance.double().cpu().numpy()))
     return found
-
-
-def farther(view: TrainView, change: float) -> TrainView:
-    """With the focal length and the distance from the object's center times eˢ."""
-    away = np.expm1(change) * pose_of(view.camera)[1]
-    return with_focal_factor(moved_view(view, np.eye(3), away), float(np.exp(change)))
 
 
 def _mirrored(

@@ -11,10 +11,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from panoless.capture.encoding import RadianceEncoding
+from panoless.capture.encoding import encoding_of
 from panoless.capture.masks import MASK_LEVEL
 from panoless.capture.silhouettes import mask_distance_px
 from panoless.capture.views import TrainView, Views
+from panoless.config import FitConfig
 from shinypartial.core.conventions import SOLID_ALPHA
 
 
@@ -36,7 +37,7 @@ class Corrections:
         """Standard deviation of log₂ of the gains; None where they are all alike."""
         return None if self.gains is None else float(np.log2(self.gains).std())
 
-    def applied(self, views: Views, encoding: RadianceEncoding) -> Views:
+    def applied(self, views: Views, config: FitConfig) -> Views:
         """The views as they would be without these errors; themselves where there are none."""
         train = views.train
         if self.focal_factor != 1:
@@ -44,7 +45,7 @@ class Corrections:
         if self.mask_offset_px:
             train = tuple(with_outline_moved(view, self.mask_offset_px) for view in train)
         if self.gains is not None:
-            exposed = zip(train, self.gains.tolist(), strict=True)
+            encoding, exposed = encoding_of(config), zip(train, self.gains.tolist(), strict=True)
             train = tuple(replace(view, radiance=encoding.without_gain(view.radiance, gain)) for view, gain in exposed)
         return replace(views, train=train)
 

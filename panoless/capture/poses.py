@@ -58,8 +58,11 @@ class Poses:
         turns = Rotation.from_rotvec(change[:, :3]) * Rotation.from_rotvec(self.turns)
         return Poses(turns.as_rotvec(), self.shifts + change[:, 3:])
 
-    def common(self, centers: Float[np.ndarray, "V 3"], prior: Float[np.ndarray, "6"]) -> Similarity:
-        """What turns, shifts and scales all cameras alike, by least squares under the weights of the prior.
+    def without_common(
+        self, centers: Float[np.ndarray, "V 3"], prior: Float[np.ndarray, "6"]
+    ) -> tuple[Similarity, "Poses"]:
+        """What turns, shifts and scales all cameras alike, by least squares under the weights of the prior, and the
+        poses in a world from which that was taken back.
 
         For cameras at o these are (θ, θ × o), (0, t) and (0, σ o). No photograph of a far world tells them.
         """
@@ -69,12 +72,9 @@ class Poses:
         scaled = np.concatenate([np.zeros((count, 1, 3)), centers[:, None]], 2)
         basis = (np.concatenate([turned, shifted, scaled], 1) * np.sqrt(prior)).transpose(0, 2, 1).reshape(-1, 7)
         found = np.linalg.lstsq(basis, (self.stacked * np.sqrt(prior)).ravel(), rcond=None)[0]
-        return Similarity(1 + float(found[6]), Rotation.from_rotvec(found[:3]).as_matrix(), found[3:6])
-
-    def without(self, common: Similarity, centers: Float[np.ndarray, "V 3"]) -> "Poses":
-        """The poses in a world from which that was taken back."""
+        common = Similarity(1 + float(found[6]), Rotation.from_rotvec(found[:3]).as_matrix(), found[3:6])
         turns = Rotation.from_matrix(common.rotation.T) * Rotation.from_rotvec(self.turns)
-        return Poses(turns.as_rotvec(), common.undone(centers + self.shifts) - centers)
+        return common, Poses(turns.as_rotvec(), common.undone(centers + self.shifts) - centers)
 
     def moved(self, views: Views) -> Views:
         """The views with their cameras there."""

@@ -10,10 +10,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from panoless.capture.encoding import LDR, RadianceEncoding
+from panoless.capture.encoding import LDR, RadianceEncoding, encoding_of
 from panoless.capture.masks import MASK_LEVEL, estimate_object_frame, without_specks
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import pose_of, raster_camera, unit_rays_camera
+from panoless.config import FitConfig
 from panoless.kernels.objective import MirrorView
 from panoless.kernels.rasterize import RasterCamera, tiles_of
 from shinypartial.core.camera import Camera
@@ -70,6 +71,10 @@ class TrainView:
         """Unit world directions of the rays through the centers of pixels (flat indices)."""
         return (self.camera_to_world_rotation @ self.rays_camera.flatten(1)[:, pixels]).T.contiguous()
 
+    def radiance_at(self, pixels: Int[Tensor, "P"]) -> Float[Tensor, "P 3"]:
+        """What pixels (flat indices) show."""
+        return self.radiance.flatten(1)[:, pixels.to(self.radiance.device)].T.contiguous()
+
     @cached_property
     def mirror(self) -> MirrorView:
         """What the objective compares with."""
@@ -106,6 +111,11 @@ class Views:
     object_frame: ObjectFrame
     near: float
     """Near plane in normalized units: a tenth of the smallest camera distance."""
+
+    @property
+    def num_solid(self) -> int:
+        """Number of pixels that lie wholly on the object."""
+        return sum(len(view.solid) for view in self.train)
 
     @property
     def camera_extent(self) -> float:
@@ -148,6 +158,13 @@ def load_views(
     return views_of(photographs)
 
 
+def configured_views(dataset: Dataset, config: FitConfig) -> Views:
+    """The training split as a configuration wants to see it."""
+    return load_views(
+        dataset, config.crop_margin_px, config.downscale, encoding_of(config), least_object_px=config.least_object_px
+    )
+
+
 def _object_px(dataset: Dataset) -> float:
     """√area of the object's mask: the median over a few views."""
     views = dataset.train[:: -(-len(dataset.train) // SIZED_VIEWS)]
@@ -187,16 +204,12 @@ def split_held_out(views: Sequence[Item]) -> tuple[list[Item], list[Item]]:
 
 def every_kth_pixel(views: Views, most: int) -> Iterator[tuple[TrainView, Int[Tensor, "P"]]]:
     """About `most` pixels of all views that lie wholly on the object, and less than twice as many."""
-    return _pixels_at(views, _count_solid(views) // most)
+    return _pixels_at(views, views.num_solid // most)
 
 
 def at_most_pixels(views: Views, most: int) -> Iterator[tuple[TrainView, Int[Tensor, "P"]]]:
     """No more than about `most` pixels of all views that lie wholly on the object, and more than half as many."""
-    return _pixels_at(views, -(-_count_solid(views) // most))
-
-
-def _count_solid(views: Views) -> int:
-    return sum(len(view.solid) for view in views.train)
+    return _pixels_at(views, -(-views.num_solid // most))
 
 
 def _pixels_at(views: Views, stride: int) -> Iterator[tuple[TrainView, Int[Tensor, "P"]]]:

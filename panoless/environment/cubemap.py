@@ -1,5 +1,7 @@
 """The cubemap: its start, look-up and resampling."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -8,6 +10,9 @@ from torch import Tensor
 from panoless.config import EnvironmentConfig
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap
 from shinypartial.core.sphere import directions_to_cube
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 INITIAL_LOGIT = 5.0
 
@@ -35,11 +40,25 @@ def resample(environment: Float[Tensor, "6 C L L"], resolution: int) -> Float[Te
     return sampled.view(6, resolution, resolution, -1).permute(0, 3, 1, 2).contiguous()
 
 
+def flat_texels(directions: Float[np.ndarray, "*P 3"], resolution: int) -> Int[np.ndarray, "*P"]:
+    """The flat index of the texel that each direction falls into."""
+    face, st = directions_to_cube(directions)
+    column, row = np.moveaxis(np.clip((st + 1) * resolution / 2, 0, resolution - 1).astype(np.int64), -1, 0)
+    return (face * resolution + row) * resolution + column
+
+
 def texels_of(directions: Float[np.ndarray, "P 3"], resolution: int) -> Int[np.ndarray, "P"]:
     """Which of the texels that are seen each direction falls into, numbered from zero."""
-    face, st = directions_to_cube(directions)
-    column, row = np.clip((st + 1) * resolution / 2, 0, resolution - 1).astype(np.int64).T
-    return np.unique((face * resolution + row) * resolution + column, return_inverse=True)[1].reshape(-1)
+    return np.unique(flat_texels(directions, resolution), return_inverse=True)[1].reshape(-1)
+
+
+def gather_texels(weights: Float[np.ndarray, "P"], texels: Int[np.ndarray, "P"]) -> "csr_matrix":
+    """G with ‖G v‖² = Σ (Σ w v)²/Σ w, sums over a texel: what a map that follows takes over of Σ w v²."""
+    from scipy.sparse import csr_matrix
+
+    total = np.maximum(np.bincount(texels, weights), 1e-12)
+    entries = weights / np.sqrt(total)[texels], (texels, np.arange(len(texels)))
+    return csr_matrix(entries, (len(total), len(texels)))
 
 
 def beyond_texels(

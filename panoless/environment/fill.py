@@ -9,8 +9,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from panoless.environment.cubemap import resample
-from shinypartial.core.sphere import cube_to_directions, directions_to_cube
+from panoless.environment.cubemap import flat_texels, resample
+from shinypartial.core.sphere import cube_to_directions
 
 #: A level of L texels a side is relaxed this often over L: the coarse ones, which carry far and cost little, most.
 RELAXED_TEXELS = 256
@@ -64,7 +64,5 @@ def texel_neighbors(resolution: int) -> Int[Tensor, "4 P"]:
     neighbors = []
     for shift in np.array([[1, 0], [-1, 0], [0, 1], [0, -1]]) * 2 / resolution:
         shifted = np.clip(np.stack([s, t], -1) + shift, -beyond, beyond)
-        other, st = directions_to_cube(cube_to_directions(face, shifted))
-        column, row = np.moveaxis(np.clip((st + 1) * resolution / 2, 0, resolution - 1).astype(int), -1, 0)
-        neighbors.append(((other * resolution + row) * resolution + column).ravel())
+        neighbors.append(flat_texels(cube_to_directions(face, shifted), resolution).ravel())
     return torch.from_numpy(np.stack(neighbors))

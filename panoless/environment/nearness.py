@@ -18,10 +18,8 @@ from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
 from panoless.environment.surroundings import Surroundings
 from panoless.kernels.cubemap import sample_cubemap
+from panoless.numeric.gauss_newton import damped_step
 from panoless.numeric.robust import bounded_error, robust_weight
-
-LEAST_CURVATURE = 1e-12
-"""Added at least to the diagonal of the matrix over the coefficients, so that it can be inverted."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +67,7 @@ class Linearized:
 
     def step(self, least_share: float) -> Float[np.ndarray, "K"]:
         """−(H + λ)⁻¹ g, λ that share of the mean diagonal; none where no ray tells anything."""
-        least = max(least_share * float(np.trace(self.matrix)) / len(self.matrix), LEAST_CURVATURE)
-        found: np.ndarray = -np.linalg.solve(self.matrix + least * np.eye(len(self.matrix)), self.gradient)
-        return found
+        return damped_step(self.gradient, self.matrix, least_share)
 
     def pull(self, least_share: float) -> float:
         """The share of the cost that a step promises: ½ gᵀ(H + λ)⁻¹g over it."""

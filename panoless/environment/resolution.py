@@ -13,6 +13,8 @@ from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap
 from panoless.numeric.gauss_newton import LEAST_GAIN, keep_if_better
 from panoless.numeric.robust import bounded_error
 
+ERROR_SCALE = 0.1
+"""Residual s (linear radiance) of held-out errors ‖e‖²/(‖e‖² + s²), here and in model selection. Not tuned."""
 RESOLUTIONS = (64, 128, 256)
 RAYS_PER_TEXEL = 4
 """Fewest in the median observed texel of a map. Chosen on Vase at 160 px, where 64, 128 and 256 texels with 18, 4.6
@@ -24,8 +26,8 @@ def finest_resolution(
 ) -> int:
     """Texels along a face side: the first of 64, 128, 256 that held-out views explain as well as the next.
 
-    Every fifth view is held out. Their error is the mean of ‖e‖²/(‖e‖² + s²), s = 0.1, weighted by trust: rays that see
-    the object itself count alike for all resolutions. The next has to lower it by the share `least_gain`.
+    Every fifth view is held out. Their error is the mean of ‖e‖²/(‖e‖² + s²), s = `ERROR_SCALE`, weighted by trust:
+    rays that see the object itself count alike for all resolutions. The next has to lower it by the share `least_gain`.
     """
     solved, held_out = split_held_out(rays)
     if not held_out or not solved:
@@ -58,7 +60,7 @@ def count_rays(rays: Sequence[Rays], resolution: int) -> Float[Tensor, "6 1 L L"
     return count
 
 
-def prediction_error(rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"], scale: float = 0.1) -> float:
+def prediction_error(rays: Sequence[Rays], environment: Float[Tensor, "6 3 L L"], scale: float = ERROR_SCALE) -> float:
     """Mean of ‖e‖²/(‖e‖² + s²) over rays, weighted by trust: 0 where a map explains them, 1 where nothing fits
     or there are none.
     """

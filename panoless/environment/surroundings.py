@@ -11,14 +11,20 @@ so ω′ is a fixed point. To first order ω′ changes with k_i by Y_i x⊥, wh
 """
 
 from dataclasses import dataclass, field
+from math import isqrt
 
 import numpy as np
 from jaxtyping import Float
+
+from shinypartial.core.harmonics import real_harmonics
 
 SHARPEST = 0.6
 """Upper bound of 1/D, in inverse radii of the object: nearer walls would touch it. Not tuned."""
 ROUNDS = 4
 """Of the fixed point; its error falls by ‖x⊥‖ ‖∇κ‖ in each. Not tuned."""
+
+ORDER = (0, 3, 1, 2, 4, 5, 7, 8, 6)
+"""Where `real_harmonics` has each of them; stored coefficients are in this order."""
 
 
 @dataclass(frozen=True)
@@ -131,12 +137,9 @@ def across_rays(points: Float[np.ndarray, "*P 3"], directions: Float[np.ndarray,
 
 
 def harmonics(directions: Float[np.ndarray, "*P 3"], count: int) -> Float[np.ndarray, "*P K"]:
-    """The first 1, 4 or 9 real spherical harmonics of unit directions, with a mean square of one."""
-    x, y, z = np.moveaxis(directions, -1, 0)
-    parts = [np.ones_like(x)]
-    if count > 1:
-        parts += [np.sqrt(3) * each for each in (x, y, z)]
-    if count > 4:
-        parts += [np.sqrt(15) * each for each in (x * y, y * z, z * x, (x**2 - y**2) / 2)]
-        parts += [np.sqrt(5) / 2 * (3 * z**2 - 1)]
-    return np.stack(parts, -1)
+    """The first 0, 1, 4 or 9 real spherical harmonics of unit directions, with a mean square of one, in the order of
+    x, y and z: 1, x, y, z, xy, yz, zx, x² − y², 3z² − 1 but for their factors.
+    """
+    basis = real_harmonics(directions, isqrt(max(count - 1, 0)))[..., ORDER[:count]]
+    basis *= np.sqrt(4 * np.pi)
+    return basis

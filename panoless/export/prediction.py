@@ -14,10 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from panoless import __version__
-from panoless.capture.encoding import encoding_of
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import raster_camera
-from panoless.capture.views import load_views
+from panoless.capture.views import configured_views
 from panoless.config import FitConfig
 from panoless.environment.surroundings import FAR, Surroundings
 from panoless.export.mesh_files import write_ply
@@ -96,7 +95,7 @@ def export_prediction(
         dataset=str(dataset.root.resolve()),
         dataset_hash=dataset_hash(dataset),
         config=asdict(config),
-        seconds={name: round(value, 3) for name, value in state.seconds.items()},
+        seconds=_stated_seconds(state),
         hardware={
             "processor": _processor_name(),
             "device": state.device,
@@ -143,10 +142,8 @@ def export_snapshots(dataset: Dataset, run: Path, config: FitConfig, prediction:
         if _is_exported(target, state, config, dataset):
             continue
         if views is None:
-            loaded = load_views(
-                dataset, config.crop_margin_px, config.downscale, encoding_of(config), config.least_object_px
-            )
-            views = state.selection.corrections.applied(loaded, encoding_of(config))
+            loaded = configured_views(dataset, config)
+            views = state.selection.corrections.applied(loaded, config)
         with timed(state.seconds, "solve environment"):
             complete(state, views, config)
         acquire_prediction(target)
@@ -160,8 +157,12 @@ def _is_exported(folder: Path, state: FitState, config: FitConfig, dataset: Data
         return False
     info = read_info(folder)
     same_fit = info.config == json.loads(json.dumps(asdict(config))) and info.dataset_hash == dataset_hash(dataset)
-    stages = {name: round(value, 3) for name, value in state.seconds.items()}
-    return same_fit and info.iteration == state.iteration and stages.items() <= info.seconds.items()
+    return same_fit and info.iteration == state.iteration and _stated_seconds(state).items() <= info.seconds.items()
+
+
+def _stated_seconds(state: FitState) -> dict[str, float]:
+    """Of each stage, to the millisecond."""
+    return {name: round(value, 3) for name, value in state.seconds.items()}
 
 
 def _write_test_views(dataset: Dataset, state: FitState, config: FitConfig, folder: Path) -> None:

@@ -16,11 +16,14 @@ class TriangleMesh:
     vertices: Float[np.ndarray, "V 3"]
     triangles: Int[np.ndarray, "T 3"]
 
+    def area_vectors(self) -> Float[np.ndarray, "T 3"]:
+        """Normals of the faces, twice as long as their areas."""
+        corners = self.vertices[self.triangles]
+        return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
     def vertex_normals(self) -> Float[np.ndarray, "V 3"]:
         """Unit means of the faces' normals, weighted by area."""
-        corners = self.vertices[self.triangles]
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        return unit(_sum_at_vertices(np.repeat(cross[:, None], 3, 1), self))
+        return unit(_sum_at_vertices(np.repeat(self.area_vectors()[:, None], 3, 1), self))
 
     def shape_tensors(self) -> Float[np.ndarray, "V 3 3"]:
         """S with dn = S dx, the change of the normal along the surface.

@@ -11,7 +11,7 @@ from torch import Tensor
 from panoless.capture.encoding import encoding_of
 from panoless.capture.poses import Poses
 from panoless.capture.rays import pixel_rays, unit_rays_camera
-from panoless.capture.views import TrainView, Views
+from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, deblur_map
 from panoless.environment.rays import Rays, normalize_confidence
@@ -99,7 +99,7 @@ class ExactGeometry:
 
 
 class ExactFamily:
-    """A kind whose `fit` does everything."""
+    """A kind that is fitted at once, without steps."""
 
     finds_poses: ClassVar[bool] = False
     refines: ClassVar[str | None] = None
@@ -152,12 +152,3 @@ def looked_up(
     unit = directions.cpu().numpy().astype(np.float64)
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     return torch.from_numpy(surroundings.looked_up(points, unit)).to(directions)
-
-
-def reflections(view: TrainView, normals_camera: Float[Tensor, "3 H W"], pixels: Tensor) -> Float[Tensor, "P 3"]:
-    """World directions that the given pixels (flat indices) of a view mirror."""
-    return reflection_directions_world(
-        normals_camera.flatten(1)[:, pixels],
-        view.rays_camera.flatten(1)[:, pixels],
-        view.camera_to_world_rotation,
-    )

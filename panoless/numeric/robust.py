@@ -7,6 +7,8 @@ from torch import Tensor
 
 Residuals = TypeVar("Residuals", np.ndarray, Tensor)
 """(P,) numbers or (P, C) vectors, one residual a row."""
+NORMAL_MEDIAN = 0.6745
+"""The median of |x| of a normal x, in standard deviations."""
 
 
 def robust_weight(error: Residuals, scale: float | Residuals) -> Residuals:

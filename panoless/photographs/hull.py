@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
+from panoless.capture.rays import camera_rays
 from panoless.photographs.lens import opencv
 from shinypartial.core.camera import Camera, project
 from shinypartial.core.errors import InputError
@@ -20,7 +21,7 @@ def nearest_point(
     normal_matrix, right_side = np.zeros((3, 3)), np.zeros(3)
     axes = [(camera, (camera.cx, camera.cy), 0.01) for camera in cameras]
     for camera, (x, y), weight in axes + [(camera, middle, 1.0) for camera, middle in seen]:
-        ray = camera.camera_to_world[:3, :3] @ [(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1]
+        ray = camera.camera_to_world[:3, :3] @ camera_rays(camera, np.asarray(x, np.float64), np.asarray(y, np.float64))
         ray /= np.linalg.norm(ray)
         across = weight * (np.eye(3) - np.outer(ray, ray))
         normal_matrix += across
@@ -62,11 +63,9 @@ def carve(
     points = center + half_side * np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
     missed = np.zeros(len(points), np.int32)
     for camera, mask in seen:
-        places = project(camera, points)
-        columns, rows = np.floor(places[:, 0]).astype(np.int64), np.floor(places[:, 1]).astype(np.int64)
-        within = (columns >= 0) & (rows >= 0) & (columns < camera.width) & (rows < camera.height)
+        rows, columns, within, depth = _pixels_of(camera, points)
         outside = within & ~mask[np.where(within, rows, 0), np.where(within, columns, 0)]
-        missed += outside | (places[:, 2] <= 0)
+        missed += outside | (depth <= 0)
         if not allowed:
             points, missed = points[missed == 0], missed[missed == 0]
     return points[missed <= allowed]
@@ -78,13 +77,20 @@ def outline(camera: Camera, points: Float[np.ndarray, "P 3"], spacing: float) ->
     covered = np.zeros((camera.height, camera.width), np.uint8)
     if not len(points):
         return covered > 0
-    places = project(camera, points)
-    columns, rows = np.floor(places[:, 0]).astype(np.int64), np.floor(places[:, 1]).astype(np.int64)
-    within = (columns >= 0) & (rows >= 0) & (columns < camera.width) & (rows < camera.height) & (places[:, 2] > 0)
+    rows, columns, within, depth = _pixels_of(camera, points)
+    within &= depth > 0
     covered[rows[within], columns[within]] = 1
     # Cells are seen at any angle: closing by their diagonal leaves no gap and does not grow the whole.
-    side = 2 * int(np.ceil(np.sqrt(3) * spacing * camera.fx / np.median(places[:, 2]) / 2)) + 1
+    side = 2 * int(np.ceil(np.sqrt(3) * spacing * camera.fx / np.median(depth) / 2)) + 1
     return cv2.morphologyEx(covered, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8)) > 0
+
+
+def _pixels_of(camera: Camera, points: Float[np.ndarray, "P 3"]) -> tuple[np.ndarray, ...]:
+    """Row, column, whether that is within the picture, and depth of each point."""
+    places = project(camera, points)
+    columns, rows = np.floor(places[:, :2]).astype(np.int64).T
+    within = (columns >= 0) & (rows >= 0) & (columns < camera.width) & (rows < camera.height)
+    return rows, columns, within, places[:, 2]
 
 
 def overlap(first: Bool[np.ndarray, "H W"], second: Bool[np.ndarray, "H W"]) -> float:

@@ -49,5 +49,6 @@ def _solve(state: FitState, views: Views, config: FitConfig) -> None:
         if config.visibility == "online" and training is not None:
             state.visibility = visibility_from_evidence(training.evidence)
         else:
-            state.visibility = visibility_from_agreement(agreement(rays, environment, encoding.saturation))
+            agreed = agreement(rays, environment, encoding.saturation, config.confidence)
+            state.visibility = visibility_from_agreement(agreed, config.confidence)
         state.environment = encoding.decoded(environment)

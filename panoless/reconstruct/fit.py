@@ -5,8 +5,7 @@ from pathlib import Path
 
 import torch
 
-from panoless.capture.encoding import encoding_of
-from panoless.capture.views import Views, load_views
+from panoless.capture.views import Views, configured_views
 from panoless.config import FitConfig, check_config
 from panoless.geometry.base import usable_views
 from panoless.geometry.registry import FAMILIES
@@ -50,16 +49,14 @@ def fit(
             return state
         seconds: dict[str, float] = {}
         with timed(seconds, "read views"):
-            views = load_views(
-                dataset, config.crop_margin_px, config.downscale, encoding_of(config), config.least_object_px
-            ).to(device)
+            views = configured_views(dataset, config).to(device)
         if state is None:
             with timed(seconds, "initialize"):
                 state = begin(views, config)
             state.seconds, state.device = seconds, device_name(device)
             print(f"Model: {state.selection.sentence}", file=sys.stderr)
         state = state.to(device)
-        photographs = state.selection.corrections.applied(views, encoding_of(config))
+        photographs = state.selection.corrections.applied(views, config)
         if state.training is not None:
             views = usable_views(photographs, state.geometry)
             family, recorder = FAMILIES[state.geometry.kind], Recorder(folder, schedule, state)
@@ -76,7 +73,7 @@ def fit(
 def begin(views: Views, config: FitConfig) -> FitState:
     """The state before the first step: the geometry that the scene needs, and what its training starts from."""
     geometry, selection = choose_geometry(views, config)
-    corrected = selection.corrections.applied(views, encoding_of(config))
+    corrected = selection.corrections.applied(views, config)
     training = FAMILIES[geometry.kind].begin(usable_views(corrected, geometry), geometry, config)
     return FitState(geometry, views.object_frame, selection, training)
 

@@ -1,6 +1,5 @@
 """What is kept of an iterative fit while it runs: seconds, curves, checkpoints and snapshots."""
 
-import resource
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -11,6 +10,7 @@ from pathlib import Path
 from panoless.geometry.base import Geometry, Training
 from panoless.reconstruct.snapshots import SnapshotSchedule, snapshot_folders
 from panoless.reconstruct.state import FitState, save_state
+from shinypartial.io.memory import peak_memory_bytes
 from shinypartial.prediction.format import SNAPSHOTS
 
 CHECKPOINT_INTERVAL_S = 20.0
@@ -56,8 +56,7 @@ class Recorder:
 
 def note_peak_memory(state: FitState) -> None:
     """Raise the state's peak to that of this process."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    state.peak_memory_bytes = max(state.peak_memory_bytes, peak)
+    state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes())
 
 
 @contextmanager

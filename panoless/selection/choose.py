@@ -9,7 +9,6 @@ from dataclasses import replace
 
 from panoless.alignment.search import PosedProposal, align_proposal, fit_at, fit_with_poses
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
-from panoless.capture.encoding import encoding_of
 from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.environment.surroundings import FAR, Surroundings
@@ -36,7 +35,6 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
     if config.model != ANY:
         return _fit_asked(views, config)
     *families, last = FAMILIES.values()
-    encoding = encoding_of(config)
     table, refused = list[Candidate](), dict[str, list[PosedProposal]]()
     starts = list[tuple[float, Geometry, Corrections]]()
     for family in families:
@@ -47,16 +45,14 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
         refused[family.kind] = [each for each in proposals if _is_near(each, config)]
         if geometry is not None:
             if candidate.verdict == Verdict.CHOSEN:
-                if not _bends_rather(
-                    family, geometry, proposals, candidate.corrections.applied(views, encoding), config
-                ):
+                if not _bends_rather(family, geometry, proposals, candidate.corrections.applied(views, config), config):
                     return geometry, Selection(family.kind, tuple(table))
                 table[-1] = replace(candidate, verdict=Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason=BENT)
                 continue
             starts.append((candidate.surfels_error or 0.0, geometry, candidate.corrections))
     nothing: tuple[float, Geometry | None, Corrections] = (0.0, None, NO_CORRECTIONS)
     _, start, corrections = min(reversed(starts), key=lambda each: each[0]) if starts else nothing
-    geometry = last.fit(corrections.applied(views, encoding), Proposal(start, 0.0, 1.0), config)
+    geometry = last.fit(corrections.applied(views, config), Proposal(start, 0.0, 1.0), config)
     reason = "no simpler kind explains the views"
     table.append(Candidate(last.kind, Verdict.CHOSEN, reason, corrections=corrections))
     return geometry, Selection(last.kind, tuple(table))
@@ -212,7 +208,7 @@ def _examine(
         return Candidate(family.kind, Verdict.REFUSED_BY_SILHOUETTES, "misses the silhouettes", *evidence), None
     geometry, start = fitted.geometry, fitted.start
     options, evidence = config.selection, (start.proposal.silhouette_px, start.proposal.overlap)
-    views = fitted.corrections.applied(views, encoding_of(config))
+    views = fitted.corrections.applied(views, config)
     own, free = held_out_errors(usable_views(views, geometry), config, geometry, trial)
     unexplained = is_refined(family.kind) and float(own.mean()) > options.largest_error
     better = is_clearly_lower(free, own, options)

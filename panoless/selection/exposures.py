@@ -47,7 +47,7 @@ def earned_exposures(
 
 def fitted_to_equal_exposures(views: Views, fitted: Fitted, config: FitConfig, refit: Refit) -> Fitted:
     """Fitted anew to views of equal exposure, where these are better explained by that."""
-    equal = fitted.corrections.applied(views, encoding_of(config))
+    equal = fitted.corrections.applied(views, config)
     again = refit(equal, fitted, anew=False)
     if (
         again is None
@@ -61,7 +61,7 @@ def fitted_to_equal_exposures(views: Views, fitted: Fitted, config: FitConfig, r
 def equal_exposures(views: Views, fitted: Fitted, config: FitConfig) -> Corrections:
     """The corrections of a fit with gains by its geometry."""
     bare = replace(fitted.corrections, gains=None)
-    usable = fewer_pixels(bare.applied(views, encoding_of(config)), 2 * config.corrections.rays)
+    usable = fewer_pixels(bare.applied(views, config), 2 * config.corrections.rays)
     with torch.no_grad():
         seen = observe_views(usable_views(usable, fitted.geometry), fitted.geometry, config.corrections.rays)
         return replace(bare, gains=_gains(list(seen), config))

@@ -12,7 +12,6 @@ from torch import Tensor
 from panoless.alignment.equations import PoseRows, outline_rows
 from panoless.alignment.search import PosedProposal
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
-from panoless.capture.encoding import encoding_of
 from panoless.capture.silhouettes import mask_distance_px
 from panoless.capture.views import Views, at_most_pixels
 from panoless.config import FitConfig
@@ -103,7 +102,7 @@ def errors_in_common(
     views: Views, before: Fitted, after: Fitted, config: FitConfig
 ) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:
     """What two fits leave unexplained of the pixels that are solid for both."""
-    said, moved = (each.corrections.applied(views, encoding_of(config)) for each in (before, after))
+    said, moved = (each.corrections.applied(views, config) for each in (before, after))
     solid = [one.solid[torch.isin(one.solid, other.solid)] for one, other in zip(said.train, moved.train, strict=True)]
     errors = [
         held_out_errors(with_solid(seen, solid), each.geometry, config)

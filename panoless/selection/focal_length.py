@@ -7,7 +7,6 @@ import numpy as np
 
 from panoless.alignment.lens import FocalPull, focal_pull
 from panoless.capture.corrections import Corrections
-from panoless.capture.encoding import encoding_of
 from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.environment.surroundings import FAR
@@ -16,11 +15,6 @@ from panoless.geometry.registry import FAMILIES
 from panoless.selection.fitted import Fitted, Refit, errors_in_common, outline_distance_px
 from panoless.selection.held_out import is_clearly_lower
 from panoless.selection.options import CorrectionOptions
-
-FARTHEST = 3
-"""A focal length that is farther from what is said of it than so many expected errors is not believed…"""
-NEAREST = 2
-"""…nor a change that is no larger than so many of its own standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +28,7 @@ class _FocalTrial:
     @classmethod
     def of(cls, views: Views, change: float, fitted: Fitted, config: FitConfig) -> "_FocalTrial":
         """With the pull of the views as they are corrected for that fit."""
-        options, seen = config.corrections, fitted.corrections.applied(views, encoding_of(config))
+        options, seen = config.corrections, fitted.corrections.applied(views, config)
         numbers = options.focal_rays, options.focal_resolution, options.focal_scale
         alike = _looks_like_a_focal_length(seen, fitted.geometry, options)
         geometry = fitted.geometry.in_surroundings(FAR) if alike else fitted.geometry
@@ -46,9 +40,9 @@ def with_focal_length(views: Views, fitted: Fitted, config: FitConfig, refit: Re
     one nearest to the zero of a line through all pulls is kept, if held-out views are clearly better explained by it
     and the factor is told better than it is known.
     """
-    options, encoding = config.corrections, encoding_of(config)
+    options = config.corrections
     jointly = FAMILIES[fitted.geometry.kind].with_focal_length(
-        fitted.corrections.applied(views, encoding), fitted.geometry, config
+        fitted.corrections.applied(views, config), fitted.geometry, config
     )
     if jointly is not None:
         geometry, change = jointly
@@ -64,7 +58,7 @@ def with_focal_length(views: Views, fitted: Fitted, config: FitConfig, refit: Re
         if following is None or any(abs(each.change - following) < options.settled_focal for each in trials):
             break
         corrections = _corrected(fitted, following, 0.0)
-        again = refit(corrections.applied(views, encoding), trials[-1].fitted, anew=False)
+        again = refit(corrections.applied(views, config), trials[-1].fitted, anew=False)
         if again is None:
             break
         trials.append(_FocalTrial.of(views, following, replace(again, corrections=corrections), config))
@@ -95,8 +89,12 @@ def _is_believed(views: Views, before: Fitted, after: Fitted, change: float, con
     if options.lens == "on":
         return True
     uncertainty = (told.focal_uncertainty or 0.0) / told.focal_factor
-    is_likely = uncertainty < options.focal_prior and abs(change) < FARTHEST * options.focal_prior
-    return is_likely and abs(change) > NEAREST * uncertainty and _focal_length_is_earned(views, before, after, config)
+    is_likely = uncertainty < options.focal_prior and abs(change) < options.farthest_focal * options.focal_prior
+    return (
+        is_likely
+        and abs(change) > options.nearest_focal * uncertainty
+        and _focal_length_is_earned(views, before, after, config)
+    )
 
 
 def _looks_like_a_focal_length(views: Views, geometry: Geometry, options: CorrectionOptions) -> bool:
@@ -128,9 +126,8 @@ def _focal_length_is_earned(views: Views, before: Fitted, after: Fitted, config:
     if is_clearly_lower(errors[1], errors[0], limits):
         return True
     in_place = after.geometry.surroundings.is_far and not before.geometry.surroundings.is_far
-    encoding = encoding_of(config)
     distances = [
-        outline_distance_px(each.corrections.applied(views, encoding), each.geometry) for each in (before, after)
+        outline_distance_px(each.corrections.applied(views, config), each.geometry) for each in (before, after)
     ]
     nearer = distances[1] <= (1 - config.corrections.least_outline_fall) * distances[0]
     return bool(in_place and nearer and errors[1].mean() <= (1 + config.selection.least_gain) * errors[0].mean())

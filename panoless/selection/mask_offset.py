@@ -8,7 +8,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.corrections import Corrections
-from panoless.capture.encoding import encoding_of
 from panoless.capture.silhouettes import mask_distance_px
 from panoless.capture.views import Views
 from panoless.config import FitConfig
@@ -41,17 +40,17 @@ def with_moved_masks(source: Family, views: Views, fitted: Fitted, config: FitCo
     """Fitted anew to masks that are larger or smaller, if held-out views are clearly better explained by that; then
     once more where photographs pull that surface's outlines off the moved ones.
     """
-    encoding, options = encoding_of(config), config.corrections
+    options = config.corrections
 
     def moved_by(offset: float) -> Fitted | None:
         corrections = replace(fitted.corrections, mask_offset_px=offset)
-        again = refit(corrections.applied(views, encoding), fitted, anew=True) if offset else None
+        again = refit(corrections.applied(views, config), fitted, anew=True) if offset else None
         return None if again is None else replace(again, corrections=corrections)
 
-    found = moved_by(find_mask_offset(source, fitted.corrections.applied(views, encoding), fitted, config))
+    found = moved_by(find_mask_offset(source, fitted.corrections.applied(views, config), fitted, config))
     if found is None or not _offset_is_earned(views, fitted, found, config):
         return fitted
-    pull = outline_pull_px(found.corrections.applied(views, encoding), found.geometry)
+    pull = outline_pull_px(found.corrections.applied(views, config), found.geometry)
     if abs(pull) < options.least_pull_px:
         return found
     nearer = moved_by(found.corrections.mask_offset_px + pull / options.pull_share)
@@ -71,7 +70,7 @@ def find_mask_offset(source: Family, views: Views, fitted: Fitted, config: FitCo
     def disagreement(offset: float) -> float:
         if -offset > depth / 4:
             return np.inf
-        moved = Corrections(offset).applied(views, encoding_of(config))
+        moved = Corrections(offset).applied(views, config)
         proposal = source.propose(moved if poses is None else poses.moved(moved), config, asked=False)
         outline = None if proposal is None else source.as_proposed(proposal, config)
         if outline is None:
@@ -103,7 +102,7 @@ def _offset_is_earned(views: Views, before: Fitted, after: Fitted, config: FitCo
     common = errors_in_common(views, before, after, config)
     if is_clearly_lower(common[1], common[0], config.selection):
         return True
-    seen = [each.corrections.applied(views, encoding_of(config)) for each in (before, after)]
+    seen = [each.corrections.applied(views, config) for each in (before, after)]
     own = [held_out_errors(part, each.geometry, config) for part, each in zip(seen, (before, after), strict=True)]
     no_worse = common[1].mean() <= (1 + config.selection.least_gain) * common[0].mean()
     return bool(no_worse and is_clearly_lower(own[1], own[0], config.selection))

@@ -17,12 +17,10 @@ from panoless.config import FitConfig
 from panoless.environment.options import MaterialOptions
 from panoless.environment.rays import Rays, joined_rays
 from panoless.environment.reflectance import Reflectance, find_reflectance, left_unexplained, unsaturated
+from panoless.environment.resolution import ERROR_SCALE
 from panoless.geometry.base import Geometry, observe_views
 from panoless.numeric.robust import bounded_error
 from panoless.selection.held_out import is_clearly_lower
-
-ERROR_SCALE = 0.1
-"""Of errors ‖e‖²/(‖e‖² + s²) of linear radiance, as elsewhere in model selection."""
 
 
 def earned_reflectance(views: Views, geometry: Geometry, config: FitConfig) -> Reflectance | None:

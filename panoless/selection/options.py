@@ -97,6 +97,10 @@ class CorrectionOptions:
     """Most fits to other focal lengths. Not tuned."""
     focal_prior: Positive = 0.02
     """Expected error of the focal length as a share of it. A factor that is not told better is not believed."""
+    farthest_focal: Positive = 3.0
+    """A factor that is farther from one than so many expected errors is not believed, nor…"""
+    nearest_focal: Positive = 2.0
+    """…a change that is no larger than so many of its own standard deviations. Neither is tuned."""
     focal_error: Share = 0.004
     """Standard deviation of a factor that was found as an unknown beside the shape. On sculpture and chrome-block it is
     off by 0.0003 to 0.0057."""

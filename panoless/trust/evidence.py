@@ -21,7 +21,7 @@ from panoless.capture.views import TrainView, Views, at_most_pixels, split_held_
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, usable_views
 from panoless.kernels.cubemap import sample_cubemap
-from panoless.numeric.robust import bounded_error
+from panoless.numeric.robust import NORMAL_MEDIAN, bounded_error
 from panoless.trust.options import TrustOptions
 
 LIGHT_FIGURES = ("unexplained", "one_color", "matte", "unexplained_part", "noise", "error_in_noise", "rank_correlation")
@@ -86,7 +86,7 @@ def gather_evidence(
     used = [index for index, view in enumerate(views.train) if len(view.solid)]
     seen = tuple(views.train[index] for index in used)
     views, usable = replace(views, train=seen), replace(views, train=tuple(found[index] for index in used))
-    solid, kept = (max(sum(len(view.solid) for view in each.train), 1) for each in (views, usable))
+    solid, kept = (max(each.num_solid, 1) for each in (views, usable))
     looked_at = [_evenly(part, options.views) for part in split_held_out(usable.train)]
     surfaces = [[(view, geometry.buffers(view.camera)) for view in part] for part in looked_at]
     light = _light(usable, surfaces, geometry, visibility, options)
@@ -144,7 +144,7 @@ def _light(
     device = views.train[0].mask.device
     places, parts = _Cells.empty(options.cells, 3, device), _Cells.empty(options.part_cells, 1, device)
     for view, surface in kept:
-        places.add(view, surface, view.solid, view.radiance.flatten(1)[:, view.solid].T)
+        places.add(view, surface, view.solid, view.radiance_at(view.solid))
     errors, confidence, explained, plain = [], [], _Mean(), {"one_color": _Mean(), "matte": _Mean()}
     for (view, surface), (_, pixels) in zip(held_out, at_most_pixels(tested, options.rays), strict=True):
         batch = geometry.observe(view, pixels)
@@ -152,7 +152,7 @@ def _light(
         explained.add(bounded_error(error, options.scale), batch.initial_weight())
         errors.append(error)
         confidence.append(sample_cubemap(visibility[:, None], batch.directions)[:, 0])
-        radiance = view.radiance.flatten(1)[:, pixels].T
+        radiance = view.radiance_at(pixels)
         normals = surface.normals_camera.flatten(1)[:, pixels]
         shown = geometry.shade(environment, view.camera, pixels, normals) - radiance
         parts.add(view, surface, pixels, bounded_error(shown, options.scale)[:, None])
@@ -261,13 +261,13 @@ def _noise(view: TrainView) -> float:
     inside = solid[:, 2:] & solid[:, 1:-1] & solid[:, :-2]
     second = view.radiance[:, :, 2:] - 2 * view.radiance[:, :, 1:-1] + view.radiance[:, :, :-2]
     values = second[:, inside]
-    return float(values.abs().median()) / (0.6745 * 6**0.5) if values.numel() else 0.0
+    return float(values.abs().median()) / (NORMAL_MEDIAN * 6**0.5) if values.numel() else 0.0
 
 
 def _saturated(views: Sequence[TrainView], options: TrustOptions) -> float:
     count, total = 0, 0
     for view in views:
-        brightest = view.radiance.flatten(1)[:, view.solid].amax(0)
+        brightest = view.radiance_at(view.solid).amax(1)
         count, total = count + int((brightest >= options.saturated).sum()), total + len(brightest)
     return count / max(total, 1)
 

@@ -4,7 +4,7 @@ Orthonormal over the sphere and without the Condon–Shortley phase, as in Ramam
 graphics since: Y₁ = √(3/4π) · (y, z, x) for m = −1, 0, 1. A function of degree l and order m has the index l² + l + m.
 """
 
-from math import factorial, isqrt, pi, sqrt
+from math import factorial, pi, prod, sqrt
 
 import numpy as np
 from jaxtyping import Float
@@ -12,23 +12,25 @@ from jaxtyping import Float
 from shinypartial.core.sphere import latlong_directions, latlong_solid_angles
 
 
-def real_harmonics(directions: Float[np.ndarray, "... 3"], degree: int) -> Float[np.ndarray, "... K"]:
-    """All (degree + 1)² values at unit directions.
+def real_harmonics(directions: Float[np.ndarray, "*P 3"], degree: int) -> Float[np.ndarray, "*P K"]:
+    """All (degree + 1)² values at unit directions, polynomials of x, y and z.
 
-    Y_lm = N · P_l^|m|(z) · {√2 sin |m|φ, 1, √2 cos mφ} for m < 0, m = 0, m > 0; N² = (2l+1)/4π · (l−|m|)!/(l+|m|)!
+    Y_lm = N · P_l^|m|(z)/sin^|m|θ · {√2 Im, 1, √2 Re}(x + iy)^|m| for m < 0, m = 0, m > 0, with
+    N² = (2l+1)/4π · (l−|m|)!/(l+|m|)! and P by its recurrence over l.
     """
-    from scipy.special import lpmv
-
     x, y, z = np.moveaxis(directions, -1, 0)
-    azimuth, columns = np.arctan2(y, x), []
-    for index in range((degree + 1) ** 2):
-        el = isqrt(index)
-        m = index - el * el - el
-        order = abs(m)
-        norm = sqrt((2 * el + 1) / (4 * pi) * factorial(el - order) / factorial(el + order))
-        around = np.ones_like(azimuth) if m == 0 else sqrt(2) * (np.sin if m < 0 else np.cos)(order * azimuth)
-        columns.append((-1) ** order * norm * lpmv(order, el, z) * around)  # scipy's P has the phase (−1)^m.
-    return np.stack(columns, -1)
+    basis = np.empty((*x.shape, (degree + 1) ** 2))
+    real, imaginary = 1.0, 0.0
+    for m in range(degree + 1):
+        before, legendre = 0.0, float(prod(range(1, 2 * m, 2)))
+        for el in range(m, degree + 1):
+            if el > m:
+                before, legendre = legendre, ((2 * el - 1) * z * legendre - (el + m - 1) * before) / (el - m)
+            norm = sqrt((2 * el + 1) / (4 * pi) * factorial(el - m) / factorial(el + m) * (2 if m else 1))
+            basis[..., el * el + el - m] = norm * legendre * imaginary
+            basis[..., el * el + el + m] = norm * legendre * real
+        real, imaginary = x * real - y * imaginary, x * imaginary + y * real
+    return basis
 
 
 def project_latlong(

@@ -17,7 +17,7 @@ from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import read_view
 from shinypartial.dataset.schema import CHECKSUMS, ENVIRONMENT_LATLONG, LICENSES, MANIFEST, Frame, View
 from shinypartial.dataset.transforms import read_frames
-from shinypartial.dataset.violations import Violation, violation_of
+from shinypartial.dataset.violations import Violation, mask_violations, violation_of
 from shinypartial.io.images import read_picture, read_png
 
 RESTORE = "Restore the file from the original dataset."
@@ -70,13 +70,7 @@ def check_plain_frame(root: Path, frame: Frame) -> Iterator[Violation]:
     except InputError as error:
         yield violation_of(name, error, error.remedy)
         return
-    inside = view.alpha > 0
-    if not inside.any():
-        yield Violation(name, "the mask is empty: the object is not in the picture", "Leave the frame out.")
-    elif inside[[0, -1]].any() or inside[:, [0, -1]].any():
-        yield Violation(
-            name, "the object touches the border of the picture", "Accept it, or leave it out.", warning=True
-        )
+    yield from mask_violations(name, view.alpha > 0, "Leave the frame out.", "Accept it, or leave it out.")
     solid = view.alpha > SOLID_ALPHA
     if frame.alpha_png.exists():
         yield from _check_alpha(root, frame, view)

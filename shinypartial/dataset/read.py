@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -48,12 +49,7 @@ def open_dataset(root: Path) -> Dataset:
 
     Raises InputError for a missing folder, transforms that are missing or broken, and poses that are not rigid.
     """
-    if not root.is_dir():
-        raise InputError(
-            expected=f"a dataset folder at {root}",
-            found="a file" if root.exists() else "nothing there",
-            remedy="Check the path, or make one: `shinypartial generate --scene vase`.",
-        )
+    require_dataset_folder(root)
     manifest = _read_manifest(root / MANIFEST) if (root / MANIFEST).exists() else {}
     if manifest.get("complete") is False:
         raise InputError(
@@ -70,6 +66,16 @@ def open_dataset(root: Path) -> Dataset:
     return Dataset(root, manifest, *splits)
 
 
+def require_dataset_folder(root: Path) -> None:
+    """Raise InputError where there is no folder."""
+    if not root.is_dir():
+        raise InputError(
+            expected=f"a dataset folder at {root}",
+            found="a file" if root.exists() else "nothing there",
+            remedy="Check the path, or make one: `shinypartial generate --scene vase`.",
+        )
+
+
 def _read_manifest(path: Path) -> dict[str, Any]:
     manifest = read_json(path, "the manifest")
     fields = manifest if isinstance(manifest, dict) else {}
@@ -82,14 +88,74 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     return fields
 
 
+@dataclass(frozen=True)
+class _Photograph:
+    """A picture as it was decoded: linear RGB or RGBA, the color premultiplied by an alpha channel or not; and the
+    channels of an EXR.
+    """
+
+    color: Float[np.ndarray, "H W C"]
+    premultiplied: bool
+    channels: dict[str, np.ndarray]
+
+
 def read_view(frame: Frame) -> View:
     """Read one view: from the EXR where there is one, else from a photograph of another format.
 
     Its mask is the file that the transforms name, else the alpha channel, else the companion `_alpha.png`. Raises
     InputError when the image is missing, truncated, of the wrong size, without a mask, or holds NaN.
     """
+    return _view_of(frame, _read_photograph(frame))
+
+
+def read_whole_view(frame: Frame) -> tuple[View, Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W"]]:
+    """A view, the straight linear color of its photograph also beyond the mask, and the share of each pixel that this
+    covers.
+
+    That is alpha where the alpha channel is the mask: then nothing lies behind the object. It is 1 where the mask is a
+    file of its own.
+    """
+    photograph = _read_photograph(frame)
+    color = photograph.color
+    shown = color[..., 3] if color.shape[2] == 4 else np.ones_like(color[..., 0])
+    straight = color[..., :3] / np.where(photograph.premultiplied & (shown > 0), shown, 1)[..., None]
+    if frame.mask is not None:
+        shown = (shown > 0).astype(np.float32)
+    return _view_of(frame, photograph), np.where(shown[..., None] > 0, straight, 0), shown
+
+
+def _read_photograph(frame: Frame) -> _Photograph:
     path = frame.photograph
-    view = _read_exr_view(frame, path) if path.suffix.lower() == EXR else _read_picture_view(frame, path)
+    if path.suffix.lower() == EXR:
+        channels = read_exr(path)
+        if "A" not in channels and frame.mask is None:
+            raise _missing_mask(frame, path)
+        names = COLOR_CHANNELS if "A" in channels else COLOR_CHANNELS[:3]
+        photograph = _Photograph(stack_channels(channels, names, path), True, channels)
+    else:
+        photograph = _Photograph(*_linear_color(read_picture(path)), {})
+    if photograph.color.shape[:2] != (frame.camera.height, frame.camera.width):
+        raise InputError(
+            expected=f"{frame.camera.width}×{frame.camera.height} pixels for {frame.name}, as its transforms say",
+            found=f"{photograph.color.shape[1]}×{photograph.color.shape[0]}",
+            remedy="Render the frame again or correct w and h.",
+        )
+    return photograph
+
+
+def _view_of(frame: Frame, photograph: _Photograph) -> View:
+    """Cut out by its mask, with the ground truth that lies in the same file or in companions."""
+    radiance, alpha = _cut_out(frame, photograph)
+    channels = photograph.channels
+    if not channels:
+        view = View(radiance, alpha, _companion_normals(frame, alpha), None, photograph.premultiplied)
+    else:
+        has_normals = all(name in channels for name in NORMAL_CHANNELS)
+        normals = stack_channels(channels, NORMAL_CHANNELS, frame.photograph) if has_normals else None
+        depth = channels[DEPTH_CHANNEL].astype(np.float32) if DEPTH_CHANNEL in channels else None
+        self_reflection = channels.get(SELF_REFLECTION_CHANNEL)
+        mask = None if self_reflection is None else self_reflection.astype(np.float32)
+        view = View(radiance, alpha, normals, depth, high_dynamic_range=True, self_reflection=mask)
     arrays = {
         "radiance": view.radiance,
         "alpha": view.alpha,
@@ -134,37 +200,6 @@ def require_normals(frame: Frame, view: View) -> Float[np.ndarray, "H W 3"]:
     return view.normals_world
 
 
-def _read_exr_view(frame: Frame, path: Path) -> View:
-    channels = read_exr(path)
-    if "A" not in channels and frame.mask is None:
-        raise _missing_mask(frame, path)
-    color = stack_channels(channels, COLOR_CHANNELS if "A" in channels else COLOR_CHANNELS[:3], path)
-    _check_size(frame, color)
-    radiance, alpha = _cut_out(frame, path, color, premultiplied=True)
-    has_normals = all(name in channels for name in NORMAL_CHANNELS)
-    normals = stack_channels(channels, NORMAL_CHANNELS, path) if has_normals else None
-    depth = channels[DEPTH_CHANNEL].astype(np.float32) if DEPTH_CHANNEL in channels else None
-    self_reflection = channels.get(SELF_REFLECTION_CHANNEL)
-    mask = None if self_reflection is None else self_reflection.astype(np.float32)
-    return View(radiance, alpha, normals, depth, high_dynamic_range=True, self_reflection=mask)
-
-
-def read_whole_picture(frame: Frame) -> tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W"]]:
-    """Straight linear color of a photograph beyond its mask, and the share of each pixel that it covers.
-
-    That is alpha where the alpha channel is the mask: then nothing lies behind the object. It is 1 where the mask is a
-    file of its own.
-    """
-    image = read_picture(frame.photograph)
-    _check_size(frame, image)
-    color, linear = _linear_color(image)
-    shown = color[..., 3] if color.shape[2] == 4 else np.ones_like(color[..., 0])
-    straight = color[..., :3] / np.where(linear & (shown > 0), shown, 1)[..., None]
-    if frame.mask is not None:
-        shown = (shown > 0).astype(np.float32)
-    return np.where(shown[..., None] > 0, straight, 0), shown
-
-
 def _linear_color(image: Num[np.ndarray, "H W C"]) -> tuple[Float[np.ndarray, "H W D"], bool]:
     """Linear RGB or RGBA of a picture as stored, and whether it was linear (and premultiplied) already."""
     values, linear = unit_values(image), image.dtype.kind == "f"
@@ -173,51 +208,38 @@ def _linear_color(image: Num[np.ndarray, "H W C"]) -> tuple[Float[np.ndarray, "H
     return values if linear else np.concatenate([srgb_to_linear(values[..., :3]), values[..., 3:]], -1), linear
 
 
-def _read_picture_view(frame: Frame, path: Path) -> View:
-    image = read_picture(path)
-    _check_size(frame, image)
-    color, linear = _linear_color(image)
-    radiance, alpha = _cut_out(frame, path, color, premultiplied=linear)
-    normals = None
-    if frame.normal_png.exists():
-        stored = read_png(frame.normal_png)
-        _check_companion(frame, frame.normal_png, stored)
-        if stored.shape[2] < 3:
-            raise InputError(
-                expected=f"three channels in {frame.normal_png}",
-                found="a gray picture",
-                remedy="Restore it, or remove it.",
-            )
-        decoded = stored[..., :3].astype(np.float32) * (2 / 255) - 1
-        length = np.linalg.norm(decoded, axis=-1, keepdims=True)
-        normals = np.where((length > 0.5) & (alpha[..., None] > 0), decoded / np.maximum(length, 1e-6), 0)
-    return View(radiance, alpha, None if normals is None else normals.astype(np.float32), None, linear)
+def _companion_normals(frame: Frame, alpha: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W 3"] | None:
+    """Unit normals of the picture beside a photograph, where there is one."""
+    if not frame.normal_png.exists():
+        return None
+    stored = read_png(frame.normal_png)
+    _check_companion(frame, frame.normal_png, stored)
+    if stored.shape[2] < 3:
+        raise InputError(
+            expected=f"three channels in {frame.normal_png}",
+            found="a gray picture",
+            remedy="Restore it, or remove it.",
+        )
+    decoded = stored[..., :3].astype(np.float32) * (2 / 255) - 1
+    length = np.linalg.norm(decoded, axis=-1, keepdims=True)
+    normals = np.where((length > 0.5) & (alpha[..., None] > 0), decoded / np.maximum(length, 1e-6), 0)
+    return normals.astype(np.float32)
 
 
-def _cut_out(
-    frame: Frame, path: Path, color: Float[np.ndarray, "H W C"], premultiplied: bool
-) -> tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W"]]:
-    """Radiance premultiplied by the mask, and the mask; `premultiplied` tells what an alpha channel has done so far."""
+def _cut_out(frame: Frame, photograph: _Photograph) -> tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W"]]:
+    """Radiance premultiplied by the mask, and the mask."""
+    color, premultiplied = photograph.color, photograph.premultiplied
     radiance, alpha = color[..., :3], color[..., 3] if color.shape[2] == 4 else None
     if frame.mask is None and alpha is not None:
         return (radiance if premultiplied else radiance * alpha[..., None]), alpha
     if frame.mask is None and not frame.alpha_png.exists():
-        raise _missing_mask(frame, path)
+        raise _missing_mask(frame, frame.photograph)
     file = frame.mask or frame.alpha_png
     mask = unit_values(read_picture(file)[..., 0])
     _check_companion(frame, file, mask)
     if premultiplied and alpha is not None:
         radiance = radiance / np.where(alpha > 0, alpha, 1)[..., None]
     return radiance * mask[..., None], mask
-
-
-def _check_size(frame: Frame, image: Num[np.ndarray, "H W C"]) -> None:
-    if image.shape[:2] != (frame.camera.height, frame.camera.width):
-        raise InputError(
-            expected=f"{frame.camera.width}×{frame.camera.height} pixels for {frame.name}, as its transforms say",
-            found=f"{image.shape[1]}×{image.shape[0]}",
-            remedy="Render the frame again or correct w and h.",
-        )
 
 
 def _check_companion(frame: Frame, path: Path, image: Num[np.ndarray, "H W *C"]) -> None:

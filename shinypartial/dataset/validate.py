@@ -22,7 +22,7 @@ from shinypartial.dataset.plain import (
     read_plain_frames,
     what_is_absent,
 )
-from shinypartial.dataset.read import open_dataset, read_inverse_distance_map
+from shinypartial.dataset.read import open_dataset, read_inverse_distance_map, require_dataset_folder
 from shinypartial.dataset.schema import (
     CHECKSUMS,
     ENVIRONMENT_CUBE,
@@ -59,12 +59,7 @@ def validate(root: Path, progress: bool = False) -> list[Violation]:
     Fewer rules hold for a plain folder (`plain.is_plain`): `unscored` says what it lacks. Raises InputError when
     there is no such folder.
     """
-    if not root.is_dir():
-        raise InputError(
-            expected=f"a dataset folder at {root}",
-            found="a file" if root.exists() else "nothing there",
-            remedy="Check the path, or make one: `shinypartial generate --scene vase`.",
-        )
+    require_dataset_folder(root)
     original = is_plain(root, {})
     manifest, violations = ({}, []) if original else _check_manifest(root)
     plain = original or is_plain(root, manifest)

@@ -16,7 +16,7 @@ from shinypartial.dataset.schema import (
     Frame,
     View,
 )
-from shinypartial.dataset.violations import REMAKE, Violation, violation_of
+from shinypartial.dataset.violations import REMAKE, Violation, mask_violations, violation_of
 from shinypartial.dataset.write import display_rgba, encode_normals, encode_unit
 from shinypartial.io.images import read_exr, read_png, stack_channels
 
@@ -104,14 +104,9 @@ def _check_values(file: str, frame: Frame, view: View) -> Iterator[Violation]:
     for what, wrong in counts.items():
         if wrong.any():
             yield Violation(file, f"{int(wrong.sum())} pixels have {what}", REMAKE)
-    if not inside.any():
-        yield Violation(
-            file, "the mask is empty: the object is not in the picture", "Correct the camera path or the mask."
-        )
-    elif inside[[0, -1]].any() or inside[:, [0, -1]].any():
-        yield Violation(
-            file, "the object touches the border of the picture", "Move the camera back, or accept it.", warning=True
-        )
+    yield from mask_violations(
+        file, inside, "Correct the camera path or the mask.", "Move the camera back, or accept it."
+    )
 
 
 def _check_companions(root: Path, frame: Frame, view: View, missing: list[Path]) -> Iterator[Violation]:

@@ -70,7 +70,9 @@ def score_view(
     image, target = (linear_to_srgb(np.clip(view.radiance, 0, 1)) for view in (predicted, truth))
     solid = truth.alpha > SOLID_ALPHA
     covered, target_covered = predicted.alpha > 0.5, truth.alpha > 0.5
-    errors = _normal_errors(frame, predicted, truth)
+    errors = _normal_errors(predicted, truth)
+    claimed = _normal_errors(predicted, truth, claimed=True)
+    paper = PaperView(paper_render(image, target), claimed) if with_paper else None
     large_enough = min(truth.alpha.shape) >= perceptual.SMALLEST_SIDE
     return ViewResult(
         scores=ViewScores(
@@ -88,21 +90,17 @@ def score_view(
         lpips_alex=lpips(image, target) if lpips is not None and large_enough else None,
         normal_errors=errors,
         sees_environment=None if truth.self_reflection is None else environment_mask(truth)[solid_mask(truth)],
-        paper=PaperView(paper_render(image, target), _claimed_errors(predicted, truth)) if with_paper else None,
+        paper=paper,
     )
 
 
-def _normal_errors(frame: Frame, predicted: View, truth: View) -> Float[np.ndarray, "P"] | None:
+def _normal_errors(predicted: View, truth: View, *, claimed: bool = False) -> Float[np.ndarray, "P"] | None:
+    """Of solid pixels, or of those that both claim to be on the object; None where one of them has no normals."""
     if truth.normals_world is None or predicted.normals_world is None:
         return None
     mask = solid_mask(truth)
-    return normal_errors_deg(predicted.normals_world[mask], truth.normals_world[mask])
-
-
-def _claimed_errors(predicted: View, truth: View) -> Float[np.ndarray, "P"] | None:
-    if truth.normals_world is None or predicted.normals_world is None:
-        return None
-    mask = claimed_mask(predicted.alpha, predicted.normals_world, truth.normals_world)
+    if claimed:
+        mask = claimed_mask(predicted.alpha, predicted.normals_world, truth.normals_world)
     return normal_errors_deg(predicted.normals_world[mask], truth.normals_world[mask])
 
 

@@ -1,1 +1,1 @@
-"""Files, pictures, progress and threads. Imports core."""
+"""Files, pictures, progress, memory and threads. Imports core."""

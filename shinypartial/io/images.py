@@ -1,4 +1,5 @@
-"""Pictures in and out: written whole, read with clear errors. No other module decodes or encodes them.
+"""Pictures in and out: written whole, read with clear errors. No other module reads them, or writes one that is read
+again; pages and sheets for people are drawn and encoded with Pillow.
 
 OpenImageIO reads and writes PNG, JPEG, TIFF and HDR; loading it takes a tenth of a second, so it is imported when
 needed. EXR stays with OpenEXR, which reads and writes our files in less than half of OpenImageIO's processor time and

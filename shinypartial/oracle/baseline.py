@@ -3,8 +3,6 @@
 Written as a prediction folder, so that the evaluator scores it like any method: a score means little without it.
 """
 
-import resource
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +16,7 @@ from shinypartial.core.sphere import pixel_footprint_sr, sample_latlong
 from shinypartial.dataset.read import open_dataset, read_environment, read_view, require_normals
 from shinypartial.dataset.schema import ENVIRONMENT_LATLONG, Dataset, Frame, View
 from shinypartial.evaluation.masks import environment_mask
+from shinypartial.io.memory import peak_memory_bytes
 from shinypartial.io.progress import Progress
 from shinypartial.io.threads import in_threads
 from shinypartial.metrics.coverage import cells_of_view, cells_to_latlong
@@ -191,8 +190,6 @@ def _info(oracle: Oracle, data: Dataset) -> PredictionInfo:
         "rays": oracle.rays,
         "candidates_psnr_linear": {f"{one.estimate}_{one.height}": one.psnr_linear for one in oracle.candidates},
     }
-    # Linux counts kibibytes, macOS bytes.
-    unit = 1 if sys.platform == "darwin" else 1024
     return PredictionInfo(
         method=METHOD,
         dataset=str(data.root),
@@ -201,5 +198,5 @@ def _info(oracle: Oracle, data: Dataset) -> PredictionInfo:
         seconds=oracle.seconds,
         hardware={"device": "cpu"},
         parameter_counts={"environment": int(chosen.radiance.size)},
-        peak_memory_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit,
+        peak_memory_bytes=peak_memory_bytes(),
     )

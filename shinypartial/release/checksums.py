@@ -66,5 +66,10 @@ def _read_sealed(path: Path) -> list[ListedFile] | None:
     first, _, body = path.read_bytes().partition(b"\n")
     if first != f"{SEAL}{hashlib.sha256(body).hexdigest()}".encode():
         return None
-    lines = body.decode().removesuffix("\n").split("\n")
+    return listed_files(body.decode())
+
+
+def listed_files(text: str) -> list[ListedFile]:
+    """The files of a list, which has a line each."""
+    lines = text.removesuffix("\n").split("\n")
     return [ListedFile(name, digest) for digest, _, name in (line.partition("  ") for line in lines)]

@@ -11,7 +11,7 @@ from shinypartial.core.sphere import latlong_to_directions, sample_latlong
 from shinypartial.dataset.read import read_view
 from shinypartial.dataset.schema import CONTACT_SHEET, Frame, View
 from shinypartial.evaluation.pictures import normal_picture
-from shinypartial.io.files import atomic_write
+from shinypartial.io.images import write_jpeg
 
 VIEWS = 6
 TILE = 160
@@ -28,16 +28,13 @@ def write_contact_sheet(root: Path, frames: Sequence[Frame], environment: Float[
     """Write `contact_sheet.jpg`: columns are training views spread over the path, rows are picture, normals,
     and self-reflection in pink; the environment runs below them all.
     """
-    from PIL import Image
-
     chosen = [frames[i] for i in sorted({*np.linspace(0, len(frames) - 1, VIEWS).round().astype(int).tolist()})]
     columns = [np.concatenate(_tiles(read_view(frame))) for frame in chosen]
     sheet = np.concatenate(columns, 1)
     width = max(sheet.shape[1], 3 * TILE)
     padding = np.zeros((sheet.shape[0], width - sheet.shape[1], 3), np.uint8)
     whole = np.concatenate([np.concatenate([sheet, padding], 1), _panorama(environment, width)])
-    with atomic_write(root / CONTACT_SHEET) as temporary:
-        Image.fromarray(whole).save(temporary, format="JPEG", quality=JPEG_QUALITY)
+    write_jpeg(root / CONTACT_SHEET, whole, JPEG_QUALITY)
 
 
 def _tiles(view: View) -> tuple[Tile, ...]:

@@ -32,7 +32,7 @@ from shinypartial.io.files import (
 from shinypartial.io.progress import Progress
 from shinypartial.release.archive import write_archive
 from shinypartial.release.card import card, citation, description
-from shinypartial.release.checksums import ListedFile, check_sealed, list_files, write_sealed_checksums
+from shinypartial.release.checksums import ListedFile, check_sealed, list_files, listed_files, write_sealed_checksums
 from shinypartial.release.croissant import croissant
 from shinypartial.release.publication import (
     ARCHIVES,
@@ -150,8 +150,7 @@ def _open(root: Path, output: Path, progress: bool) -> _Source:
             found="the plain layout, without ground truth and with images of another origin",
             remedy="Release what `shinypartial generate` made; of a subset publish the `shinypartial subset` command.",
         )
-    lines = (root / CHECKSUMS).read_text(encoding="utf-8").removesuffix("\n").split("\n")
-    files = [ListedFile(name, digest) for digest, _, name in (line.partition("  ") for line in lines)]
+    files = listed_files((root / CHECKSUMS).read_text(encoding="utf-8"))
     return _Source(dataset, (*files, ListedFile(CHECKSUMS, sha256_of(root / CHECKSUMS))))
 
 

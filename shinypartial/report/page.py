@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from shinypartial.core.errors import InputError
 from shinypartial.evaluation.key_metrics import key_metrics
 from shinypartial.evaluation.pictures import (
@@ -36,6 +38,7 @@ from shinypartial.evaluation.scores import (
     read_scores,
     score_rows,
 )
+from shinypartial.io.images import read_png
 from shinypartial.io.progress import format_seconds
 from shinypartial.metrics.registry import Direction
 from shinypartial.prediction.format import DECOMPOSITION, PredictionInfo, read_info
@@ -235,13 +238,8 @@ def _inline_picture(path: Path, longest_px: int) -> str:
     """A data URI of the picture, at most `longest_px` on its longer side; lossless when that is small."""
     from PIL import Image
 
-    try:
-        with Image.open(path) as opened:
-            picture = opened.convert("RGB")
-    except OSError as error:
-        raise InputError(
-            expected=f"a complete picture at {path}", found=str(error), remedy="Delete it, then evaluate again."
-        ) from None
+    pixels = read_png(path)
+    picture = Image.fromarray(pixels[..., :3] if pixels.shape[2] > 1 else np.repeat(pixels, 3, 2))
     picture.thumbnail((longest_px, longest_px), Image.Resampling.LANCZOS)
     lossless, lossy = io.BytesIO(), io.BytesIO()
     picture.save(lossless, "PNG", optimize=True)

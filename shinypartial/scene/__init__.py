@@ -2,7 +2,7 @@
 
 `shapes`, `room` and `spec` say what a recipe may hold and in which range, `check` refuses values that contradict each
 other, and `recipes` finds, loads and varies scenes. The same checks hold for values that the command line overrides.
-May import trajectory and the core below it; never dataset, blender or bpy.
+Imports io and core; never dataset, blender or bpy.
 """
 
 from shinypartial.scene.recipes import (

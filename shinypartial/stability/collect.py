@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from shinypartial.evaluation.scores import read_scores
-from shinypartial.io.files import read_json, write_text
+from shinypartial.io.files import write_text
 from shinypartial.metrics.calibration import auroc
 from shinypartial.prediction.format import read_info
 from shinypartial.stability.attempt import read_record
@@ -121,20 +121,6 @@ def write_results(path: Path, results: Results) -> None:
 def _facts(outcome: Outcome) -> dict[str, object]:
     content = asdict(outcome)
     return {name: value for name, value in content.items() if name != "cell" and value not in (None, "", {})}
-
-
-def read_results(path: Path) -> Results:
-    """Read what `write_results` wrote."""
-    content = read_json(path, "results of a stability suite")
-    names = list(Cell.__dataclass_fields__)
-    outcomes = (
-        Outcome(
-            Cell(*(each[name] for name in names)),
-            **{name: value for name, value in each.items() if name not in names},
-        )
-        for each in content["cells"]
-    )
-    return Results(Size(**content["size"]), tuple(outcomes))
 
 
 def crossing(positions: Sequence[float], losses: Sequence[float | None], limit: float) -> float | None:

@@ -28,7 +28,6 @@ SCENES = {
 TINY = "tiny-vase"
 SIMPLE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 Plans = Literal["core", "all", "clean", "tiny"]
-Kind = Literal["render", "perturb", "fit", "score"]
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """The source tree as the architecture tests see it."""
 
 import ast
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -47,3 +48,39 @@ def _undocumented_below(parent: ast.Module | ast.ClassDef, prefix: str) -> Itera
             yield prefix + node.name
         if isinstance(node, ast.ClassDef):
             yield from _undocumented_below(node, f"{prefix}{node.name}.")
+
+
+def code_names(tree: ast.Module) -> set[str]:
+    """Every name in the code of a module, modules that it imports, and words that are whole strings; not docstrings."""
+    names: set[str] = set()
+    for node in ast.walk(tree):
+        match node:
+            case ast.Name(id=name) | ast.Attribute(attr=name) | ast.arg(arg=name) | ast.keyword(arg=str(name)):
+                names.add(name)
+            case ast.FunctionDef(name=name) | ast.ClassDef(name=name):
+                names.add(name)
+            case ast.ImportFrom() | ast.Import():
+                imported = [alias.name for alias in node.names] + [getattr(node, "module", None) or ""]
+                names.update(part for each in imported for part in each.split("."))
+            case ast.Constant(value=str(text)) if text.isidentifier():
+                names.add(text)
+    return names
+
+
+def names_in_docstrings(tree: ast.Module) -> Iterator[tuple[str, str, bool]]:
+    """Where a docstring stands, a name like `this` or `This.one` in it, and whether it is that of a class."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            for name in re.findall(r"`(?:[A-Z][a-z]\w*\.)?([a-z_]\w*)`", ast.get_docstring(node) or ""):
+                yield getattr(node, "name", "the module"), name, isinstance(node, ast.ClassDef)
+
+
+def unknown_in_docstrings(sources: Mapping[str, str]) -> Iterator[str]:
+    """Names in docstrings that no code knows: for a class the code of its module, for others that of any module."""
+    trees = {module: ast.parse(source) for module, source in sources.items()}
+    own = {module: code_names(tree) for module, tree in trees.items()}
+    everywhere = set().union(*own.values(), *(module.split(".") for module in sources))
+    for module, tree in trees.items():
+        for place, name, of_class in names_in_docstrings(tree):
+            if name not in (own[module] if of_class else everywhere):
+                yield f"{module}: {place}: {name}"

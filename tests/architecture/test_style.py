@@ -8,11 +8,13 @@ from jaxtyping import TypeCheckError
 
 from shinypartial.core.sphere import directions_to_latlong
 from shinypartial.dataset.schema import View
-from tests.architecture.source import ROOT, source_files, undocumented
+from tests.architecture.source import ROOT, source_files, undocumented, unknown_in_docstrings
 from tests.conftest import checked_modules
 
 MAX_LINES = 450
 EMPTY_NAMES = {"utils", "util", "helpers", "helper", "misc", "common", "stuff"}
+#: In docstrings: a library that nothing imports, and a folder of Python's.
+NAMES_OF_OTHERS = {"mlcroissant", "__pycache__"}
 
 every_file = pytest.mark.parametrize("path", source_files(), ids=lambda path: str(path.relative_to(ROOT)))
 
@@ -25,6 +27,22 @@ def test_public_names_have_a_docstring(path: Path) -> None:
 def test_a_missing_docstring_would_be_seen() -> None:
     source = "class A:\n    '''Doc.'''\n    def b(self): ...\n    def _c(self): ...\ndef d(): ...\n"
     assert list(undocumented(source)) == ["the module", "A.b", "d"]
+
+
+def test_docstrings_name_what_is_there() -> None:
+    """A class describes no field that it lacks."""
+    sources = {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts): path.read_text(encoding="utf-8")
+        for path in source_files()
+    }
+    unknown = {line.rpartition(": ")[2]: line for line in unknown_in_docstrings(sources)}
+    assert unknown.keys() <= NAMES_OF_OTHERS, unknown
+
+
+def test_a_field_that_is_gone_would_be_seen() -> None:
+    source = "class Ab:\n    '''`b` and `c`.'''\n    b: int\ndef d():\n    '''`e` of `Ab.f`.'''\n"
+    found = unknown_in_docstrings({"one": source, "two": "c, e = 1, 2"})
+    assert list(found) == ["one: Ab: c", "one: d: f"]
 
 
 @every_file

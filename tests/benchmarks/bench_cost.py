@@ -14,7 +14,6 @@ processor time is also split into a share a step, a pair, a surfel, a pixel and 
 import argparse
 import json
 import math
-import resource
 import statistics
 import sys
 import tempfile
@@ -26,6 +25,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from shinypartial.io.memory import peak_memory_bytes
 
 # Torch and what needs it are imported where they are used. A process begins with the peak memory of the one that
 # starts it, so the latter must stay small.
@@ -178,8 +179,7 @@ def _count_views(trainer: Any, indices: set[int]) -> dict[int, Any]:
 
 
 def _peak_mib() -> float:
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+    return peak_memory_bytes() / 2**20
 
 
 def _synthetic_root(folder: Path) -> Path:

@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import fields, is_dataclass
+from functools import reduce
 from pathlib import Path
 from typing import get_args, get_type_hints
 
@@ -30,6 +31,8 @@ TUNED = (
     "corrections",
     "selection",
     "trust",
+    "confidence",
+    "surfels.tuned",
 )
 TINY = ["--config.iterations", "4", "--config.surfels.count", "40", "--config.surfels.hull-resolution", "24"]
 AS_TOLD = ["--set", "corrections.masks=off", "corrections.exposure=off", "corrections.lens=off"]
@@ -67,7 +70,7 @@ def test_help_lists_every_option(capsys: pytest.CaptureFixture[str], monkeypatch
 def test_every_tuned_number_can_be_set(section: str) -> None:
     """To its own value, which changes nothing, and by a wrong word, which is refused."""
     config = FitConfig()
-    values = write_record(config)[section]
+    values = reduce(dict.__getitem__, section.split("."), write_record(config))
     overrides = [f"{section}.{name}={json.dumps(value)}" for name, value in values.items()]
     assert with_overrides(config, overrides) == config
     for override in (f"{section}.of_the_future=1", f"{overrides[0].partition('=')[0]}=word", section):

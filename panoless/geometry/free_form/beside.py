@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from panoless.geometry.free_form.observations import PixelRays
 from panoless.kernels.constants import LEAST_SLANT
 
 
@@ -63,23 +62,6 @@ class Beside:
         count = len(value)
         pulled = self.photographs.backward(seen, count) + self.silhouettes.backward(outlined, count)
         return pulled + self.precision * value
-
-
-def lens_turns(directions: Float[np.ndarray, "P 3"], axes: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
-    """By which ω rays turn with the logarithm of the focal length: d = cos θ (a + p) with the optical axis a becomes
-    a + e⁻ˢ p, to first order d + s ω × d.
-    """
-    turned: np.ndarray = np.cross(directions, (directions * axes).sum(1, keepdims=True) * axes)
-    return turned
-
-
-def by_focal(
-    rays: PixelRays, by_pose: Float[np.ndarray, "P K 6"], axes: Float[np.ndarray, "P 3"]
-) -> Float[np.ndarray, "P K 1"]:
-    """What residuals change by with s, where the camera at o goes to eˢ o and has eˢ times the focal length."""
-    motion = np.concatenate([lens_turns(rays.directions, axes), rays.origins], 1)
-    found: np.ndarray = np.matmul(by_pose, motion[..., None])
-    return found
 
 
 def pixel_pose_rows(

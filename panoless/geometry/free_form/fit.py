@@ -211,15 +211,14 @@ def take_round(
     if solution.poses is None:
         return found
     # The map follows with the next round, which starts it anew.
-    common = solution.poses.common(task.centers, solution.pose_prior)
-    poses = solution.poses.without(common, task.centers)
+    common, poses = solution.poses.without_common(task.centers, solution.pose_prior)
     return replace(found, surface=solution.surface.taken_back(common), poses=poses, environment=None)
 
 
 def make_task(views: Views, settings: FreeFormRound, options: FreeFormOptions) -> Task:
     """The pixels and outlines of a round, weighted as if `counted_rays` pixels took part."""
     pixels, outlines = solid_pixels(views, settings.rays), outline_rays(views)
-    total = max(sum(len(view.solid) for view in views.train), 1)
+    total = max(views.num_solid, 1)
     chosen = outlines.chosen(slice(None, None, max(1, -(-len(outlines.size) // options.outline_points))))
     share = options.counted_rays / options.radiance_sigma**2 / max(len(pixels.inner_px), 1)
     density = options.counted_rays / total * len(outlines.size) / max(len(chosen.size), 1)

@@ -66,7 +66,7 @@ class FreeFormMirror(ExactGeometry):
         chosen = pixels[torch.from_numpy(seeing).to(pixels.device)]
         trust = self.trust.at(self.surface.points(sights.hits.places[seeing]))
         outgoing, trusted = (torch.from_numpy(each).float() for each in (sights.outgoing[seeing, 0], trust))
-        radiance = view.radiance.flatten(1)[:, chosen].T.contiguous()
+        radiance = view.radiance_at(chosen)
         incoming = view.directions_world(chosen)
         return Rays(outgoing.to(radiance.device), radiance, trusted.to(radiance.device), incoming)
 
@@ -95,7 +95,7 @@ class FreeFormMirror(ExactGeometry):
             kept = sights.clear & trusted & (sights.turn < self.options.widest_footprint_rad)
             directions = torch.from_numpy(sights.outgoing[kept]).float().to(view.radiance.device)
             chosen = pixels[torch.from_numpy(kept).to(pixels.device)]
-            found.append(PixelFootprints(directions, view.radiance.flatten(1)[:, chosen].T.contiguous()))
+            found.append(PixelFootprints(directions, view.radiance_at(chosen)))
         parts = [part for part in found if len(part.radiance)]
         if not parts:
             return None
@@ -112,17 +112,17 @@ class FreeFormMirror(ExactGeometry):
         normals_camera: Float[Tensor, "3 P"],
     ) -> Float[Tensor, "P 3"]:
         """Means over the pixels' areas; where the object sees itself, along the ray that leaves in the end."""
-        return free_form_light(self.surface, environment, camera, pixels, normals_camera)
+        return free_form_light(self.surface, environment, camera, pixels, normals_camera, self.options)
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
-        """By intersection; alpha by 4×4 rays at outlines."""
-        return free_form_buffers(self.surface, camera)
+        """By intersection; alpha by a grid of rays at outlines."""
+        return free_form_buffers(self.surface, camera, self.options)
 
     def to_surfels(self, config: FitConfig) -> SurfelMirror:
         """Surfels all over the surface, curved as it is."""
         mesh, _ = self.surface.mesh(points_a_cell=1)
         pixel = self.surface.spacing * self.options.surfel_pixel
-        return SurfelMirror.of(surfels_on_mesh(mesh, config.surfels.count, pixel, config.seed), config, self)
+        return SurfelMirror.of(surfels_on_mesh(mesh, config.surfels, pixel, config.seed), config, self)
 
     def mesh(self, frame: ObjectFrame) -> Mesh:
         """Marching cubes, with the exact normals of the vertices and the trust there, `confidence` in [0, 1]."""

@@ -7,9 +7,10 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from panoless.capture.poses import Poses
-from panoless.capture.rays import pose_of
+from panoless.capture.rays import camera_rays, pose_of
 from panoless.capture.silhouettes import mask_contours
 from panoless.capture.views import TrainView, Views, concatenated, every_kth_pixel
+from panoless.capture.zoom import farther_rays
 from panoless.kernels.rasterize import RasterCamera
 from shinypartial.core.conventions import PIXEL_CENTER, SOLID_ALPHA
 
@@ -33,15 +34,14 @@ class PixelRays:
     ) -> "PixelRays":
         """Through places (column, row) of a picture, in pixels; `view` is its number."""
         rotation, center = pose_of(camera)
-        x, y = (column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
-        directions = np.stack([x, y, np.ones_like(x)], 1) @ rotation
+        directions = camera_rays(camera, column, row) @ rotation
         length = np.linalg.norm(directions, axis=1, keepdims=True)
         directions /= length
         axes = rotation[:2] / np.array([[camera.fx], [camera.fy]])
         across = np.einsum("pi,ai->pa", directions, axes)
         steps = (axes - across[..., None] * directions[:, None]) / length[..., None]
-        size, number = 1 / (camera.fx * length[:, 0]), np.full(len(x), view)
-        return cls(np.tile(center, (len(x), 1)), directions, steps, size, number)
+        size, number = 1 / (camera.fx * length[:, 0]), np.full(len(column), view)
+        return cls(np.tile(center, (len(column), 1)), directions, steps, size, number)
 
     def chosen(self, index: slice | Bool[np.ndarray, "P"] | Int[np.ndarray, "M"]) -> "PixelRays":
         """Some of them."""
@@ -57,10 +57,8 @@ class PixelRays:
     def zoomed(self, change: float, axes: Float[np.ndarray, "P 3"]) -> "PixelRays":
         """With cameras eˢ as far from the origin, and eˢ times the focal length; `axes` are the optical ones."""
         factor = float(np.exp(change))
-        cosines = (self.directions * axes).sum(1, keepdims=True)
-        directions = axes + (self.directions / cosines - axes) / factor
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        return PixelRays(self.origins * factor, directions, self.steps / factor, self.size / factor, self.view)
+        moved = farther_rays(self.origins, self.directions, axes, change)
+        return PixelRays(*moved, self.steps / factor, self.size / factor, self.view)
 
     @classmethod
     def centers(cls, camera: RasterCamera, pixels: Int[np.ndarray, "P"], view: int = 0) -> "PixelRays":
@@ -93,7 +91,7 @@ def solid_pixels(views: Views, count: int) -> Pixels:
     for number, (view, pixels) in enumerate(every_kth_pixel(views, count)):
         index = pixels.cpu().numpy()
         rays.append(PixelRays.centers(view.camera, index, number))
-        radiance.append(view.radiance.flatten(1)[:, pixels].T.cpu().numpy().astype(np.float64))
+        radiance.append(view.radiance_at(pixels).cpu().numpy().astype(np.float64))
         inner.append(inner_distance_px(view).ravel()[index])
     return Pixels(concatenated(rays), np.concatenate(radiance), np.concatenate(inner))
 

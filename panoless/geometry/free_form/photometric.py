@@ -11,9 +11,10 @@ from torch import Tensor
 
 from panoless.capture.poses import Poses
 from panoless.capture.views import concatenated
+from panoless.capture.zoom import farther_motion
 from panoless.environment.cubemap import resample
 from panoless.environment.footprints import PixelFootprints
-from panoless.geometry.free_form.beside import Beside, BlockRows, by_focal, pixel_pose_rows
+from panoless.geometry.free_form.beside import Beside, BlockRows, pixel_pose_rows
 from panoless.geometry.free_form.equations import Rows, gauge_rows, joined_rows, silhouette_rows
 from panoless.geometry.free_form.map import sharpened_map, splatted_map
 from panoless.geometry.free_form.observations import PixelRays, Pixels
@@ -312,13 +313,13 @@ class Solution:
         """
         around, options = self.surface.surroundings.coefficients, self.task.options
         photographs, silhouettes = self.photographs, self.silhouettes
-        by_distance = self.surface.surroundings.rows(self.slopes, self.points, self.sights.mirrored)
-        seen = [by_distance[..., : len(around)]]
+        seen = [self.surface.surroundings.rows(self.slopes, self.points, self.sights.mirrored)]
         outlined = [np.zeros((*silhouettes.residual.shape, len(around)))]
         if self.focal is not None:
             rays = self.rays, concatenated(list(self._silhouette_rays))
             for found, of, by_pose in zip((seen, outlined), rays, self.pose_rows, strict=True):
-                found.append(by_focal(of, by_pose.rows, self.task.axes[of.view]))
+                motion = farther_motion(of.origins, of.directions, self.task.axes[of.view])
+                found.append(np.matmul(by_pose.rows, motion[..., None]))
         rows = np.concatenate(seen, 2) * (photographs.weights > 0)[:, None, None]
         beyond = np.stack([self.beyond_map(np.ascontiguousarray(column)) for column in np.moveaxis(rows, 2, 0)], 2)
         of_silhouettes = BlockRows(

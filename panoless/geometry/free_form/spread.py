@@ -15,13 +15,15 @@ from panoless.numeric.robust import bounded_error
 
 @dataclass(frozen=True)
 class FinalRays:
-    """Where rays of pixels go after all reflections, which of them met the surface and left it again, where they met
-    it first, and the normals there (the normalized frame).
+    """Where rays of pixels go after all reflections, which of them met the surface, and left it again, where they met
+    it first and last, and the normals at the first point (the normalized frame).
     """
 
     directions: Float[np.ndarray, "P 3"]
+    met: Bool[np.ndarray, "P"]
     left: Bool[np.ndarray, "P"]
     points: Float[np.ndarray, "P 3"]
+    last: Float[np.ndarray, "P 3"]
     normals: Float[np.ndarray, "P 3"]
 
     @classmethod
@@ -29,19 +31,21 @@ class FinalRays:
         """By tracing rays through at most so many reflections."""
         hits = surface.hits(rays.origins, rays.directions)
         first = surface.points(hits.places)
-        directions, going = rays.directions.copy(), np.flatnonzero(hits.met)
+        directions, last, going = rays.directions.copy(), first.copy(), np.flatnonzero(hits.met)
         points, normals = first[going], hits.normals[going]
         for _ in range(bounces):
-            directions[going] = reflect(directions[going], normals)
+            directions[going], last[going] = reflect(directions[going], normals), points
             again = surface.hits(points, directions[going], leaving=True)
             going, normals = going[again.met], again.normals[again.met]
             points = surface.points(again.places[again.met])
+            if not len(going):
+                break
         left = hits.met.copy()
         left[going] = False
-        return cls(directions, left, first, hits.normals)
+        return cls(directions, hits.met, left, first, last, hits.normals)
 
 
-def texels_of(directions: Float[np.ndarray, "P 3"], resolution: int) -> Int[np.ndarray, "P"]:
+def cells_of(directions: Float[np.ndarray, "P 3"], resolution: int) -> Int[np.ndarray, "P"]:
     """Flat index of the cell of each direction on a cube whose faces have so many cells of equal angle along a side."""
     face, st, _ = project_to_face(torch.from_numpy(directions))
     place = (torch.atan(st) * (4 / np.pi) + 1) * (resolution / 2)
@@ -66,7 +70,7 @@ def disagreement(
     found = bounded_error(radiance - radiance.mean(0), scale)
     if not left.any():
         return found
-    colors, cells = radiance[left], texels_of(directions[left], resolution)
+    colors, cells = radiance[left], cells_of(directions[left], resolution)
     _, cell = np.unique(cells, return_inverse=True)
     _, own = np.unique(cell * (int(view.max()) + 1) + view[left], return_inverse=True)
     count = np.bincount(cell)[cell] - np.bincount(own)[own]

@@ -68,7 +68,7 @@ class HeightFieldMirror(ExactGeometry):
         Curvatures are D²h/√(1 + |∇h|²), the shape operator but for terms of second order in the slope.
         """
         field = self.height_field
-        places, radius = places_within(field.plane.boundary, config.surfels.count, config.seed)
+        places, radius = places_within(field.plane.boundary, config.surfels, config.seed)
         h, h_u, h_v, *bends = field.heights(places)
         points = field.plane.points(places) + h[:, None] * field.plane.normal
         norm, zero = np.sqrt(1 + h_u**2 + h_v**2), np.zeros_like(h)

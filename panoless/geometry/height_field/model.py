@@ -184,7 +184,7 @@ def height_field_rays(height_field: HeightField, view: TrainView, pixels: Int[Te
     """What pixels of a view observed of the environment."""
     visible = visible_reflections(height_field, view, pixels)
     outgoing = torch.from_numpy(visible.outgoing).float().to(view.radiance.device)
-    radiance = view.radiance.flatten(1)[:, visible.pixels].T.contiguous()
+    radiance = view.radiance_at(visible.pixels)
     return Rays(outgoing, radiance, incoming=view.directions_world(visible.pixels))
 
 

@@ -17,13 +17,13 @@ from torch import Tensor
 
 from panoless.capture.rays import reflect
 from panoless.capture.views import Views, concatenated, every_kth_pixel
+from panoless.environment.cubemap import gather_texels, texels_of
 from panoless.environment.rays import Rays
 from panoless.geometry.height_field.model import HeightField, HeightFieldHits, visible_reflections
 from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.gauss_newton import jacobian_of_rows, normal_equations
 from panoless.numeric.robust import robust_weight
-from shinypartial.core.sphere import directions_to_cube
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -46,7 +46,7 @@ def observe(
 ) -> Observations:
     """About `max_pixels` pixels of all views, evenly."""
     visible = [visible_reflections(height_field, *chosen, options) for chosen in every_kth_pixel(views, max_pixels)]
-    radiance = [view.radiance.flatten(1)[:, part.pixels].T for view, part in zip(views.train, visible, strict=True)]
+    radiance = [view.radiance_at(part.pixels) for view, part in zip(views.train, visible, strict=True)]
     outgoing = torch.from_numpy(np.concatenate([part.outgoing for part in visible])).float()
     return Observations(
         np.concatenate([part.origins for part in visible]),
@@ -84,7 +84,7 @@ class Photographs:
         radiance = observed.rays.radiance.cpu().numpy()
         residual = _look_up(environment, height_field, observed, observed.hits) - radiance
         weights = robust_weight(residual, robust_scale) / radiance_sigma**2
-        texel = _texels(observed.rays.directions, environment.shape[-1])
+        texel = texels_of(observed.rays.directions.cpu().numpy().astype(np.float64), environment.shape[-1])
         return cls(height_field, observed, environment, residual, weights, texel)
 
     def equations(self) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
@@ -125,13 +125,8 @@ class Photographs:
 
     @cached_property
     def gather(self) -> "csr_matrix":
-        """G with ‖G x‖² = Σ_texels (Σ w x)²/Σ w."""
-        from scipy import sparse
-
-        count = len(self.weights)
-        total = np.maximum(np.bincount(self.texel, self.weights), 1e-12)
-        values = self.weights / np.sqrt(total)[self.texel]
-        return sparse.csr_matrix((values, (self.texel, np.arange(count))), shape=(len(total), count))
+        """What the map takes over (see `gather_texels`)."""
+        return gather_texels(self.weights, self.texel)
 
     def _radiance_by_slope(self) -> Float[np.ndarray, "2 P 3"]:
         """Derivatives of what is seen by the slopes along u and v: differences over a texel."""
@@ -157,10 +152,3 @@ def _look_up(
         distance = np.where(hits.met, hits.distance, 0.0)[:, None]
         mirrored = surroundings.looked_up(observed.origins + distance * observed.directions, mirrored)
     return sample_cubemap(environment, torch.from_numpy(mirrored).to(environment)).cpu().numpy().astype(np.float64)
-
-
-def _texels(directions: Float[Tensor, "P 3"], resolution: int) -> Int[np.ndarray, "P"]:
-    """Which of the texels that are seen each direction falls into, numbered from zero."""
-    face, st = directions_to_cube(directions.cpu().numpy().astype(np.float64))
-    column, row = np.clip((st + 1) * resolution / 2, 0, resolution - 1).astype(np.int64).T
-    return np.unique((face * resolution + row) * resolution + column, return_inverse=True)[1].reshape(-1)

@@ -13,7 +13,7 @@ from panoless.config import FitConfig
 from panoless.environment.rays import Rays
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import SOLID_SURFACE_ALPHA, Geometry, Mesh, Proposal, SurfaceBuffers
-from panoless.geometry.exact import ExactFamily, ExactGeometry, looked_up, reflections
+from panoless.geometry.exact import ExactFamily, ExactGeometry, looked_up, mirrored_directions
 from panoless.geometry.plane.fit import fit_plane
 from panoless.geometry.plane.model import Plane, plane_buffers, unoccluded_share
 from panoless.geometry.surfels.mirror import SurfelMirror
@@ -58,9 +58,9 @@ class PlaneMirror(ExactGeometry):
         """The rays of those of the pixels that the plane covers."""
         buffers = plane_buffers(self.plane, view.camera)
         pixels = pixels[buffers.alpha.flatten()[pixels] > SOLID_SURFACE_ALPHA]
-        directions = reflections(view, buffers.normals_camera, pixels)
+        directions = mirrored_directions(view.camera, pixels, buffers.normals_camera.flatten(1)[:, pixels])
         directions = looked_up(self.surroundings, view.camera, buffers.depth, pixels, directions)
-        radiance = view.radiance.flatten(1)[:, pixels].T.contiguous()
+        radiance = view.radiance_at(pixels)
         return Rays(directions, radiance, incoming=view.directions_world(pixels))
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
@@ -69,7 +69,7 @@ class PlaneMirror(ExactGeometry):
 
     def to_surfels(self, config: FitConfig) -> SurfelMirror:
         """Flat surfels evenly within the boundary, on a hexagonal grid shifted by the seed."""
-        places, radius = places_within(self.plane.boundary, config.surfels.count, config.seed)
+        places, radius = places_within(self.plane.boundary, config.surfels, config.seed)
         axes = np.stack([self.plane.tangent_u, self.plane.tangent_v, self.plane.normal], 1)
         frames = np.broadcast_to(axes, (len(places), 3, 3))
         scales, curvatures = np.full((len(places), 2), radius), np.zeros((len(places), 3))

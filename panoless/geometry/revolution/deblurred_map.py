@@ -26,7 +26,7 @@ def pixel_footprints(
     occlusion_test: bool = True,
 ) -> Footprints:
     """Footprints of all pixels of evenly chosen views that are reflected up to `max_bounces` times."""
-    stride = -(-sum(len(view.solid) for view in views.train) // options.map.pixels)
+    stride = -(-views.num_solid // options.map.pixels)
     chosen, batch = views.train[:: max(stride, 1)], options.map.batch_views
     found, others = [], []
     for view in chosen:
@@ -37,7 +37,7 @@ def pixel_footprints(
         )
         pixels = view.solid[torch.from_numpy(smooth).to(view.solid.device)]
         directions = torch.stack(list(at.within(OFFSETS)), 1).to(view.radiance.device)
-        found.append(PixelFootprints(directions, view.radiance.flatten(1)[:, pixels].T.contiguous()))
+        found.append(PixelFootprints(directions, view.radiance_at(pixels)))
         others.append(places[~smooth])
     joined = [_joined(found[first : first + batch]) for first in range(0, len(found), batch)]
     smooth_batches = [areas for areas in joined if len(areas.radiance)]

@@ -104,7 +104,7 @@ def _lid_pixels(
     for view in views.train:
         origins, rays = pixel_rays(view.camera, view.solid.cpu().numpy())
         lid = np.flatnonzero(closed.hits(origins, rays).side >= closed.lip)
-        radiance = view.radiance.flatten(1)[:, view.solid].T.cpu().numpy()
+        radiance = view.radiance_at(view.solid).cpu().numpy()
         parts.append((origins[lid], rays[lid] / np.linalg.norm(rays[lid], axis=1, keepdims=True), radiance[lid]))
     origins, rays, radiance = (np.concatenate([part[k] for part in parts]) for k in range(3))
     stride = max(1, len(rays) // count)

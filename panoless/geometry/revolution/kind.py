@@ -93,7 +93,7 @@ class RevolutionMirror(ExactGeometry):
 
     def to_surfels(self, config: FitConfig) -> SurfelMirror:
         """Rings of surfels, curved as the surface is."""
-        return SurfelMirror.of(surfels_on_revolution(self.surface, config.surfels.count), config)
+        return SurfelMirror.of(surfels_on_revolution(self.surface, config.surfels), config)
 
     def state_dict(self) -> dict[str, Any]:
         """All numbers as lists and plain values."""

@@ -29,8 +29,10 @@ from panoless.geometry.revolution.pixels import PixelBundles
 from panoless.geometry.revolution.profile import resample_profile
 from panoless.geometry.revolution.silhouette import ContourRays, adapted_scale, in_axis_frame, silhouette_residuals
 from panoless.kernels.rasterize import RasterCamera
+from panoless.numeric.bspline import cubic_bspline
 from panoless.numeric.gauss_newton import accept_step, damped_step
 from panoless.numeric.robust import robust_weight
+from shinypartial.core.conventions import PIXEL_CENTER
 
 RING_POINTS = 2000
 """Around the lip's image: more than its pixels."""
@@ -161,7 +163,7 @@ def beside_lip(camera: RasterCamera, surface: SurfaceOfRevolution, reach_px: int
     x, y = project(camera, seen)
     reach = np.arange(-reach_px, reach_px + 1)
     column, row = np.floor(x)[:, None, None] + reach, np.floor(y)[:, None, None] + reach[:, None]
-    distance = np.hypot(column + 0.5 - x[:, None, None], row + 0.5 - y[:, None, None])
+    distance = np.hypot(column + PIXEL_CENTER - x[:, None, None], row + PIXEL_CENTER - y[:, None, None])
     near = (distance < reach_px) & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
     beside = np.zeros(camera.height * camera.width, bool)
     beside[(row * camera.width + column)[near].astype(np.int64)] = True
@@ -221,8 +223,7 @@ def _shifts(surface: SurfaceOfRevolution, pixel: float, options: LipOptions) -> 
     place = (surface.arc_lengths - surface.arc_lengths[surface.lip]) / pixel
     last = min(float(place[-1]), options.length_px)
     places = place - np.arange(-options.length_px, last + options.knot_px + 1, options.knot_px)[:, None]
-    splines = np.abs(places) / options.knot_px
-    splines = np.where(splines < 1, 2 / 3 - splines**2 + splines**3 / 2, np.clip(2 - splines, 0, None) ** 3 / 6)
+    splines = cubic_bspline(places / options.knot_px)
     along = np.gradient(surface.profile, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
     shifts = splines[..., None] * np.stack([along[:, 1], -along[:, 0]], 1)

@@ -111,7 +111,7 @@ class SurfaceOfRevolution:
     def turned_over(self) -> "SurfaceOfRevolution":
         """The same outside with the axis the other way round, closed flat at both ends."""
         outer = self.profile[1 : self.lip + 1][::-1] * [1.0, -1.0]
-        profile = np.concatenate([[[0.0, outer[0, 1]]], outer, [[0.0, outer[-1, 1]]]])
+        profile = closed_profile(outer)
         return replace(self, axis=-self.axis, profile=profile, lip=len(outer))
 
     @cached_property
@@ -215,6 +215,11 @@ def _hits_within(surface: SurfaceOfRevolution, camera: RasterCamera, pixels: Int
     return whole
 
 
+def closed_profile(outer: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "M 2"]:
+    """(ρ, h) of an outside from the bottom up, closed flat at both ends."""
+    return np.concatenate([[[0.0, outer[0, 1]]], outer, [[0.0, outer[-1, 1]]]])
+
+
 _NEIGHBORS = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
 
 
@@ -297,5 +302,5 @@ def revolution_rays(
         image.reshape(-1, 3)[places], mask.ravel()[places] = paths.directions[left], True
         footprint_sr = pixel_footprint_sr(image, mask)[mask]
         trust = torch.from_numpy(1 / (1 + footprint_sr / options.confidence_texel_rad**2)).to(outgoing)
-    radiance, incoming = view.radiance.flatten(1)[:, kept].T.contiguous(), view.directions_world(kept)
+    radiance, incoming = view.radiance_at(kept), view.directions_world(kept)
     return Rays(outgoing, radiance, trust, incoming), paths.first.of(left)

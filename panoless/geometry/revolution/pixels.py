@@ -42,8 +42,8 @@ class PixelBundles:
         for view, pixels in chosen:
             rays = [pixel_rays(view.camera, pixels, place) for place in places]
             origins, directions = (np.stack([each[part] for each in rays], 1).reshape(-1, 3) for part in (0, 1))
-            seen = view.radiance.flatten(1)[:, torch.from_numpy(pixels).to(view.radiance.device)]
-            parts.append(cls(origins, directions, seen.T.cpu().numpy().astype(np.float64)))
+            seen = view.radiance_at(torch.from_numpy(pixels)).cpu().numpy()
+            parts.append(cls(origins, directions, seen.astype(np.float64)))
         return concatenated(parts)
 
     @property

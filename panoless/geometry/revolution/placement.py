@@ -4,20 +4,21 @@ import math
 
 import numpy as np
 
+from panoless.config import SurfelConfig
 from panoless.geometry.revolution.model import SurfaceOfRevolution
 from panoless.geometry.surfels.model import Surfels
-from panoless.geometry.surfels.placement import OVERLAP, surfels_at
+from panoless.geometry.surfels.placement import surfels_at
 
 
-def surfels_on_revolution(surface: SurfaceOfRevolution, count: int) -> Surfels:
-    """About `count` surfels in rings around a surface of revolution, curved as it is: half as long along the profile
-    as around.
+def surfels_on_revolution(surface: SurfaceOfRevolution, config: SurfelConfig) -> Surfels:
+    """About as many surfels as configured in rings around a surface of revolution, curved as it is: half as long along
+    the profile as around.
     """
     profile, ends = surface.profile, surface.angles
     steps = np.diff(surface.arc_lengths)
     areas = math.pi * steps * (profile[:-1, 0] + profile[1:, 0])
     # A ring of radius ρ and width w holds 2πρ/2w surfels.
-    width = math.sqrt(areas.sum() / count / 2)
+    width = math.sqrt(areas.sum() / config.count / 2)
     rings = max(round(surface.arc_lengths[-1] / width), 1)
     place = (np.arange(rings) + 0.5) * surface.arc_lengths[-1] / rings
     side = np.clip(np.searchsorted(surface.arc_lengths, place) - 1, 0, len(steps) - 1)
@@ -39,5 +40,5 @@ def surfels_on_revolution(surface: SurfaceOfRevolution, count: int) -> Surfels:
     # n = n₀ − S·(x − x₀): the normal turns with the profile, and by n_ρ/ρ around the axis.
     curvatures = np.stack([-along_axis / np.maximum(radius[ring], width / 2), zero, -bend[ring]], 1)
     spacing = np.stack([2 * math.pi * radius[ring] / around[ring], np.full(len(ring), width)], 1)
-    scales = OVERLAP * np.maximum(spacing, 1e-6)
+    scales = config.tuned.overlap * np.maximum(spacing, 1e-6)
     return surfels_at(surface.origin + local @ surface.frame, frames, scales, curvatures)

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from panoless.capture.rays import camera_rays, pose_of
 from panoless.capture.silhouettes import MaskContours, mask_contours
 from panoless.capture.views import Views
-from panoless.geometry.revolution.model import SurfaceOfRevolution
+from panoless.geometry.revolution.model import SurfaceOfRevolution, closed_profile
 from panoless.geometry.revolution.options import DEFAULTS, SilhouetteOptions
 from panoless.geometry.revolution.profile import ProfileSplines, apply_step, resample_profile
 from panoless.kernels.revolution import closest_approach, distance_grid, envelope
@@ -123,7 +123,7 @@ def outer_surface(
     for lowest, highest in reversed(ends) if stem else ends:
         if highest - lowest >= rays.options.least_cells:
             outer = np.stack([radius, heights], 1)[lowest : highest + 1]
-            profile = np.concatenate([[[0.0, outer[0, 1]]], outer, [[0.0, outer[-1, 1]]]])
+            profile = closed_profile(outer)
             return resample_profile(replace(start, profile=profile, lip=len(outer)), cell)
     return None
 

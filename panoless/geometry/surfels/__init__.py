@@ -1,1 +1,1 @@
-"""Curved Gaussian surfels, fitted by gradient descent."""
+"""Curved Gaussian surfels, fitted by gradient descent. Imports no other kind."""

@@ -13,8 +13,6 @@ from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.geometry.surfels.placement import initial_surfels
 from panoless.geometry.surfels.train import train_surfels
 
-INITIAL_RAYS = 1_000_000
-
 
 class SurfelFamily:
     """Free surfels."""
@@ -52,7 +50,7 @@ class SurfelFamily:
         length = environment.shape[-1]
         if config.environment.solve and config.environment.activation == "clamp":
             with torch.no_grad():
-                rays = list(observe_views(views, geometry, INITIAL_RAYS))
+                rays = list(observe_views(views, geometry, config.surfels.tuned.initial_rays))
                 environment = resample(solve_environment(rays, length // 2), length)
         return Training(environment, environment.new_zeros(6, length, length))
 

@@ -27,8 +27,9 @@ from panoless.geometry.base import (
     poses_from_plain,
     to_plain,
 )
-from panoless.geometry.exact import reflections, shade_centers
+from panoless.geometry.exact import mirrored_directions, shade_centers
 from panoless.geometry.surfels.model import Surfels
+from panoless.geometry.surfels.options import SurfelOptions
 from panoless.geometry.surfels.rendering import ALPHA_FLOOR, rasterize_surfels, surface_buffers, tiles_of
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.rasterize import Channels, RasterBuffers, RasterCamera
@@ -36,14 +37,6 @@ from panoless.kernels.reference.rasterize import rotation_matrices
 from panoless.numeric.robust import robust_weight
 from shinypartial.core.conventions import SOLID_ALPHA
 
-#: Share of the rays that is enough to find out whom to trust and how fine a map is worth it.
-TRIAL_SHARE = 1 / 8
-TRUST_VIEWS = 40
-TRIAL_RESOLUTION = 128
-TRUST_SCALE = 0.15
-#: Pixels' worth of an opinion that every surfel starts with, so that one that is hardly seen is hardly believed.
-PRIOR_PIXELS, PRIOR_TRUST = 1.0, 0.2
-TRUST_POWER = 4
 SH_DEGREE_0 = 0.28209479177387814
 
 
@@ -115,8 +108,8 @@ class SurfelMirror:
         )
         pixels = pixels[buffers.alpha.flatten()[pixels] > SOLID_SURFACE_ALPHA]
         diffuse = buffers.colors.flatten(1)[:, pixels]
-        radiance = (view.radiance.flatten(1)[:, pixels] - diffuse).T.contiguous()
-        directions = reflections(view, buffers.normals_camera, pixels)
+        radiance = view.radiance_at(pixels) - diffuse.T
+        directions = mirrored_directions(view.camera, pixels, buffers.normals_camera.flatten(1)[:, pixels])
         return Rays(directions, radiance, incoming=view.directions_world(pixels)), pixels
 
     def footprints(self, views: Views) -> Footprints | None:
@@ -129,22 +122,25 @@ class SurfelMirror:
         A trial map says which surfels to trust, and held-out views how fine the map should be, unless the
         configuration does; then all rays are solved.
         """
-        most = config.environment.rays
+        most, own = config.environment.rays, config.surfels.tuned
         observed = [(view, *self.observe_covered(view, pixels)) for view, pixels in at_most_pixels(views, most)]
-        resolution = config.environment.solve_resolution
-        few = most * TRIAL_SHARE
-        coarse = solve_environment(_thin([rays for _, rays, _ in observed], few), resolution or TRIAL_RESOLUTION)
-        trust = surfel_trust(views, self, coarse)
-        rays = [replace(rays, trust=self._trust_of(view, trust, pixels)) for view, rays, pixels in observed]
+        resolution, few = config.environment.solve_resolution, most * own.trial_share
+        trial_resolution = resolution or own.trial_resolution
+        coarse = solve_environment(_thin([rays for _, rays, _ in observed], few), trial_resolution)
+        trust = surfel_trust(views, self, coarse, own)
+        rays = [
+            replace(rays, trust=self._trust_of(view, trust, pixels) ** own.trust_power)
+            for view, rays, pixels in observed
+        ]
         trial = _thin(rays, few)
-        coarse = solve_environment(trial, resolution or TRIAL_RESOLUTION)
+        coarse = solve_environment(trial, trial_resolution)
         return solve_environment(rays, resolution or finest_resolution(trial, coarse), coarse), rays
 
     def _trust_of(self, view: TrainView, trust: Float[Tensor, "K"], pixels: Int[Tensor, "P"]) -> Float[Tensor, "P"]:
-        """The trust of the surfels that pixels see, blended, to the fourth power."""
+        """The trust of the surfels that pixels see, blended."""
         buffers = rasterize_attribute(view, self.surfels, trust[:, None].expand(-1, 3).contiguous())
         blended = buffers.colors[0].flatten()[pixels] / buffers.alpha.flatten()[pixels].clamp(min=ALPHA_FLOOR)
-        return blended.clamp(0, 1) ** TRUST_POWER
+        return blended.clamp(0, 1)
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
         """Blended over the surfels."""
@@ -218,8 +214,10 @@ def _thin(rays: Sequence[Rays], most: float) -> list[Rays]:
     return [batch.every(stride, index % stride) for index, batch in enumerate(rays)]
 
 
-def surfel_trust(views: Views, mirror: SurfelMirror, environment: Float[Tensor, "6 3 L L"]) -> Float[Tensor, "K"]:
-    """Share of the pixels that a surfel makes up, over some forty views, whose radiance agrees with a map; in [0, 1].
+def surfel_trust(
+    views: Views, mirror: SurfelMirror, environment: Float[Tensor, "6 3 L L"], options: SurfelOptions
+) -> Float[Tensor, "K"]:
+    """Share of the pixels that a surfel makes up, over some views, whose radiance agrees with a map; in [0, 1].
 
     A surfel whose normal is wrong disagrees in most views although its rays agree with each other in one; a pixel alone
     cannot tell. Agreement is the Geman–McClure weight of the residual; a pixel counts for a surfel by its share in the
@@ -227,20 +225,20 @@ def surfel_trust(views: Views, mirror: SurfelMirror, environment: Float[Tensor, 
     """
     surfels = mirror.surfels
     agreeing, total = torch.zeros_like(surfels.means[:, 0]), torch.zeros_like(surfels.means[:, 0])
-    for view in views.train[:: math.ceil(len(views.train) / TRUST_VIEWS)]:
+    for view in views.train[:: math.ceil(len(views.train) / options.trust_views)]:
         rays, pixels = mirror.observe_covered(view, view.solid)
         error = sample_cubemap(environment, rays.directions) - rays.radiance
         shares = torch.zeros(surfels.count, 3, device=surfels.means.device, requires_grad=True)
         with torch.enable_grad():
             buffers = rasterize_attribute(view, surfels.detached(), shares)
             votes = torch.zeros_like(buffers.colors).flatten(1)
-            votes[0, pixels], votes[1, pixels] = robust_weight(error, TRUST_SCALE), 1.0
+            votes[0, pixels], votes[1, pixels] = robust_weight(error, options.trust_scale), 1.0
             # A scalar, because torch loads much code to check the shapes of other cotangents.
             voted = (buffers.colors * votes.view_as(buffers.colors)).sum()
         (gradient,) = torch.autograd.grad(voted, shares)
         agreeing += gradient[:, 0]
         total += gradient[:, 1]
-    return (agreeing + PRIOR_TRUST * PRIOR_PIXELS) / (total + PRIOR_PIXELS)
+    return (agreeing + options.prior_trust * options.prior_pixels) / (total + options.prior_pixels)
 
 
 def rasterize_attribute(view: TrainView, surfels: Surfels, attribute: Float[Tensor, "K 3"]) -> RasterBuffers:

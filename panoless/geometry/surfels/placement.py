@@ -15,13 +15,6 @@ from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.first_surface.visual_hull import Hull, carve_hull
 from panoless.geometry.surfels.model import Surfels
 
-OVERLAP = 0.8
-#: A surfel's disk may leave the first surface, or the hull, by so much at twice its radius.
-SAG_PX = 1.0
-LEAST_RADIUS_PX = 1.5
-SHRINKING_STEPS, SHRINKAGE = 6, 0.75
-CANDIDATES = 8
-RELAXATION_ROUNDS = 3
 TIE_TOLERANCE = 1e-6
 INITIAL_OPACITY_LOGIT = 2.2
 INITIAL_ROUGHNESS_LOGIT = -2.2
@@ -37,12 +30,12 @@ def hull_surfels(views: Views, config: SurfelConfig, seed: int, options: FirstSu
     hull = carve_hull(views, config.hull_resolution, config.hull_votes, options)
     surface = complete_surface(hull, views, options) if config.initial == "thin-plate" else hull_surface(hull)
     facing = _faces_some_camera(surface, views)
-    return surfels_on_mesh(surface, config.count, hull.pixel, seed, facing, hull)
+    return surfels_on_mesh(surface, config, hull.pixel, seed, facing, hull)
 
 
 def surfels_on_mesh(
     surface: TriangleMesh,
-    count: int,
+    config: SurfelConfig,
     pixel: float,
     seed: int,
     facing: Bool[np.ndarray, "T"] | None = None,
@@ -50,50 +43,48 @@ def surfels_on_mesh(
 ) -> Surfels:
     """Surfels over the triangles of a mesh that are `facing`, or all, curved as it is, and within a hull if given."""
     vertex_normals, tensors = surface.vertex_normals(), surface.shape_tensors()
-    corners = surface.vertices[surface.triangles]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    areas = np.linalg.norm(cross, axis=1) / 2 * (1.0 if facing is None else facing)
+    areas = np.linalg.norm(surface.area_vectors(), axis=1) / 2 * (1.0 if facing is None else facing)
     face_normals = unit(vertex_normals[surface.triangles].sum(1))
     bends, _ = _principal(tensors[surface.triangles].mean(1), _tangent_frames(face_normals))
-    radii, largest = _radii(areas, bends, count, pixel)
+    radii, largest = _radii(areas, bends, pixel, config)
     rng = np.random.default_rng(seed)
     expected = np.cumsum(areas / radii.prod(1))
     # Stratified over the cumulative number, and more than are needed, so that they can be spread.
-    candidates = CANDIDATES * count
+    candidates = config.tuned.candidates * config.count
     picks = np.searchsorted(expected, (np.arange(candidates) + rng.random(candidates)) * expected[-1] / candidates)
-    faces = surface.triangles[np.minimum(picks, len(corners) - 1)]
+    faces = surface.triangles[np.minimum(picks, len(surface.triangles) - 1)]
     shares = rng.dirichlet([1.0, 1.0, 1.0], candidates)
     points = np.einsum("kv,kvi->ki", shares, surface.vertices[faces])
-    chosen = _spread(points, count)
+    chosen = _spread(points, config)
     points, faces, shares = points[chosen], faces[chosen], shares[chosen]
     normals, tensors = (np.einsum("kv,kv...->k...", shares, values[faces]) for values in (vertex_normals, tensors))
     bends, frames = _principal(tensors, _tangent_frames(unit(normals)))
-    scales = np.minimum(_reach(bends, pixel), largest)
+    scales = np.minimum(_reach(bends, pixel, config), largest)
     if hull is not None:
-        scales = _within_hull(hull, points, frames, scales)
+        scales = _within_hull(hull, points, frames, scales, config)
     return surfels_at(points, frames, scales, _shape_operators(tensors, frames))
 
 
 def _radii(
-    areas: Float[np.ndarray, "T"], bends: Float[np.ndarray, "T 2"], count: int, pixel: float
+    areas: Float[np.ndarray, "T"], bends: Float[np.ndarray, "T 2"], pixel: float, config: SurfelConfig
 ) -> tuple[Float[np.ndarray, "T 2"], float]:
-    """Radii of `count` overlapping surfels on faces of these principal curvatures, and the largest of them.
+    """Radii of as many overlapping surfels as configured on faces of these principal curvatures, and the largest.
 
-    The largest radius r solves Σ A/(min(r, l_u) min(r, l_v)) = n/OVERLAP², l the limit by curvature.
+    The largest radius r solves Σ A/(min(r, l_u) min(r, l_v)) = n/`overlap`², l the limit by curvature.
     """
-    limits = _reach(bends, pixel)
-    low, high = 1e-6, OVERLAP * math.sqrt(areas.sum() / count) * 100
+    limits = _reach(bends, pixel, config)
+    low, high = 1e-6, config.tuned.overlap * math.sqrt(areas.sum() / config.count) * 100
     for _ in range(60):
         middle = math.sqrt(low * high)
-        needed = (areas / np.minimum(limits, middle).prod(1)).sum() * OVERLAP**2
-        low, high = (middle, high) if needed > count else (low, middle)
+        needed = (areas / np.minimum(limits, middle).prod(1)).sum() * config.tuned.overlap**2
+        low, high = (middle, high) if needed > config.count else (low, middle)
     return np.minimum(limits, high), high
 
 
-def _reach(bends: Float[np.ndarray, "K 2"], pixel: float) -> Float[np.ndarray, "K 2"]:
-    """The radius s at which a disk leaves a surface of curvature κ by SAG_PX at 2 s, at least LEAST_RADIUS_PX."""
-    limit = np.sqrt(SAG_PX * pixel / 2 / np.maximum(np.abs(bends), 1e-9))
-    return np.maximum(limit, LEAST_RADIUS_PX * pixel)
+def _reach(bends: Float[np.ndarray, "K 2"], pixel: float, config: SurfelConfig) -> Float[np.ndarray, "K 2"]:
+    """The radius s at which a disk leaves a surface of curvature κ by `sag_px` at 2 s, at least `least_radius_px`."""
+    limit = np.sqrt(config.tuned.sag_px * pixel / 2 / np.maximum(np.abs(bends), 1e-9))
+    return np.maximum(limit, config.tuned.least_radius_px * pixel)
 
 
 def _within_hull(
@@ -101,27 +92,28 @@ def _within_hull(
     points: Float[np.ndarray, "K 3"],
     frames: Float[np.ndarray, "K 3 3"],
     radii: Float[np.ndarray, "K 2"],
+    config: SurfelConfig,
 ) -> Float[np.ndarray, "K 2"]:
-    """Radii, shrunk until the disk at twice the radius leaves the hull by no more than SAG_PX, along either axis.
+    """Radii, shrunk until the disk at twice the radius leaves the hull by no more than `sag_px`, along either axis.
 
     What lies outside the hull is seen outside the masks, where it would be a halo.
     """
     radii = radii.copy()
-    for _ in range(SHRINKING_STEPS):
+    for _ in range(config.tuned.shrinking_steps):
         tips = 2 * radii[:, :, None] * frames[:, :, :2].transpose(0, 2, 1)
         excess = np.maximum(hull.at(points[:, None] + tips), hull.at(points[:, None] - tips))
-        radii = np.where(
-            excess > SAG_PX * hull.pixel, np.maximum(SHRINKAGE * radii, LEAST_RADIUS_PX * hull.pixel), radii
-        )
+        shrunk = np.maximum(config.tuned.shrinkage * radii, config.tuned.least_radius_px * hull.pixel)
+        radii = np.where(excess > config.tuned.sag_px * hull.pixel, shrunk, radii)
     return radii
 
 
-def _spread(points: Float[np.ndarray, "C 3"], count: int) -> Int[np.ndarray, "K"]:
-    """Indices of `count` of the points, spread evenly among them: Lloyd's relaxation of a regular choice."""
+def _spread(points: Float[np.ndarray, "C 3"], config: SurfelConfig) -> Int[np.ndarray, "K"]:
+    """Indices of as many points as configured, spread evenly among all: Lloyd's relaxation of a regular choice."""
     from scipy.spatial import cKDTree
 
+    count = config.count
     centers = points[:: max(len(points) // count, 1)][:count]
-    for _ in range(RELAXATION_ROUNDS):
+    for _ in range(config.tuned.relaxation_rounds):
         _, owner = cKDTree(centers).query(points)
         total = np.bincount(owner, minlength=count)
         sums = np.stack([np.bincount(owner, column, minlength=count) for column in points.T], 1)
@@ -137,25 +129,27 @@ def _principal(
 ) -> tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, "K 3 3"]]:
     """Principal curvatures of shape tensors, and the frames turned about their normals to the principal directions."""
     tangents = frames[:, :, :2]
-    shape = np.einsum("kiu,kij,kjv->kuv", tangents, tensors, tangents)
+    shape = _within_tangents(tensors, frames)
     bends, directions = np.linalg.eigh((shape + shape.transpose(0, 2, 1)) / 2)
     tangent_u = np.einsum("kiu,ku->ki", tangents, directions[:, :, 0])
     return bends, np.stack([tangent_u, np.cross(frames[:, :, 2], tangent_u), frames[:, :, 2]], 2)
 
 
-def places_within(boundary: Float[np.ndarray, "N 2"], count: int, seed: int) -> tuple[Float[np.ndarray, "K 2"], float]:
+def places_within(
+    boundary: Float[np.ndarray, "N 2"], config: SurfelConfig, seed: int
+) -> tuple[Float[np.ndarray, "K 2"], float]:
     """Points of a hexagonal grid within an boundary, and the radius of surfels there."""
     from skimage.measure import points_in_poly
 
     low, extent = boundary.min(0), np.ptp(boundary, 0)
     x, y = boundary.T
     area = abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
-    across = math.sqrt(area / count / math.sin(math.pi / 3))
+    across = math.sqrt(area / config.count / math.sin(math.pi / 3))
     up = across * math.sin(math.pi / 3)
     shift = np.random.default_rng(seed).random(2) - 1
     row, column = np.indices((math.ceil(extent[1] / up) + 2, math.ceil(extent[0] / across) + 2)).reshape(2, -1)
     grid = low + np.stack([(column + row % 2 / 2 + shift[0]) * across, (row + shift[1]) * up], 1)
-    return grid[points_in_poly(grid, boundary)], OVERLAP * math.sqrt(area / count)
+    return grid[points_in_poly(grid, boundary)], config.tuned.overlap * math.sqrt(area / config.count)
 
 
 def random_surfels(config: SurfelConfig, seed: int) -> Surfels:
@@ -220,10 +214,17 @@ def _tangent_frames(normals: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3
     return np.stack([tangent_u, np.cross(normals, tangent_u), normals], 2)
 
 
+def _within_tangents(
+    tensors: Float[np.ndarray, "K 3 3"], frames: Float[np.ndarray, "K 3 3"]
+) -> Float[np.ndarray, "K 2 2"]:
+    """Tᵀ S T with T the first two columns of a frame."""
+    tangents = frames[:, :, :2]
+    return np.einsum("kiu,kij,kjv->kuv", tangents, tensors, tangents)
+
+
 def _shape_operators(
     tensors: Float[np.ndarray, "K 3 3"], frames: Float[np.ndarray, "K 3 3"]
 ) -> Float[np.ndarray, "K 3"]:
     """(a, b, c) in the tangent frame of S, dn = S dx: the normal field is n₀ − …, hence a = −t_uᵀ S t_u."""
-    tangents = frames[:, :, :2]
-    shape = -np.einsum("kiu,kij,kjv->kuv", tangents, tensors, tangents)
+    shape = -_within_tangents(tensors, frames)
     return np.stack([shape[:, 0, 0], (shape[:, 0, 1] + shape[:, 1, 0]) / 2, shape[:, 1, 1]], 1)

@@ -13,7 +13,7 @@ from panoless.config import FitConfig
 from panoless.environment.cubemap import look_up
 from panoless.environment.visibility import accumulate
 from panoless.geometry.base import Training, TrainingObserver
-from panoless.geometry.exact import reflections
+from panoless.geometry.exact import mirrored_directions
 from panoless.geometry.surfels.density import DensityStatistics, grow_and_prune, propagate_normals, reset_opacities
 from panoless.geometry.surfels.losses import photometric_paper
 from panoless.geometry.surfels.mirror import SurfelMirror
@@ -203,7 +203,8 @@ class SurfelTrainer:
         observed = None
         if self.config.visibility == "online":
             with torch.no_grad():
-                observed = Observed(reflections(view, raster.normals_camera, pixels), raster.alpha.flatten()[pixels])
+                directions = mirrored_directions(view.camera, pixels, raster.normals_camera.flatten(1)[:, pixels])
+                observed = Observed(directions, raster.alpha.flatten()[pixels])
         return LossTerms(total, photometric, objective.normal_consistency, objective.silhouette), observed
 
     def _composited(
@@ -211,7 +212,7 @@ class SurfelTrainer:
     ) -> Tensor:
         """Eq. 9 over the whole image, to which the given pixels add more than the background."""
         alpha = buffers.alpha.flatten()[pixels]
-        directions = reflections(view, buffers.normals_camera, pixels)
+        directions = mirrored_directions(view.camera, pixels, buffers.normals_camera.flatten(1)[:, pixels])
         specular = look_up(self.optimizer.environment, directions, self.config.environment.activation).T
         if self.config.loss.roughness_weighted:
             specular = specular * (1 - self._roughness(view, surfels).flatten()[pixels]).square()

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from shinypartial.core.camera import Camera
 from shinypartial.dataset.perturb import masks, sensor
 from shinypartial.dataset.perturb.options import MaskErrors, SensorErrors, Side
-from shinypartial.dataset.read import read_view, read_whole_picture
+from shinypartial.dataset.read import read_whole_view
 from shinypartial.dataset.schema import Frame, View
 
 Resampling = Callable[[np.ndarray], np.ndarray]
@@ -47,7 +47,7 @@ class Picture:
 
 def read_uncut(frame: Frame) -> Picture:
     """Read a view together with what lies beyond its mask."""
-    view, (straight, shown) = read_view(frame), read_whole_picture(frame)
+    view, straight, shown = read_whole_view(frame)
     return Picture(straight, shown, view.alpha, view.normals_world, view.depth, view.self_reflection)
 
 

@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from panoless.alignment.lens import farther, focal_pull
+from panoless.alignment.lens import focal_pull
 from panoless.capture.corrections import with_focal_factor
-from panoless.capture.views import Views
+from panoless.capture.rays import pose_of
+from panoless.capture.views import TrainView, Views
+from panoless.capture.zoom import farther, farther_motion, farther_rays
 from panoless.geometry.plane.kind import PlaneMirror
 from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
 
@@ -31,6 +33,22 @@ def test_a_camera_farther_away_sees_the_object_as_one_as_much_smaller(views: Vie
         near = scaled(np.exp(-change)).observe(with_focal_factor(view, float(np.exp(change))), view.solid)
         away = scaled(1.0).observe(farther(view, change), view.solid)
         assert near.directions.numpy() == pytest.approx(away.directions.numpy(), abs=1e-5)
+
+
+def test_rays_of_a_camera_farther_away_are_those_of_its_pixels(views: Views) -> None:
+    """To all orders; and to first order they are turned and shifted as told."""
+    view, change = views.train[0], 0.03
+
+    def rays(of: TrainView) -> tuple[np.ndarray, np.ndarray]:
+        directions = of.directions_world(of.solid).double().numpy()
+        return np.tile(of.position, (len(directions), 1)), directions / np.linalg.norm(directions, axis=1)[:, None]
+
+    before, axes = rays(view), np.tile(pose_of(view.camera)[0][2], (len(view.solid), 1))
+    for found, expected in zip(farther_rays(*before, axes, change), rays(farther(view, change)), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+    motion, ahead = 1e-6 * farther_motion(*before, axes), farther_rays(*before, axes, 1e-6)
+    np.testing.assert_allclose(ahead[1] - before[1], np.cross(motion[:, :3], before[1]), atol=1e-11)
+    np.testing.assert_allclose(ahead[0] - before[0], motion[:, 3:], atol=1e-11)
 
 
 @pytest.mark.parametrize("wrong", [-0.02, 0.0, 0.02])

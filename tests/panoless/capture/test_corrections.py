@@ -8,9 +8,10 @@ import torch
 from skimage.measure import find_contours
 
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections, with_outline_moved
-from panoless.capture.encoding import LDR, RadianceEncoding
+from panoless.capture.encoding import encoding_of
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import TrainView, Views
+from panoless.config import FitConfig
 from shinypartial.core.conventions import SOLID_ALPHA
 from tests.support.mirror_plane import camera_at, train_view
 
@@ -55,14 +56,13 @@ def test_only_what_a_photograph_shows_whole_is_solid(offset_px: float) -> None:
 
 def test_gains_are_divided_out_but_for_saturated_pixels() -> None:
     """Radiance comes back exactly where neither exposure saturates, and never above the largest value."""
-    tinted = RadianceEncoding(tint=(0.8, 1.0, 0.5))
     view = disk(12.0)
-    for encoding in (LDR, tinted):
-        largest = encoding.saturation[:, None, None]
+    for config in (FitConfig(), FitConfig(tint=(0.8, 1.0, 0.5))):
+        largest = encoding_of(config).saturation[:, None, None]
         radiance = view.radiance * largest
         for gain in (0.7, 1.4):
             taken = replace(view, radiance=torch.minimum(radiance * gain, largest))
-            (found,) = Corrections(gains=np.array([gain])).applied(views_of(taken), encoding).train
+            (found,) = Corrections(gains=np.array([gain])).applied(views_of(taken), config).train
             saturated = taken.radiance >= 0.998 * largest
             assert torch.allclose(found.radiance[~saturated], radiance[~saturated], atol=1e-6)
             assert torch.equal(found.radiance[saturated], largest.expand_as(radiance)[saturated])
@@ -70,6 +70,6 @@ def test_gains_are_divided_out_but_for_saturated_pixels() -> None:
 
 def test_no_corrections_leave_views_alone() -> None:
     views = views_of(disk(12.0))
-    assert NO_CORRECTIONS.applied(views, LDR).train[0] is views.train[0]
+    assert NO_CORRECTIONS.applied(views, FitConfig()).train[0] is views.train[0]
     assert NO_CORRECTIONS.exposure_stops is None
     assert Corrections(gains=np.array([0.5, 2.0])).exposure_stops == pytest.approx(1.0)

@@ -63,10 +63,14 @@ def test_a_far_world_is_looked_up_as_it_is_mirrored() -> None:
     assert not FAR.inverse_distance(directions).any()
 
 
-def test_harmonics_have_a_mean_square_of_one() -> None:
-    """And are orthogonal: over many directions, the error of whose means is about 1 %."""
-    basis = harmonics(unit(40_000), 9)
-    np.testing.assert_allclose(basis.T @ basis / len(basis), np.eye(9), atol=0.04)
+def test_harmonics_are_polynomials_in_the_order_of_stored_coefficients() -> None:
+    """With a mean square of one over the sphere, which is that of x, xy and x² − y² to within their factors."""
+    x, y, z = unit(100).T
+    first = [np.ones_like(x), *(np.sqrt(3) * each for each in (x, y, z))]
+    second = [np.sqrt(15) * each for each in (x * y, y * z, z * x, (x**2 - y**2) / 2)]
+    expected = np.stack([*first, *second, np.sqrt(5) / 2 * (3 * z**2 - 1)], -1)
+    for count in (0, 1, 4, 9):
+        np.testing.assert_allclose(harmonics(unit(100), count), expected[:, :count], atol=1e-14)
 
 
 def test_light_changes_with_direction_and_distance_as_rows_say() -> None:

@@ -113,7 +113,7 @@ def test_a_finished_fit_is_returned_at_once(finished: FinishedFit, monkeypatch: 
     def forbidden(*_) -> None:
         raise AssertionError("a finished fit reads no view")
 
-    monkeypatch.setattr(fit_module, "load_views", forbidden)
+    monkeypatch.setattr(fit_module, "configured_views", forbidden)
     again = fit(finished.dataset, finished.config, finished.folder)
     assert again.iteration == finished.config.iterations
     assert_same(again, finished.state)

@@ -13,7 +13,7 @@ from panoless.geometry.free_form.hollows import Chart, Hollow, Relief, smooth_ma
 from panoless.geometry.free_form.kind import FreeFormFamily
 from panoless.geometry.free_form.observations import solid_pixels
 from panoless.geometry.free_form.options import DEFAULTS, ConcaveOptions
-from panoless.geometry.free_form.spread import FinalRays, disagreement, texels_of
+from panoless.geometry.free_form.spread import FinalRays, cells_of, disagreement
 from panoless.geometry.free_form.surface import LevelSet
 from tests.panoless.geometry.free_form.test_fit import normal_errors_deg
 from tests.support.mirror_body import (
@@ -57,7 +57,7 @@ def directions(count: int) -> np.ndarray:
 
 
 def test_cells_of_directions_are_about_equally_large() -> None:
-    cells = texels_of(directions(200_000), 6)
+    cells = cells_of(directions(200_000), 6)
     share = np.bincount(cells, minlength=216) * 216 / 200_000
     # Equal angles: 1.37 at the corners of a face against 1 in its middle, about their mean.
     assert 0.75 < share.min() < share.max() < 1.3

@@ -8,6 +8,7 @@ import torch
 
 from panoless.capture.rays import reflect
 from panoless.capture.silhouettes import mask_contours
+from panoless.config import SurfelConfig
 from panoless.geometry.revolution.fit import propose_revolution
 from panoless.geometry.revolution.interior import search_interior
 from panoless.geometry.revolution.model import RAY_EPSILON, SurfaceOfRevolution, revolution_buffers, trace_reflections
@@ -114,7 +115,7 @@ def test_a_body_turned_over_is_where_it_was() -> None:
 def test_surfels_of_a_ball_have_its_normals_and_curvature() -> None:
     """Normals point from the center; both principal curvatures are −1/R, as for outward normals."""
     surface, radius = ball(0.7), 0.7
-    surfels = surfels_on_revolution(surface, 1500)
+    surfels = surfels_on_revolution(surface, SurfelConfig(count=1500))
     outward = (surfels.means.numpy() - surface.origin) / radius
     middle = np.abs(outward @ surface.axis) < 0.95
     normals = rotation_matrices(surfels.quats)[:, :, 2].numpy()
