@@ -22,7 +22,7 @@ from panoless.geometry.free_form.observations import PixelRays, inner_distance_p
 from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions
 from panoless.geometry.free_form.photometric import Sights
 from panoless.geometry.free_form.rendering import free_form_buffers, free_form_light
-from panoless.geometry.free_form.start import first_level_set
+from panoless.geometry.free_form.start import first_surfaces, started
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import Trust, full_trust
 from panoless.geometry.surfels.mirror import SurfelMirror
@@ -156,18 +156,19 @@ class FreeFormFamily(ExactFamily):
     finds_poses: ClassVar[bool] = True
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
-        """The first surface as a level set; one that is closed explains any silhouettes in the end.
+        """First surfaces as level sets; one that is closed explains any silhouettes in the end.
 
         None where there are too few views to judge it by.
         """
         if len(views.train) < config.free_form.least_views and not asked:
             return None
-        return Proposal(first_level_set(views, config), 0.0, 1.0)
+        return Proposal(first_surfaces(views, config), 0.0, 1.0)
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The first surface, trusted everywhere."""
-        trust = full_trust(proposal.shape, config.free_form.trust_cells)
-        return FreeFormMirror(proposal.shape, trust, config.environment.trace, config.free_form)
+        surface = proposal.shape.surface
+        trust = full_trust(surface, config.free_form.trust_cells)
+        return FreeFormMirror(surface, trust, config.environment.trace, config.free_form)
 
     def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
         """On from a fit, in rounds with that logarithm among the unknowns."""
@@ -181,7 +182,8 @@ class FreeFormFamily(ExactFamily):
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """All coefficients by outlines and photographs together."""
         if proposal.fitted is None:
-            surface, trust, poses = fit_free_form(views, proposal.shape, config.free_form)
+            start = started(views, proposal.shape, config.free_form)
+            surface, trust, poses = fit_free_form(views, start, config.free_form)
         else:
             found = _followed(views, proposal.fitted, config.free_form)
             surface, trust, poses = found.surface, found.trust, found.poses

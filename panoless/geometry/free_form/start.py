@@ -3,12 +3,13 @@ pixels agree best.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 
 from panoless.capture.views import Views
 from panoless.config import FitConfig
+from panoless.environment.surroundings import FAR, Surroundings
 from panoless.first_surface.completion import completed, trusted_hull
 from panoless.first_surface.mesh import TriangleMesh
 from panoless.first_surface.visual_hull import carve_hull
@@ -21,11 +22,26 @@ from panoless.numeric.gauss_newton import keep_if_better
 from shinypartial.io.progress import Progress
 
 
-def first_level_set(views: Views, config: FitConfig) -> LevelSet:
-    """The first surface as a level set, under the tension of the plate that leaves least disagreement, or what it
-    descends to.
+@dataclass(frozen=True)
+class FirstSurfaces:
+    """What a fit may start from, in one world: the plate whose pixels disagree least, held inside the hull, and the
+    plates that descend.
+    """
 
-    Outlines don't tell how far an object bulges between their contacts: a stone does, a box does not. Candidates are
+    plain: LevelSet
+    plates: tuple[LevelSet, ...]
+    surroundings: Surroundings = FAR
+
+    @property
+    def surface(self) -> LevelSet:
+        """The plain one there."""
+        return replace(self.plain, surroundings=self.surroundings)
+
+
+def first_surfaces(views: Views, config: FitConfig) -> FirstSurfaces:
+    """First surfaces as level sets, under the tensions of the plate that leave least disagreement.
+
+    Outlines don't tell how far an object bulges between their contacts: a stone does, a box does not. Plates are
     solved once, without what holds them inside the hull, which hardly changes their disagreement.
     """
     options, first = config.free_form, config.first_surface
@@ -36,46 +52,41 @@ def first_level_set(views: Views, config: FitConfig) -> LevelSet:
     def level_set(mesh: TriangleMesh) -> LevelSet:
         return level_set_of(mesh, options.start_cells, options.margin)
 
-    pixels = solid_pixels(views, options.start_pixels)
-    inner = pixels.inner_px > options.inner_px
-    scored = Scored(pixels.rays.chosen(inner), pixels.radiance[inner], options.concave)
-
-    def disagreement(surface: LevelSet) -> float:
-        return scored(surface, options.concave.resolutions[-1])
-
-    if not inner.any():
-        return level_set(completed(known, first, options.start_tensions[0]))
-    candidates = {tension: level_set(completed(known, first, tension, rounds=1)) for tension in options.start_tensions}
-    order = sorted(candidates, key=lambda tension: disagreement(candidates[tension]))
-    plain = level_set(completed(known, first, order[0]))
-    starts = [candidates[tension] for tension in order[: options.descent.followed]]
-    return started(views, plain, starts, disagreement, options)
+    disagreement = _disagreement(views, options)
+    plates = {tension: level_set(completed(known, first, tension, rounds=1)) for tension in options.start_tensions}
+    order = sorted(plates, key=lambda tension: disagreement(plates[tension]))
+    followed = tuple(plates[tension] for tension in order[: options.descent.followed])
+    return FirstSurfaces(level_set(completed(known, first, order[0])), followed)
 
 
-def started(
-    views: Views,
-    plain: LevelSet,
-    candidates: Sequence[LevelSet],
-    disagreement: Callable[[LevelSet], float],
-    options: FreeFormOptions,
-) -> LevelSet:
-    """What the best of the candidates descends to, if pixels agree better under it than under a plain start, both after
+def started(views: Views, first: FirstSurfaces, options: FreeFormOptions) -> LevelSet:
+    """What the best of the plates descends to, if pixels agree better under it than under the plain surface, both after
     the first round of the fit.
     """
-    descent = options.descent
+    descent, plain = options.descent, first.surface
     if not descent.rounds:
         return plain
     short = replace(options, outline_points=min(descent.outline_points, options.outline_points), poses="off")
     tried, rest = descent.rounds[: descent.tried], descent.rounds[descent.tried :]
-    steps = [each.steps for each in (*tried * len(candidates), *rest, *options.rounds[:1] * 2)]
-    progress = Progress("looking for a start", sum(steps))
+    steps = [each.steps for each in (*tried * len(first.plates), *rest, *options.rounds[:1] * 2)]
+    progress, disagreement = Progress("looking for a start", sum(steps)), _disagreement(views, options)
 
     def taken(surface: LevelSet, rounds: Sequence[FreeFormRound], options: FreeFormOptions) -> LevelSet:
         return coarse_stage(views, surface, rounds, options, progress).surface
 
     with torch.no_grad():
-        best = min((taken(each, tried, short) for each in candidates), key=disagreement)
-        descended = taken(best, rest, short)
+        plates = (replace(plate, surroundings=first.surroundings) for plate in first.plates)
+        best = min((taken(plate, tried, short) for plate in plates), key=disagreement)
         return keep_if_better(
-            (plain, descended), lambda each: disagreement(taken(each, options.rounds[:1], options)), descent.least_gain
+            (plain, taken(best, rest, short)),
+            lambda each: disagreement(taken(each, options.rounds[:1], options)),
+            descent.least_gain,
         )
+
+
+def _disagreement(views: Views, options: FreeFormOptions) -> Callable[[LevelSet], float]:
+    """How badly pixels of all views agree under a surface."""
+    pixels = solid_pixels(views, options.start_pixels)
+    inner = pixels.inner_px > options.inner_px
+    scored = Scored(pixels.rays.chosen(inner), pixels.radiance[inner], options.concave)
+    return lambda surface: scored(surface, options.concave.resolutions[-1]) if inner.any() else 1.0
