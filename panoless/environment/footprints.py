@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import max_pool2d
+from torch.nn.functional import max_pool2d, normalize
 
 from panoless.environment.cubemap import resample
 from panoless.environment.options import DEFAULTS, FootprintMapOptions
+from panoless.environment.rays import Rays
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap, scatter_cubemap
 from panoless.numeric.conjugate_gradients import conjugate_gradients
 from panoless.numeric.robust import robust_weight
@@ -29,6 +30,23 @@ class PixelFootprints:
 
     directions: Float[Tensor, "P K 3"]
     radiance: Float[Tensor, "P 3"]
+    trust: Float[Tensor, "P"] | None = None
+    """How far each is believed beforehand; None: all alike."""
+
+    @classmethod
+    def centers(cls, rays: Rays) -> "PixelFootprints":
+        """Rays as pixels without an area."""
+        return cls(rays.directions[:, None], rays.radiance, rays.trust)
+
+    def rays(self) -> Rays:
+        """As rays in their mean directions."""
+        return Rays(normalize(self.directions.mean(1), dim=1), self.radiance, self.trust)
+
+    def every(self, stride: int, first: int) -> "PixelFootprints":
+        """Every stride-th pixel from the first."""
+        part = slice(first, None, stride)
+        trust = None if self.trust is None else self.trust[part]
+        return PixelFootprints(self.directions[part].contiguous(), self.radiance[part].contiguous(), trust)
 
     def seen(self, environment: Float[Tensor, "6 C L L"]) -> Float[Tensor, "P C"]:
         """Means of the map over the areas."""
@@ -46,6 +64,8 @@ class PixelFootprints:
     ) -> Float[Tensor, "P 3"]:
         """Robust weights of the errors of what is seen of a map; zero where it and the pixel are saturated."""
         weight = robust_weight(seen.minimum(saturation) - self.radiance, scale)[:, None]
+        if self.trust is not None:
+            weight = weight * self.trust[:, None]
         return weight * ~(seen.minimum(self.radiance) >= saturated * saturation)
 
 

@@ -1,7 +1,9 @@
 """The tuned numbers of the map from pixel footprints, of its confidence, and of the distance of what it shows."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from msgspec import Meta
 
 
 @dataclass(frozen=True)
@@ -112,3 +114,43 @@ class MaterialOptions:
     least_gain: float = 0.02
     """Share by which the held-out error has to fall. It falls by 0.045 and 0.065 on golden copies of vase and
     sculpture; texels as wide as pixels leave much of it in any case."""
+    roughness: Literal["auto", "off"] = "auto"
+    """Whether the mirror may be slightly rough; not of surfels, whose normals are too coarse to tell, and never in a
+    high dynamic range."""
+    known_roughness: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.0
+    """Where it is known, in units of Blender's principled shader and in [0, 0.5]; 0: held-out views tell it."""
+    first_roughness: float = 0.085
+    """That of which held-out views are asked first: it lowers their error by 0.04 and 0.03 of it on copies of sculpture
+    and vase with 0.1, and raises it by 0.06, 0.22 and 0.15 on sculpture, vase and mirror themselves."""
+    least_roughness_gain: float = 0.01
+    """Share by which that has to lower the held-out error."""
+    roughnesses: tuple[float, float] = (0.06, 0.3)
+    """Among these it is searched for. Not tuned."""
+    roughness_trials: int = 6
+    """So many are tried in the search, which tells it to 15 %. Not tuned."""
+    judged_pixels: int = 60_000
+    """About so many pixels at most make a map under which roughness is judged: two or three a texel. With fewer, the
+    map of a smooth mirror fits noise, and sculpture itself is taken for rough; with many, a smooth mirror in a blurred
+    world explains the copy of vase better."""
+    judged_resolution: int = 64
+    """Texels along a face side of it. With 128, a roughness of 0.1 comes out as 0.07 to 0.09."""
+    judged_rounds: int = 8
+    """Steps that sharpen it for the first question; the search takes those of the exported map."""
+    sharpening_rounds: int = 20
+    """Steps that sharpen the exported map of a rough mirror. Further ones amplify noise."""
+    step_power: float = 1.5
+    """Exponent of a step: 1 is the method's, more goes faster. Not tuned."""
+    sharpening_scale: float = 0.16
+    """Robust scale of radiance errors, as that of footprints."""
+    lit: float = 0.95
+    """Share of the largest value from which a texel of the start is saturated."""
+    lamp_border_rad: float = 0.0123
+    """By so much lamps are smaller at the start than what they saturate: a texel of 128. Twice as much costs 1 dB on a
+    copy of mirror with 0.1."""
+    lamp_light: float = 3.0
+    """Their radiance at the start, in largest values of views. Chosen among 2, 3 and 10 on copies of vase, mirror and
+    sculpture with 0.1: with 10, sculpture loses 2.6 dB."""
+    inertia: float = 1e-4
+    """Added above and below the bar of a step, in rays times radiance, so that what no pixel sees stays. Not tuned."""
+    least_light: float = 1e-3
+    """Radiance at the start of what is darker: zero would stay zero. Not tuned."""

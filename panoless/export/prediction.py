@@ -118,6 +118,7 @@ def export_prediction(
         verdict=state.verdict,
         surroundings=_near_surroundings(around, state.frame),
         reflectance=None if state.reflectance is None else state.reflectance.tint,
+        roughness=state.roughness,
         iteration=state.iteration if snapshot else None,
     )
     write_info(folder, info)
@@ -168,10 +169,11 @@ def _stated_seconds(state: FitState) -> dict[str, float]:
 def _write_test_views(dataset: Dataset, state: FitState, config: FitConfig, folder: Path) -> None:
     """Render and write the test views on two threads; the middle one is drawn in its parts."""
     progress = Progress("exporting test views", len(dataset.test))
+    environment = state.shown_environment()
 
     def export(index: int) -> None:
         frame = dataset.test[index]
-        parts = _render_frame(frame, state, config)
+        parts = _render_frame(frame, state, environment, config)
         view = View(
             radiance=parts.radiance.permute(1, 2, 0).numpy(),
             alpha=parts.alpha.numpy(),
@@ -191,11 +193,12 @@ def _write_test_views(dataset: Dataset, state: FitState, config: FitConfig, fold
             progress.advance()
 
 
-def _render_frame(frame: Frame, state: FitState, config: FitConfig) -> Decomposition:
-    assert state.environment is not None
+def _render_frame(
+    frame: Frame, state: FitState, environment: Float[Tensor, "6 3 L L"], config: FitConfig
+) -> Decomposition:
     distance = np.linalg.norm(frame.camera.position_world - state.frame.center) / state.frame.radius
     camera = raster_camera(frame.camera, state.frame, 0.1 * float(distance))
-    return render(state.geometry, state.environment, camera, state.frame, config, state.reflectance)
+    return render(state.geometry, environment, camera, state.frame, config, state.reflectance)
 
 
 def viewpoint_of(frame: ObjectFrame) -> Float[np.ndarray, "3"]:

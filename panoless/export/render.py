@@ -39,8 +39,8 @@ def render(
     config: FitConfig,
     reflectance: Reflectance | None = None,
 ) -> Decomposition:
-    """Render one camera with the final environment (radiance, not logits) in a mirror of that reflectance, else of the
-    configured tint.
+    """Render one camera with an environment as the surface shows it (radiance, not logits) in a mirror of that
+    reflectance, else of the configured tint.
     """
     with torch.no_grad():
         buffers = geometry.buffers(camera)

@@ -15,7 +15,7 @@ from panoless.capture.poses import Poses
 from panoless.capture.rays import unit_rays_camera
 from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
-from panoless.environment.footprints import Footprints
+from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays
 from panoless.environment.surroundings import Surroundings
 from panoless.kernels.rasterize import RasterCamera
@@ -312,3 +312,13 @@ def observe_views(views: Views, geometry: Geometry, max_rays: int) -> Iterator[R
     """What solid pixels observed, at most `max_rays` of them, a batch a view."""
     for view, pixels in at_most_pixels(views, max_rays):
         yield geometry.observe(view, pixels)
+
+
+def pixel_areas(views: Views, geometry: Geometry, max_rays: int) -> list[PixelFootprints]:
+    """What solid pixels saw as means over their areas, of pixels that see the environment smoothly; of kinds without
+    areas their centers, at most `max_rays` of them.
+    """
+    footprints = geometry.footprints(views)
+    if footprints is not None:
+        return footprints.smooth
+    return [PixelFootprints.centers(rays) for rays in observe_views(views, geometry, max_rays)]

@@ -3,24 +3,30 @@
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from panoless.capture.encoding import encoding_of
 from panoless.capture.views import Views
 from panoless.config import FitConfig
+from panoless.environment.lobe import Lobe
 from panoless.environment.resolution import count_rays
+from panoless.environment.roughness import sharpened_map, with_smaller_lamps
+from panoless.environment.solve import solve_environment
 from panoless.environment.visibility import agreement, visibility_from_agreement, visibility_from_evidence
-from panoless.geometry.base import observe_views, usable_views
+from panoless.geometry.base import Geometry, observe_views, pixel_areas, usable_views
 from panoless.reconstruct.state import FitState
-from panoless.selection.material import as_perfect_mirror, earned_reflectance
+from panoless.selection.material import as_perfect_mirror, earned_reflectance, earned_roughness
 
 GRAY = 0.5
 
 
 def complete(state: FitState, views: Views, config: FitConfig) -> Views:
-    """Set reflectance, environment and visibility of a state from its geometry and corrected photographs. These are
-    returned as a perfect mirror would have shown them.
+    """Set reflectance, roughness, environment and visibility of a state from its geometry and corrected photographs.
+    These are returned as a mirror of all light would have shown them.
 
     The map is solved in closed form, unless the configuration keeps that of an iterative fit, which knows no material.
+    Only kinds in closed form are asked for a roughness: wrong normals blur a map as well.
     """
     usable = usable_views(views, state.geometry)
     if config.environment.solve or state.training is None:
@@ -30,6 +36,7 @@ def complete(state: FitState, views: Views, config: FitConfig) -> Views:
         shown = zip(usable.train, views.train, strict=True)
         usable = replace(usable, train=tuple(replace(part, radiance=view.radiance) for part, view in shown))
         config = replace(config, tint=state.reflectance.tint)
+    state.roughness = earned_roughness(usable, state.geometry, config) if state.training is None else None
     _solve(state, usable, config)
     return views
 
@@ -40,15 +47,31 @@ def _solve(state: FitState, views: Views, config: FitConfig) -> None:
     with torch.no_grad():
         if config.environment.solve or training is None:
             environment, rays = state.geometry.solve_map(views, config)
+            shown = environment
+            if state.roughness is not None:
+                environment = _of_rough_mirror(state.roughness, state.geometry, views, config, environment.shape[-1])
+                shown = Lobe.of(state.roughness, environment.shape[-1]).blurred(environment)
             if not config.environment.fill:
                 environment = torch.where(count_rays(rays, environment.shape[-1]) > 0, environment, GRAY)
         else:
             rays = list(observe_views(views, state.geometry, config.environment.rays))
             sigmoid = config.environment.activation == "sigmoid"
             environment = torch.sigmoid(training.environment) if sigmoid else training.environment
+            shown = environment
         if config.visibility == "online" and training is not None:
             state.visibility = visibility_from_evidence(training.evidence)
         else:
-            agreed = agreement(rays, environment, encoding.saturation, config.confidence)
+            agreed = agreement(rays, shown, encoding.saturation, config.confidence)
             state.visibility = visibility_from_agreement(agreed, config.confidence)
         state.environment = encoding.decoded(environment)
+
+
+def _of_rough_mirror(
+    roughness: float, geometry: Geometry, views: Views, config: FitConfig, resolution: int
+) -> Float[Tensor, "6 3 L L"]:
+    """The sharpened map. It starts from one of pixel centers: footprints, which sharpen as well, would do so twice."""
+    areas, options = pixel_areas(views, geometry, config.environment.rays), config.material
+    saturation = encoding_of(config).saturation
+    start = with_smaller_lamps(solve_environment([each.rays() for each in areas], resolution), saturation, options)
+    lobe = Lobe.of(roughness, resolution)
+    return sharpened_map(start, areas, lobe, saturation, options, options.sharpening_rounds)

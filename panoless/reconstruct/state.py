@@ -11,6 +11,7 @@ from torch import Tensor
 
 from panoless.capture.object_frame import ObjectFrame
 from panoless.config import FitConfig, config_from_dict
+from panoless.environment.lobe import Lobe
 from panoless.environment.reflectance import Reflectance
 from panoless.geometry.base import Geometry, Training, from_plain, to_plain
 from panoless.geometry.registry import FAMILIES
@@ -42,6 +43,8 @@ class FitState:
     """The name of what computed it."""
     reflectance: Reflectance | None = None
     """Of the object, where held-out views ask for one; None: it mirrors all light."""
+    roughness: float | None = None
+    """Of the object, where held-out views ask for one; None: it is smooth."""
     verdict: Trust | None = None
     """How far it is to be trusted; None before the end, and in runs of an earlier version."""
 
@@ -49,6 +52,13 @@ class FitState:
     def iteration(self) -> int:
         """Number of finished steps."""
         return 0 if self.training is None else self.training.iteration
+
+    def shown_environment(self) -> Float[Tensor, "6 3 L L"]:
+        """The map as the object shows it: blurred where it is rough. Only a finished fit has one."""
+        assert self.environment is not None
+        if self.roughness is None:
+            return self.environment
+        return Lobe.of(self.roughness, self.environment.shape[-1]).blurred(self.environment)
 
     def to(self, device: torch.device) -> "FitState":
         """The same state on a device."""

@@ -1,10 +1,12 @@
-"""What the mirror is made of, by what a finished geometry explains: a metal's color, which pales at grazing angles.
+"""What the mirror is made of, by what a finished geometry explains: a metal's color, which pales at grazing angles, and
+how rough it is.
 
 It is taken for a perfect mirror until held-out views speak against it.
 """
 
+import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,13 +16,17 @@ from torch import Tensor
 from panoless.capture.encoding import NO_TINT, RadianceEncoding, encoding_of
 from panoless.capture.views import Views, split_held_out
 from panoless.config import FitConfig
+from panoless.environment.footprints import PixelFootprints
+from panoless.environment.lobe import Lobe
 from panoless.environment.options import MaterialOptions
 from panoless.environment.rays import Rays, joined_rays
 from panoless.environment.reflectance import Reflectance, find_reflectance, left_unexplained, unsaturated
 from panoless.environment.resolution import ERROR_SCALE
-from panoless.geometry.base import Geometry, observe_views
+from panoless.environment.roughness import sharpened_map
+from panoless.environment.solve import solve_environment
+from panoless.geometry.base import Geometry, observe_views, pixel_areas
 from panoless.numeric.robust import bounded_error
-from panoless.selection.held_out import is_clearly_lower
+from panoless.selection.held_out import held_out_parts, is_clearly_lower
 
 
 def earned_reflectance(views: Views, geometry: Geometry, config: FitConfig) -> Reflectance | None:
@@ -75,3 +81,79 @@ def as_perfect_mirror(views: Views, posed: Views, geometry: Geometry, reflectanc
         share = reflectance.share(geometry.buffers(seen.camera).cosines(seen.camera))
         train.append(replace(view, radiance=_without(view.radiance, share, reflectance)))
     return replace(views, train=tuple(train))
+
+
+def earned_roughness(views: Views, geometry: Geometry, config: FitConfig) -> float | None:
+    """The roughness of the object in (0, 0.5], if held-out views are clearly better explained by it; else None. Views
+    are those of usable pixels.
+
+    Four fifths of the views make the maps by which the others are judged: one that is shown as it is, and others that a
+    lobe blurs, after the same steps from the same start, and on areas of pixels, because a map that knows of none is
+    better blurred for that. A first roughness tells whether to search on (Brent 1973). Nobody asks where it is
+    known, or in a high dynamic range, in which a mean of encoded values is not the encoding of the mean.
+    """
+    from scipy.optimize import minimize_scalar
+
+    options, encoding = config.material, encoding_of(config)
+    if options.roughness == "off" or encoding.high_dynamic_range:
+        return None
+    if options.known_roughness > 0:
+        return options.known_roughness
+    with torch.no_grad():
+        trial = _RoughnessTrial.of(views, geometry, config)
+        if trial is None:
+            return None
+        rounds = options.judged_rounds
+        smooth, first = trial.errors(None, rounds), trial.errors(options.first_roughness, rounds)
+        clearly = replace(config.selection, least_gain=options.least_roughness_gain)
+        if not is_clearly_lower(first, smooth, clearly):
+            return None
+        found = minimize_scalar(
+            lambda logarithm: float(trial.errors(math.exp(logarithm), options.sharpening_rounds).mean()),
+            bounds=np.log(options.roughnesses),
+            method="bounded",
+            options={"maxiter": options.roughness_trials},
+        )
+        return math.exp(found.x)
+
+
+@dataclass(frozen=True)
+class _RoughnessTrial:
+    """Areas of pixels of the views that make a map, those of each other view, and the start of that map."""
+
+    known: list[PixelFootprints]
+    held_out: list[list[PixelFootprints]]
+    start: Float[Tensor, "6 3 L L"]
+    saturation: Float[Tensor, "3"]
+    options: MaterialOptions
+
+    @classmethod
+    def of(cls, views: Views, geometry: Geometry, config: FitConfig) -> "_RoughnessTrial | None":
+        """None where there are too few views."""
+        parts, options = held_out_parts(views), config.material
+        if parts is None:
+            return None
+        known, *held_out = (
+            _thinned(pixel_areas(each, geometry, config.environment.rays), options.judged_pixels)
+            for each in (parts[0], *(replace(views, train=(view,)) for view in parts[1].train))
+        )
+        if not known:
+            return None
+        start = solve_environment([each.rays() for each in known], options.judged_resolution)
+        return cls(known, held_out, start, encoding_of(config).saturation, options)
+
+    def errors(self, roughness: float | None, rounds: int) -> Float[np.ndarray, "V"]:
+        """Mean of ‖e‖²/(‖e‖² + s²) of each held-out view with that roughness, None being none, after so many rounds."""
+        lobe, options = Lobe.of(roughness, self.start.shape[-1]), self.options
+        found = sharpened_map(self.start, self.known, lobe, self.saturation, options, rounds)
+        shown, found_errors = lobe.blurred(found), []
+        for view in self.held_out:
+            error = [each.seen(shown).minimum(self.saturation.to(shown)) - each.radiance for each in view]
+            found_errors.append(float(bounded_error(torch.cat(error), ERROR_SCALE).mean()) if error else 0.0)
+        return np.array(found_errors)
+
+
+def _thinned(areas: Sequence[PixelFootprints], most: int) -> list[PixelFootprints]:
+    """About so many of the pixels at most, evenly."""
+    stride = max(1, -(-sum(len(each.radiance) for each in areas) // most))
+    return [each.every(stride, index % stride) for index, each in enumerate(areas)]

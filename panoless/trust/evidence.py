@@ -70,6 +70,8 @@ class Evidence:
     """Standard deviation of the exposures of the views, as far as the fit took it back."""
     focal_factor: float = 1.0
     """The focal length that the fit found over what is said of it."""
+    roughness: float = 0.0
+    """Of the object, as the fit found it."""
 
 
 def gather_evidence(
@@ -78,9 +80,10 @@ def gather_evidence(
     visibility: Float[Tensor, "6 L L"],
     options: TrustOptions,
     corrections: Corrections = NO_CORRECTIONS,
+    roughness: float | None = None,
 ) -> Evidence:
-    """The evidence for a geometry in the views that it was fitted to, after their corrections, which are told along;
-    `visibility` is that of the final map.
+    """The evidence for a geometry in the views that it was fitted to, after their corrections, which are told along as
+    the roughness is; `visibility` is that of the final map.
     """
     found = usable_views(views, geometry).train
     used = [index for index, view in enumerate(views.train) if len(view.solid)]
@@ -107,6 +110,7 @@ def gather_evidence(
         mask_offset_px=corrections.mask_offset_px,
         exposure_stops=corrections.exposure_stops or 0.0,
         focal_factor=corrections.focal_factor,
+        roughness=roughness or 0.0,
     )
 
 

@@ -44,6 +44,8 @@ class TrustOptions:
     misses the hollow has 0.62, one that finds it 0.0005."""
     largest_saturated: Positive = 0.3
     """Share of saturated pixels from which it is."""
+    largest_roughness: Positive = 0.1
+    """Roughness of the object from which it is. With 0.1, vase loses 7 dB and sculpture 1."""
     least_one_color: Positive = 0.01
     """Light that one color a view leaves unexplained, up to which a fit is doubted."""
     refused: Positive = 2.0

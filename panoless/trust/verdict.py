@@ -19,6 +19,7 @@ MATTER = "Photograph a shinier object: this one shows its own color."
 SHAPE = "Look at poses, masks and exposure first; parts that are concave or see themselves may be wrong as well."
 PART = "Look at the confidence of the mesh: a hollow that no outline shows may have been missed, or be too deep."
 VIEWS = "Add views: at least five that see the object from different sides."
+SHINE = "Photograph a shinier object: what a rough one blurs comes back in part only, beside lamps least of all."
 TEXTURE = "Take it to surroundings that differ from one direction to another, or expose longer."
 EXPOSURE = "Photograph with a shorter exposure, or in high dynamic range."
 #: Light that one color a view leaves unexplained is not told from none below this.
@@ -74,6 +75,12 @@ DOUBTS = (
             "explains little of it"
         ),
         PART,
+    ),
+    _Doubt(
+        lambda found: found.roughness,
+        lambda options: options.largest_roughness,
+        lambda found: f"the object has a roughness of {found.roughness:.2g}, which blurs what it mirrors",
+        SHINE,
     ),
     _Doubt(
         lambda found: found.saturated,

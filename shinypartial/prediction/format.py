@@ -129,7 +129,8 @@ class PredictionInfo:
     finished steps of a snapshot, `model_selection` how the kind of model was chosen; `model` says the same in free
     words; `verdict` is what the method says of its result; `surroundings` how near it found them; `reflectance` what
     share of the light (linear red, green, blue) it found the object to mirror at normal incidence, where that is not
-    all of it. Each is None where it is unknown or has no meaning.
+    all of it; `roughness` how rough, in units of Blender's principled shader, where it is not smooth. Each is None
+    where it is unknown or has no meaning.
     """
 
     method: str
@@ -149,6 +150,7 @@ class PredictionInfo:
     iteration: int | None = None
     surroundings: NearSurroundings | None = None
     reflectance: tuple[Share, Share, Share] | None = None
+    roughness: Share | None = None
 
     @property
     def hardware_text(self) -> str:

@@ -297,6 +297,7 @@ def _provenance(info: PredictionInfo, scores: Scores) -> list[tuple[str, str]]:
         ("protocol", scores.protocol),
         ("method", info.method),
         *([("model", info.model)] if info.model else []),
+        *([("roughness", f"{info.roughness:.2g}")] if info.roughness is not None else []),
     ]
 
 

@@ -90,17 +90,19 @@ def test_a_state_survives_the_disk(tmp_path: Path, final: bool) -> None:
         assert torch.equal(loaded.environment, state.environment)
 
 
-def test_a_reflectance_survives_the_disk_and_an_earlier_version_had_none(tmp_path: Path) -> None:
-    state = replace(some_state(True), reflectance=Reflectance(np.array([1.0, 0.77, 1 / 3])))
+def test_a_material_survives_the_disk_and_an_earlier_version_had_none(tmp_path: Path) -> None:
+    state = replace(some_state(True), reflectance=Reflectance(np.array([1.0, 0.77, 1 / 3])), roughness=0.1)
     loaded = reloaded(tmp_path, state)
+    assert loaded.roughness == 0.1
     assert loaded.reflectance is not None
     assert loaded.reflectance.tint == (1.0, 0.77, 1 / 3)
     content = torch.load(tmp_path / CHECKPOINT, weights_only=True)
-    del content["reflectance"]
+    del content["reflectance"], content["roughness"]
     torch.save(content, tmp_path / CHECKPOINT)
     earlier = load_state(tmp_path)
     assert earlier is not None
     assert earlier.reflectance is None
+    assert earlier.roughness is None
 
 
 def exact_kinds() -> list[Geometry]:

@@ -11,7 +11,7 @@ from panoless.capture.views import TrainView, Views
 from panoless.geometry.plane.kind import PlaneMirror
 from panoless.trust.evidence import Evidence, gather_evidence
 from panoless.trust.options import TrustOptions
-from panoless.trust.verdict import MATTER, POSES, TEXTURE, judge
+from panoless.trust.verdict import MATTER, POSES, SHINE, TEXTURE, judge
 from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
 
 OPTIONS = TrustOptions(resolution=32)
@@ -167,3 +167,11 @@ def test_photographs_of_one_color_tell_nothing(views: Views, radiance: float) ->
 def test_a_verdict_holds_every_figure_by_name(views: Views) -> None:
     found = evidence(views)
     assert set(judge(found, OPTIONS).evidence) == {field.name for field in fields(Evidence)}
+
+
+def test_a_rough_mirror_is_not_trusted(views: Views) -> None:
+    """With the roughness that the fit found, however well its views are explained."""
+    found = gather_evidence(views, MIRROR, VISIBILITY, OPTIONS, roughness=0.18)
+    verdict = judge(found, OPTIONS)
+    assert (verdict.verdict, verdict.remedy) == ("partly", SHINE)
+    assert "roughness of 0.18" in verdict.reason
