@@ -57,12 +57,18 @@ class Patch:
     scored: Scored
 
 
-def concave_start(views: Views, surface: LevelSet, options: ConcaveOptions) -> LevelSet | None:
-    """The surface with the hollows that make pixels agree better; None where there is none.
+def concave_start(views: Views, surface: LevelSet, settled: LevelSet, options: ConcaveOptions) -> LevelSet | None:
+    """The surface with the hollows that make pixels agree better; None where there is none, or where the same surface
+    explains all pixels once it is `settled` by steps.
 
     Hollows are looked for under one patch after the other, each on the surface that those before it left.
     """
     pixels = solid_pixels(views, options.rays)
+    settled = settled.resampled(options.cells)
+    if not any(
+        any(unexplained_patches(chart, settled, pixels, options)) for chart in charts(settled, pixels.rays, options)
+    ):
+        return None
     coarse, found = surface.resampled(options.cells), False
     for chart in charts(coarse, pixels.rays, options):
         for patch in unexplained_patches(chart, coarse, pixels, options):

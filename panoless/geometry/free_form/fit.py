@@ -77,7 +77,8 @@ def fit_free_form(
 
     with torch.no_grad():
         stage = coarse_stage(solved, start, options.rounds, options, progress)
-        hollowed = concave_start(solved, start, options.concave) if options.concave.search else None
+        search = options.concave.search
+        hollowed = concave_start(solved, start, stage.surface, options.concave) if search else None
         if hollowed is not None:
             deeper = coarse_stage(solved, hollowed, options.concave.rounds, options)
             stage = better(stage, deeper, options.concave.least_held_out_gain) if held_out else deeper

@@ -172,7 +172,7 @@ def test_a_hollow_that_no_outline_shows_is_found(dish: tuple[Body, Views]) -> No
     body, views = dish
     lidded = Body(lambda x: np.maximum(ellipsoid(OUTER).value(x), x[:, 0] - RIM))
     start = level_set_of(lidded, views)
-    found = concave_start(views, start, OPTIONS)
+    found = concave_start(views, start, start, OPTIONS)
     assert found is not None
     before, after = (hollow_errors_deg(each, body, views) for each in (start, found))
     wrong = before > 10
@@ -184,18 +184,26 @@ def test_a_hollow_that_no_outline_shows_is_found(dish: tuple[Body, Views]) -> No
 def test_a_convex_body_is_left_alone() -> None:
     """Pixels agree all over it, so nothing is searched."""
     views = body_views(ellipsoid(), 14, 56)
-    assert concave_start(views, level_set_of(ellipsoid((0.97, 0.82, 0.65)), views), OPTIONS) is None
+    start = level_set_of(ellipsoid((0.97, 0.82, 0.65)), views)
+    assert concave_start(views, start, start, OPTIONS) is None
+
+
+def test_what_steps_explain_is_not_searched(dish: tuple[Body, Views]) -> None:
+    body, views = dish
+    lidded = Body(lambda x: np.maximum(ellipsoid(OUTER).value(x), x[:, 0] - RIM))
+    assert concave_start(views, level_set_of(lidded, views), level_set_of(body, views), OPTIONS) is None
 
 
 def test_photographs_of_one_color_tell_no_hollow(dish: tuple[Body, Views]) -> None:
     body, views = dish
     plain = tuple(replace(view, radiance=0 * view.radiance + 0.5) for view in views.train)
-    assert concave_start(replace(views, train=plain), level_set_of(body, views), OPTIONS) is None
+    start = level_set_of(body, views)
+    assert concave_start(replace(views, train=plain), start, start, OPTIONS) is None
 
 
 def test_a_surface_that_no_pixel_meets_has_no_hollow(dish: tuple[Body, Views]) -> None:
     far = level_set_of(Body(lambda x: np.linalg.norm(x - [0, 0, 9.0], axis=1)), dish[1])
-    assert concave_start(dish[1], far, OPTIONS) is None
+    assert concave_start(dish[1], far, far, OPTIONS) is None
 
 
 @pytest.mark.slow
