@@ -50,6 +50,7 @@ def coarse_config() -> FitConfig:
             rounds=tuple(replace(each, rays=5000) for each in config.free_form.rounds[:2]),
             finer=(),
             concave=replace(config.free_form.concave, search=False),
+            descent=replace(config.free_form.descent, rounds=()),
         ),
     )
 
