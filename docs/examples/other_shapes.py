@@ -4,7 +4,8 @@
     python docs/examples/other_shapes.py --shapes brick torus --set free_form.descent.rounds='[]'
 
 Each shape is rendered, fitted with the preset `fast` and scored by commands in processes of their own. Finished ones
-are skipped, so the same line continues. Figures go to docs/results/other-shapes.json, unless the fit has other options.
+are skipped, so the same line continues. Figures, but no times, go to docs/results/other-shapes.json, unless the fit has
+other options.
 """
 
 import argparse
@@ -161,7 +162,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--set", action="append", default=[], help="SECTION.OPTION=VALUE of `panoless fit`")
     options = parser.parse_args(arguments)
     for name in options.shapes:
-        found = figures(make(name, options.set))
+        found = figures(make(name, options.set)) or {}
+        found = {key: value for key, value in found.items() if not key.startswith("seconds")}
         print(json.dumps({name: found}, indent=1))
         if not options.set:
             numbers = json.loads(NUMBERS.read_text(encoding="utf-8")) if NUMBERS.exists() else {}
