@@ -2,22 +2,23 @@
 
     python docs/examples/self_reflection.py datasets/vase-400 runs/vase-400-default --output self-reflection.json
 
-A geometry that can trace its own reflections observes nothing through such pixels; surfels can't. A fit never reads the
-mask; this example does, for every `--every`-th training view. Results of other datasets in the output are kept.
+Those are the pixels through which a geometry observes the surroundings only if its mirrored rays are not traced against
+itself. Surfels and height fields don't do that. A fit never reads the mask; this example does, for every `--every`-th
+training view. Results of other datasets in the output are kept.
 """
 
 import argparse
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.ndimage import binary_dilation
 
-from panoless.capture.views import load_views
+from panoless.capture.views import TrainView, load_views
 from panoless.config import FitConfig
-from panoless.geometry.base import Geometry
 from panoless.reconstruct.state import load_state
 from shinypartial.dataset.read import open_dataset, read_view
 from shinypartial.dataset.schema import Dataset
@@ -41,13 +42,24 @@ def main() -> None:
         state = load_state(run)
         if state is None:
             parser.error(f"no checkpoint in {run}")
+        if not hasattr(state.geometry, "occlusion_test"):
+            parser.error(f"the {state.geometry.kind} of {run} is not traced against itself")
         found[run.name] = score(dataset, state.geometry, options.every)
     everything = read_json(options.output, "earlier scores") if options.output.exists() else {}
     write_json(options.output, {**everything, dataset.name: found})
     print(json.dumps(found, indent=1))
 
 
-def score(dataset: Dataset, geometry: Geometry, every: int) -> dict[str, object]:
+def observed_pixels(geometry: Any, view: TrainView) -> np.ndarray:
+    """Whether a geometry observes the surroundings through each pixel (flat)."""
+    observed = np.zeros(view.mask.numel(), bool)
+    numbers = torch.arange(len(observed), dtype=torch.float64).view(1, *view.mask.shape).expand(3, -1, -1)
+    numbered = geometry.observe(replace(view, radiance=numbers), view.solid).radiance[:, 0]
+    observed[numbered.long().numpy()] = True
+    return observed
+
+
+def score(dataset: Dataset, geometry: Any, every: int) -> dict[str, object]:
     """Precision and recall over wholly covered pixels, for the pixels found and for those within a margin of them."""
     counts = {margin: np.zeros(3, int) for margin in MARGINS_PX}
     solid_pixels = 0
@@ -58,12 +70,10 @@ def score(dataset: Dataset, geometry: Geometry, every: int) -> dict[str, object]
         rows, columns = np.nonzero(truth.alpha > 0)
         top, left = max(rows.min() - CROP_MARGIN_PX, 0), max(columns.min() - CROP_MARGIN_PX, 0)
         true = truth.self_reflection[top : top + view.camera.height, left : left + view.camera.width] > 0
-        solid, observed = np.zeros((2, view.mask.numel()), bool)
+        solid = np.zeros(view.mask.numel(), bool)
         solid[view.solid.numpy()] = True
-        numbers = torch.arange(view.mask.numel(), dtype=torch.float32).view(1, *view.mask.shape).expand(3, -1, -1)
-        numbered = geometry.observe(replace(view, radiance=numbers), view.solid).radiance[:, 0]
-        observed[numbered.long().numpy()] = True
-        found, solid = (solid & ~observed).reshape(view.mask.shape), solid.reshape(view.mask.shape)
+        observed = [observed_pixels(each, view) for each in (geometry, replace(geometry, occlusion_test=False))]
+        found, solid = (each.reshape(view.mask.shape) for each in (observed[1] & ~observed[0], solid))
         solid_pixels += int(solid.sum())
         for margin in MARGINS_PX:
             marked = binary_dilation(found, np.ones((3, 3)), margin) if margin else found
