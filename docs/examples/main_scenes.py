@@ -48,12 +48,19 @@ def make(scene: str, resolution: int) -> None:
     """Render, fit and score a scene, as far as that is not done."""
     dataset = DATASETS / f"{scene}-{resolution}"
     prediction, oracle = PREDICTIONS / f"{dataset.name}-default", PREDICTIONS / f"{dataset.name}{ORACLE_SUFFIX}"
+    make_folders(dataset, prediction, oracle, ("--scene", scene, "--resolution", resolution))
+
+
+def make_folders(
+    dataset: Path, prediction: Path, oracle: Path, scene: Sequence[object], settings: Sequence[object] = ()
+) -> None:
+    """The same of any scene, by arguments of `shinypartial generate`, and of `panoless fit`."""
     if not (dataset / CHECKSUMS).exists():
-        run("shinypartial", "generate", "--scene", scene, "--resolution", resolution, "--output", dataset)
+        run("shinypartial", "generate", *scene, "--output", dataset)
     if not is_scored(oracle):
         run("shinypartial", "oracle", dataset, "--output", oracle)
     if not (prediction / DESCRIPTION).exists():
-        run("panoless", "fit", dataset, "--output", prediction)
+        run("panoless", "fit", dataset, *settings, "--output", prediction)
     if not is_scored(prediction):
         run("shinypartial", "evaluate", prediction, "--oracle", oracle)
 

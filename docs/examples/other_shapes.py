@@ -14,11 +14,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from main_scenes import figures, is_scored, run
+from main_scenes import figures, make_folders
 
-from shinypartial.dataset.schema import CHECKSUMS
 from shinypartial.io.files import write_json, write_text
-from shinypartial.prediction.format import DESCRIPTION
 
 FOLDER = Path("build/other-shapes")
 NUMBERS = Path("docs/results/other-shapes.json")
@@ -140,18 +138,11 @@ def make(name: str, options: Sequence[str]) -> Path:
     scene, dataset = FOLDER / "scenes" / name / "scene.toml", FOLDER / "datasets" / name
     fitted = FOLDER / "predictions" / "-".join([name, *options]).replace("/", "_")
     oracle = FOLDER / "predictions" / f"{name}-oracle"
-    if not (dataset / CHECKSUMS).exists():
-        scene.parent.mkdir(parents=True, exist_ok=True)
-        write_text(scene, TRIALS[name].recipe(name))
-        views = ("--resolution", 160, "--train", 50, "--test", 6)
-        run("shinypartial", "generate", "--scene", scene, *views, "--output", dataset)
-    if not is_scored(oracle):
-        run("shinypartial", "oracle", dataset, "--output", oracle)
-    if not (fitted / DESCRIPTION).exists():
-        settings = (word for option in options for word in ("--set", option))
-        run("panoless", "fit", dataset, "--preset", "fast", "--output", fitted, *settings)
-    if not is_scored(fitted):
-        run("shinypartial", "evaluate", fitted, "--oracle", oracle)
+    scene.parent.mkdir(parents=True, exist_ok=True)
+    write_text(scene, TRIALS[name].recipe(name))
+    generated = ("--scene", scene, "--resolution", 160, "--train", 50, "--test", 6)
+    settings = [word for option in options for word in ("--set", option)]
+    make_folders(dataset, fitted, oracle, generated, ("--preset", "fast", *settings))
     return fitted
 
 

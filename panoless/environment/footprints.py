@@ -6,8 +6,10 @@ radiance s, c = min(s, mean_k E(ω_k)): a saturated pixel has no error while its
 above s is told by pixels that see a lamp in part.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float
@@ -48,6 +50,14 @@ class PixelFootprints:
         trust = None if self.trust is None else self.trust[part]
         return PixelFootprints(self.directions[part].contiguous(), self.radiance[part].contiguous(), trust)
 
+    @classmethod
+    def joined(cls, parts: "Sequence[PixelFootprints]") -> "PixelFootprints":
+        """All pixels of at least one part, which all say how far they are believed, or none."""
+        trust = [part.trust for part in parts if part.trust is not None]
+        directions = torch.cat([part.directions for part in parts])
+        radiance = torch.cat([part.radiance for part in parts])
+        return cls(directions, radiance, torch.cat(trust) if trust else None)
+
     def seen(self, environment: Float[Tensor, "6 C L L"]) -> Float[Tensor, "P C"]:
         """Means of the map over the areas."""
         count = self.directions.shape[1]
@@ -67,6 +77,15 @@ class PixelFootprints:
         if self.trust is not None:
             weight = weight * self.trust[:, None]
         return weight * ~(seen.minimum(self.radiance) >= saturated * saturation)
+
+
+Batch = TypeVar("Batch", Rays, PixelFootprints)
+
+
+def thinned(batches: Sequence[Batch], most: float) -> list[Batch]:
+    """About `most` of the rays or pixels at most: every k-th, beginning elsewhere in each batch."""
+    stride = max(1, math.ceil(sum(len(batch.radiance) for batch in batches) / most))
+    return [batch.every(stride, index % stride) for index, batch in enumerate(batches)]
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from torch import Tensor
 from panoless.capture.encoding import NO_TINT, RadianceEncoding, encoding_of
 from panoless.capture.views import Views, split_held_out
 from panoless.config import FitConfig
-from panoless.environment.footprints import PixelFootprints
+from panoless.environment.footprints import PixelFootprints, thinned
 from panoless.environment.lobe import Lobe
 from panoless.environment.options import MaterialOptions
 from panoless.environment.rays import Rays, joined_rays
@@ -134,7 +134,7 @@ class _RoughnessTrial:
         if parts is None:
             return None
         known, *held_out = (
-            _thinned(pixel_areas(each, geometry, config.environment.rays), options.judged_pixels)
+            thinned(pixel_areas(each, geometry, config.environment.rays), options.judged_pixels)
             for each in (parts[0], *(replace(views, train=(view,)) for view in parts[1].train))
         )
         if not known:
@@ -151,9 +151,3 @@ class _RoughnessTrial:
             error = [each.seen(shown).minimum(self.saturation.to(shown)) - each.radiance for each in view]
             found_errors.append(float(bounded_error(torch.cat(error), ERROR_SCALE).mean()) if error else 0.0)
         return np.array(found_errors)
-
-
-def _thinned(areas: Sequence[PixelFootprints], most: int) -> list[PixelFootprints]:
-    """About so many of the pixels at most, evenly."""
-    stride = max(1, -(-sum(len(each.radiance) for each in areas) // most))
-    return [each.every(stride, index % stride) for index, each in enumerate(areas)]

@@ -99,9 +99,7 @@ class FreeFormMirror(ExactGeometry):
         parts = [part for part in found if len(part.radiance)]
         if not parts:
             return None
-        areas = PixelFootprints(
-            torch.cat([part.directions for part in parts]), torch.cat([part.radiance for part in parts])
-        )
+        areas = PixelFootprints.joined(parts)
         return Footprints([areas], lambda: areas)
 
     def shade(

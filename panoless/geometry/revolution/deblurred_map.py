@@ -39,7 +39,7 @@ def pixel_footprints(
         directions = torch.stack(list(at.within(OFFSETS)), 1).to(view.radiance.device)
         found.append(PixelFootprints(directions, view.radiance_at(pixels)))
         others.append(places[~smooth])
-    joined = [_joined(found[first : first + batch]) for first in range(0, len(found), batch)]
+    joined = [PixelFootprints.joined(found[first : first + batch]) for first in range(0, len(found), batch)]
     smooth_batches = [areas for areas in joined if len(areas.radiance)]
     return Footprints(smooth_batches, lambda: _trace(chosen, surface, others, options))
 
@@ -59,7 +59,3 @@ def _trace(
     directions = paths.directions.reshape(-1, bundles.rays_per_pixel, 3)[whole]
     radiance = torch.from_numpy(bundles.radiance[whole])
     return PixelFootprints(torch.from_numpy(directions).float().to(device), radiance.float().to(device))
-
-
-def _joined(areas: Sequence[PixelFootprints]) -> PixelFootprints:
-    return PixelFootprints(torch.cat([each.directions for each in areas]), torch.cat([each.radiance for each in areas]))

@@ -14,7 +14,7 @@ from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.poses import Poses
 from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
-from panoless.environment.footprints import Footprints
+from panoless.environment.footprints import Footprints, thinned
 from panoless.environment.rays import Rays
 from panoless.environment.resolution import finest_resolution
 from panoless.environment.solve import solve_environment
@@ -126,13 +126,13 @@ class SurfelMirror:
         observed = [(view, *self.observe_covered(view, pixels)) for view, pixels in at_most_pixels(views, most)]
         resolution, few = config.environment.solve_resolution, most * own.trial_share
         trial_resolution = resolution or own.trial_resolution
-        coarse = solve_environment(_thin([rays for _, rays, _ in observed], few), trial_resolution)
+        coarse = solve_environment(thinned([rays for _, rays, _ in observed], few), trial_resolution)
         trust = surfel_trust(views, self, coarse, own)
         rays = [
             replace(rays, trust=self._trust_of(view, trust, pixels) ** own.trust_power)
             for view, rays, pixels in observed
         ]
-        trial = _thin(rays, few)
+        trial = thinned(rays, few)
         coarse = solve_environment(trial, trial_resolution)
         return solve_environment(rays, resolution or finest_resolution(trial, coarse), coarse), rays
 
@@ -206,12 +206,6 @@ class SurfelMirror:
 
 def _columns(names: Sequence[str], matrix: Tensor) -> dict[str, Tensor]:
     return {name: matrix[:, index] for index, name in enumerate(names)}
-
-
-def _thin(rays: Sequence[Rays], most: float) -> list[Rays]:
-    """About `most` of the rays at most: every k-th, beginning elsewhere in each batch."""
-    stride = max(1, math.ceil(sum(len(batch.directions) for batch in rays) / most))
-    return [batch.every(stride, index % stride) for index, batch in enumerate(rays)]
 
 
 def surfel_trust(
