@@ -142,8 +142,10 @@ class Geometry(Protocol):
         """What pixels of a view observed of the environment: reflected directions and radiance."""
         ...
 
-    def footprints(self, views: Views) -> Footprints | None:
-        """Directions over the areas of pixels, for a map that knows of them; None: a pixel is its center."""
+    def footprints(self, views: Views, max_pixels: int) -> Footprints | None:
+        """Directions over the areas of pixels, for a map that knows of them; None: a pixel is its center. A kind that
+        traces each of them takes no more than about `max_pixels`.
+        """
         ...
 
     def solve_map(self, views: Views, config: FitConfig) -> tuple[Float[Tensor, "6 3 L L"], list[Rays]]:
@@ -318,7 +320,7 @@ def pixel_areas(views: Views, geometry: Geometry, max_rays: int) -> list[PixelFo
     """What solid pixels saw as means over their areas, of pixels that see the environment smoothly; of kinds without
     areas their centers, at most `max_rays` of them.
     """
-    footprints = geometry.footprints(views)
+    footprints = geometry.footprints(views, max_rays)
     if footprints is not None:
         return footprints.smooth
     return [PixelFootprints.centers(rays) for rays in observe_views(views, geometry, max_rays)]

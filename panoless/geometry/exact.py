@@ -44,7 +44,7 @@ class ExactGeometry:
         """With their cameras where the fit found them."""
         return views if self.poses is None else self.poses.moved(views)
 
-    def footprints(self, views: Views) -> Footprints | None:
+    def footprints(self, views: Views, max_pixels: int) -> Footprints | None:
         """None: a pixel is its center."""
         return None
 
@@ -63,7 +63,7 @@ class ExactGeometry:
         environment = solve_environment(rays, resolution)
         encoding = encoding_of(config)
         if not encoding.high_dynamic_range:
-            footprints = self.footprints(views)
+            footprints = self.footprints(views, config.environment.rays)
             if footprints is not None:
                 environment = deblur_map(footprints, environment, encoding.saturation, config.footprint_map)
         return environment, rays

@@ -83,7 +83,7 @@ def assess(state: FitState, views: Views, config: FitConfig) -> Trust:
     assert state.visibility is not None
     corrections = state.selection.corrections
     with torch.no_grad():
-        found = gather_evidence(views, state.geometry, state.visibility, config.trust, corrections, state.roughness)
+        found = gather_evidence(views, state.geometry, state.visibility, config, corrections, state.roughness)
     return judge(found, config.trust)
 
 

@@ -1,8 +1,8 @@
 """What training views say about a finished fit: held-out light, silhouettes, and how much was there to be seen.
 
-Every fifth view is held out from a map that is solved anew for the final geometry. What it leaves unexplained is
-compared with what two models leave that know no mirror: one color a view, and one color a place on the surface, as a
-matte object has.
+Every fifth view is held out from a map that is solved anew for the final geometry, of pixels as areas where the kind
+knows them: what a pixel blurs is no error of the shape. What the map leaves unexplained is compared with what two
+models leave that know no mirror: one color a view, and one color a place on the surface, as a matte object has.
 """
 
 import math
@@ -15,11 +15,15 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
+from panoless.capture.encoding import encoding_of
 from panoless.capture.masks import MASK_LEVEL
 from panoless.capture.silhouettes import mask_distance_px
 from panoless.capture.views import TrainView, Views, at_most_pixels, split_held_out
+from panoless.config import FitConfig
+from panoless.environment.footprints import Footprints, PixelFootprints, deblur_map, thinned
+from panoless.environment.resolution import densest_resolution
 from panoless.environment.solve import solve_environment
-from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, usable_views
+from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, pixel_areas, usable_views
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.robust import NORMAL_MEDIAN, bounded_error
 from panoless.trust.options import TrustOptions
@@ -78,13 +82,14 @@ def gather_evidence(
     views: Views,
     geometry: Geometry,
     visibility: Float[Tensor, "6 L L"],
-    options: TrustOptions,
+    config: FitConfig,
     corrections: Corrections = NO_CORRECTIONS,
     roughness: float | None = None,
 ) -> Evidence:
     """The evidence for a geometry in the views that it was fitted to, after their corrections, which are told along as
     the roughness is; `visibility` is that of the final map.
     """
+    options = config.trust
     found = usable_views(views, geometry).train
     used = [index for index, view in enumerate(views.train) if len(view.solid)]
     seen = tuple(views.train[index] for index in used)
@@ -92,7 +97,7 @@ def gather_evidence(
     solid, kept = (max(each.num_solid, 1) for each in (views, usable))
     looked_at = [_evenly(part, options.views) for part in split_held_out(usable.train)]
     surfaces = [[(view, geometry.buffers(view.camera)) for view in part] for part in looked_at]
-    light = _light(usable, surfaces, geometry, visibility, options)
+    light = _light(usable, surfaces, geometry, visibility, config)
     silhouettes = [_silhouette(*each) for part in surfaces for each in part]
     distance, shift, overlap = (np.array([each[i] for each in silhouettes]) for i in range(3))
     focal = np.array([view.camera.fx for part in looked_at for view in part])
@@ -134,31 +139,31 @@ def _light(
     surfaces: Sequence[Sequence[tuple[TrainView, SurfaceBuffers]]],
     geometry: Geometry,
     visibility: Float[Tensor, "6 L L"],
-    options: TrustOptions,
+    config: FitConfig,
 ) -> dict[str, float | None]:
     """The figures that come from held-out light; None where there are too few views."""
-    nothing = dict.fromkeys(LIGHT_FIGURES)
+    nothing, options = dict.fromkeys(LIGHT_FIGURES), config.trust
     kept, held_out = surfaces
     if not kept or not held_out:
         return nothing
     solved = replace(views, train=tuple(split_held_out(views.train)[0]))
     tested = replace(views, train=tuple(view for view, _ in held_out))
-    rays = list(observe_views(solved, geometry, options.rays))
-    environment = solve_environment(rays, min(options.resolution, visibility.shape[-1]))
+    environment = _predicting_map(_seen_areas(solved, geometry, config), config)
     device = views.train[0].mask.device
     places, parts = _Cells.empty(options.cells, 3, device), _Cells.empty(options.part_cells, 1, device)
     for view, surface in kept:
         places.add(view, surface, view.solid, view.radiance_at(view.solid))
     errors, confidence, explained, plain = [], [], _Mean(), {"one_color": _Mean(), "matte": _Mean()}
-    for (view, surface), (_, pixels) in zip(held_out, at_most_pixels(tested, options.rays), strict=True):
-        batch = geometry.observe(view, pixels)
-        error = sample_cubemap(environment, batch.directions) - batch.radiance
-        explained.add(bounded_error(error, options.scale), batch.initial_weight())
+    saturation = encoding_of(config).saturation.to(environment)
+    for areas in _seen_areas(tested, geometry, config):
+        rays, error = areas.rays(), areas.seen(environment).minimum(saturation) - areas.radiance
+        explained.add(bounded_error(error, options.scale), rays.initial_weight())
         errors.append(error)
-        confidence.append(sample_cubemap(visibility[:, None], batch.directions)[:, 0])
+        confidence.append(sample_cubemap(visibility[:, None], rays.directions)[:, 0])
+    for (view, surface), (_, pixels) in zip(held_out, at_most_pixels(tested, options.rays), strict=True):
         radiance = view.radiance_at(pixels)
         normals = surface.normals_camera.flatten(1)[:, pixels]
-        shown = geometry.shade(environment, view.camera, pixels, normals) - radiance
+        shown = geometry.shade(environment, view.camera, pixels, normals).minimum(saturation) - radiance
         parts.add(view, surface, pixels, bounded_error(shown, options.scale)[:, None])
         guesses = {"one_color": radiance.mean(0), "matte": places.means(view, surface, pixels)}
         for name, guess in guesses.items():
@@ -176,6 +181,23 @@ def _light(
         "error_in_noise": float(every.abs().median()) / max(noise, options.least_noise),
         "rank_correlation": _rank_correlation(sure, every.square().sum(1)),
     }
+
+
+def _seen_areas(views: Views, geometry: Geometry, config: FitConfig) -> list[PixelFootprints]:
+    """What pixels saw as means over their areas; encoded radiance, which has no such means, at their centers."""
+    most = config.trust.rays
+    if encoding_of(config).high_dynamic_range:
+        return [PixelFootprints.centers(rays) for rays in observe_views(views, geometry, most)]
+    return thinned(pixel_areas(views, geometry, most), most)
+
+
+def _predicting_map(areas: Sequence[PixelFootprints], config: FitConfig) -> Float[Tensor, "6 3 L L"]:
+    """The map of these pixels, as fine as they are dense."""
+    rays = [each.rays() for each in areas]
+    environment = solve_environment(rays, min(config.trust.resolution, densest_resolution(rays)))
+    options = replace(config.footprint_map, coarse_rounds=0)
+    footprints = Footprints(list(areas), lambda: PixelFootprints.joined(areas))
+    return deblur_map(footprints, environment, encoding_of(config).saturation, options)
 
 
 @dataclass

@@ -20,12 +20,8 @@ from panoless.numeric.evolution import evolve
 from panoless.numeric.robust import bounded_error
 from shinypartial.io.progress import Progress
 
-FIRST_STEPS = np.array([0.08] * 2 + [0.06] + [0.05] * 4 + [0.08] + [0.08] * 3 + [0.08] * 2)
-"""Standard deviations of a hollow's numbers at the first resolution; halved at each later one."""
 LEAST_VARIETY = 1e-6
 """Disagreement with the mean color below which pixels show one color, so that nothing can be told from them."""
-LEAST_FACING = 0.1
-"""Cosine between normals of a patch and its chart's."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +121,7 @@ def _far_apart(points: Float[np.ndarray, "P 3"], count: int) -> list[int]:
 
 def unexplained_patches(chart: Chart, surface: LevelSet, pixels: Pixels, options: ConcaveOptions) -> Iterator[Patch]:
     """The part of a surface that faces a chart where pixels disagree on most of it; else each part where they do."""
-    relief = Relief(surface, chart, options.rounding_cells)
+    relief = Relief(surface, chart, options)
     size, waves = outline_of(relief, options.lid_angle_deg)
     whole = patch_inside(relief, size, waves, pixels, options)
     if whole is None:
@@ -138,7 +134,7 @@ def unexplained_patches(chart: Chart, surface: LevelSet, pixels: Pixels, options
     for part in parts:
         about, ratio = chart_about(final.points[part], final.normals[part])
         waves = np.array([np.log(ratio) / 2, 0.0, 0.0, 0.0])
-        patch = patch_inside(Relief(surface, about, options.rounding_cells), 0.0, waves, pixels, options)
+        patch = patch_inside(Relief(surface, about, options), 0.0, waves, pixels, options)
         if patch is not None:
             yield patch
 
@@ -184,7 +180,7 @@ def patch_inside(
     final = FinalRays.of(relief.surface, pixels.rays, 0)
     place = relief.chart.coordinates(final.points)
     share = Hollow.bowl(size, waves, 1.0).share(place[:, 0], place[:, 1])
-    facing = final.normals @ relief.chart.axes[2] > LEAST_FACING
+    facing = final.normals @ relief.chart.axes[2] > options.least_facing
     inside = np.flatnonzero((share < 1) & facing & (np.abs(place[:, 2]) < HALF_SIDE))
     if len(inside) < options.least_pixels:
         return None
@@ -228,12 +224,13 @@ def searched(patch: Patch, options: ConcaveOptions) -> Hollow | None:
         progress.advance(steps=progress.total - progress.done)
         return found
 
+    scales = first_steps(options)
     costs = np.array([cost(guess, first) for guess in guesses])
     if costs.min() >= before:
         return ended(None)
     best, least = min(
         (
-            evolve(lambda x: cost(x, first), guesses[k], FIRST_STEPS, options.evaluations[0])
+            evolve(lambda x: cost(x, first), guesses[k], scales, options.evaluations[0])
             for k in np.argsort(costs, kind="stable")[: options.descents]
         ),
         key=lambda each: each[1],
@@ -242,9 +239,16 @@ def searched(patch: Patch, options: ConcaveOptions) -> Hollow | None:
         return ended(None)
     later = zip(options.resolutions[1:], options.evaluations[1:], strict=True)
     for number, (resolution, evaluations) in enumerate(later, 1):
-        steps = FIRST_STEPS * 0.5**number
+        steps = scales * 0.5**number
         best, _ = evolve(lambda x, r=resolution: cost(x, r), best, steps, evaluations, number)  # type: ignore[misc]
     return ended(Hollow.from_vector(best))
+
+
+def first_steps(options: ConcaveOptions) -> Float[np.ndarray, "13"]:
+    """Standard deviations of the numbers of a hollow at the start of a descent."""
+    middle, waves, depth = (np.ones(2) * options.step_middle, np.ones(4) * options.step_waves, options.step_depth)
+    bent = Hollow(middle, options.step_size, waves, depth, np.ones(3) * depth, np.ones(2) * depth)
+    return bent.vector
 
 
 def first_guesses(patch: Patch, options: ConcaveOptions) -> list[Float[np.ndarray, "13"]]:

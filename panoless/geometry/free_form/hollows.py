@@ -6,18 +6,15 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
+from panoless.geometry.free_form.options import ConcaveOptions
 from panoless.geometry.free_form.surface import NODE, LevelSet
 
 KNOTS = np.linspace(0, np.pi / 2, 5)
 """Angles from a hollow's axis at which its reach is given; at the first and the last of them it is 1."""
 HALF_SIDE, SIDE = 1.8, 73
 """Half the side of a chart in its radii, and points along the side."""
-AT_RIM = 0.08
-"""The lid is fitted to heights within so much of the rim, in ways to it."""
 FAR_CELLS = 8.0
 """Most distance from a hollow's wall that is told."""
-LID_STIFFNESS = 0.02
-"""Weight of a lid's squared curvatures, in heights."""
 
 
 @dataclass(frozen=True)
@@ -111,8 +108,7 @@ class Relief:
 
     surface: LevelSet
     chart: Chart
-    rounding: float
-    """Width, in cells, over which surface and hollow melt together where they cross."""
+    options: ConcaveOptions
 
     @cached_property
     def grid(self) -> tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N N"]]:
@@ -156,9 +152,9 @@ class Relief:
     def lid(self, hollow: Hollow) -> Float[np.ndarray, "6"]:
         """Coefficients of 1, u, v, u², uv and v² of the height that passes through the surface along a rim."""
         u, v = self.grid
-        at_rim = (np.abs(hollow.share(u, v) - 1) < AT_RIM) & np.isfinite(self.heights)
+        at_rim = (np.abs(hollow.share(u, v) - 1) < self.options.rim_share) & np.isfinite(self.heights)
         rows, heights = _quadric(u[at_rim], v[at_rim]), self.heights[at_rim]
-        stiff = np.diag([1e-6, 1e-6, 1e-6, 1.0, 1.0, 1.0]) * LID_STIFFNESS * max(len(rows), 1)
+        stiff = np.diag([1e-6, 1e-6, 1e-6, 1.0, 1.0, 1.0]) * self.options.lid_stiffness * max(len(rows), 1)
         found: np.ndarray = np.linalg.solve(rows.T @ rows + stiff, rows.T @ heights)
         return found
 
@@ -169,7 +165,9 @@ class Relief:
         slope = np.sqrt(sum(each**2 for each in np.gradient(level)))
         values = self.values.copy()
         hollowed = (1 - level) / np.maximum(slope, 1e-3)
-        values[self.box] = smooth_maximum(values[self.box], np.minimum(hollowed, FAR_CELLS), self.rounding)
+        values[self.box] = smooth_maximum(
+            values[self.box], np.minimum(hollowed, FAR_CELLS), self.options.rounding_cells
+        )
         return self.surface.interpolating(values)
 
 

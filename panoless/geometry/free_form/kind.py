@@ -85,10 +85,10 @@ class FreeFormMirror(ExactGeometry):
         """As fine as held-out views want it."""
         return finest_resolution(rays)
 
-    def footprints(self, views: Views) -> Footprints | None:
-        """Four directions over each of about `footprints` pixels that are trusted and turn little."""
+    def footprints(self, views: Views, max_pixels: int) -> Footprints | None:
+        """Four directions over each of at most `footprints` pixels that are trusted and turn little."""
         found = []
-        for view, pixels in at_most_pixels(views, self.options.footprints):
+        for view, pixels in at_most_pixels(views, min(max_pixels, self.options.footprints)):
             rays = PixelRays.centers(view.camera, pixels.cpu().numpy())
             sights = Sights.of(self.surface, rays, 4, self.options.least_map_cosine, occlusion_test=self.occlusion_test)
             trusted = self.trust.at(self.surface.points(sights.hits.places)) > self.options.least_footprint_trust

@@ -77,6 +77,20 @@ class ConcaveOptions:
     """Exponents p of their profiles ρᵖ + δᵖ = 1: from nearly a cone to nearly a box."""
     rounding_cells: float = 0.7
     """Width over which hollow and surface melt together at the rim."""
+    rim_share: float = 0.08
+    """The lid is fitted to the surface within so much of the rim, in ways to it. Not tuned."""
+    lid_stiffness: float = 0.02
+    """Weight of a lid's squared curvatures, in heights. Not tuned."""
+    least_facing: float = 0.1
+    """Cosine between a patch's mean normal and that of a pixel in it. Not tuned."""
+    step_middle: float = 0.08
+    """First standard deviations of a descent, in the patch's radii: of the rim's middle…"""
+    step_size: float = 0.06
+    """…of the logarithm of its size…"""
+    step_waves: float = 0.05
+    """…of the waves of its outline…"""
+    step_depth: float = 0.08
+    """…of its depth, of the reach at its knots and of its lean. Not tuned."""
     least_gain: float = 0.1
     """A hollow is kept if it lowers the disagreement under it by this share…"""
     standard_errors: float = 4.0

@@ -23,7 +23,6 @@ from panoless.geometry.revolution.photometric import refine_round, solve_map
 from panoless.geometry.revolution.pixels import CENTER, PixelBundles, evenly
 from panoless.geometry.revolution.profile import resample_profile
 from panoless.geometry.revolution.silhouette import (
-    JUDGED_SCALE_PX,
     ContourRays,
     axis_starts,
     contour_cost,
@@ -77,7 +76,7 @@ def _propose(
     if start is None:
         return None
     residuals = silhouette_residuals(rays.at_most(own.start_points), start, rays.pixel)
-    if contour_cost(residuals, JUDGED_SCALE_PX) > own.largest_start_cost:
+    if contour_cost(residuals, own.judged_scale_px) > own.largest_start_cost:
         return None
     base, lid = (_count(end) for end in end_pixels(views, start, options.mouth.pixels))
     surface = refine_outer(rays, start if lid >= base else start.turned_over(), stem=stem)

@@ -73,7 +73,7 @@ class RevolutionMirror(ExactGeometry):
             options=self.options.map,
         )[0]
 
-    def footprints(self, views: Views) -> Footprints:
+    def footprints(self, views: Views, max_pixels: int) -> Footprints:
         """Of all pixels that see the environment at once, and of a sample of the others."""
         return pixel_footprints(views, self.surface, self.options, occlusion_test=self.occlusion_test)
 

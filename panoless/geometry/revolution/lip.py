@@ -36,7 +36,6 @@ from shinypartial.core.conventions import PIXEL_CENTER
 
 RING_POINTS = 2000
 """Around the lip's image: more than its pixels."""
-TIP_DAMPING = 2e-3
 
 
 def tip_shift(
@@ -59,7 +58,7 @@ def tip_shift(
     in_pixels = distance / contours.pixel_lengths[over]
     weights = robust_weight(in_pixels, adapted_scale(contours, in_pixels, scale_px))
     weighted = normals * weights[:, None]
-    return damped_step(-weighted.T @ distance, weighted.T @ normals, TIP_DAMPING)
+    return damped_step(-weighted.T @ distance, weighted.T @ normals, options.tip_damping)
 
 
 def open_at_lip(

@@ -44,8 +44,10 @@ class SilhouetteOptions:
     """Most that a step turns the axis, and shifts it in radii of the object frame."""
     damping: float = 1e-6
     """Of every step, in mean diagonals."""
+    judged_scale_px: float = 2.0
+    """Scale s of the errors e²/(e² + s²) by which coarse fits are compared. Not tuned."""
     largest_start_cost: float = 0.6
-    """Mean of e²/(e² + s²), s = 2 px, over a coarse fit above which no axis is near."""
+    """Mean of them over a coarse fit above which no axis is near."""
     least_views: int = 6
     """Fewer views with a contour propose nothing."""
     believed_overlap: float = 0.98
@@ -165,6 +167,8 @@ class LipOptions:
     """Contour rays that pass the lip farther away touch something else."""
     steps: int = 6
     """Of placing the lip by silhouettes."""
+    tip_damping: float = 2e-3
+    """Of each of them, in mean diagonals. Not tuned."""
     spoiled_px: float = 7.0
     """Length of the wall below a flat lid that the lid's corner bends."""
     fitted_px: float = 16.0

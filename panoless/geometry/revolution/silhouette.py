@@ -25,8 +25,6 @@ from shinypartial.core.conventions import PIXEL_CENTER
 REACH = 1.5
 TALLEST = 1.05
 """The normalized object lies in the unit ball; rays are followed a little beyond."""
-JUDGED_SCALE_PX = 2.0
-"""Scale s of the errors e²/(e² + s²) by which starts are compared."""
 
 
 @dataclass(frozen=True)
@@ -268,7 +266,7 @@ def fit_outer(
     for start in starts:
         surface = _refine(sparse, start, cell, options.start_scales_px, stem)
         if surface is not None:
-            cost = contour_cost(silhouette_residuals(sparse, surface, cell), JUDGED_SCALE_PX)
+            cost = contour_cost(silhouette_residuals(sparse, surface, cell), options.judged_scale_px)
             if cost < least:
                 best, least = surface, cost
     return best

@@ -112,7 +112,7 @@ class SurfelMirror:
         directions = mirrored_directions(view.camera, pixels, buffers.normals_camera.flatten(1)[:, pixels])
         return Rays(directions, radiance, incoming=view.directions_world(pixels)), pixels
 
-    def footprints(self, views: Views) -> Footprints | None:
+    def footprints(self, views: Views, max_pixels: int) -> Footprints | None:
         """None: normals are not known well enough beside a pixel's center."""
         return None
 

@@ -6,15 +6,20 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch.nn.functional import normalize
 
 from panoless.capture.views import TrainView, Views
+from panoless.config import FitConfig
+from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.geometry.plane.kind import PlaneMirror
+from panoless.kernels.cubemap import cubemap_directions
 from panoless.trust.evidence import Evidence, gather_evidence
 from panoless.trust.options import TrustOptions
 from panoless.trust.verdict import MATTER, POSES, SHINE, TEXTURE, judge
 from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
 
 OPTIONS = TrustOptions(resolution=32)
+CONFIG = FitConfig(trust=OPTIONS)
 MIRROR = PlaneMirror(plane_of(RECTANGLE))
 VISIBILITY = torch.linspace(0.1, 1.0, 6 * 32 * 32).reshape(6, 32, 32)
 
@@ -25,7 +30,7 @@ def views() -> Views:
 
 
 def evidence(views: Views) -> Evidence:
-    return gather_evidence(views, MIRROR, VISIBILITY, OPTIONS)
+    return gather_evidence(views, MIRROR, VISIBILITY, CONFIG)
 
 
 def each(views: Views, change) -> Views:
@@ -171,7 +176,39 @@ def test_a_verdict_holds_every_figure_by_name(views: Views) -> None:
 
 def test_a_rough_mirror_is_not_trusted(views: Views) -> None:
     """With the roughness that the fit found, however well its views are explained."""
-    found = gather_evidence(views, MIRROR, VISIBILITY, OPTIONS, roughness=0.18)
+    found = gather_evidence(views, MIRROR, VISIBILITY, CONFIG, roughness=0.18)
     verdict = judge(found, OPTIONS)
     assert (verdict.verdict, verdict.remedy) == ("partly", SHINE)
     assert "roughness of 0.18" in verdict.reason
+
+
+class BlurringMirror(PlaneMirror):
+    """A flat mirror every other pixel of which is a mean over eleven degrees each way."""
+
+    def footprints(self, views: Views, max_pixels: int) -> Footprints:
+        return Footprints([blurred_pixels(view) for view in views.train], lambda: blurred_pixels(views.train[0]))
+
+
+def blurred_pixels(view: TrainView) -> PixelFootprints:
+    rays = MIRROR.observe(view, view.solid)
+    width = torch.where(view.solid % 2 == 0, 0.1, 0.002)[:, None]
+    across = width * normalize(torch.linalg.cross(rays.directions, torch.tensor([[0.3, 0.5, 0.8]])))
+    other = torch.linalg.cross(rays.directions, across)
+    corners = [rays.directions + one * across + two * other for one in (-1, 1) for two in (-1, 1)]
+    return PixelFootprints(normalize(torch.stack(corners, 1), dim=2), rays.radiance)
+
+
+def test_what_pixels_blur_is_not_unexplained(views: Views) -> None:
+    """No map of their centers explains pixels that see a place sharply and as a mean; one of their areas does."""
+    world = (0.5 + 0.4 * torch.sin(10 * cubemap_directions(64))).permute(0, 3, 1, 2)
+
+    def blurred(_: int, view: TrainView) -> TrainView:
+        colors = torch.zeros_like(view.radiance).flatten(1)
+        colors[:, view.solid] = blurred_pixels(view).seen(world.contiguous()).T
+        return replace(view, radiance=colors.reshape(view.radiance.shape))
+
+    photographs, areas = each(views, blurred), BlurringMirror(MIRROR.plane)
+    by_area, by_center = (gather_evidence(photographs, mirror, VISIBILITY, CONFIG) for mirror in (areas, MIRROR))
+    assert by_area.unexplained is not None
+    assert by_center.unexplained is not None
+    assert by_area.unexplained < 0.5 * by_center.unexplained

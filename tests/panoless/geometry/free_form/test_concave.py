@@ -122,7 +122,7 @@ def test_a_bowl_of_reach_one_is_an_ellipsoid() -> None:
     chart = Chart.about(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.8)
     hollow = Hollow.bowl(0.0, np.zeros(4), 0.5)
     np.testing.assert_allclose(hollow.reach, 1)
-    mesh, _ = Relief(flat_block(), chart, 0.3).carved(hollow).mesh(1)
+    mesh, _ = Relief(flat_block(), chart, ConcaveOptions(rounding_cells=0.3)).carved(hollow).mesh(1)
     inside = mesh.vertices[(mesh.vertices[:, 2] < -0.1)]
     level = np.sqrt((inside[:, :2] ** 2).sum(1) / 0.8**2 + inside[:, 2] ** 2 / 0.4**2)
     assert len(inside) > 200
@@ -131,7 +131,11 @@ def test_a_bowl_of_reach_one_is_an_ellipsoid() -> None:
 
 def test_nothing_is_carved_beyond_the_rim() -> None:
     chart = Chart.about(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.6)
-    mesh, _ = Relief(flat_block(), chart, 0.3).carved(Hollow.bowl(0.0, np.zeros(4), 0.5)).mesh(1)
+    mesh, _ = (
+        Relief(flat_block(), chart, ConcaveOptions(rounding_cells=0.3))
+        .carved(Hollow.bowl(0.0, np.zeros(4), 0.5))
+        .mesh(1)
+    )
     beyond = np.hypot(*mesh.vertices[:, :2].T) > 0.7
     np.testing.assert_allclose(mesh.vertices[beyond, 2], 0, atol=0.005)
 
