@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from panoless.kernels.backend import Backend, choose_backend
+from panoless.kernels.reference.adam import adam_step_reference
 
 UNBOUNDED = (-math.inf, math.inf)
 
@@ -47,12 +48,7 @@ def adam_step(
         adam_step_cpu(tensors, betas, epsilon)
         return
     for each in tensors:
-        each.mean.lerp_(each.gradient, 1 - betas[0])
-        each.square.mul_(betas[1]).addcmul_(each.gradient, each.gradient, value=1 - betas[1])
-        spread = (each.square / (1 - betas[1] ** each.steps)).sqrt() + epsilon
-        each.parameter.addcdiv_(each.mean, spread, value=-each.rate / (1 - betas[0] ** each.steps))
-        if each.bounds != UNBOUNDED:
-            each.parameter.clamp_(*each.bounds)
+        adam_step_reference(each, betas, epsilon)
 
 
 @lru_cache(maxsize=8)

@@ -16,7 +16,7 @@ def splatted_map(pixels: PixelFootprints, weights: Float[Tensor, "P"], resolutio
     )
 
 
-def sharpened_map(
+def smoothed_map(
     environment: Float[Tensor, "6 3 L L"],
     pixels: PixelFootprints,
     weights: Float[Tensor, "P"],

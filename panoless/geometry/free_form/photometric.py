@@ -16,7 +16,7 @@ from panoless.environment.cubemap import resample
 from panoless.environment.footprints import PixelFootprints
 from panoless.geometry.free_form.beside import Beside, BlockRows, pixel_pose_rows
 from panoless.geometry.free_form.equations import Rows, gauge_rows, joined_rows, silhouette_rows
-from panoless.geometry.free_form.map import sharpened_map, splatted_map
+from panoless.geometry.free_form.map import smoothed_map, splatted_map
 from panoless.geometry.free_form.observations import PixelRays, Pixels
 from panoless.geometry.free_form.options import FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.surface import Hits, LevelSet
@@ -153,7 +153,7 @@ class Solution:
             gain = torch.from_numpy(gain_of(seen.double().numpy())).float()
             agreed = robust_weight((seen - areas.radiance) * gain[:, None], settings.robust_scale)
             votes = torch.from_numpy(weights).float() * gain**2 * agreed
-            environment = sharpened_map(environment, areas, votes, options.map_smoothness, options.map_steps)
+            environment = smoothed_map(environment, areas, votes, options.map_smoothness, options.map_steps)
         length = settings.resolution + 2
         padded = padded_texels(environment).reshape(6, length, length, 3).double().numpy()
         light, slopes, texels = seen_with_slopes(padded, sights.outgoing)
