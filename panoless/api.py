@@ -49,7 +49,7 @@ class Reconstruction:
 
     @property
     def model(self) -> str:
-        """The kind of geometry that was taken: `plane`, `height_field`, `revolution`, `free_form` or `surfels`."""
+        """The kind of geometry taken: `sphere`, `plane`, `height_field`, `revolution`, `free_form`, `surfels`."""
         return self.info.model_selection.chosen if self.info.model_selection else ""
 
     @property
@@ -146,7 +146,7 @@ def fit(
 
     announce_compilation()
     data = open_dataset(resolve_dataset(dataset))
-    prediction = DEFAULT_FOLDER / f"{data.name}-{config.preset}" if output is None else Path(output)
+    prediction = prediction_folder(data, config, output)
     run_folder = RUNS / prediction.resolve().name
     place = find_device(device)
     schedule = snapshot_schedule(snapshots, snapshot_seconds, config.iterations)
@@ -156,6 +156,11 @@ def fit(
         state = reconstruct(data, config, run_folder, schedule, place)
         export_prediction(data, state, config, prediction)
     return Reconstruction(prediction)
+
+
+def prediction_folder(dataset: Dataset, config: FitConfig, output: str | Path | None) -> Path:
+    """Where a fit writes its prediction: to `output`, or to predictions/DATASET-PRESET."""
+    return DEFAULT_FOLDER / f"{dataset.name}-{config.preset}" if output is None else Path(output)
 
 
 def load(prediction: str | Path) -> Reconstruction:

@@ -1,10 +1,10 @@
-"""The `panoless` command: make a dataset of photographs, fit it, export a finished fit."""
+"""The `panoless` command: make a dataset of photographs, fit it, export or view a finished fit."""
 
 import sys
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -13,6 +13,9 @@ from panoless.photographs.options import CaptureOptions
 from panoless.presets import PRESETS
 from shinypartial.core.errors import InputError, parse_and_run
 from shinypartial.io.records import check_record
+
+if TYPE_CHECKING:
+    from panoless.viewer.server import Viewer
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,8 @@ class Fit:
     docs/how-to/compare-methods.md."""
     snapshot_seconds: tuple[float, ...] = ()
     """Keep the moments after these seconds of fitting."""
+    viewer: bool = False
+    """Show cameras, photographs and what the fit saves in the browser while it runs, and the result afterwards."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the fit computes; `cuda` (NVIDIA or AMD) needs a GPU, torch for it and Triton; see
     docs/how-to/use-a-gpu.md."""
@@ -45,6 +50,7 @@ class Fit:
         from panoless.api import RUNS, fit
 
         config = with_overrides(self.config, tuple(chain(*self.set)))
+        viewer = self._viewer(config) if self.viewer else None
         result = fit(
             self.dataset,
             output=self.output,
@@ -67,6 +73,23 @@ class Fit:
                 print(f"No snapshots: this run took {label}, whose map is solved without steps.")
         if result.info.verdict:
             print(f"Verdict: {result.info.verdict.sentence()}")
+        if viewer is not None:
+            from panoless.viewer.server import serve
+
+            serve(viewer)
+
+    def _viewer(self, config: FitConfig) -> "Viewer":
+        from panoless.api import RUNS, prediction_folder
+        from panoless.viewer.server import Viewer, follow_run
+        from shinypartial.dataset.bundled import resolve_dataset
+        from shinypartial.dataset.read import open_dataset
+
+        dataset = open_dataset(resolve_dataset(self.dataset))
+        prediction = prediction_folder(dataset, config, self.output)
+        viewer = Viewer(dataset, prediction)
+        print(f"Viewer: {viewer.url}")
+        follow_run(viewer, RUNS / prediction.resolve().name)
+        return viewer
 
 
 @dataclass(frozen=True)
@@ -124,6 +147,29 @@ class Export:
         print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
         if self.snapshots:
             print(f"Then: shinypartial evaluate {prediction} --snapshots")
+
+
+@dataclass(frozen=True)
+class View:
+    """Show a prediction, or a run that goes on, in the browser: surface, cameras, environment, rays, errors."""
+
+    prediction: Annotated[Path | None, tyro.conf.Positional] = None
+    """Prediction folder; without it the newest below ./predictions."""
+    host: str = "127.0.0.1"
+    """Where to listen; 0.0.0.0 opens it to the network."""
+    port: int = 8080
+    """Port; the next free one where it is taken."""
+
+    def run(self) -> None:
+        """Open the viewer and stay."""
+        from panoless.viewer.server import Address, open_prediction, serve
+        from shinypartial.io.files import newest_folder
+        from shinypartial.prediction.format import DEFAULT_FOLDER, DESCRIPTION
+
+        folder = self.prediction or newest_folder(
+            DEFAULT_FOLDER, DESCRIPTION, "a prediction", "Make one: `panoless fit`."
+        )
+        serve(open_prediction(folder, Address(self.host, self.port)))
 
 
 @dataclass(frozen=True)
@@ -222,11 +268,12 @@ def main(arguments: list[str] | None = None) -> int:
     kinds = (
         Annotated[Fit, tyro.conf.subcommand("fit", default=fit_default)]
         | Annotated[Export, tyro.conf.subcommand("export")]
+        | Annotated[View, tyro.conf.subcommand("view")]
         | Annotated[Capture, tyro.conf.subcommand("capture")]
         | Annotated[PrintBoard, tyro.conf.subcommand("board")]
     )
 
-    def parse() -> Fit | Export | Capture | PrintBoard:
+    def parse() -> Fit | Export | View | Capture | PrintBoard:
         return tyro.cli(
             kinds,  # type: ignore[arg-type]
             args=arguments,

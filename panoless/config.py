@@ -20,6 +20,7 @@ from panoless.geometry.free_form.options import FreeFormOptions
 from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.options import PlaneOptions
 from panoless.geometry.revolution.options import RevolutionOptions
+from panoless.geometry.sphere.options import SphereOptions
 from panoless.geometry.surfels.options import SurfelOptions
 from panoless.selection.options import CorrectionOptions, SelectionOptions
 from panoless.trust.options import TrustOptions
@@ -29,7 +30,7 @@ from shinypartial.io.records import Count, NonNegative, Positive, Share, check_r
 Options = TypeVar("Options")
 Tuned = Annotated[Options, tyro.conf.Suppress]
 """Tuned numbers of a stage, which `--set` changes: too many for the help of a command."""
-Model = Literal["auto", "plane", "height_field", "revolution", "free_form", "surfels"]
+Model = Literal["auto", "sphere", "plane", "height_field", "revolution", "free_form", "surfels"]
 #: Values of --model that an earlier version had, and today's.
 RENAMED_MODELS = {"bent": "height_field"}
 
@@ -167,9 +168,9 @@ class FitConfig:
     seed: int = 0
     """Seed of the initial surfels and of the order of views."""
     model: Annotated[Model, tyro.conf.arg(prefix_name=False)] = "auto"
-    """`auto`: the simplest that explains held-out views; `plane`: three numbers and a boundary; `height_field`: a
-    smooth height over that plane; `revolution`: an axis and a profile; `free_form`: a closed smooth surface; `surfels`:
-    curved."""
+    """`auto`: the simplest that explains held-out views; `sphere`: center and radius; `plane`: three numbers and a
+    boundary; `height_field`: a smooth height over that plane; `revolution`: an axis and a profile; `free_form`: a
+    closed smooth surface; `surfels`: curved."""
     albedo: bool = False
     """Learn a diffuse term A (Eq. 8); a perfect mirror has none."""
     tint: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
@@ -195,6 +196,7 @@ class FitConfig:
     density: DensityConfig = field(default_factory=DensityConfig)
     rates: RateConfig = field(default_factory=RateConfig)
     first_surface: Tuned[FirstSurfaceOptions] = field(default_factory=FirstSurfaceOptions)
+    sphere: Tuned[SphereOptions] = field(default_factory=SphereOptions)
     plane: Tuned[PlaneOptions] = field(default_factory=PlaneOptions)
     height_field: Tuned[HeightFieldOptions] = field(default_factory=HeightFieldOptions)
     revolution: Tuned[RevolutionOptions] = field(default_factory=RevolutionOptions)

@@ -25,6 +25,8 @@ SPARE = 1.1
 REACH_QUANTILE = 0.95
 #: Least eigenvalue, a view, of the equations of a center.
 LEAST_SPREAD = 1e-4
+#: Where views leave the depth of the object open, it is at least this, in units of the world.
+LEAST_DEPTH = 1.0
 
 
 def largest_pieces(inside: Bool[np.ndarray, "H W"], share: float, gap_px: int = 0) -> Bool[np.ndarray, "H W"]:
@@ -56,7 +58,9 @@ def cut_sides(alpha: Float[np.ndarray, "H W"]) -> tuple[bool, bool, bool, bool]:
     return left, top, right, bottom
 
 
-def estimate_object_frame(masks: Sequence[tuple[Camera, Float[np.ndarray, "_ _"]]]) -> ObjectFrame:
+def estimate_object_frame(
+    masks: Sequence[tuple[Camera, Float[np.ndarray, "_ _"]]], known_radius: float = 0.0
+) -> ObjectFrame:
     """Center, radius and reach of the object from where the masks lie in the views.
 
     The center is the point nearest, in least squares, to the rays through the middles of the masks' boxes. Of a box
@@ -64,7 +68,8 @@ def estimate_object_frame(masks: Sequence[tuple[Camera, Float[np.ndarray, "_ _"]
     of the ray, and of one that is cut both ways nothing, unless too little is left.
     The radius is the median of (largest distance of a mask pixel from the projected center) · depth / focal length over
     the uncut views, or all if there are none, with a tenth to spare; the reach is a high quantile over all views.
-    Raises InputError when all cameras look along one line, which leaves the depth open.
+    When all cameras look along one line, the depth is open: it is that at which the masks have a `known_radius`, or,
+    for zero, that of the point of the line nearest to the world's origin, at least one unit.
     """
     pieces = [(camera, largest_pieces(alpha >= MASK_LEVEL, MAIN_SHARE)) for camera, alpha in masks]
     cuts = [cut_sides(alpha) for _, alpha in masks]
@@ -72,15 +77,30 @@ def estimate_object_frame(masks: Sequence[tuple[Camera, Float[np.ndarray, "_ _"]
     center = _center(pieces, cuts)
     if center is None:
         center = _center(pieces, [(False,) * 4] * len(masks))
+    depth_is_open = center is None
     if center is None:
-        raise InputError(
-            expected="cameras that see the object from different directions",
-            found="views along a single line",
-            remedy="Add views from the sides; an arc of at least 30° is best.",
-        )
+        center = _center_on_line(pieces, known_radius)
     radii = np.array([_mask_radius(camera, inside, center) for camera, inside in pieces])
     radius = SPARE * float(np.median(radii[uncut] if uncut.any() else radii))
-    return ObjectFrame(center, radius, float(np.quantile(radii, REACH_QUANTILE)) / radius)
+    return ObjectFrame(center, radius, float(np.quantile(radii, REACH_QUANTILE)) / radius, depth_is_open)
+
+
+def _center_on_line(pieces: Sequence[tuple[Camera, Bool[np.ndarray, "_ _"]]], known_radius: float) -> np.ndarray:
+    """A point on the line along which all cameras look, at which the first mask has the `known_radius`, unless zero."""
+    camera, inside = pieces[0]
+    ray = _middle_ray(camera, inside)
+    depth = max(float(-ray @ camera.position_world), LEAST_DEPTH)
+    if known_radius:
+        depth *= known_radius / _mask_radius(camera, inside, camera.position_world + depth * ray)
+    return camera.position_world + depth * ray
+
+
+def _middle_ray(camera: Camera, inside: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "3"]:
+    """The unit ray through the middle of a mask's box."""
+    rows, columns = np.nonzero(inside)
+    x, y = (np.array((places.min() + places.max() + 1) / 2) for places in (columns, rows))
+    ray: np.ndarray = camera.camera_to_world[:3, :3] @ camera_rays(camera, x, y)
+    return ray / np.linalg.norm(ray)
 
 
 def _center(
@@ -89,10 +109,7 @@ def _center(
     """The point nearest to the rays, or planes, through the middles of the boxes; None where they leave it open."""
     normal_matrix, right_side = np.zeros((3, 3)), np.zeros(3)
     for (camera, inside), (left, top, right, bottom) in zip(pieces, cuts, strict=True):
-        rows, columns = np.nonzero(inside)
-        x, y = (np.array((places.min() + places.max() + 1) / 2) for places in (columns, rows))
-        ray = camera.camera_to_world[:3, :3] @ camera_rays(camera, x, y)
-        ray /= np.linalg.norm(ray)
+        ray = _middle_ray(camera, inside)
         across = np.eye(3) - np.outer(ray, ray)
         # The camera axis along which the plane through the middle extends.
         for cut, along in ((left or right, 0), (top or bottom, 1)):

@@ -14,6 +14,8 @@ class ObjectFrame:
     radius: float
     reach: float = 1.0
     """How far from the origin, in normalized units, the object extends in some views: 1 or less is within the ball."""
+    depth_is_open: bool = False
+    """Whether all views look along one line, so that how far away the center is was only assumed."""
 
     def to_world(self, points: Float[np.ndarray, "*P 3"]) -> Float[np.ndarray, "*P 3"]:
         """Points of the object frame in the world."""

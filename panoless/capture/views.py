@@ -134,6 +134,7 @@ def load_views(
     downscale: int = 1,
     encoding: RadianceEncoding = LDR,
     least_object_px: float = 0.0,
+    known_radius: float = 0.0,
 ) -> Views:
     """Read the training split, averaged over blocks of `downscale` pixels a side, its radiance encoded.
 
@@ -155,13 +156,18 @@ def load_views(
         radiance = encoding.encoded(_block_means(encoding.clipped(frame, view), downscale))
         photographs.append(cropped(frame.camera.downscaled(downscale), radiance, alpha, crop_margin_px))
         progress.advance()
-    return views_of(photographs)
+    return views_of(photographs, known_radius)
 
 
 def configured_views(dataset: Dataset, config: FitConfig) -> Views:
     """The training split as a configuration wants to see it."""
     return load_views(
-        dataset, config.crop_margin_px, config.downscale, encoding_of(config), least_object_px=config.least_object_px
+        dataset,
+        config.crop_margin_px,
+        config.downscale,
+        encoding_of(config),
+        least_object_px=config.least_object_px,
+        known_radius=config.sphere.radius,
     )
 
 
@@ -171,9 +177,10 @@ def _object_px(dataset: Dataset) -> float:
     return float(np.median([np.sqrt(read_view(frame).alpha.clip(0, 1).sum()) for frame in views]))
 
 
-def views_of(photographs: Sequence[Photograph]) -> Views:
-    """The same pictures in the normalized frame that their masks determine."""
-    object_frame = estimate_object_frame([(photograph.camera, photograph.mask.numpy()) for photograph in photographs])
+def views_of(photographs: Sequence[Photograph], known_radius: float = 0.0) -> Views:
+    """The same pictures in the normalized frame that their masks determine; see `estimate_object_frame`."""
+    masks = [(photograph.camera, photograph.mask.numpy()) for photograph in photographs]
+    object_frame = estimate_object_frame(masks, known_radius)
     near = 0.1 * min(
         float(np.linalg.norm(photograph.camera.position_world - object_frame.center)) / object_frame.radius
         for photograph in photographs

@@ -220,6 +220,8 @@ class Family(Protocol):
     """Whether its fit finds the poses of views itself, or it explains any outlines."""
     refines: ClassVar[str | None]
     """The kind whose proposal it takes on where that one is not chosen; None: it makes its own."""
+    needs_depth: ClassVar[bool]
+    """Whether views have to come from different directions, which tell how far away the object is."""
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """A shape that explains the silhouettes; None where they determine none.

@@ -103,6 +103,7 @@ class ExactFamily:
 
     finds_poses: ClassVar[bool] = False
     refines: ClassVar[str | None] = None
+    needs_depth: ClassVar[bool] = True
 
     def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
         """None: it is told by how far photographs pull (see `panoless.alignment.lens`)."""

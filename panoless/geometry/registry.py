@@ -5,10 +5,18 @@ from panoless.geometry.free_form.kind import FreeFormFamily
 from panoless.geometry.height_field.kind import HeightFieldFamily
 from panoless.geometry.plane.kind import PlaneFamily
 from panoless.geometry.revolution.kind import RevolutionFamily
+from panoless.geometry.sphere.kind import SphereFamily
 from panoless.geometry.surfels.kind import SurfelFamily
 
 FAMILIES: dict[str, Family] = {
     family.kind: family
-    for family in (PlaneFamily(), HeightFieldFamily(), RevolutionFamily(), FreeFormFamily(), SurfelFamily())
+    for family in (
+        SphereFamily(),
+        PlaneFamily(),
+        HeightFieldFamily(),
+        RevolutionFamily(),
+        FreeFormFamily(),
+        SurfelFamily(),
+    )
 }
 """In the order of model selection; the last one explains what no other does."""

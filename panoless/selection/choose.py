@@ -19,6 +19,7 @@ from panoless.selection.corrections import with_corrections
 from panoless.selection.fitted import Fitted, is_refined
 from panoless.selection.held_out import Trial, held_out_errors, is_clearly_lower, train_briefly
 from panoless.selection.surroundings import explains_clearly_more, proposed_surroundings
+from shinypartial.core.errors import InputError
 
 ANY = "auto"
 BENT = "a bend explains more than near surroundings do"
@@ -30,11 +31,14 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
     Candidates are examined from the simplest on. One is refused when it misses the silhouettes, or when surfels that
     start on it explain held-out views clearly better. Surfels explain what is left; of the candidates that explained
     the silhouettes they start on the one from which they explained held-out views best. `config.model` overrides.
-    Raises InputError when a kind is asked for and can't be proposed.
+    Raises InputError when a kind is asked for and can't be proposed, and when views along one line show no kind that
+    these tell.
     """
     if config.model != ANY:
         return _fit_asked(views, config)
     *families, last = FAMILIES.values()
+    if views.object_frame.depth_is_open:
+        families = [family for family in families if not family.needs_depth]
     table, refused = list[Candidate](), dict[str, list[PosedProposal]]()
     starts = list[tuple[float, Geometry, Corrections]]()
     for family in families:
@@ -50,6 +54,8 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
                 table[-1] = replace(candidate, verdict=Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason=BENT)
                 continue
             starts.append((candidate.surfels_error or 0.0, geometry, candidate.corrections))
+    if views.object_frame.depth_is_open:
+        raise _along_one_line()
     nothing: tuple[float, Geometry | None, Corrections] = (0.0, None, NO_CORRECTIONS)
     _, start, corrections = min(reversed(starts), key=lambda each: each[0]) if starts else nothing
     geometry = last.fit(corrections.applied(views, config), Proposal(start, 0.0, 1.0), config)
@@ -182,6 +188,8 @@ def _bends_rather(
 
 def _fit_asked(views: Views, config: FitConfig) -> tuple[Geometry, Selection]:
     family = FAMILIES[config.model]
+    if views.object_frame.depth_is_open and family.needs_depth:
+        raise _along_one_line()
     fitted = _best_fit(family, _proposals(_source(family), views, config, asked=True), views, config, asked=True)
     assert fitted is not None, "a kind that is asked for is proposed"
     asked_for = Candidate(
@@ -192,6 +200,15 @@ def _fit_asked(views: Views, config: FitConfig) -> tuple[Geometry, Selection]:
         corrections=fitted.corrections,
     )
     return fitted.geometry, Selection(family.kind, (asked_for,))
+
+
+def _along_one_line() -> InputError:
+    labels = " or ".join(family.label for family in FAMILIES.values() if not family.needs_depth)
+    return InputError(
+        expected=f"cameras that see the object from different directions, or {labels}",
+        found="views along a single line",
+        remedy="Add views from the sides; an arc of at least 30° is best.",
+    )
 
 
 def _examine(

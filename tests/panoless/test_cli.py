@@ -20,6 +20,7 @@ from shinypartial.prediction.format import read_info
 
 TUNED = (
     "first_surface",
+    "sphere",
     "plane",
     "height_field",
     "revolution",

@@ -134,7 +134,8 @@ def test_a_stored_value_out_of_range_is_refused() -> None:
     with pytest.raises(InputError, match=r"`surfels\.count`.*at least 1"):
         config_from_dict(content)
     with pytest.raises(
-        InputError, match=r"`model`.*one of auto, plane, height_field, revolution, free_form, surfels; found 'ball'"
+        InputError,
+        match=r"`model`.*one of auto, sphere, plane, height_field, revolution, free_form, surfels; found 'ball'",
     ):
         config_from_dict(write_record(PRESETS["default"]) | {"model": "ball"})
 
@@ -165,7 +166,7 @@ def test_the_command_line_is_derived_from_the_same_fields(capsys: pytest.Capture
     assert main(["fit", "--help"]) == 0
     text = capsys.readouterr().out
     for name in (
-        "--model {auto,plane,height_field,revolution,free_form,surfels}",
+        "--model {auto,sphere,plane,height_field,revolution,free_form,surfels}",
         "--config.surfels.hull-votes",
         "--config.tint",
     ):

@@ -22,6 +22,7 @@ class SurfelFamily:
     label: ClassVar[str] = "surfels"
     finds_poses: ClassVar[bool] = True
     refines: ClassVar[str | None] = None
+    needs_depth: ClassVar[bool] = True
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """Surfels explain any silhouettes."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from panoless.capture.masks import SPARE
 from panoless.capture.views import TrainView, Views, load_views
 from shinypartial.core.camera import project, ray_directions_world
 from shinypartial.core.errors import InputError
@@ -134,10 +135,16 @@ def test_an_empty_mask_is_named(damaged_dataset: Path) -> None:
         load_views(dataset, 2)
 
 
-def test_views_along_one_line_are_refused(sphere_dataset: Dataset) -> None:
+def test_views_along_one_line_leave_the_depth_open(sphere_dataset: Dataset) -> None:
+    """The ball of radius 1 about the origin is taken to be there; known to be twice as large, it is farther away."""
     first = sphere_dataset.train[0].camera.camera_to_world
-    with pytest.raises(InputError, match="single line"):
-        load_views(moved(sphere_dataset, lambda pose: first.copy()), 2)
+    along = moved(sphere_dataset, lambda pose: first.copy())
+    frames = [load_views(along, 2, known_radius=radius).object_frame for radius in (0.0, 2.0)]
+    assert all(frame.depth_is_open for frame in frames)
+    assert not load_views(sphere_dataset, 2).object_frame.depth_is_open
+    # Half a pixel of 32: masks are asked for the pixels that they cover at least by half.
+    np.testing.assert_allclose(frames[0].center, 0, atol=0.1)
+    np.testing.assert_allclose([frame.radius / SPARE for frame in frames], [1.0, 2.0], rtol=0.05)
 
 
 def test_cameras_that_look_away_are_refused(sphere_dataset: Dataset) -> None:

@@ -126,6 +126,7 @@ def test_right_surfels_beat_the_plane_of_a_bent_mirror() -> None:
     geometry, selection = choose_geometry(framed(0.0, 0.3), CONFIG, lambda *_: dome(plane_of(RECTANGLE), 0.3, 800))
     assert geometry.kind == selection.chosen == "surfels"
     assert verdicts(selection) == {
+        "sphere": Verdict.NOT_PROPOSED,
         "plane": Verdict.REFUSED_BY_HELD_OUT_VIEWS,
         "height_field": Verdict.REFUSED_BY_HELD_OUT_VIEWS,
         "revolution": Verdict.NOT_PROPOSED,
@@ -143,7 +144,7 @@ def test_surfels_that_explain_as_much_do_not_beat_the_plane() -> None:
     """Flat surfels on the plane say the same as the plane does."""
     geometry, selection = choose_geometry(framed(0.0), CONFIG, as_started)
     assert geometry.kind == "plane"
-    (row,) = selection.candidates
+    _, row = selection.candidates
     assert row.silhouette_px is not None
     assert row.silhouette_px < 0.5
     assert row.held_out_error == pytest.approx(row.surfels_error, abs=0.05)
@@ -173,8 +174,8 @@ def test_a_box_is_refused_by_its_silhouettes() -> None:
     geometry, selection = choose_geometry(pillar_views(around(10, SIZE_PX)), CONFIG, as_started)
     assert geometry.kind == "free_form"
     refused = Verdict.REFUSED_BY_SILHOUETTES, Verdict.NOT_PROPOSED
-    assert all(verdicts(selection)[kind] in refused for kind in ("plane", "height_field", "revolution"))
-    plane = selection.candidates[0]
+    assert all(verdicts(selection)[kind] in refused for kind in ("sphere", "plane", "height_field", "revolution"))
+    plane = selection.candidates[1]
     assert plane.verdict == Verdict.NOT_PROPOSED or plane.silhouette_px > 0.5 or plane.overlap < 0.98
     assert selection.sentence.startswith("free_form (surfels are no better;")
 
@@ -183,7 +184,7 @@ def test_a_fit_remembers_why_it_took_its_kind() -> None:
     """The table becomes part of the state, from which it goes into the prediction."""
     state = begin(pillar_views(around(10, SIZE_PX)), CONFIG)
     assert state.selection.chosen == state.geometry.kind
-    kinds = ["plane", "height_field", "revolution", "free_form", "surfels"]
+    kinds = ["sphere", "plane", "height_field", "revolution", "free_form", "surfels"]
     assert [each.kind for each in state.selection.candidates] == kinds[: kinds.index(state.geometry.kind) + 1]
     assert (state.training is None) == (state.geometry.kind != "surfels")
 

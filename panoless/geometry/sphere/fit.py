@@ -1,0 +1,179 @@
+"""A sphere by outlines: a cone for each view, all cones in one linear system, then all contour points together.
+
+The rays that touch a sphere form a circular cone about the camera. Its axis a and half angle α put the center at
+c = o + ρ a/sin α from the camera at o, which is linear in c and ρ: two views determine both, one leaves open how far
+away the ball is.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from panoless.capture.silhouettes import mask_contours
+from panoless.capture.views import Views
+from panoless.geometry.sphere.model import Sphere, sphere_buffers
+from panoless.geometry.sphere.options import SphereOptions
+from panoless.numeric.gauss_newton import accept_step, damped_step
+from panoless.numeric.robust import bounded_error, robust_scale, robust_weight
+
+ORIGIN_PULL = 1e-6
+"""Weight of a center at the origin of the normalized frame, for views that leave its distance open; not tuned."""
+WIDEST_COSINE = 0.9999
+"""A cone of a smaller half angle (0.8°) is no cone; not tuned."""
+
+
+@dataclass(frozen=True)
+class OutlineRays:
+    """Unit rays of the contour points of all views, and how many pixels an angle of one is there."""
+
+    view: Int[np.ndarray, "P"]
+    origins: Float[np.ndarray, "P 3"]
+    directions: Float[np.ndarray, "P 3"]
+    pixels_per_rad: Float[np.ndarray, "P"]
+
+    @classmethod
+    def of(cls, views: Views) -> "OutlineRays":
+        """Those of the longest contour of each mask."""
+        contours = mask_contours(views)
+        length = np.linalg.norm(contours.rays, axis=1)
+        focal = np.array([view.camera.fx for view in views.train])[contours.view]
+        return cls(contours.view, contours.centers, contours.rays / length[:, None], focal * length)
+
+
+@dataclass(frozen=True)
+class Cones:
+    """A circular cone for each view that has one, and how far its contour points are from it."""
+
+    origins: Float[np.ndarray, "V 3"]
+    axes: Float[np.ndarray, "V 3"]
+    sines: Float[np.ndarray, "V"]
+    """Of half the opening angle."""
+    median_px: Float[np.ndarray, "V"]
+
+    @classmethod
+    def of(cls, rays: OutlineRays, rounds: int) -> "Cones":
+        """By robust linear least squares: m·r = 1 for all rays r of the cone with m = a/cos α."""
+        found = []
+        for view in np.unique(rays.view):
+            own = rays.view == view
+            directions, scale = rays.directions[own], rays.pixels_per_rad[own]
+            weights = np.ones(len(directions))
+            for _ in range(rounds):
+                weighted = directions * weights[:, None]
+                moment = weighted.T @ directions + 1e-12 * np.eye(3)
+                m = np.linalg.solve(moment, weighted.sum(0))
+                cosine = min(1 / float(np.linalg.norm(m)), WIDEST_COSINE)
+                # m·r = cos β/cos α, and the angle β − α is what the pixels are off by.
+                off_px = (np.arccos(np.clip(directions @ m * cosine, -1, 1)) - np.arccos(cosine)) * scale
+                weights = robust_weight(off_px, robust_scale(off_px, 0.5, 3.0))
+            median_px = float(np.median(np.abs(off_px)))
+            found.append((rays.origins[own][0], m / np.linalg.norm(m), np.sqrt(1 - cosine**2), median_px))
+        origins, axes, sines, medians = zip(*found, strict=True) if found else ([], [], [], [])
+        return cls(np.array(origins).reshape(-1, 3), np.array(axes).reshape(-1, 3), np.array(sines), np.array(medians))
+
+    def sphere(self, radius: float) -> Sphere:
+        """The sphere whose cones are nearest to these, by linear least squares; of a `radius` that is known, unless 0.
+
+        Solves c − ρ a/sin α = o for all views. What they leave open is settled by a center near the origin.
+        """
+        toward = self.axes / self.sines[:, None]
+        weights = np.repeat(robust_weight(self.median_px, 1.0), 3) ** 0.5
+        rows = np.concatenate([np.tile(np.eye(3), (len(toward), 1)), -toward.reshape(-1, 1)], 1) * weights[:, None]
+        right = self.origins.ravel() * weights
+        pull = ORIGIN_PULL * np.eye(4)[:3]
+        if radius:
+            right, rows = right - radius * rows[:, 3], np.concatenate([rows[:, :3], 0 * rows[:, 3:]], 1)
+        solved = np.linalg.lstsq(np.concatenate([rows, pull]), np.append(right, np.zeros(3)), rcond=None)[0]
+        return Sphere(solved[:3], radius or float(solved[3]))
+
+
+@dataclass(frozen=True)
+class OutlineResiduals:
+    """How far contour rays are from touching a sphere, in pixels, positive outside, and their derivatives by (c, ρ).
+
+    With p = c − o the angle between a ray r and p is β, and that of a ray that touches is α = arcsin(ρ/‖p‖). The angle
+    β − α stays where all is scaled about a camera, so that one view moves nothing along what it leaves open.
+    """
+
+    sphere: Sphere
+    rays: OutlineRays
+
+    @cached_property
+    def pixels(self) -> Float[np.ndarray, "P"]:
+        """β − α, in pixels."""
+        toward = self.sphere.center - self.rays.origins
+        along = (toward * self.rays.directions).sum(1)
+        across = np.linalg.norm(toward - along[:, None] * self.rays.directions, axis=1)
+        sine = self.sphere.radius / np.linalg.norm(toward, axis=1)
+        return (np.arctan2(across, along) - np.arcsin(np.clip(sine, -1, 1))) * self.rays.pixels_per_rad
+
+    @cached_property
+    def rows(self) -> Float[np.ndarray, "P 4"]:
+        """∂β/∂c = ((p·r) p⊥/‖p⊥‖ − ‖p⊥‖ r)/‖p‖² and ∂α/∂(c, ρ) = (−ρ p/‖p‖², 1)/√(‖p‖² − ρ²), in pixels."""
+        directions = self.rays.directions
+        toward = self.sphere.center - self.rays.origins
+        square = (toward**2).sum(1)[:, None]
+        along = (toward * directions).sum(1)[:, None]
+        passing = toward - along * directions
+        across = np.maximum(np.linalg.norm(passing, axis=1, keepdims=True), 1e-12)
+        room = np.sqrt(np.maximum(square - self.sphere.radius**2, 1e-12))
+        by_center = (along * passing / across - across * directions) / square
+        by_center += self.sphere.radius * toward / square / room
+        return np.concatenate([by_center, -1 / room], 1) * self.rays.pixels_per_rad[:, None]
+
+    def equations(self, scale: float) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "4 4"]]:
+        """Gradient Jᵀ W e and matrix Jᵀ W J with Geman–McClure weights of that scale."""
+        weighted = self.rows * robust_weight(self.pixels, scale)[:, None]
+        return weighted.T @ self.pixels, weighted.T @ self.rows
+
+    def cost(self, scale: float) -> float:
+        """Sum of e²/(e² + s²)."""
+        return float(bounded_error(self.pixels, scale).sum())
+
+
+@dataclass(frozen=True)
+class SphereFit:
+    """A sphere and how well it explains the masks, view by view."""
+
+    sphere: Sphere
+    median_px: Float[np.ndarray, "V"]
+    """Median distance of the mask's contour from the outline."""
+    overlap: Float[np.ndarray, "V"]
+    """Σ min(alpha, mask) / Σ max(alpha, mask)."""
+
+
+def fit_sphere(views: Views, options: SphereOptions, *, asked: bool) -> SphereFit | None:
+    """The sphere that explains the masks best; None where their outlines are no cones, unless it was `asked` for."""
+    rays = OutlineRays.of(views)
+    cones = Cones.of(rays, options.cone_rounds)
+    if not len(cones.sines) or not (asked or np.median(cones.median_px) <= options.largest_cone_px):
+        return None
+    known = options.radius / views.object_frame.radius
+    sphere = _refined(cones.sphere(known), rays, known > 0, options)
+    size = np.abs(OutlineResiduals(sphere, rays).pixels)
+    medians = [np.median(size[rays.view == view]) for view in np.unique(rays.view)]
+    overlaps = []
+    for view in views.train:
+        alpha = sphere_buffers(sphere, view.camera, options.samples).alpha.to(view.mask)
+        both, either = alpha.minimum(view.mask).sum(), alpha.maximum(view.mask).sum()
+        overlaps.append(float(both / either) if either > 0 else 0.0)
+    return SphereFit(sphere, np.array(medians), np.array(overlaps))
+
+
+def _refined(sphere: Sphere, rays: OutlineRays, radius_known: bool, options: SphereOptions) -> Sphere:
+    """After a robust Gauss–Newton step of all contour points for each scale."""
+    state = OutlineResiduals(sphere, rays)
+    for least_px in options.scales_px:
+        scale = robust_scale(state.pixels, least_px, options.noise_scale)
+        gradient, matrix = state.equations(scale)
+        if radius_known:
+            gradient[3], matrix[3], matrix[:, 3] = 0, 0, 0
+        state = accept_step(
+            state,
+            damped_step(gradient, matrix),
+            lambda state, step: replace(state, sphere=state.sphere.moved(step)),
+            lambda state, scale=scale: state.cost(scale),  # type: ignore[misc]
+        )
+    return state.sphere

@@ -1,0 +1,207 @@
+"""The sphere as a kind of geometry."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from panoless.capture.object_frame import ObjectFrame
+from panoless.capture.rays import pixel_rays
+from panoless.capture.views import TrainView, Views
+from panoless.config import FitConfig
+from panoless.environment.footprints import Footprints, PixelFootprints
+from panoless.environment.rays import Rays
+from panoless.environment.surroundings import Surroundings
+from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, poses_from_plain, to_plain
+from panoless.geometry.exact import ExactFamily, ExactGeometry
+from panoless.geometry.sphere.fit import fit_sphere
+from panoless.geometry.sphere.model import CENTER, Sphere, mirrored, parts_of_pixel, sphere_buffers
+from panoless.geometry.sphere.options import SphereOptions
+from panoless.geometry.surfels.mirror import SurfelMirror
+from panoless.geometry.surfels.placement import surfels_at
+from panoless.kernels.cubemap import sample_cubemap
+from panoless.kernels.rasterize import RasterCamera
+from shinypartial.core.errors import InputError
+from shinypartial.io.records import read_record, write_record
+
+MERIDIANS = 128
+RINGS = 64
+
+
+@dataclass(frozen=True)
+class SphereMirror(ExactGeometry):
+    """A mirror ball. It is convex, so every pixel of it shows the surroundings."""
+
+    kind: ClassVar[str] = "sphere"
+    sphere: Sphere
+    operator_deg: float = 0.0
+    """Rays that return to their camera within this angle are hardly trusted."""
+    options: SphereOptions = field(default_factory=SphereOptions)
+
+    @property
+    def num_parameters(self) -> int:
+        """Center and radius."""
+        return self.sphere.num_parameters
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """Those of the sphere."""
+        return self.sphere.surroundings
+
+    def in_surroundings(self, surroundings: Surroundings) -> "SphereMirror":
+        """The same sphere there."""
+        return replace(self, sphere=replace(self.sphere, surroundings=surroundings))
+
+    def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
+        """Solid pixels whose centers the sphere covers."""
+        met = self.sphere.hits(*pixel_rays(view.camera, view.solid.cpu().numpy())).met
+        return view.solid[torch.from_numpy(met).to(view.solid.device)]
+
+    def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
+        """The rays of those of the pixels that the sphere covers, trusted by the angle that each spans."""
+        index = pixels.cpu().numpy()
+        outgoing, met = mirrored(self.sphere, view.camera, index, [CENTER])
+        kept = met[:, 0]
+        chosen, found = pixels[torch.from_numpy(kept).to(pixels.device)], outgoing[kept, 0]
+        corners, _ = mirrored(self.sphere, view.camera, index[kept], parts_of_pixel(2))
+        trust = _trust_by_span(corners) * self._trust_by_return(view, found)
+        return Rays(
+            torch.from_numpy(found).float().to(view.radiance.device),
+            view.radiance_at(chosen),
+            torch.from_numpy(trust).float().to(view.radiance.device),
+            view.directions_world(chosen),
+        )
+
+    def footprints(self, views: Views) -> Footprints | None:
+        """Of the pixels that the sphere covers wholly and that span a narrow angle."""
+        found = []
+        for view in views.train:
+            corners, met = mirrored(self.sphere, view.camera, view.solid.cpu().numpy(), parts_of_pixel(2))
+            kept = met.all(1) & (_spans(corners) < self.options.widest_footprint_rad**2)
+            if kept.any():
+                pixels = view.solid[torch.from_numpy(kept).to(view.solid.device)]
+                trust = self._trust_by_return(view, corners[kept].mean(1))
+                directions, trusted = (
+                    torch.from_numpy(each).float().to(view.radiance.device) for each in (corners[kept], trust)
+                )
+                found.append(PixelFootprints(directions, view.radiance_at(pixels), trusted))
+        if not found:
+            return None
+        areas = PixelFootprints.joined(found)
+        return Footprints([areas], lambda: areas)
+
+    def shade(
+        self,
+        environment: Float[Tensor, "6 3 L L"],
+        camera: RasterCamera,
+        pixels: Int[Tensor, "P"],
+        normals_camera: Float[Tensor, "3 P"],
+    ) -> Float[Tensor, "P 3"]:
+        """Mean over the pixels' areas, as far as the sphere covers them; zero where it covers nothing."""
+        outgoing, met = mirrored(self.sphere, camera, pixels.cpu().numpy(), parts_of_pixel(self.options.samples))
+        directions, weight = (torch.from_numpy(each).to(environment) for each in (outgoing, met))
+        light = sample_cubemap(environment, directions.flatten(0, 1)).unflatten(0, met.shape)
+        return (light * weight[..., None]).sum(1) / weight.sum(1).clamp(min=1)[:, None]
+
+    def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
+        """By intersection; alpha by a grid of rays at the outline."""
+        return sphere_buffers(self.sphere, camera, self.options.samples)
+
+    def to_surfels(self, config: FitConfig) -> SurfelMirror:
+        """Surfels all over it on a Fibonacci lattice, curved as it is."""
+        count, radius = config.surfels.count, self.sphere.radius
+        normals = _lattice(count)
+        helper = np.eye(3)[np.abs(normals).argmin(1)]
+        across = np.cross(helper, normals)
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        frames = np.stack([across, np.cross(normals, across), normals], 2)
+        width = config.surfels.tuned.overlap * radius * float(np.sqrt(4 * np.pi / count))
+        scales, bends = np.full((count, 2), width), np.tile([-1 / radius, 0.0, -1 / radius], (count, 1))
+        points = self.sphere.center + radius * normals
+        return SurfelMirror.of(surfels_at(points, frames, scales, bends), config, self)
+
+    def mesh(self, frame: ObjectFrame) -> Mesh:
+        """Quadrilaterals between 128 meridians and 64 rings, with exact normals; triangles' worth at the poles."""
+        polar = np.pi * np.arange(RINGS + 1) / RINGS
+        turn = 2 * np.pi * np.arange(MERIDIANS) / MERIDIANS
+        across, up = np.sin(polar)[:, None], np.cos(polar)[:, None] + 0 * turn
+        normals = np.stack([across * np.cos(turn), across * np.sin(turn), up], -1).reshape(-1, 3)
+        index = np.arange(len(normals)).reshape(RINGS + 1, MERIDIANS)
+        upper, lower = index[:-1], index[1:]
+        faces = np.stack([upper, lower, np.roll(lower, -1, 1), np.roll(upper, -1, 1)], -1).reshape(-1, 4)
+        return Mesh.smooth(frame.to_world(self.sphere.center + self.sphere.radius * normals), faces, normals)
+
+    def state_dict(self) -> dict[str, Any]:
+        """All numbers as lists and plain values."""
+        known = {"operator_deg": self.operator_deg, "options": write_record(self.options)}
+        return {"sphere": to_plain(self.sphere), "poses": to_plain(self.poses), **known}
+
+    @classmethod
+    def from_state_dict(cls, content: dict[str, Any]) -> "SphereMirror":
+        """The geometry that `state_dict` was taken from."""
+        options = read_record(SphereOptions, content["options"], "the options of a sphere", allow_unknown=True)
+        sphere = from_plain(Sphere, content["sphere"])
+        return cls(sphere, content["operator_deg"], options, poses=poses_from_plain(content))
+
+    def _trust_by_return(self, view: TrainView, outgoing: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
+        """Little where rays come back to their camera, which sees itself and who holds it there."""
+        back = view.position - self.sphere.center
+        returns = outgoing @ (back / np.linalg.norm(back)) > np.cos(np.radians(self.operator_deg))
+        return np.where(returns & (self.operator_deg > 0), self.options.operator_trust, 1.0)
+
+
+def _spans(corners: Float[np.ndarray, "P 4 3"]) -> Float[np.ndarray, "P"]:
+    """The square of the larger angle that pixels span along rows and columns, by the middles of their four quarters."""
+    along_row, along_column = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return 4 * np.maximum((along_row**2).sum(1), (along_column**2).sum(1))
+
+
+def _trust_by_span(corners: Float[np.ndarray, "P 4 3"]) -> Float[np.ndarray, "P"]:
+    """1/(1 + a/ā) of the square angles a of pixels with the median ā: beside the outline one spans a wide strip."""
+    spans = _spans(corners)
+    return 1 / (1 + spans / np.median(spans)) if len(spans) else spans
+
+
+def _lattice(count: int) -> Float[np.ndarray, "K 3"]:
+    """Points evenly on the unit sphere."""
+    index = np.arange(count) + 0.5
+    height, azimuth = 1 - 2 * index / count, np.pi * (1 + 5**0.5) * index
+    level = np.sqrt(1 - height**2)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), height], 1)
+
+
+class SphereFamily(ExactFamily):
+    """Spheres that explain silhouettes."""
+
+    kind: ClassVar[str] = "sphere"
+    geometry: ClassVar[type[Geometry]] = SphereMirror
+    label: ClassVar[str] = "a sphere"
+    needs_depth: ClassVar[bool] = False
+
+    def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
+        """Center and radius by outlines."""
+        found = fit_sphere(views, config.sphere, asked=asked)
+        if found is not None:
+            return Proposal(found.sphere, float(np.median(found.median_px)), float(np.median(found.overlap)))
+        if asked:
+            raise InputError(
+                expected="masks with an outline, for --model sphere",
+                found="none within the pictures",
+                remedy="Check that the ball lies within the pictures.",
+            )
+        return None
+
+    def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
+        """The sphere."""
+        return SphereMirror(proposal.shape, options=config.sphere)
+
+    def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
+        """The proposal itself: outlines tell a sphere to the end. After an earlier fit, they are asked again."""
+        shape, options = proposal.shape, config.sphere
+        again = None if proposal.fitted is None else self.propose(views, config, asked=False)
+        if again is not None:
+            shape = replace(again.shape, surroundings=proposal.fitted.surroundings)
+        return SphereMirror(shape, options.operator_deg if len(views.train) > 1 else 0.0, options)
