@@ -15,9 +15,12 @@ class Convert:
 
     prediction: tyro.conf.Positional[Path | None] = None
     """Prediction folder of any method; the newest one when not given."""
-    to: tuple[Literal["blender", "cubemap", "sh", "glb"], ...] = field(kw_only=True)
+    to: tuple[Literal["blender", "cubemap", "sh", "sg", "glb", "mitsuba", "usd", "threejs", "mask"], ...] = field(
+        kw_only=True
+    )
     """What to write, one or more: `blender` world.exr and scene.blend; `cubemap` px.hdr to nz.hdr; `sh`
-    harmonics.json; `glb` surface.glb."""
+    harmonics.json; `sg` lobes.json; `glb` surface.glb; `mitsuba` scene.xml; `usd` scene.usda; `threejs` index.html;
+    `mask` mask.png of what was seen."""
     output: Path | None = None
     """Folder to write; PREDICTION-converted beside it when not given."""
     confidence: Literal["keep", "darken", "fill"] = "keep"
@@ -27,6 +30,10 @@ class Convert:
     """Of cube maps: for three.js, whose lookups mirror x, or for lookups in the direction itself."""
     degree: int = 4
     """Of spherical harmonics, 0 to 4."""
+    lobes: int = 24
+    """Number of spherical Gaussians, 1 to 512."""
+    feather_deg: float = 5.0
+    """Width over which the mask falls to zero, inward from the border of what was seen."""
 
     def run(self) -> None:
         """Write and say what."""
@@ -35,6 +42,6 @@ class Convert:
 
         prediction = self.prediction or announce_newest("prediction", newest_prediction())
         output = self.output or prediction.resolve().with_name(f"{prediction.resolve().name}-converted")
-        options = ConversionOptions(self.confidence, self.layout, self.degree)
+        options = ConversionOptions(self.confidence, self.layout, self.degree, self.lobes, self.feather_deg)
         for path in convert(prediction, self.to, output, options):
             print(f"Wrote {path}")

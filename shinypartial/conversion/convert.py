@@ -1,5 +1,6 @@
 """One prediction folder to one folder of files for other programs."""
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,17 +8,29 @@ from typing import Literal
 
 import numpy as np
 
-from shinypartial.conversion.light import Confidence, Layout, cube_faces, harmonics_of, light_of
+from shinypartial.conversion.light import Confidence, Layout, cube_faces, harmonics_of, light_of, seen_mask
+from shinypartial.conversion.lobes import lobes_of
+from shinypartial.conversion.scenes import (
+    ViewOf,
+    mitsuba_scene,
+    usd_scene,
+    web_page,
+    write_triangles,
+)
 from shinypartial.conversion.surface import surface_of, write_glb
 from shinypartial.core.conventions import FACES
 from shinypartial.core.errors import InputError
-from shinypartial.io.files import write_json
-from shinypartial.io.images import write_exr_rgb, write_hdr
+from shinypartial.io.files import write_json, write_text
+from shinypartial.io.images import write_exr_rgb, write_hdr, write_png
 from shinypartial.prediction.format import read_info
 
-Target = Literal["blender", "cubemap", "sh", "glb"]
+Target = Literal["blender", "cubemap", "sh", "sg", "glb", "mitsuba", "usd", "threejs", "mask"]
 
 WORLD, BLEND, HARMONICS, GLB = "world.exr", "scene.blend", "harmonics.json", "surface.glb"
+LOBES, MASK, MITSUBA, MITSUBA_SURFACE = "lobes.json", "mask.png", "scene.xml", "surface.ply"
+USD, PAGE = "scene.usda", "index.html"
+WITH_SURFACE = {"blender", "glb", "mitsuba", "usd", "threejs"}
+WITH_WORLD = {"blender", "mitsuba", "usd"}
 
 
 @dataclass(frozen=True)
@@ -31,6 +44,10 @@ class ConversionOptions:
     """Of cube maps: `three` for three.js, whose lookups mirror x; `opengl` for lookups in the direction itself."""
     degree: int = 4
     """Of spherical harmonics, at most 4."""
+    lobes: int = 24
+    """Number of spherical Gaussians."""
+    feather_deg: float = 5.0
+    """Width over which the mask of what was seen falls to zero, inward."""
 
 
 def convert(
@@ -42,7 +59,7 @@ def convert(
     """
     info, written = read_info(prediction), []
     reflectance = info.reflectance or (1.0, 1.0, 1.0)
-    surface = surface_of(prediction) if {"blender", "glb"} & set(targets) else None
+    surface = surface_of(prediction) if WITH_SURFACE & set(targets) else None
     if "glb" in targets and surface is None:
         raise InputError(
             expected=f"a PLY with faces in {prediction}, for --to glb",
@@ -52,20 +69,46 @@ def convert(
     if "glb" in targets and surface is not None:
         write_glb(output / GLB, surface, reflectance)
         written.append(output / GLB)
-    if set(targets) == {"glb"}:
+    if "mask" in targets:
+        write_png(output / MASK, np.rint(255 * seen_mask(prediction, options.feather_deg)).astype(np.uint8))
+        written.append(output / MASK)
+    if set(targets) <= {"glb", "mask"}:
         return written
     light = np.maximum(light_of(prediction, options.confidence), 0)
     if "sh" in targets:
         write_json(output / HARMONICS, harmonics_of(light, options.degree))
         written.append(output / HARMONICS)
+    if "sg" in targets:
+        write_json(output / LOBES, lobes_of(light, options.lobes))
+        written.append(output / LOBES)
     if "cubemap" in targets:
         for name, face in zip(FACES, cube_faces(light, options.layout), strict=True):
             write_hdr(output / f"{name}.hdr", face.astype(np.float32))
             written.append(output / f"{name}.hdr")
+    if WITH_WORLD & set(targets):
+        write_exr_rgb(output / WORLD, light)
+        written.append(output / WORLD)
+    if "mitsuba" in targets:
+        if surface is not None:
+            write_triangles(output / MITSUBA_SURFACE, surface)
+            written.append(output / MITSUBA_SURFACE)
+        beside = None if surface is None else MITSUBA_SURFACE
+        write_text(output / MITSUBA, mitsuba_scene(WORLD, beside, reflectance, ViewOf(surface)))
+        written.append(output / MITSUBA)
+    if "usd" in targets:
+        write_text(output / USD, usd_scene(WORLD, surface, reflectance))
+        written.append(output / USD)
+    if "threejs" in targets:
+        with tempfile.TemporaryDirectory() as scratch:
+            hdr, glb = Path(scratch) / "light.hdr", Path(scratch) / GLB
+            write_hdr(hdr, light.astype(np.float32))
+            if surface is not None:
+                write_glb(glb, surface, reflectance)
+            write_text(output / PAGE, web_page(hdr.read_bytes(), None if surface is None else glb.read_bytes()))
+        written.append(output / PAGE)
     if "blender" in targets:
         from shinypartial.blender.mirror_scene import write_mirror_scene
 
-        write_exr_rgb(output / WORLD, light)
         write_mirror_scene(output / BLEND, output / WORLD, surface, reflectance)
-        written += [output / WORLD, output / BLEND]
+        written.append(output / BLEND)
     return written

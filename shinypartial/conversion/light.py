@@ -11,7 +11,7 @@ from scipy.sparse.linalg import splu
 from shinypartial.core.conventions import Y_UP_TO_WORLD
 from shinypartial.core.errors import InputError
 from shinypartial.core.harmonics import project_latlong
-from shinypartial.core.sphere import cube_directions, latlong_directions, sample_latlong
+from shinypartial.core.sphere import blur_latlong, cube_directions, latlong_directions, sample_latlong
 from shinypartial.prediction.format import VISIBILITY, read_environment_map, read_visibility
 
 Confidence = Literal["keep", "darken", "fill"]
@@ -33,18 +33,32 @@ def light_of(prediction: Path, confidence: Confidence) -> Float[np.ndarray, "H W
     radiance = read_environment_map(prediction)
     if confidence == "keep":
         return radiance
-    visibility = read_visibility(prediction)
-    if visibility is None:
-        raise InputError(
-            expected=f"{VISIBILITY} in {prediction}, for --confidence {confidence}",
-            found="none",
-            remedy="Take --confidence keep.",
-        )
+    visibility = _visibility(prediction, f"--confidence {confidence}", "Take --confidence keep.")
     if len(visibility) != len(radiance):
         visibility = sample_latlong(visibility[..., None], latlong_directions(len(radiance)))[..., 0]
     if confidence == "darken":
         return radiance * visibility[..., None]
     return filled(radiance, visibility > 0)
+
+
+def seen_mask(prediction: Path, feather_deg: float, threshold: float = 0.5) -> Float[np.ndarray, "H W"]:
+    """Where the light was seen, as a lat-long mask in [0, 1] for a program that must not trust the rest.
+
+    2 b − 1 with b the share of directions in a Gaussian of half of `feather_deg` whose visibility is at least the
+    threshold: zero along a straight border, and one at about the feather's width within it. Zero beyond.
+    """
+    seen = _visibility(prediction, "--to mask", "Leave mask out.") >= threshold
+    if feather_deg <= 0:
+        return seen.astype(np.float64)
+    share = blur_latlong(seen[..., None].astype(np.float64), np.radians(feather_deg) / 2)[..., 0]
+    return np.clip(2 * share - 1, 0, 1) * seen
+
+
+def _visibility(prediction: Path, needed_for: str, remedy: str) -> Float[np.ndarray, "H W"]:
+    visibility = read_visibility(prediction)
+    if visibility is None:
+        raise InputError(expected=f"{VISIBILITY} in {prediction}, for {needed_for}", found="none", remedy=remedy)
+    return visibility
 
 
 def filled(radiance: Float[np.ndarray, "H W 3"], seen: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W 3"]:
