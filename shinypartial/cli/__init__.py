@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import tyro
 
-from shinypartial.cli.converting import Convert
+from shinypartial.cli.converting import Convert, Relight
 from shinypartial.cli.datasets import ExportCameras, Perturb, Release, Subset, Validate
 from shinypartial.cli.presenting import Chart, Leaderboard, Report
 from shinypartial.cli.scenes import Generate
@@ -22,6 +22,7 @@ Command = (
     | Oracle
     | Postprocess
     | Convert
+    | Relight
     | Compare
     | Weights
     | Report

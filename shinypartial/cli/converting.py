@@ -1,4 +1,4 @@
-"""The command that hands a prediction to other programs."""
+"""The commands that hand a prediction to other programs, and show its light on an object."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,3 +45,44 @@ class Convert:
         options = ConversionOptions(self.confidence, self.layout, self.degree, self.lobes, self.feather_deg)
         for path in convert(prediction, self.to, output, options):
             print(f"Wrote {path}")
+
+
+@dataclass(frozen=True)
+class Relight:
+    """Render an object of yours in the recovered light: before, after and, of a dataset, in the true light."""
+
+    prediction: tyro.conf.Positional[Path | None] = None
+    """Prediction folder of any method; the newest one when not given."""
+    object: Path | None = None
+    """A .blend, .glb or .gltf; three balls, mirror, metal and matte, when not given."""
+    dataset: Path | None = None
+    """Dataset whose true light is rendered, too."""
+    output: Path | None = None
+    """Folder to write; PREDICTION-relit beside it when not given."""
+    confidence: Literal["keep", "darken", "fill"] = "keep"
+    """Directions that were not seen, as for `convert`."""
+    resolution: int = 512
+    """Pixels along the width."""
+    samples: int = 64
+    """Paths a pixel."""
+
+    def run(self) -> None:
+        """Render and say what was written."""
+        from shinypartial.conversion.relight import relight
+        from shinypartial.prediction.format import newest_prediction
+
+        prediction = self.prediction or announce_newest("prediction", newest_prediction())
+        output = self.output or prediction.resolve().with_name(f"{prediction.resolve().name}-relit")
+        relit = relight(
+            prediction,
+            output,
+            source=self.object,
+            dataset=self.dataset,
+            confidence=self.confidence,
+            resolution=self.resolution,
+            samples=self.samples,
+        )
+        for path in relit.pictures.values():
+            print(f"Wrote {path}")
+        if relit.psnr_srgb is not None:
+            print(f"In the recovered light it looks as in the true one to {relit.psnr_srgb:.1f} dB.")

@@ -30,7 +30,7 @@ def lobes_of(latlong: Float[np.ndarray, "H W 3"], count: int) -> dict[str, Any]:
     axes = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), height], 1)
     cosines, root = directions @ axes.T, np.sqrt(areas)[:, None]
     found = {share * count: _fitted(cosines, light, root, share * count) for share in SHARPNESS_SHARES}
-    sharpness = min(found, key=lambda each: found[each][0])
+    sharpness = min(found, key=lambda each: float(found[each][0]))
     error, colors = found[sharpness]
     return {
         "lobes": [
@@ -63,4 +63,4 @@ def _fitted(
     lobes = np.exp(sharpness * (cosines - 1)) * root
     colors = np.stack([nnls(lobes, channel)[0] for channel in (light * root).T], 1)
     residual = lobes @ colors - light * root
-    return float(np.linalg.norm(residual) / max(np.linalg.norm(light * root), 1e-12)), colors
+    return float(np.linalg.norm(residual)) / max(float(np.linalg.norm(light * root)), 1e-12), colors

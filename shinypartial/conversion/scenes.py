@@ -40,7 +40,7 @@ def write_triangles(path: Path, mesh: Mesh) -> None:
 
 
 def mitsuba_scene(world: str, surface: str | None, reflectance: tuple[float, float, float], view: "ViewOf") -> str:
-    """A scene of Mitsuba 3 with an environment map and, from a PLY, a mirror of that reflectance; files lie beside it."""
+    """A scene of Mitsuba 3 with an environment map and, from a PLY, a mirror; files lie beside it."""
     turn = np.eye(4)
     turn[:3, :3] = LATLONG_TO_WORLD
     shape = f"""

@@ -112,10 +112,8 @@ def test_lobes_of_a_lobe_are_that_lobe() -> None:
 
 
 def test_the_mask_is_zero_where_nothing_was_seen_and_one_well_inside(prediction: Path) -> None:
-    assert (
-        main(["convert", str(prediction), "--to", "mask", "--feather-deg", "10", "--output", str(prediction / "o")])
-        == 0
-    )
+    arguments = ["--to", "mask", "--feather-deg", "10", "--output", str(prediction / "o")]
+    assert main(["convert", str(prediction), *arguments]) == 0
     mask = read_picture(prediction / "o" / "mask.png")[..., 0].astype(float) / 255
     depth_deg = np.degrees(np.arcsin(latlong_directions(64)[..., 0]))
     assert (mask[depth_deg <= 0] == 0).all()
