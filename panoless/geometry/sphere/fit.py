@@ -51,6 +51,10 @@ class Cones:
     sines: Float[np.ndarray, "V"]
     """Of half the opening angle."""
     median_px: Float[np.ndarray, "V"]
+    ellipticity: Float[np.ndarray, "V"]
+    """Amplitude of cos 2φ, φ around the axis, in the contour's distance from the cone, as a share of its radius. Noise
+    of masks hardly shows in it, and another shape does.
+    """
 
     @classmethod
     def of(cls, rays: OutlineRays, rounds: int) -> "Cones":
@@ -69,9 +73,19 @@ class Cones:
                 off_px = (np.arccos(np.clip(directions @ m * cosine, -1, 1)) - np.arccos(cosine)) * scale
                 weights = robust_weight(off_px, robust_scale(off_px, 0.5, 3.0))
             median_px = float(np.median(np.abs(off_px)))
-            found.append((rays.origins[own][0], m / np.linalg.norm(m), np.sqrt(1 - cosine**2), median_px))
-        origins, axes, sines, medians = zip(*found, strict=True) if found else ([], [], [], [])
-        return cls(np.array(origins).reshape(-1, 3), np.array(axes).reshape(-1, 3), np.array(sines), np.array(medians))
+            axis, sine = m / np.linalg.norm(m), np.sqrt(1 - cosine**2)
+            oval = _second_harmonic(directions, axis, off_px / scale, weights) / np.arccos(cosine)
+            found.append((rays.origins[own][0], axis, sine, median_px, oval))
+        origins, axes, *figures = zip(*found, strict=True) if found else [()] * 5
+        return cls(np.array(origins).reshape(-1, 3), np.array(axes).reshape(-1, 3), *map(np.array, figures))
+
+    def are_of_a_sphere(self, options: SphereOptions) -> bool:
+        """Whether the median view has a contour near its cone, and not an oval one."""
+        return bool(
+            len(self.sines)
+            and np.median(self.median_px) <= options.largest_cone_px
+            and np.median(self.ellipticity) <= options.largest_ellipticity
+        )
 
     def sphere(self, radius: float) -> Sphere:
         """The sphere whose cones are nearest to these, by linear least squares; of a `radius` that is known, unless 0.
@@ -87,6 +101,20 @@ class Cones:
             right, rows = right - radius * rows[:, 3], np.concatenate([rows[:, :3], 0 * rows[:, 3:]], 1)
         solved = np.linalg.lstsq(np.concatenate([rows, pull]), np.append(right, np.zeros(3)), rcond=None)[0]
         return Sphere(solved[:3], radius or float(solved[3]))
+
+
+def _second_harmonic(
+    directions: Float[np.ndarray, "P 3"],
+    axis: Float[np.ndarray, "3"],
+    values: Float[np.ndarray, "P"],
+    weights: Float[np.ndarray, "P"],
+) -> float:
+    """√(a² + b²) of the a cos 2φ + b sin 2φ nearest to values with weights, φ being the azimuth about an axis."""
+    across = np.linalg.svd(axis[None])[2][1:]
+    azimuth = np.arctan2(directions @ across[1], directions @ across[0])
+    basis = np.stack([np.cos(2 * azimuth), np.sin(2 * azimuth)], 1)
+    weighted = basis * weights[:, None]
+    return float(np.linalg.norm(np.linalg.solve(weighted.T @ basis + 1e-12 * np.eye(2), weighted.T @ values)))
 
 
 @dataclass(frozen=True)
@@ -148,7 +176,7 @@ def fit_sphere(views: Views, options: SphereOptions, *, asked: bool) -> SphereFi
     """The sphere that explains the masks best; None where their outlines are no cones, unless it was `asked` for."""
     rays = OutlineRays.of(views)
     cones = Cones.of(rays, options.cone_rounds)
-    if not len(cones.sines) or not (asked or np.median(cones.median_px) <= options.largest_cone_px):
+    if not len(cones.sines) or not (asked or cones.are_of_a_sphere(options)):
         return None
     known = options.radius / views.object_frame.radius
     sphere = _refined(cones.sphere(known), rays, known > 0, options)
