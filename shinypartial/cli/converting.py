@@ -8,6 +8,8 @@ import tyro
 
 from shinypartial.cli.newest import announce_newest
 
+Target = Literal["blender", "cubemap", "sh", "sg", "glb", "mitsuba", "usd", "threejs", "mask", "room"]
+
 
 @dataclass(frozen=True)
 class Convert:
@@ -15,12 +17,10 @@ class Convert:
 
     prediction: tyro.conf.Positional[Path | None] = None
     """Prediction folder of any method; the newest one when not given."""
-    to: tuple[Literal["blender", "cubemap", "sh", "sg", "glb", "mitsuba", "usd", "threejs", "mask"], ...] = field(
-        kw_only=True
-    )
+    to: tuple[Target, ...] = field(kw_only=True)
     """What to write, one or more: `blender` world.exr and scene.blend; `cubemap` px.hdr to nz.hdr; `sh`
     harmonics.json; `sg` lobes.json; `glb` surface.glb; `mitsuba` scene.xml; `usd` scene.usda; `threejs` index.html;
-    `mask` mask.png of what was seen."""
+    `mask` mask.png of what was seen; `room` room.json of near surroundings."""
     output: Path | None = None
     """Folder to write; PREDICTION-converted beside it when not given."""
     confidence: Literal["keep", "darken", "fill"] = "keep"

@@ -10,6 +10,7 @@ import numpy as np
 
 from shinypartial.conversion.light import Confidence, Layout, cube_faces, harmonics_of, light_of, seen_mask
 from shinypartial.conversion.lobes import lobes_of
+from shinypartial.conversion.room import room_of
 from shinypartial.conversion.scenes import (
     ViewOf,
     mitsuba_scene,
@@ -24,11 +25,11 @@ from shinypartial.io.files import write_json, write_text
 from shinypartial.io.images import write_exr_rgb, write_hdr, write_png
 from shinypartial.prediction.format import read_info
 
-Target = Literal["blender", "cubemap", "sh", "sg", "glb", "mitsuba", "usd", "threejs", "mask"]
+Target = Literal["blender", "cubemap", "sh", "sg", "glb", "mitsuba", "usd", "threejs", "mask", "room"]
 
 WORLD, BLEND, HARMONICS, GLB = "world.exr", "scene.blend", "harmonics.json", "surface.glb"
 LOBES, MASK, MITSUBA, MITSUBA_SURFACE = "lobes.json", "mask.png", "scene.xml", "surface.ply"
-USD, PAGE = "scene.usda", "index.html"
+USD, PAGE, ROOM = "scene.usda", "index.html", "room.json"
 WITH_SURFACE = {"blender", "glb", "mitsuba", "usd", "threejs"}
 WITH_WORLD = {"blender", "mitsuba", "usd"}
 
@@ -72,7 +73,10 @@ def convert(
     if "mask" in targets:
         write_png(output / MASK, np.rint(255 * seen_mask(prediction, options.feather_deg)).astype(np.uint8))
         written.append(output / MASK)
-    if set(targets) <= {"glb", "mask"}:
+    if "room" in targets:
+        write_json(output / ROOM, room_of(prediction))
+        written.append(output / ROOM)
+    if set(targets) <= {"glb", "mask", "room"}:
         return written
     light = np.maximum(light_of(prediction, options.confidence), 0)
     if "sh" in targets:

@@ -13,9 +13,17 @@ from plyfile import PlyData
 from shinypartial.cli import main
 from shinypartial.conversion.convert import convert
 from shinypartial.conversion.lobes import lobes_of
+from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import latlong_directions, sample_latlong
+from shinypartial.io.files import read_json
 from shinypartial.io.images import read_exr_rgb, read_picture
-from shinypartial.prediction.format import PredictionInfo, write_environment_map, write_info, write_visibility
+from shinypartial.prediction.format import (
+    PredictionInfo,
+    write_environment_map,
+    write_info,
+    write_inverse_distance,
+    write_visibility,
+)
 from tests.shinypartial.conversion.test_surface import write_ply
 from tests.support.polyhedra import wavy_patch
 from tests.support.tiny_scene import direction_colors
@@ -119,3 +127,17 @@ def test_the_mask_is_zero_where_nothing_was_seen_and_one_well_inside(prediction:
     assert (mask[depth_deg <= 0] == 0).all()
     assert (mask[depth_deg > 15] > 0.99).all()
     assert 0.5 < sample_latlong(mask[..., None], np.array([np.sin(np.radians(5)), 0, np.cos(np.radians(5))]))[0] < 0.95
+
+
+def test_the_walls_of_a_box_are_found(prediction: Path) -> None:
+    """1/D of a box is the largest of ω·a/h over its walls; a far world has none."""
+    with pytest.raises(InputError, match="infinitely far"):
+        convert(prediction, ("room",), prediction / "out")
+    walls = np.array([3.0, 2.0, 1.5, 4.0, 2.5, 1.0])
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    write_inverse_distance(prediction, (latlong_directions(64) @ axes.T / walls).max(-1))
+    convert(prediction, ("room",), prediction / "out")
+    room = read_json(prediction / "out" / "room.json", "a room")
+    # The world's +X, +Y, +Z are +x, −z, +y with Y up.
+    np.testing.assert_allclose(room["box_max"], [3.0, 1.5, 2.5], rtol=0.02)
+    np.testing.assert_allclose(room["box_min"], [-4.0, -1.0, -2.0], rtol=0.02)
