@@ -34,6 +34,8 @@ class SphereOptions:
     widest_footprint_rad: Positive = 0.2
     """Pixels that span more tell the map by their centers only. Not tuned."""
     operator_deg: NonNegative = 12.0
-    """Of several views, rays that return to their camera within this angle show who holds it, and…"""
+    """Of several views, rays that return to their camera within this angle show who holds it, and… With a figure of 1.7
+    scene units in two photographs of a rendered ball, 0°, 12° and 25° give maps of 22.5, 22.7 and 22.0 dB; without
+    one 24.5, 24.6 and 24.7 dB."""
     operator_trust: Share = 0.01
     """…count so little that any other view of their directions decides. They are a hundredth of all. Not tuned."""
