@@ -28,6 +28,8 @@ from shinypartial.io.progress import Progress
 HELD_OUT_EVERY = 5
 SIZED_VIEWS = 5
 """From so many views at most the size of the object is taken."""
+NAMED_VIEWS = 5
+"""So many of the views with empty masks are named at most."""
 Item = TypeVar("Item")
 
 
@@ -142,20 +144,24 @@ def load_views(
     Raises InputError for unreadable images and for masks that are all empty.
     """
     progress = Progress("reading views", len(dataset.train))
-    photographs = []
+    photographs, empty = [], []
     downscale = max(1, min(downscale, int(_object_px(dataset) / least_object_px))) if least_object_px else downscale
     for frame in dataset.train:
         view = read_view(frame)
         alpha = _block_means(np.clip(view.alpha, 0, 1), downscale)
-        if not (alpha >= MASK_LEVEL).any():
-            raise InputError(
-                expected=f"the object in {frame.name}: some mask pixel of at least one half",
-                found="an empty mask",
-                remedy="Correct the mask, or remove the frame from transforms_train.json.",
-            )
-        radiance = encoding.encoded(_block_means(encoding.clipped(frame, view), downscale))
-        photographs.append(cropped(frame.camera.downscaled(downscale), radiance, alpha, crop_margin_px))
+        if (alpha >= MASK_LEVEL).any():
+            radiance = encoding.encoded(_block_means(encoding.clipped(frame, view), downscale))
+            photographs.append(cropped(frame.camera.downscaled(downscale), radiance, alpha, crop_margin_px))
+        else:
+            empty.append(frame.name)
         progress.advance()
+    if empty:
+        more = f" and {len(empty) - NAMED_VIEWS} more" if len(empty) > NAMED_VIEWS else ""
+        raise InputError(
+            expected="the object in every training view: some mask pixel of at least one half",
+            found=f"{len(empty)} of {len(dataset.train)} masks empty: {', '.join(empty[:NAMED_VIEWS])}{more}",
+            remedy="Correct these masks, or remove their frames from transforms_train.json.",
+        )
     return views_of(photographs, known_radius)
 
 

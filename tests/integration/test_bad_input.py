@@ -120,7 +120,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     "truncated image": (truncate_exr, ("r_001.exr", "truncated")),
     "image of another size": (shrink_exr, ("train/r_001", "32×31")),
     "no mask": (remove_mask, ("mask", "train/r_001")),
-    "empty mask": (change_view(np.zeros_like, "alpha"), ("empty mask", "train/r_001")),
+    "empty mask": (change_view(np.zeros_like, "alpha"), ("masks empty", "train/r_001")),
     "NaN": (change_view(put_nan, "radiance"), ("finite radiance", "train/r_001")),
     "pose that can't be inverted": (set_pose(0.0, 0, 0), ("rigid", "train/r_001")),
     "pose that is not finite": (set_pose(float("nan"), 0, 3), ("finite pose", "train/r_001")),
