@@ -129,8 +129,8 @@ def _mask_radius(camera: Camera, inside: Bool[np.ndarray, "H W"], center: Float[
         raise InputError(
             expected="cameras that look at one object",
             found="an object center behind one of the cameras",
-            remedy="Check the axes of transform_matrix (OpenGL, the camera looks along −z), and that the cameras stand in "
-            "different places.",
+            remedy="Check the axes of transform_matrix: OpenGL, the camera looks along −z. Cameras that stand in one "
+            "place do not tell where the object is.",
         )
     rows, columns = np.nonzero(inside)
     across = np.hypot((columns + PIXEL_CENTER - x) / camera.fx, (rows + PIXEL_CENTER - y) / camera.fy).max()

@@ -13,6 +13,7 @@ import argparse
 import json
 import os
 import random
+import shlex
 import shutil
 import signal
 import subprocess
@@ -38,17 +39,20 @@ FIT = f"""{sys.executable} -c
 from panoless.reconstruct import recorder; import panoless.cli, sys
 recorder.CHECKPOINT_INTERVAL_S = 0.2; sys.exit(panoless.cli.main(sys.argv[1:]))
 """.split(maxsplit=2)
-SMALL = """fit fewer --preset fast --config.iterations 400 --config.surfels.count 500 --config.environment.rays 100000
---config.environment.resolution 32 --config.environment.solve-resolution 32
---set corrections.masks=off corrections.exposure=off corrections.lens=off poses.mode=off surroundings.mode=off""".split()
-FEW_STEPS = (
-    '{"cells": 16, "resolution": 8, "robust_scale": 0.3, "samples": 1, "rays": 3000, "smoothing": 100, "steps": 2}'
-)
-REVOLUTION = """--set revolution.photometric.pixels=10000 revolution.mouth.judged_pixels=5000 revolution.lip.length_px=5
-revolution.map.pixels=100000 revolution.footprints.pixels=5000 --model revolution""".split()
-FREE_FORM = """--set free_form.concave.search=false free_form.descent.rounds=[] free_form.start_tensions=[10]
-free_form.footprints=20000 free_form.render_samples=1 free_form.render_directions=1""".split()
-FREE_FORM += [f"free_form.rounds=[{FEW_STEPS}]", "--model", "free_form"]
+SMALL = shlex.split("""
+    fit fewer --preset fast --config.iterations 400 --config.surfels.count 500 --config.environment.rays 100000
+    --config.environment.resolution 32 --config.environment.solve-resolution 32
+    --set corrections.masks=off corrections.exposure=off corrections.lens=off poses.mode=off surroundings.mode=off
+""")
+REVOLUTION = shlex.split("""
+    --model revolution --set revolution.photometric.pixels=10000 revolution.mouth.judged_pixels=5000
+    revolution.lip.length_px=5 revolution.map.pixels=100000 revolution.footprints.pixels=5000
+""")
+FREE_FORM = shlex.split("""
+    --model free_form --set free_form.concave.search=false free_form.descent.rounds=[] free_form.start_tensions=[10]
+    free_form.footprints=20000 free_form.render_samples=1 free_form.render_directions=1 free_form.rounds='[{
+    "cells": 16, "resolution": 8, "robust_scale": 0.3, "samples": 1, "rays": 3000, "smoothing": 100, "steps": 2}]'
+""")
 
 
 @dataclass(frozen=True)
