@@ -111,7 +111,7 @@ def carve_hull(views: Views, resolution: int, votes: float, options: FirstSurfac
         raise InputError(
             expected="masks and poses that agree on an object",
             found=f"no point in space that {votes:.0%} of the masks contain",
-            remedy="Check the axes of transform_matrix (OpenGL) and that masks mark the object, not the background.",
+            remedy="Check the axes of transform_matrix (OpenGL), and that masks mark one object, not the background.",
         )
     return Hull(distance, half_side, pixel)
 

@@ -42,7 +42,7 @@ def earned_reflectance(views: Views, geometry: Geometry, config: FitConfig) -> R
     with torch.no_grad():
         seen = [unsaturated(rays, encoding.saturation) for rays in observe_views(views, geometry, options.rays)]
         kept, held_out = split_held_out(seen)
-        if not kept or not held_out:
+        if not held_out or not any(len(rays.radiance) for rays in kept):
             return None
         found = find_reflectance(joined_rays(kept), options)
         if min(found.tint) > options.largest_reflectance:

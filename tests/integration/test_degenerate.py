@@ -72,6 +72,28 @@ def twice_in_the_picture(view: View) -> View:
     return replace(view, alpha=alpha, radiance=radiance)
 
 
+def few_pixels_wide(view: View) -> View:
+    """The object at a quarter of its size: six pixels across."""
+    alpha, radiance = np.zeros_like(view.alpha), np.zeros_like(view.radiance)
+    side = len(alpha) // 4
+    middle = slice((len(alpha) - side) // 2, (len(alpha) + side) // 2)
+    alpha[middle, middle] = view.alpha.reshape(side, 4, side, 4).mean((1, 3))
+    radiance[middle, middle] = view.radiance.reshape(side, 4, side, 4, 3).mean((1, 3))
+    return replace(view, alpha=alpha, radiance=radiance)
+
+
+def half_without_object(root: Path) -> None:
+    for frame in open_dataset(root).train[::2]:
+        view = read_view(frame)
+        write_view(frame, replace(view, alpha=np.zeros_like(view.alpha), radiance=np.zeros_like(view.radiance)))
+
+
+def about_turn(frames: list[dict]) -> None:
+    """Cameras that look the other way, as poses of OpenCV taken for those of OpenGL do."""
+    for frame in frames:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([-1.0, 1.0, -1.0, 1.0])).tolist()
+
+
 def lit_by(radiance: Callable[[View], np.ndarray]) -> Callable[[View], View]:
     return lambda view: replace(view, radiance=(radiance(view) * view.alpha[..., None]).astype(np.float32))
 
@@ -80,13 +102,18 @@ DOUBTED: dict[str, Change] = {
     "two views": cameras(lambda frames: frames.__delitem__(slice(2, None))),
     "an object cut by the frame": pictures(cut_by_the_frame),
     "two objects": pictures(twice_in_the_picture),
+    "an object of six pixels": pictures(few_pixels_wide),
+    "too much light": pictures(lit_by(lambda view: np.ones_like(view.radiance))),
     "noise": pictures(lit_by(lambda view: np.random.default_rng(0).random(view.radiance.shape))),
     "no light": pictures(lit_by(lambda view: np.zeros_like(view.radiance))),
     "one color": pictures(lit_by(lambda view: np.full_like(view.radiance, 0.5))),
 }
 REFUSED: dict[str, Change] = {
     "one view": cameras(lambda frames: frames.__delitem__(slice(1, None))),
+    "one place": cameras(lambda frames: [frame.update(frames[0]) for frame in frames]),
+    "cameras that look away": cameras(about_turn),
     "cameras beside each other": cameras(beside_each_other),
+    "half of the views without the object": half_without_object,
     "no object anywhere": pictures(lambda view: replace(view, alpha=np.zeros_like(view.alpha))),
 }
 
