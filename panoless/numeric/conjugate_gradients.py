@@ -24,17 +24,22 @@ def conjugate_gradients(
     result, residual = start.clone(), residual.clone()
     scaled = precondition * residual
     direction = scaled.clone()
-    energy = (residual * scaled).sum()
+    energy = _inner(residual, scaled)
     for _ in range(steps):
         ahead = product(direction)
-        step = energy / (direction * ahead).sum().clamp(min=1e-12)
+        step = energy / _inner(direction, ahead).clamp(min=1e-12)
         result += step * direction
         residual -= step * ahead
         scaled = precondition * residual
-        new_energy = (residual * scaled).sum()
+        new_energy = _inner(residual, scaled)
         direction = scaled + (new_energy / energy.clamp(min=1e-12)) * direction
         energy = new_energy
     return result
+
+
+def _inner(first: Float[Tensor, "*S L"], second: Float[Tensor, "*S L"]) -> Float[Tensor, ""]:
+    """Σ a b, row by row: torch splits one sum of all among its threads, so that it would depend on their number."""
+    return (first * second).sum(-1).sum()
 
 
 def solve_by_products(

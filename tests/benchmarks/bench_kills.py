@@ -70,7 +70,9 @@ def _program(package: str, *words: str) -> list[str]:
 
 COMMANDS = {
     "generate": Command(_program("shinypartial", "generate", "--scene", "recipe/scene.toml"), 20, "t*/*.exr"),
-    "perturb": Command(_program("shinypartial", "perturb", "tiny-vase", "--sensor.shot-noise", "0.02"), 10, "t*/r_???.png"),
+    "perturb": Command(
+        _program("shinypartial", "perturb", "tiny-vase", "--sensor.shot-noise", "0.02"), 10, "t*/r_???.png"
+    ),
     "fit: surfels": Command([*FIT, *SMALL, "--model", "surfels", "--output", str(MADE)], 20, "nothing"),
     "fit: revolution": Command([*FIT, *SMALL, *REVOLUTION, "--output", str(MADE)], 15, "nothing"),
     "fit: free form": Command([*FIT, *SMALL, *FREE_FORM, "--output", str(MADE)], 15, "nothing"),

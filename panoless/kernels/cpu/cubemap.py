@@ -2,8 +2,8 @@
 
 The faces are first copied, with their ring of neighboring texels, into a padded texture whose channels lie
 together, so that a ray touches two short runs of memory and never asks where a face ends. The adjoint goes the
-same way back: rays add to padded buffers, one for each thread, which are then summed and folded onto the faces in
-a fixed order, so the result does not depend on the scheduling of threads.
+same way back: fixed shares of the rays add to padded buffers of their own, which are then summed and folded onto the faces
+in a fixed order, so the result depends neither on the scheduling of threads nor on their number.
 
 Rays go in blocks: all of a block are projected first, without a branch, then each is interpolated. What the ray loops
 touch is passed flat, because LLVM vectorizes steps of a constant 3 but guesses wrong about the row length of a
@@ -22,13 +22,15 @@ from torch import Tensor
 
 from panoless.kernels.cpu.compilation import VECTORIZED_LOOPS
 from panoless.kernels.cpu.simd_memory import fetch_add
-from panoless.kernels.cpu.workers import run_shared, thread_count
+from panoless.kernels.cpu.workers import run_shared
 from panoless.kernels.reference.cubemap import SHORTEST_DIRECTION, cubemap_padding
 
 f32 = np.float32
 SHORTEST, LARGEST = f32(SHORTEST_DIRECTION), np.finfo(np.float32).max
 RAYS_PER_BLOCK = 512
 LINES_PER_CLAIM = 16
+MOST_SHARES = 4
+"""Of the rays that are scattered: so many threads can work at them."""
 
 
 class SampleCubemap(torch.autograd.Function):
@@ -72,7 +74,7 @@ def scatter_cubemap(
     padding = cubemap_padding(resolution, torch.device("cpu"))
     # Clearing and adding up one more buffer must cost less than the work it takes from the others.
     useful = max(1, 4 * len(directions) // (6 * resolution**2))
-    buffers = _scatter_buffers(min(thread_count(), useful), resolution, channels, get_ident())
+    buffers = _scatter_buffers(min(MOST_SHARES, useful), resolution, channels, get_ident())
     flat_buffers = buffers.reshape(len(buffers), -1)
     run_shared(_scatter, _flat(values), _flat(directions), flat_buffers, resolution, (0,) * channels)
     cubemap = values.new_empty(6, channels, resolution, resolution)
