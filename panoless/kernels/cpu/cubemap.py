@@ -2,8 +2,8 @@
 
 The faces are first copied, with their ring of neighboring texels, into a padded texture whose channels lie
 together, so that a ray touches two short runs of memory and never asks where a face ends. The adjoint goes the
-same way back: fixed shares of the rays add to padded buffers of their own, which are then summed and folded onto the faces
-in a fixed order, so the result depends neither on the scheduling of threads nor on their number.
+same way back: fixed shares of the rays add to padded buffers of their own, which are then summed and folded onto the
+faces in a fixed order, so the result depends neither on the scheduling of threads nor on their number.
 
 Rays go in blocks: all of a block are projected first, without a branch, then each is interpolated. What the ray loops
 touch is passed flat, because LLVM vectorizes steps of a constant 3 but guesses wrong about the row length of a

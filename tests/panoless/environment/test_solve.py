@@ -181,3 +181,15 @@ def test_the_initial_map_is_reproducible_and_shows_radiance(activation: str) -> 
     seen = look_up(first, random_rays(500).directions, activation)
     assert 0.0 <= float(seen.min()) <= float(seen.max()) <= 1.0
     assert float(seen.mean()) == pytest.approx(0.5, abs=0.05)
+
+
+def test_the_map_does_not_depend_on_the_number_of_threads() -> None:
+    """With so many texels that torch would split a sum of all of them."""
+    rays, threads, found = [random_rays(40_000)], torch.get_num_threads(), []
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            found.append(solve_environment(rays, 80))
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(*found)
