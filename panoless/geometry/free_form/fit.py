@@ -84,7 +84,7 @@ def fit_free_form(
             stage = better(stage, deeper, options.concave.least_held_out_gain) if held_out else deeper
         if held_out and options.poses == "auto" and pose_pull(solved, stage, options) > options.least_pose_pull:
             settled = _settled(solved, stage, options.pose_steps, options)
-            stage = better(settled, _with_poses(solved, stage, options), options.least_pose_gain)
+            stage = better(settled, _with_poses(solved, start, options), options.least_pose_gain)
         if held_out and options.finer:
             stage = keep_if_better(_stages(solved, stage, options, progress), error, options.least_held_out_gain)
         assert stage.settings is not None, "a fit has rounds"
@@ -148,11 +148,12 @@ def coarse_stage(
     return stage
 
 
-def _with_poses(views: Views, stage: FitStage, options: FreeFormOptions) -> FitStage:
-    """A stage after its round was taken again with free poses."""
-    free = replace(stage, poses=Poses.none(len(views.train)))
-    found = take_round(views, free, _freed(stage, options.pose_steps), options)
-    return replace(found, settings=stage.settings)
+def _with_poses(views: Views, start: LevelSet, options: FreeFormOptions) -> FitStage:
+    """What the rounds lead to from a first surface with poses free from the first step on, and more of the last one:
+    a surface that settled under wrong cameras holds them there.
+    """
+    free = coarse_stage(views, start, options.rounds, replace(options, poses="on"))
+    return replace(take_round(views, free, _freed(free, options.pose_steps), options), settings=free.settings)
 
 
 def _joined(solved: Poses, tested: Poses) -> Poses:

@@ -75,7 +75,7 @@ class SphereMirror(ExactGeometry):
             view.directions_world(chosen),
         )
 
-    def footprints(self, views: Views) -> Footprints | None:
+    def footprints(self, views: Views, max_pixels: int) -> Footprints | None:
         """Of the pixels that the sphere covers wholly and that span a narrow angle."""
         found = []
         for view in views.train:
