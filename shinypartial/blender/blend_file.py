@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from shinypartial.blender.materials import make_material
-from shinypartial.blender.mesh import Mesh, deformed
+from shinypartial.blender.mesh import deformed
 from shinypartial.core.errors import InputError
+from shinypartial.core.mesh import Mesh
 from shinypartial.scene import BlendFile, Material, SceneSpec
 
 #: Kinds of objects that have a surface. Lights, cameras and the world of the file are not used.

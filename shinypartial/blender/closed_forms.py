@@ -6,7 +6,8 @@ On the faces of the default grids, the mean of the four normals is within 0.02°
 import numpy as np
 from jaxtyping import Float
 
-from shinypartial.blender.mesh import Mesh, grid_faces
+from shinypartial.blender.mesh import grid_faces
+from shinypartial.core.mesh import Mesh
 from shinypartial.scene import RadialHarmonics, Ring, Superquadric
 
 #: Zonal harmonics about seeded axes for each degree l: as many as there are harmonics, 2l + 1, are drawn.

@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from shinypartial.blender.closed_forms import harmonic_mesh, ring_mesh, superquadric_mesh
-from shinypartial.blender.mesh import Mesh, Outline, grid_faces, joined, placed
+from shinypartial.blender.mesh import Outline, grid_faces, joined, placed
 from shinypartial.blender.organic import blob_mesh, soft_balls_mesh
+from shinypartial.core.mesh import Mesh
 from shinypartial.scene import (
     Blob,
     Frame,

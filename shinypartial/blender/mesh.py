@@ -6,21 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from shinypartial.core.mesh import Mesh, polygon_normals
 from shinypartial.scene import Deformation
 
 #: Waves whose sum makes a displacement; with 24 it is close to a Gaussian random field.
 WAVES = 24
 #: Vertices nearer than this share of the mesh's size are one point: both sides of a crease move together.
 SAME_POINT = 1e-6
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """Polygons with one outward unit normal a vertex; a face lists its vertices counterclockwise from outside."""
-
-    vertices: Float[np.ndarray, "P 3"]
-    normals: Float[np.ndarray, "P 3"]
-    faces: list[tuple[int, ...]]
 
 
 @dataclass(frozen=True)
@@ -99,18 +91,6 @@ def displacement_field(points: Float[np.ndarray, "P 3"], deformation: Deformatio
     phases = random.uniform(0, 2 * np.pi, WAVES)
     waves = np.cos(2 * np.pi / deformation.wavelength * points @ directions.T + phases)
     return np.sqrt(2 / WAVES) * waves.sum(-1)
-
-
-def polygon_normals(vertices: Float[np.ndarray, "P 3"], faces: list[tuple[int, ...]]) -> Float[np.ndarray, "P 3"]:
-    """Unit normal of each vertex from the faces around it, weighted by their area."""
-    total = np.zeros_like(vertices)
-    for count in {len(face) for face in faces}:
-        corners = np.array([face for face in faces if len(face) == count])
-        ring = vertices[corners] - vertices[corners[:, :1]]
-        area = np.cross(ring[:, 1:-1], ring[:, 2:]).sum(1)
-        for i in range(count):
-            np.add.at(total, corners[:, i], area)
-    return total / np.maximum(np.linalg.norm(total, axis=-1, keepdims=True), 1e-30)
 
 
 def _shared_normals(mesh: Mesh) -> Float[np.ndarray, "P 3"]:

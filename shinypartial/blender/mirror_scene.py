@@ -5,9 +5,9 @@ from pathlib import Path
 
 from shinypartial.blender.assemble import light_from_afar
 from shinypartial.blender.materials import make_material
-from shinypartial.blender.mesh import Mesh
 from shinypartial.blender.objects import BODY, mesh_of
 from shinypartial.blender.runtime import import_blender, quiet
+from shinypartial.core.mesh import Mesh
 from shinypartial.io.files import atomic_write
 from shinypartial.scene import Material, Render
 

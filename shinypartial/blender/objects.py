@@ -8,7 +8,8 @@ import numpy as np
 from shinypartial.blender.blend_file import load_blend_object
 from shinypartial.blender.geometry import make_part
 from shinypartial.blender.materials import add_depth_pass, make_material
-from shinypartial.blender.mesh import Mesh, deformed, joined, scaled
+from shinypartial.blender.mesh import deformed, joined, scaled
+from shinypartial.core.mesh import Mesh
 from shinypartial.scene import Assembly, BlendFile, Material, Part, SceneSpec
 
 BODY = "object"

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from shinypartial.blender.mesh import Mesh
 from shinypartial.core.errors import InputError
+from shinypartial.core.mesh import Mesh
 from shinypartial.scene import Blob, SoftBalls
 
 BALLS = 96

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from shinypartial.conversion.gltf import write_glb
 from shinypartial.conversion.light import Confidence, Layout, cube_faces, harmonics_of, light_of, seen_mask
 from shinypartial.conversion.lobes import lobes_of
 from shinypartial.conversion.room import room_of
@@ -18,12 +19,12 @@ from shinypartial.conversion.scenes import (
     web_page,
     write_triangles,
 )
-from shinypartial.conversion.surface import surface_of, write_glb
 from shinypartial.core.conventions import FACES
 from shinypartial.core.errors import InputError
 from shinypartial.io.files import write_json, write_text
 from shinypartial.io.images import write_exr_rgb, write_hdr, write_png
 from shinypartial.prediction.format import read_info
+from shinypartial.prediction.surface import surface_of
 
 Target = Literal["blender", "cubemap", "sh", "sg", "glb", "mitsuba", "usd", "threejs", "mask", "room"]
 

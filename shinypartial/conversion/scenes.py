@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from shinypartial.blender.mesh import Mesh
-from shinypartial.conversion.surface import triangles_of
+from shinypartial.core.mesh import Mesh
 from shinypartial.io.files import atomic_write
+from shinypartial.prediction.surface import triangles_of
 
 #: Columns are where the axes x, y, z of a lat-long light of Mitsuba and UsdLux lie in the world.
 LATLONG_TO_WORLD = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])

@@ -1,1 +1,1 @@
-"""Conventions, cameras, the sphere of directions, color and errors. Imports no other room."""
+"""Conventions, cameras, the sphere of directions, meshes, color and errors. Imports no other room."""

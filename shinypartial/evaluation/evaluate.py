@@ -45,6 +45,7 @@ from shinypartial.evaluation.scores import (
     read_oracle_baseline,
     write_scores,
 )
+from shinypartial.evaluation.turning import TURNING, write_turning
 from shinypartial.evaluation.view_scores import (
     ViewResult,
     count_all,
@@ -82,6 +83,8 @@ from shinypartial.prediction.format import read_inverse_distance as read_predict
 
 #: Test views that are shown in the report, spread evenly over the split.
 PICTURED_VIEWS = 4
+#: Test views whose normals tell the errors of the surface, spread likewise.
+SURFACE_VIEWS = 16
 #: Slack for values that 16-bit storage rounds beyond [0, 1].
 VISIBILITY_TOLERANCE = 1e-3
 
@@ -137,8 +140,8 @@ def evaluate(
     data = _open_dataset(info, None if dataset is None else Path(dataset), prediction)
     left_out: list[LeftOut] = []
     networks = _load_networks(lpips_weights, left_out)
-    for old in (prediction / EVALUATION).glob("*.png"):
-        old.unlink()
+    for old in (*(prediction / EVALUATION).glob("*.png"), prediction / EVALUATION / TURNING):
+        old.unlink(missing_ok=True)
     progress = Progress("evaluate", total=len(data.train) + len(data.test) + 1)
     observed = _observed_directions(data, left_out, progress)
     with_paper = protocol == "both"
@@ -147,6 +150,7 @@ def evaluate(
         scoring = beside.submit(_score_maps, prediction, data, observed, networks, left_out, with_paper)
         results = list(_score_views(prediction, data, networks, progress, with_paper))
         maps = scoring.result()
+    _picture_surface(prediction, data, left_out)
     progress.advance("environment")
     if not with_paper:
         left_out.append(LeftOut(PAPER_PROTOCOL, "not asked for (--protocol both)"))
@@ -173,6 +177,15 @@ def evaluate(
     read_oracle_baseline(prediction, scores)
     write_scores(prediction, scores)
     return scores
+
+
+def _picture_surface(prediction: Path, data: Dataset, left_out: list[LeftOut]) -> None:
+    """The surface as a picture; one that can't be read is left out, for no score is made of it."""
+    frames = data.test[:: -(-len(data.test) // SURFACE_VIEWS) or 1]
+    try:
+        write_turning(prediction, ((frame.camera, read_view(frame)) for frame in frames))
+    except InputError as error:
+        left_out.append(LeftOut("picture of the surface", f"expected {error.expected}; found {error.found}"))
 
 
 def _pool_paper(maps: _MapScores, results: list[ViewResult]) -> PaperScores:

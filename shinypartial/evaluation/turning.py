@@ -11,10 +11,12 @@ from shinypartial.core.camera import Camera, project
 from shinypartial.core.conventions import PIXEL_CENTER
 from shinypartial.dataset.schema import View
 from shinypartial.evaluation.masks import solid_mask
-from shinypartial.evaluation.pictures import NEUTRAL_GRAY, VISIBILITY, Scale, scalar_picture
+from shinypartial.evaluation.pictures import EVALUATION, VISIBILITY, Scale, normal_picture, scalar_picture
 from shinypartial.io.files import atomic_write
 from shinypartial.metrics.angular import normal_errors_deg
+from shinypartial.prediction.surface import PredictedSurface, surface_of, triangles_of
 
+TURNING = "surface.webp"
 #: Points on the surface, and pixels along the sides of a panel: enough that no gap shows.
 POINTS, PANEL_PX = 120_000, 220
 FRAMES, FRAME_MS, WEBP_QUALITY = 24, 150, 60
@@ -41,26 +43,20 @@ class SurfacePoints:
     """In [0, 1]; None where the method states none."""
 
     @classmethod
-    def spread(
-        cls,
-        vertices: Float[np.ndarray, "V 3"],
-        normals: Float[np.ndarray, "V 3"],
-        triangles: Int[np.ndarray, "T 3"],
-        confidence: Float[np.ndarray, "V"] | None = None,
-        count: int = POINTS,
-    ) -> "SurfacePoints":
+    def spread(cls, surface: PredictedSurface, count: int = POINTS) -> "SurfacePoints":
         """Points drawn by area, with the values of the corners mixed; the same ones in every run."""
-        corners = vertices[triangles]
+        triangles, confidence = triangles_of(surface), surface.confidence
+        corners = surface.vertices[triangles]
         areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         generator = np.random.default_rng(0)
         places = (np.arange(count) + generator.random(count)) / count * areas.sum()
         chosen = triangles[np.searchsorted(np.cumsum(areas), places).clip(max=len(triangles) - 1)]
         root, other = np.sqrt(generator.random(count)), generator.random(count)
         shares = np.stack([1 - root, root * (1 - other), root * other], 1)
-        mixed = (normals[chosen] * shares[..., None]).sum(1)
+        mixed = (surface.normals[chosen] * shares[..., None]).sum(1)
         mixed /= np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-12)
         sure = None if confidence is None else (confidence[chosen] * shares).sum(1)
-        return cls((vertices[chosen] * shares[..., None]).sum(1), mixed, sure)
+        return cls((surface.vertices[chosen] * shares[..., None]).sum(1), mixed, sure)
 
 
 def errors_on_surface(surface: SurfacePoints, views: Iterable[tuple[Camera, View]]) -> Float[np.ndarray, "P"]:
@@ -112,12 +108,12 @@ def _least_depth(
 
 def turning_panels(surface: SurfacePoints, errors_deg: Float[np.ndarray, "P"] | None) -> list[UInt8[np.ndarray, "P 3"]]:
     """Colors of the points, a panel each: normals as (n + 1)/2, errors where there are any, confidence where stated."""
-    panels = [((surface.normals + 1) * 127.5).astype(np.uint8)]
-    for values, scale in ((errors_deg, SURFACE_ERROR), (surface.confidence, VISIBILITY)):
-        if values is not None:
-            colors = scalar_picture(np.nan_to_num(values)[None], scale)[0]
-            panels.append(np.where(np.isnan(values)[:, None], np.uint8(NEUTRAL_GRAY), colors))
-    return panels
+    panels = [normal_picture(surface.normals[None])]
+    if errors_deg is not None:
+        panels.append(scalar_picture(errors_deg[None], SURFACE_ERROR, ~np.isnan(errors_deg)[None]))
+    if surface.confidence is not None:
+        panels.append(scalar_picture(surface.confidence[None], VISIBILITY))
+    return [panel[0] for panel in panels]
 
 
 def turning_frames(
@@ -146,7 +142,21 @@ def turning_frames(
     return found
 
 
-def write_turning(path: Path, frames: list[UInt8[np.ndarray, "S W 3"]]) -> None:
+def write_turning(prediction: Path, views: Iterable[tuple[Camera, View]]) -> None:
+    """Write PREDICTION/evaluation/surface.webp: the surface with its errors in these views; nothing where the method
+    exported none.
+    """
+    surface = surface_of(prediction)
+    if surface is None:
+        return
+    points = SurfacePoints.spread(surface)
+    errors = errors_on_surface(points, views)
+    panels = turning_panels(points, None if np.isnan(errors).all() else errors)
+    frames = turning_frames(points, panels)
+    write_frames(prediction / EVALUATION / TURNING, frames)
+
+
+def write_frames(path: Path, frames: list[UInt8[np.ndarray, "S W 3"]]) -> None:
     """Write an animated WebP that runs for ever."""
     from PIL import Image
 

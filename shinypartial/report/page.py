@@ -38,6 +38,7 @@ from shinypartial.evaluation.scores import (
     read_scores,
     score_rows,
 )
+from shinypartial.evaluation.turning import SURFACE_ERROR, TURNING
 from shinypartial.io.images import read_png
 from shinypartial.io.progress import format_seconds
 from shinypartial.metrics.registry import Direction
@@ -131,6 +132,7 @@ def write_report(prediction: Path, output: Path | None = None) -> Path:
         info=info,
         scores=scores,
         cards=_cards(info, {row.path: row for row in rows}, oracle),
+        surface=_surface(prediction / EVALUATION / TURNING),
         maps=_figures((prediction / EVALUATION / name, text, scale) for name, text, scale in MAPS),
         views=_views(prediction / EVALUATION, scores),
         view_charts=_line_charts(_view_series(scores)),
@@ -147,6 +149,10 @@ def write_report(prediction: Path, output: Path | None = None) -> Path:
     )
 
 
+_SURFACE_CAPTION = (
+    "The surface, turning about +Z: its normals as (n + 1)/2; their errors, as far as test views see it, gray "
+    "elsewhere; and its confidence, where the method states one (violet: none, yellow: full)."
+)
 _SHEET_CAPTION = "What the method makes of one test view."
 
 
@@ -223,6 +229,14 @@ def _trios(folder: Path, stem: str) -> tuple[tuple[Figure, ...], ...]:
         )
         trios.append(tuple(_figures(trio, SMALL_PX)))
     return tuple(trio for trio in trios if trio)
+
+
+def _surface(path: Path) -> Figure | None:
+    """The animated picture as it is; None where there is none."""
+    if not path.is_file():
+        return None
+    uri = "data:image/webp;base64," + base64.b64encode(path.read_bytes()).decode()
+    return Figure(uri, _SURFACE_CAPTION, color_bar(SURFACE_ERROR))
 
 
 def _figures(pictures: Iterable[tuple[Path, str, Scale | None]], longest_px: int = LARGE_PX) -> list[Figure]:

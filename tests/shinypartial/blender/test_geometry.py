@@ -8,8 +8,9 @@ import pytest
 from scipy.spatial import KDTree
 
 from shinypartial.blender.geometry import make_mesh, make_part, profile_outlines
-from shinypartial.blender.mesh import Mesh, deformed, displacement_field, polygon_normals
+from shinypartial.blender.mesh import deformed, displacement_field
 from shinypartial.core.errors import InputError
+from shinypartial.core.mesh import Mesh, polygon_normals
 from shinypartial.scene import (
     Blob,
     Deformation,

@@ -9,10 +9,10 @@ import pytest
 from shinypartial.blender.mirror_scene import write_mirror_scene
 from shinypartial.blender.runtime import import_blender, quiet
 from shinypartial.conversion.convert import convert
-from shinypartial.conversion.surface import surface_of
 from shinypartial.core.sphere import latlong_directions
 from shinypartial.io.images import read_exr_rgb, write_exr_rgb
 from shinypartial.prediction.format import PredictionInfo, write_environment_map, write_info
+from shinypartial.prediction.surface import surface_of
 from tests.shinypartial.conversion.test_surface import write_ply
 from tests.support.polyhedra import wavy_patch
 

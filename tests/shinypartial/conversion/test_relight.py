@@ -8,11 +8,12 @@ import pytest
 from shinypartial.blender.relight import AWAY, BALLS, VIEW_DEG, PictureOptions, render_in_lights
 from shinypartial.blender.runtime import import_blender, quiet
 from shinypartial.cli import main
+from shinypartial.conversion.gltf import write_glb
 from shinypartial.conversion.relight import psnr
-from shinypartial.conversion.surface import surface_of, write_glb
 from shinypartial.core.camera import Camera, look_at, project
 from shinypartial.core.errors import InputError
 from shinypartial.io.images import read_png, write_exr_rgb
+from shinypartial.prediction.surface import surface_of
 from tests.shinypartial.conversion.test_blender import ball
 from tests.support.tiny_scene import direction_colors
 from tests.support.truth_prediction import write_truth_prediction

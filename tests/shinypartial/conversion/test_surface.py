@@ -9,8 +9,9 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from shinypartial.cli import main
-from shinypartial.conversion.surface import surface_of, triangles_of, write_glb
+from shinypartial.conversion.gltf import write_glb
 from shinypartial.prediction.format import PredictionInfo, write_info
+from shinypartial.prediction.surface import surface_of, triangles_of
 from tests.support.polyhedra import L_SHAPE, spiral, wavy_patch
 
 TINT = (0.9, 0.6, 0.3)

@@ -1,0 +1,85 @@
+"""The surface of a prediction, read from its PLY, in polygons or triangles."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from shinypartial.core.errors import InputError
+from shinypartial.core.mesh import Mesh, polygon_normals
+
+
+@dataclass(frozen=True)
+class PredictedSurface(Mesh):
+    """Polygons in world units, and how far the method trusts each vertex, in [0, 1]; None where it does not say."""
+
+    confidence: Float[np.ndarray, "P"] | None = None
+
+
+def surface_of(prediction: Path) -> PredictedSurface | None:
+    """The one PLY of the folder, in world units; None where there is none, or a cloud of points.
+
+    Normals are its columns nx, ny, nz; where it has none, those of the faces around a vertex, weighted by area.
+    Confidence is its column `confidence`.
+    """
+    from plyfile import PlyData, PlyParseError
+
+    paths = sorted(prediction.glob("*.ply"))
+    if len(paths) > 1:
+        raise InputError(
+            expected=f"one PLY in {prediction}",
+            found=", ".join(path.name for path in paths),
+            remedy="Remove those that are not the surface.",
+        )
+    if not paths:
+        return None
+    try:
+        content = PlyData.read(str(paths[0]))
+    except PlyParseError as error:
+        raise InputError(
+            expected=f"a complete PLY at {paths[0]}", found=str(error), remedy="Export the prediction again."
+        ) from None
+    if "face" not in content or not len(content["face"].data):
+        return None
+    table, lists = content["vertex"].data, content["face"].data
+    vertices = np.stack([table[name] for name in "xyz"], 1).astype(np.float64)
+    faces = [tuple(face.tolist()) for face in lists[lists.dtype.names[0]]]
+    if {"nx", "ny", "nz"} <= set(table.dtype.names):
+        normals = np.stack([table[name] for name in ("nx", "ny", "nz")], 1).astype(np.float64)
+    else:
+        normals = polygon_normals(vertices, faces)
+    confidence = table["confidence"].astype(np.float64) if "confidence" in table.dtype.names else None
+    return PredictedSurface(vertices, normals, faces, confidence)
+
+
+def triangles_of(mesh: Mesh) -> Int[np.ndarray, "T 3"]:
+    """Every face in triangles, counterclockwise as it is; those without area are left out."""
+    triangles = np.array([each for face in mesh.faces for each in _cut(face, mesh.vertices)]).reshape(-1, 3)
+    corners = mesh.vertices[triangles]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return triangles[areas > 1e-12 * areas.max(initial=0)]
+
+
+def _cut(face: tuple[int, ...], vertices: Float[np.ndarray, "P 3"]) -> list[tuple[int, int, int]]:
+    """Triangles of a flat polygon, convex or not, by clipping ears (Meisters 1975)."""
+    if len(face) < 5:
+        return [(face[0], face[i], face[i + 1]) for i in range(1, len(face) - 1)]
+    ring = vertices[list(face)] - vertices[face[0]]
+    normal = np.cross(ring[1:-1], ring[2:]).sum(0)
+
+    def turn(a: int, b: int, c: int) -> float:
+        return float(np.cross(vertices[b] - vertices[a], vertices[c] - vertices[b]) @ normal)
+
+    left, triangles = list(face), []
+    while len(left) > 3:
+        for i, tip in enumerate(left):
+            before, after = left[i - 1], left[(i + 1) % len(left)]
+            others = (each for each in left if each not in (before, tip, after))
+            sides = ((before, tip), (tip, after), (after, before))
+            if turn(before, tip, after) > 0 and not any(all(turn(*s, p) >= 0 for s in sides) for p in others):
+                break
+        else:  # Only rounding leaves none: corners on one line.
+            i, before, after = 0, left[-1], left[1]
+        triangles.append((before, left.pop(i), after))
+    return [*triangles, (left[0], left[1], left[2])]
