@@ -61,7 +61,8 @@ def fit_free_form(
     poses of the views where these are unknowns.
 
     Rounds are taken with four fifths of the views as long as the others gain by them, and the last of those once more
-    with all. After the rounds that are always taken, poses are set free, if held-out views gain.
+    with all. After the rounds that are always taken, poses are set free, if outlines ask for it and held-out views
+    gain, or show nothing yet that could tell.
     """
     kept, held_out = split_held_out(views.train)
     solved = replace(views, train=tuple(kept)) if kept and held_out else views
@@ -82,9 +83,11 @@ def fit_free_form(
         if hollowed is not None:
             deeper = coarse_stage(solved, hollowed, options.concave.rounds, options)
             stage = better(stage, deeper, options.concave.least_held_out_gain) if held_out else deeper
-        if held_out and options.poses == "auto" and pose_pull(solved, stage, options) > options.least_pose_pull:
-            settled = _settled(solved, stage, options.pose_steps, options)
-            stage = better(settled, _with_poses(solved, start, options), options.least_pose_gain)
+        pull = pose_pull(solved, stage, options) if held_out and options.poses == "auto" else 0.0
+        if pull > options.least_pose_pull:
+            settled, free = _settled(solved, stage, options.pose_steps, options), _with_poses(solved, start, options)
+            untold = pull > options.outline_pull and error(settled) > options.unexplained_error
+            stage = free if untold else better(settled, free, options.least_pose_gain)
         if held_out and options.finer:
             stage = keep_if_better(_stages(solved, stage, options, progress), error, options.least_held_out_gain)
         assert stage.settings is not None, "a fit has rounds"
@@ -126,7 +129,8 @@ def _freed(stage: FitStage, steps: int | None = None) -> FreeFormRound:
 
 def pose_pull(views: Views, stage: FitStage, options: FreeFormOptions) -> float:
     """The share of the cost that one step of the poses alone would take: Σ ½ gᵀH⁻¹g of the views, over the cost."""
-    task, poses = make_task(views, _freed(stage), options), Poses.none(len(views.train))
+    wide = replace(options, outline_scale_px=options.pull_scale_px)
+    task, poses = make_task(views, _freed(stage), wide), Poses.none(len(views.train))
     solution = Solution.at(task, stage.surface, stage.trust, stage.environment, 0, poses)
     gradient = solution.gradient()[1][0]
     steps = np.linalg.solve(solution.beside[0].blocks, gradient[..., None])[..., 0]

@@ -277,8 +277,15 @@ class FreeFormOptions:
     """Most steps of the round in which poses are set free, and of finding those of other views."""
     least_pose_pull: float = 0.03
     """Share of the cost that a step of the poses alone has to promise for them to be tried. On sculpture at 160 px it
-    is 0.003 with true cameras, and 0.20, 0.22 and 0.07 with cameras turned by 0.1°, 0.25° and 0.5°; on
-    chrome-block over a dark ground 0.02 with true ones."""
+    is 0.003 with true cameras, and 0.26 and 0.14 with cameras turned by 0.25° and 2°; 0.016 with masks 2 px too large,
+    0.018 in a room at 10 radii; on chrome-block over a dark ground 0.02 with true ones."""
+    pull_scale_px: float = 10.0
+    """Distance of outlines beyond which these have no say in that: they are this far off where cameras are by 2°."""
+    outline_pull: float = 0.1
+    """A share from which outlines alone decide…"""
+    unexplained_error: float = 0.4
+    """…where colors tell nothing of poses yet, because the held-out error is more than this. With cameras turned by 2°
+    it is 0.5 on sculpture, with and without poses as unknowns."""
     least_pose_gain: float = 0.05
     """Share of the held-out error by which poses as unknowns have to lower it. On the block true cameras gain 0.04 when
     they are set free, and normals lose 0.3°."""
