@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import tyro
 
-from shinypartial.cli.converting import Convert, Relight
+from shinypartial.cli.converting import Convert, Import, Relight
 from shinypartial.cli.datasets import ExportCameras, Perturb, Release, Subset, Validate
 from shinypartial.cli.presenting import Chart, Leaderboard, Report
 from shinypartial.cli.scenes import Generate
@@ -23,6 +23,7 @@ Command = (
     | Postprocess
     | Convert
     | Relight
+    | Import
     | Compare
     | Weights
     | Report

@@ -1,4 +1,4 @@
-"""The commands that hand a prediction to other programs, and show its light on an object."""
+"""The commands that hand a prediction to other programs, show its light, and take one from other methods' code."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -7,6 +7,7 @@ from typing import Literal
 import tyro
 
 from shinypartial.cli.newest import announce_newest
+from shinypartial.conversion.layouts import LayoutName
 
 Target = Literal["blender", "cubemap", "sh", "sg", "glb", "mitsuba", "usd", "threejs", "mask", "room"]
 
@@ -86,3 +87,43 @@ class Relight:
             print(f"Wrote {path}")
         if relit.psnr_srgb is not None:
             print(f"In the recovered light it looks as in the true one to {relit.psnr_srgb:.1f} dB.")
+
+
+@dataclass(frozen=True)
+class Import:
+    """Make a prediction folder of what another method's code wrote, in the layout that it has; then `evaluate` it."""
+
+    layout: tyro.conf.Positional[LayoutName]
+    """Whose code wrote it. docs/how-to/compare-methods.md says from which files of which commit a layout was taken."""
+    folder: tyro.conf.Positional[Path]
+    """The method's output folder (its --model_path)."""
+    dataset: Path = field(kw_only=True)
+    """Dataset folder that it was trained on."""
+    output: Path = field(kw_only=True)
+    """Prediction folder to write, new or empty."""
+    iteration: int | None = None
+    """The last one that was saved when not given."""
+    background: Literal["white", "black"] | None = None
+    """Behind the object in its renders; as its cfg_args says when not given."""
+    seconds: float | None = None
+    """How long it trained, which its folder doesn't tell."""
+    device: str | None = None
+    """What it trained on, such as "NVIDIA RTX 4090"."""
+
+    def run(self) -> None:
+        """Write and say what."""
+        from shinypartial.conversion.outside import Cost, import_result
+
+        imported = import_result(
+            self.layout,
+            self.folder,
+            self.dataset,
+            self.output,
+            iteration=self.iteration,
+            background=self.background,
+            cost=Cost(self.seconds, self.device),
+        )
+        views = f"{imported.test_views} test views" if imported.test_views else "no test views"
+        print(f"Wrote {self.output}: {imported.info.method}, iteration {imported.info.config['iteration']}, {views}")
+        for reason in imported.left_out:
+            print(f"Left out {reason}")

@@ -1,1 +1,4 @@
-"""A prediction as files that other programs open: Blender, game engines, web pages. Imports prediction and blender."""
+"""A prediction as files that other programs open, and what other methods' code wrote as a prediction.
+
+Imports prediction and blender.
+"""

@@ -89,14 +89,21 @@ def sample_latlong(
     """Bilinear lookup; wraps around in azimuth and clamps at the poles."""
     height, width = latlong.shape[:2]
     uv = directions_to_latlong(directions)
-    x = uv[..., 0] * width - 0.5
-    y = np.clip(uv[..., 1] * height - 0.5, 0, height - 1)
+    return interpolate_wrapped(latlong, uv[..., 0] * width - 0.5, uv[..., 1] * height - 0.5)
+
+
+def interpolate_wrapped(
+    picture: Float[np.ndarray, "H W C"], x: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."]
+) -> Float[np.ndarray, "... C"]:
+    """Bilinear lookup at columns x and rows y, integers at texel centers; columns wrap around, rows are clamped."""
+    height, width = picture.shape[:2]
+    y = np.clip(y, 0, height - 1)
     x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
     fx, fy = (x - x0)[..., None], (y - y0)[..., None]
     y1 = np.minimum(y0 + 1, height - 1)
     left, right = x0 % width, (x0 + 1) % width
-    top = latlong[y0, left] * (1 - fx) + latlong[y0, right] * fx
-    bottom = latlong[y1, left] * (1 - fx) + latlong[y1, right] * fx
+    top = picture[y0, left] * (1 - fx) + picture[y0, right] * fx
+    bottom = picture[y1, left] * (1 - fx) + picture[y1, right] * fx
     return top * (1 - fy) + bottom * fy
 
 

@@ -49,6 +49,7 @@ from shinypartial.evaluation.turning import TURNING, write_turning
 from shinypartial.evaluation.view_scores import (
     ViewResult,
     count_all,
+    frames_to_score,
     pool_environment_normals,
     pool_normals,
     pool_renders,
@@ -142,13 +143,14 @@ def evaluate(
     networks = _load_networks(lpips_weights, left_out)
     for old in (*(prediction / EVALUATION).glob("*.png"), prediction / EVALUATION / TURNING):
         old.unlink(missing_ok=True)
-    progress = Progress("evaluate", total=len(data.train) + len(data.test) + 1)
+    frames = frames_to_score(prediction, data)
+    progress = Progress("evaluate", total=len(data.train) + len(frames) + 1)
     observed = _observed_directions(data, left_out, progress)
     with_paper = protocol == "both"
     _import_metrics()
     with ThreadPoolExecutor(1) as beside:
         scoring = beside.submit(_score_maps, prediction, data, observed, networks, left_out, with_paper)
-        results = list(_score_views(prediction, data, networks, progress, with_paper))
+        results = list(_score_views(prediction, frames, networks, progress, with_paper))
         maps = scoring.result()
     _picture_surface(prediction, data, left_out)
     progress.advance("environment")
@@ -165,7 +167,7 @@ def evaluate(
         environment=maps.environment,
         normals=pool_normals(results, left_out),
         normals_environment=pool_environment_normals(results, left_out),
-        render=pool_renders(results, networks.alex, left_out),
+        render=pool_renders(results, networks.alex, left_out, own_masks=info.masks is None),
         calibration=maps.calibration,
         paper=_pool_paper(maps, results) if with_paper else None,
         oracle=None if oracle is None else str(Path(oracle).resolve()),
@@ -346,10 +348,10 @@ def _require_visibility(visibility: Float[np.ndarray, "H W"], path: Path) -> Non
 
 
 def _score_views(
-    prediction: Path, data: Dataset, networks: _Networks, progress: Progress, with_paper: bool
+    prediction: Path, frames: tuple[Frame, ...], networks: _Networks, progress: Progress, with_paper: bool
 ) -> Iterator[ViewResult]:
-    spread = np.linspace(0, len(data.test) - 1, min(PICTURED_VIEWS, len(data.test)))
-    pictured = {data.test[round(index)].name for index in spread}
+    spread = np.linspace(0, len(frames) - 1, min(PICTURED_VIEWS, len(frames)))
+    pictured = {frames[round(index)].name for index in spread}
 
     def score(frame: Frame) -> ViewResult:
         truth, predicted = read_view(frame), read_prediction(prediction, frame)
@@ -357,6 +359,6 @@ def _score_views(
             write_view_pictures(prediction / EVALUATION, frame.stem.name, predicted, truth)
         return score_view(frame, predicted, truth, networks.alex, with_paper=with_paper)
 
-    for result in in_threads(score, data.test):
+    for result in in_threads(score, frames):
         yield result
         progress.advance("test views")

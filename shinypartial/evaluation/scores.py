@@ -58,7 +58,7 @@ class RenderScores:
     psnr_foreground: float | None
     ssim: float
     l1: float
-    alpha_iou: float
+    alpha_iou: float | None
     lpips_alex: float | None
 
 

@@ -18,7 +18,9 @@ from shinypartial.metrics import perceptual
 from shinypartial.metrics.angular import AngularStatistics, angular_statistics, normal_errors_deg
 from shinypartial.metrics.image import SSIM_RADIUS, l1, psnr, ssim
 from shinypartial.metrics.paper import PaperView, claimed_mask, paper_render
-from shinypartial.prediction.format import prediction_frame
+from shinypartial.prediction.format import TEST_VIEWS, prediction_frame
+
+NO_VIEWS = "the dataset or the prediction has no test views"
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,11 @@ class ViewResult:
     normal_errors: Float[np.ndarray, "P"] | None
     sees_environment: Bool[np.ndarray, "P"] | None
     paper: PaperView | None
+
+
+def frames_to_score(prediction: Path, data: Dataset) -> tuple[Frame, ...]:
+    """The dataset's test views, or none of them where the prediction holds maps alone."""
+    return data.test if (prediction / TEST_VIEWS).is_dir() else ()
 
 
 def read_prediction(prediction: Path, frame: Frame) -> View:
@@ -115,7 +122,7 @@ def pool_normals(results: Sequence[ViewResult], left_out: list[LeftOut]) -> Angu
             remedy="Export the test views again with channels normal.X, normal.Y and normal.Z.",
         )
     if not errors or not sum(error.size for error in errors):
-        reason = "dataset or prediction has no normals" if results else "the dataset has no test views"
+        reason = "dataset or prediction has no normals" if results else NO_VIEWS
         left_out.append(LeftOut("normals", reason))
         return None
     return angular_statistics(np.concatenate(errors))
@@ -138,12 +145,14 @@ def pool_environment_normals(results: Sequence[ViewResult], left_out: list[LeftO
 
 
 def pool_renders(
-    results: Sequence[ViewResult], lpips: perceptual.Lpips | None, left_out: list[LeftOut]
+    results: Sequence[ViewResult], lpips: perceptual.Lpips | None, left_out: list[LeftOut], *, own_masks: bool = True
 ) -> RenderScores | None:
-    """Means over views, and the pooled intersection over union."""
+    """Means over views, and the pooled intersection over union, if the masks are the method's own."""
     if not results:
-        left_out.append(LeftOut("render", "the dataset has no test views"))
+        left_out.append(LeftOut("render", NO_VIEWS))
         return None
+    if not own_masks:
+        left_out.append(LeftOut("render.alpha_iou", "the dataset's masks cut out the test views, not the method's own"))
     if lpips is not None and all(result.lpips_alex is None for result in results):
         left_out.append(LeftOut("render.lpips_alex", f"test views are smaller than {perceptual.SMALLEST_SIDE} px"))
     union = sum(result.union for result in results)
@@ -152,7 +161,7 @@ def pool_renders(
         psnr_foreground=_mean_or_none([result.psnr_foreground for result in results]),
         ssim=float(np.mean([result.scores.ssim for result in results])),
         l1=float(np.mean([result.l1 for result in results])),
-        alpha_iou=sum(result.intersection for result in results) / union if union else 1.0,
+        alpha_iou=(sum(result.intersection for result in results) / union if union else 1.0) if own_masks else None,
         lpips_alex=_mean_or_none([result.lpips_alex for result in results]),
     )
 
@@ -167,7 +176,7 @@ def count_all(data: Dataset, results: Sequence[ViewResult]) -> Counts:
     errors = [result.normal_errors for result in results if result.normal_errors is not None]
     return Counts(
         train_views=len(data.train),
-        test_views=len(data.test),
+        test_views=len(results),
         normal_pixels=sum(error.size for error in errors),
         normal_holes=sum(int(np.isnan(error).sum()) for error in errors),
     )

@@ -32,6 +32,8 @@ DESCRIPTION = "prediction.json"
 SNAPSHOTS = "snapshots"
 #: The oracle baseline of a dataset lies beside the predictions made from it, under the dataset's name with this ending.
 ORACLE_SUFFIX = "-oracle"
+#: Folder of the test views.
+TEST_VIEWS = "test"
 ENVIRONMENT = "environment.exr"
 VISIBILITY = "visibility.exr"
 VISIBILITY_CHANNEL = "Y"
@@ -129,8 +131,9 @@ class PredictionInfo:
     finished steps of a snapshot, `model_selection` how the kind of model was chosen; `model` says the same in free
     words; `verdict` is what the method says of its result; `surroundings` how near it found them; `reflectance` what
     share of the light (linear red, green, blue) it found the object to mirror at normal incidence, where that is not
-    all of it; `roughness` how rough, in units of Blender's principled shader, where it is not smooth. Each is None
-    where it is unknown or has no meaning.
+    all of it; `roughness` how rough, in units of Blender's principled shader, where it is not smooth; `masks` is
+    "dataset" where the method wrote none and its test views were cut out by the dataset's. Each is None where it is
+    unknown or has no meaning.
     """
 
     method: str
@@ -151,6 +154,7 @@ class PredictionInfo:
     surroundings: NearSurroundings | None = None
     reflectance: tuple[Share, Share, Share] | None = None
     roughness: Share | None = None
+    masks: Literal["dataset"] | None = None
 
     @property
     def hardware_text(self) -> str:
@@ -189,12 +193,12 @@ def _is_snapshot(folder: Path) -> bool:
 
 def prediction_frame(root: Path, frame: Frame) -> Frame:
     """Where the prediction of a dataset's test frame lies."""
-    return Frame(frame.name, frame.camera, root / "test" / frame.stem.name)
+    return Frame(frame.name, frame.camera, root / TEST_VIEWS / frame.stem.name)
 
 
 def acquire_prediction(root: Path) -> None:
     """Make sure that `root` can be written; InputError when it holds something that is no prediction."""
-    begun = (root / DESCRIPTION).exists() or (root / "test").is_dir()
+    begun = (root / DESCRIPTION).exists() or (root / TEST_VIEWS).is_dir()
     if root.exists() and (not root.is_dir() or (any(root.iterdir()) and not begun)):
         raise InputError(
             expected=f"a new, empty or earlier prediction folder at {root}",
