@@ -91,7 +91,7 @@ class Relight:
 
 @dataclass(frozen=True)
 class Import:
-    """Make a prediction folder of what another method's code wrote, in the layout that it has; then `evaluate` it."""
+    """Make a prediction folder of what another method's code wrote, to be evaluated like any other."""
 
     layout: tyro.conf.Positional[LayoutName]
     """Whose code wrote it. docs/how-to/compare-methods.md says from which files of which commit a layout was taken."""

@@ -56,7 +56,7 @@ class Layout:
     linear_argument: str | None = None
     """A flag in `cfg_args` with which the light is linear."""
     model: tuple[str, ...] = ("point_cloud/iteration_{iteration}/point_cloud.ply",)
-    """What a renderer needs; the first is a PLY with a vertex a primitive."""
+    """What a renderer needs; every PLY has a vertex a primitive."""
 
 
 X, Y, Z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
@@ -69,7 +69,7 @@ NVDIFFREC = Grid(forward=(0, 0, -1), right=X, up=Y, rows=(1, 1), columns=(0.5, 0
 USAGE = Grid(forward=X, right=Y, up=Z, rows=(0, 0), columns=(0, 1))
 
 _REF_GAUSSIAN = Layout(
-    # eval.py, scene/gaussian_model.py (get_env_direction1 and 2, save_ply), scene/light.py.
+    # fudan-zvg/ref-gaussian at af7691a: eval.py, gaussian_renderer/__init__.py, scene/gaussian_model.py and light.py.
     method="Ref-Gaussian",
     environment="env2.png",
     environment_grid=ENDPOINTS,
@@ -97,10 +97,13 @@ LAYOUTS: dict[LayoutName, Layout] = {
             "point_cloud/iteration_{iteration}/point_cloud.map",
         ),
     ),
-    # fudan-zvg/ref-gaussian at af7691a.
     "ref-gaussian": _REF_GAUSSIAN,
-    # wen-yuan-zhang/MaterialRefGS at 280edee: the same files of the same names.
-    "materialrefgs": replace(_REF_GAUSSIAN, method="MaterialRefGS"),
+    # wen-yuan-zhang/MaterialRefGS at 280edee: the same files under the same names, and Gaussians of the surroundings.
+    "materialrefgs": replace(
+        _REF_GAUSSIAN,
+        method="MaterialRefGS",
+        model=(*_REF_GAUSSIAN.model, "point_cloud/iteration_{iteration}/env_point_cloud.ply"),
+    ),
     # Asparagus15/GaussianShader at de77861: render.py, scene/__init__.py, scene/NVDIFFREC/util.py and light.py.
     "gaussianshader": Layout(
         method="GaussianShader",

@@ -112,6 +112,7 @@ def import_result(
 
 def _describe(result: _Result, data: Dataset, layout: LayoutName, views: int, cost: Cost) -> PredictionInfo:
     files = [path for path in map(result.path, result.layout.model) if path.is_file()]
+    clouds = [path for path in files if path.suffix == ".ply"]
     return PredictionInfo(
         method=result.layout.method,
         dataset=str(data.root),
@@ -121,7 +122,7 @@ def _describe(result: _Result, data: Dataset, layout: LayoutName, views: int, co
         hardware={} if cost.device is None else {"device": cost.device},
         parameter_counts={},
         peak_memory_bytes=0,
-        primitives=_vertices(files[0]) if files and files[0].suffix == ".ply" else None,
+        primitives=sum(map(_vertices, clouds)) if clouds else None,
         model_bytes=sum(path.stat().st_size for path in files) if len(files) == len(result.layout.model) else None,
         masks="dataset" if views and result.layout.masks is None else None,
     )
@@ -156,15 +157,13 @@ def _last_iteration(folder: Path) -> int:
     return max(saved)
 
 
-def _vertices(path: Path) -> int | None:
+def _vertices(path: Path) -> int:
     """Number of vertices that the header of a PLY states."""
     with path.open("rb") as file:
         for line in file:
-            if line.startswith(b"element vertex"):
+            if line.startswith(b"element vertex "):
                 return int(line.split()[2])
-            if line.startswith(b"end_header"):
-                break
-    return None
+    raise InputError(expected=f"a PLY with vertices at {path}", found="another file", remedy="Save the model again.")
 
 
 def _import_maps(result: _Result, output: Path, left_out: list[str]) -> bool:

@@ -140,7 +140,7 @@ def pool_environment_normals(results: Sequence[ViewResult], left_out: list[LeftO
         return angular_statistics(errors)
     known = any(result.sees_environment is not None for result in results)
     reason = "no normals to score" if known else "the dataset doesn't mark pixels that see the object itself"
-    left_out.append(LeftOut("normals_environment", reason))
+    left_out.append(LeftOut("normals_environment", reason if results else NO_VIEWS))
     return None
 
 

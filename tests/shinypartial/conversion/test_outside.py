@@ -112,15 +112,14 @@ def test_every_axis_has_its_color(tmp_path: Path, sphere_dataset: Dataset, name:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_maps_agree_in_all_directions(tmp_path: Path, sphere_dataset: Dataset, name: LayoutName) -> None:
-    """Half a texel, which axes don't show, would be 0.025 on these 64 rows; RGBE's 8 bits make 0.0123."""
+    """Half a texel, which axes don't show, is up to 0.025 on these 64 rows. 8 bits leave 0.0040, RGBE 0.0123."""
     write_map(begin(tmp_path / "run"), name, slopes)
     import_result(name, tmp_path / "run", sphere_dataset.root, tmp_path / "out")
     random = np.random.default_rng(0).normal(size=(2000, 3))
     directions = random / np.linalg.norm(random, axis=1, keepdims=True)
-    directions = directions[np.abs(directions[:, 2]) < 0.98]
     found = sample_latlong(read_environment_map(tmp_path / "out"), directions)
     expected = to_code(255 * (directions + 1) / 2)
-    assert np.abs(found - expected).max() < 0.015
+    assert np.abs(found - expected).max() < (0.013 if MAPS[name][0].endswith(".hdr") else 0.005)
 
 
 def test_a_linear_map_is_not_decoded(tmp_path: Path, sphere_dataset: Dataset) -> None:
