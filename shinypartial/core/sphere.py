@@ -89,7 +89,8 @@ def sample_latlong(
     """Bilinear lookup; wraps around in azimuth and clamps at the poles."""
     height, width = latlong.shape[:2]
     uv = directions_to_latlong(directions)
-    return interpolate_wrapped(latlong, uv[..., 0] * width - 0.5, uv[..., 1] * height - 0.5)
+    x, y = (np.asarray(uv[..., axis] * count - 0.5) for axis, count in enumerate((width, height)))
+    return interpolate_wrapped(latlong, x, y)
 
 
 def interpolate_wrapped(

@@ -18,7 +18,7 @@ from shinypartial.prediction.surface import PredictedSurface, surface_of, triang
 
 TURNING = "surface.webp"
 #: Points on the surface, and pixels along the sides of a panel: enough that no gap shows.
-POINTS, PANEL_PX = 120_000, 220
+POINTS, PANEL_PX = 60_000, 220
 FRAMES, FRAME_MS, WEBP_QUALITY = 24, 150, 60
 #: The camera looks down by this angle.
 ELEVATION_DEG = 20.0

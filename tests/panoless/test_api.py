@@ -47,9 +47,9 @@ def snippet() -> str:
 
 
 def test_every_option_of_the_command_is_a_keyword() -> None:
-    """And has the same default; `model` is a configuration's field that the command also takes alone."""
+    """And has the same default, but for the viewer; `model` is a configuration's field that the command takes alone."""
     keywords = inspect.signature(panoless.fit).parameters
-    options = {item.name: item.default for item in fields(Fit) if item.name != "config"}
+    options = {item.name: item.default for item in fields(Fit) if item.name not in ("config", "viewer")}
     assert {name: keywords[name].default for name in options} == options
     assert keywords.keys() == {*options, "config", "model"}
 

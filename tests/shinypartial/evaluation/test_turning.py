@@ -69,7 +69,7 @@ def test_points_are_spread_by_area() -> None:
 
 def test_frames_show_the_near_side_without_gaps() -> None:
     """Each panel is a disc; the first frame looks along −X, so that its middle shows normals near +X."""
-    points = SurfacePoints.spread(globe(confidence=True), 60_000)
+    points = SurfacePoints.spread(globe(confidence=True), 20_000)
     panels = turning_panels(points, None)
     frames = turning_frames(points, panels, frames=4, side=100)
     assert [frame.shape for frame in frames] == [(100, 200, 3)] * 4
