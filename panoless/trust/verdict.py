@@ -19,6 +19,7 @@ MATTER = "Photograph a shinier object: this one shows its own color."
 SHAPE = "Look at poses, masks and exposure first; parts that are concave or see themselves may be wrong as well."
 PART = "Look at the confidence of the mesh: a hollow that no outline shows may have been missed, or be too deep."
 VIEWS = "Add views: at least five that see the object from different sides."
+BETWEEN = "Add views from between these, and look at the visibility map."
 SHINE = "Photograph a shinier object: what a rough one blurs comes back in part only, beside lamps least of all."
 TEXTURE = "Take it to surroundings that differ from one direction to another, or expose longer."
 EXPOSURE = "Photograph with a shorter exposure, or in high dynamic range."
@@ -81,6 +82,12 @@ DOUBTS = (
         lambda options: options.largest_roughness,
         lambda found: f"the object has a roughness of {found.roughness:.2g}, which blurs what it mirrors",
         SHINE,
+    ),
+    _Doubt(
+        lambda found: 1 / max(found.views, 1),
+        lambda options: 1 / options.few_views,
+        lambda found: f"{found.views} views leave gaps between the directions that they see",
+        BETWEEN,
     ),
     _Doubt(
         lambda found: found.saturated,

@@ -15,7 +15,7 @@ from panoless.geometry.plane.kind import PlaneMirror
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.trust.evidence import Evidence, gather_evidence
 from panoless.trust.options import TrustOptions
-from panoless.trust.verdict import MATTER, POSES, SHINE, TEXTURE, judge
+from panoless.trust.verdict import BETWEEN, MATTER, POSES, SHINE, TEXTURE, judge
 from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
 
 OPTIONS = TrustOptions(resolution=32)
@@ -149,7 +149,7 @@ def test_views_without_the_object_count_for_nothing(views: Views) -> None:
 
     found = evidence(each(views, emptied))
     assert found.views == 7
-    assert judge(found, OPTIONS).verdict == "trust"
+    assert judge(replace(found, views=15), OPTIONS).verdict == "trust"
 
 
 @pytest.mark.parametrize("figure", ["unexplained", "view_shift_px", "silhouette_px", "saturated"])
@@ -212,3 +212,10 @@ def test_what_pixels_blur_is_not_unexplained(views: Views) -> None:
     assert by_area.unexplained is not None
     assert by_center.unexplained is not None
     assert by_area.unexplained < 0.5 * by_center.unexplained
+
+
+def test_few_views_are_doubted_however_well_they_agree(views: Views) -> None:
+    """Five of the fifteen, which the true mirror explains as well."""
+    verdict = judge(replace(evidence(views), views=5), OPTIONS)
+    assert (verdict.verdict, verdict.remedy) == ("partly", BETWEEN)
+    assert "5 views leave gaps" in verdict.reason
