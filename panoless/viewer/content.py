@@ -21,6 +21,7 @@ from shinypartial.prediction.format import (
     read_environment_map,
     read_visibility,
 )
+from shinypartial.prediction.surface import surface_of, triangles_of
 
 Shown = Literal["light", "visibility", "light that was seen"]
 Picture = Literal["photograph", "prediction", "error", "normals"]
@@ -107,42 +108,8 @@ class Surface:
 
 def read_surface(folder: Path) -> Surface | None:
     """The surface of a prediction folder, from its PLY; None where it has none."""
-    from plyfile import PlyData
-
-    paths = sorted(folder.glob("*.ply"))
-    if not paths:
-        return None
-    content = PlyData.read(str(paths[0]))
-    table = content["vertex"].data
-    vertices = np.stack([table[name] for name in "xyz"], 1).astype(np.float64)
-    known = {"nx", "ny", "nz"} <= set(table.dtype.names)
-    normals = np.stack([table[name] for name in ("nx", "ny", "nz")], 1).astype(np.float64) if known else 0 * vertices
-    polygons = list(content["face"].data["vertex_indices"]) if "face" in content else []
-    return Surface(vertices, normals, triangulated(vertices, polygons))
-
-
-def triangulated(vertices: Float[np.ndarray, "V 3"], polygons: list[Int[np.ndarray, "_"]]) -> Int[np.ndarray, "T 3"]:
-    """Triangles of polygons: fans of those with four corners or fewer; of larger flat ones, those of a Delaunay
-    triangulation whose middles lie within.
-    """
-    found = list[np.ndarray]()
-    small = [polygon for polygon in polygons if len(polygon) <= 4]
-    for corners in {len(polygon) for polygon in small}:
-        alike = np.array([polygon for polygon in small if len(polygon) == corners])
-        found += [alike[:, [0, i, i + 1]] for i in range(1, corners - 1)]
-    found += [_within(vertices, polygon) for polygon in polygons if len(polygon) > 4]
-    return np.concatenate([np.zeros((0, 3), np.int64), *found]).astype(np.int64)
-
-
-def _within(vertices: Float[np.ndarray, "V 3"], polygon: Int[np.ndarray, "N"]) -> Int[np.ndarray, "T 3"]:
-    from matplotlib.path import Path as Outline
-    from scipy.spatial import Delaunay
-
-    ring = vertices[polygon] - vertices[polygon].mean(0)
-    flat = ring @ np.linalg.svd(ring, full_matrices=False)[2][:2].T
-    simplices = Delaunay(flat).simplices
-    inside = Outline(flat).contains_points(flat[simplices].mean(1))
-    return np.asarray(polygon)[simplices[inside]]
+    found = surface_of(folder, clouds=True)
+    return None if found is None else Surface(found.vertices, found.normals, triangles_of(found))
 
 
 @dataclass(frozen=True)

@@ -21,13 +21,14 @@ from panoless.viewer.content import (
     moment_folders,
     picture_of_test,
     thumbnail,
-    triangulated,
 )
 from shinypartial.core.camera import ray_directions_world
 from shinypartial.core.errors import InputError
+from shinypartial.core.mesh import Mesh
 from shinypartial.dataset.read import open_dataset
 from shinypartial.dataset.schema import Dataset, Frame
 from shinypartial.prediction.format import DESCRIPTION, read_info
+from shinypartial.prediction.surface import triangles_of
 
 FRUSTUM_RADII = 0.25
 """Length of a camera in the picture, in radii of the surface."""
@@ -268,9 +269,9 @@ def surface_of_run(run: Path) -> tuple[Surface, str]:
     assert state is not None, "there is a checkpoint"
     mesh = state.geometry.mesh(state.frame)
     normals = np.stack([mesh.columns[name] for name in ("nx", "ny", "nz")], 1).astype(np.float64)
-    polygons = [] if mesh.faces is None else list(mesh.faces)
+    polygons = [] if mesh.faces is None else [tuple(face) for face in mesh.faces.tolist()]
     vertices = mesh.vertices.astype(np.float64)
-    surface = Surface(vertices, normals, triangulated(vertices, polygons))
+    surface = Surface(vertices, normals, triangles_of(Mesh(vertices, normals, polygons)))
     return surface, f"{state.geometry.kind}, {state.iteration} steps"
 
 

@@ -17,8 +17,9 @@ class PredictedSurface(Mesh):
     confidence: Float[np.ndarray, "P"] | None = None
 
 
-def surface_of(prediction: Path) -> PredictedSurface | None:
-    """The one PLY of the folder, in world units; None where there is none, or a cloud of points.
+def surface_of(prediction: Path, *, clouds: bool = False) -> PredictedSurface | None:
+    """The one PLY of the folder, in world units; None where there is none, or a cloud of points, unless `clouds` are
+    asked for as surfaces without faces.
 
     Normals are its columns nx, ny, nz; where it has none, those of the faces around a vertex, weighted by area.
     Confidence is its column `confidence`.
@@ -40,11 +41,12 @@ def surface_of(prediction: Path) -> PredictedSurface | None:
         raise InputError(
             expected=f"a complete PLY at {paths[0]}", found=str(error), remedy="Export the prediction again."
         ) from None
-    if "face" not in content or not len(content["face"].data):
+    corners = [] if "face" not in content else content["face"].data[content["face"].properties[0].name]
+    if not len(corners) and not clouds:
         return None
-    table, lists = content["vertex"].data, content["face"].data
+    table = content["vertex"].data
     vertices = np.stack([table[name] for name in "xyz"], 1).astype(np.float64)
-    faces = [tuple(face.tolist()) for face in lists[lists.dtype.names[0]]]
+    faces = [tuple(face.tolist()) for face in corners]
     if {"nx", "ny", "nz"} <= set(table.dtype.names):
         normals = np.stack([table[name] for name in ("nx", "ny", "nz")], 1).astype(np.float64)
     else:
@@ -55,7 +57,8 @@ def surface_of(prediction: Path) -> PredictedSurface | None:
 
 def triangles_of(mesh: Mesh) -> Int[np.ndarray, "T 3"]:
     """Every face in triangles, counterclockwise as it is; those without area are left out."""
-    triangles = np.array([each for face in mesh.faces for each in _cut(face, mesh.vertices)]).reshape(-1, 3)
+    cut = [each for face in mesh.faces for each in _cut(face, mesh.vertices)]
+    triangles = np.array(cut, dtype=np.int64).reshape(-1, 3)
     corners = mesh.vertices[triangles]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     return triangles[areas > 1e-12 * areas.max(initial=0)]

@@ -17,13 +17,14 @@ from panoless.viewer.content import (
     picture_of_test,
     read_surface,
     thumbnail,
-    triangulated,
 )
 from panoless.viewer.server import Address, Viewer, open_prediction
+from shinypartial.core import mesh as core
 from shinypartial.core.color import to_display
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import sample_latlong
 from shinypartial.dataset.schema import Dataset
+from shinypartial.prediction.surface import triangles_of
 from tests.support.truth_prediction import write_truth_prediction
 
 
@@ -35,7 +36,12 @@ def ball(rings: int = 60) -> Surface:
     index = np.arange(polar.size).reshape(polar.shape)
     upper, lower = index[:-1], index[1:]
     quads = np.stack([upper, lower, np.roll(lower, -1, 1), np.roll(upper, -1, 1)], -1).reshape(-1, 4)
-    return Surface(points.reshape(-1, 3), points.reshape(-1, 3), triangulated(points.reshape(-1, 3), list(quads)))
+    points = points.reshape(-1, 3)
+    return Surface(points, points, triangles_of(polygons(points, quads)))
+
+
+def polygons(vertices: np.ndarray, faces: np.ndarray) -> core.Mesh:
+    return core.Mesh(vertices, 0 * vertices, [tuple(face) for face in faces.tolist()])
 
 
 def test_a_ray_is_mirrored_by_a_ball_as_in_closed_form() -> None:
@@ -58,7 +64,7 @@ def test_polygons_become_triangles_of_their_area() -> None:
     corners = np.array([[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2]], dtype=float)
     vertices = np.concatenate([corners, np.zeros((6, 1))], 1)
     for polygon, area in ((np.array([0, 1, 2, 3]), 1.5), (np.arange(6), 3.0)):
-        a, b, c = vertices[triangulated(vertices, [polygon])].transpose(1, 0, 2)
+        a, b, c = vertices[triangles_of(polygons(vertices, polygon[None]))].transpose(1, 0, 2)
         assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(area)
 
 
