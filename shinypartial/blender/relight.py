@@ -14,13 +14,12 @@ from shinypartial.blender.geometry import make_part
 from shinypartial.blender.materials import make_material
 from shinypartial.blender.objects import mesh_of
 from shinypartial.blender.runtime import choose_device, import_blender, quiet, set_threads
-from shinypartial.core.camera import look_at, opencv_to_opengl
+from shinypartial.core.camera import front_view, look_at, opencv_to_opengl
 from shinypartial.core.errors import InputError
 from shinypartial.io.images import read_exr, stack_channels
 from shinypartial.scene import Material, Part, Sphere
 
-#: From where an object without a camera is seen: from the front and a little above.
-AWAY = np.array([0.35, -1.0, 0.45])
+#: Field of view of the camera of an object that has none.
 VIEW_DEG = 35.0
 #: Of the default object: a mirror, a rough metal and a white matte ball side by side.
 BALLS = (
@@ -116,13 +115,12 @@ def _frame(bpy: Any, scene: Any) -> None:
             for each in surfaces
         ]
     )
-    target, radius = (corners.min(0) + corners.max(0)) / 2, np.linalg.norm(np.ptp(corners, axis=0)) / 2
-    distance = radius / np.sin(np.radians(VIEW_DEG / 2))
+    position, target = front_view(corners.min(0), corners.max(0), VIEW_DEG)
+    distance = float(np.linalg.norm(position - target))
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     camera.data.angle = np.radians(VIEW_DEG)
     camera.data.clip_start, camera.data.clip_end = 1e-3 * distance, 1e2 * distance
-    pose = look_at(target + distance * AWAY / np.linalg.norm(AWAY), target)
-    camera.matrix_world = opencv_to_opengl(pose).T.tolist()
+    camera.matrix_world = opencv_to_opengl(look_at(position, target)).T.tolist()
     scene.collection.objects.link(camera)
     scene.camera = camera
     scene.render.resolution_x = scene.render.resolution_y = 1024

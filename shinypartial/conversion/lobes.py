@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from shinypartial.core.conventions import Y_UP_TO_WORLD
 from shinypartial.core.errors import InputError
-from shinypartial.core.sphere import latlong_directions, latlong_solid_angles
+from shinypartial.core.sphere import fibonacci_directions, latlong_directions, latlong_solid_angles
 
 ROWS = 32
 """Of the grid on which lobes are fitted; narrower ones than of some 5° are not told."""
@@ -24,10 +24,7 @@ def lobes_of(latlong: Float[np.ndarray, "H W 3"], count: int) -> dict[str, Any]:
     if not 1 <= count <= MOST_LOBES:
         raise InputError(expected=f"--lobes from 1 to {MOST_LOBES}", found=str(count), remedy="24 is usual.")
     light, directions, areas = _means(latlong)
-    index = np.arange(count) + 0.5
-    height, azimuth = 1 - 2 * index / count, np.pi * (1 + 5**0.5) * index
-    level = np.sqrt(1 - height**2)
-    axes = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), height], 1)
+    axes = fibonacci_directions(count)
     cosines, root = directions @ axes.T, np.sqrt(areas)[:, None]
     found = {share * count: _fitted(cosines, light, root, share * count) for share in SHARPNESS_SHARES}
     sharpness = min(found, key=lambda each: float(found[each][0]))

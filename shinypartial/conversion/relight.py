@@ -13,6 +13,7 @@ from shinypartial.core.conventions import SOLID_ALPHA
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import open_dataset, read_environment
 from shinypartial.io.images import write_exr_rgb, write_png
+from shinypartial.metrics import image
 from shinypartial.prediction.format import read_info
 
 SUFFIXES = (".blend", ".glb", ".gltf")
@@ -74,7 +75,7 @@ def displayed(picture: Float[np.ndarray, "H W 4"]) -> np.ndarray:
 
 
 def psnr(picture: Float[np.ndarray, "H W 4"], truth: Float[np.ndarray, "H W 4"]) -> float:
-    """−10 log₁₀ of the mean squared difference of sRGB colors in [0, 1], over pixels wholly on the object (dB)."""
+    """Of sRGB colors in [0, 1], over pixels wholly on the object (dB); not a number where there are none."""
     solid = (picture[..., 3] > SOLID_ALPHA) & (truth[..., 3] > SOLID_ALPHA)
-    one, other = (linear_to_srgb(each[solid][:, :3].clip(0, 1)) for each in (picture, truth))
-    return float(-10 * np.log10(max(np.mean((one - other) ** 2), 1e-12))) if solid.any() else float("nan")
+    one, other = (linear_to_srgb(each[solid][None, :, :3].clip(0, 1)) for each in (picture, truth))
+    return image.psnr(one, other, data_range=1.0) if solid.any() else float("nan")

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from shinypartial.core.camera import front_view
 from shinypartial.core.mesh import Mesh
 from shinypartial.io.files import atomic_write
 from shinypartial.prediction.surface import triangles_of
@@ -144,11 +145,7 @@ class ViewOf:
     def __init__(self, surface: Mesh | None) -> None:
         """Of nothing, that of the unit ball."""
         low, high = (-np.ones(3), np.ones(3)) if surface is None else (surface.vertices.min(0), surface.vertices.max(0))
-        self.target = (low + high) / 2
-        radius = float(np.linalg.norm(high - low)) / 2
-        away = np.array([0.35, -1.0, 0.45])
-        distance = 1.2 * radius / np.sin(np.radians(self.fov_deg / 2))
-        self.position = self.target + distance * away / np.linalg.norm(away)
+        self.position, self.target = front_view(low, high, self.fov_deg, spare=1.2)
 
 
 def web_page(light_hdr: bytes, surface_glb: bytes | None) -> str:

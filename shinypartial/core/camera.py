@@ -9,6 +9,8 @@ from shinypartial.core.conventions import OPENGL_OPENCV, PIXEL_CENTER
 from shinypartial.core.errors import InputError
 
 ROTATION_TOLERANCE = 1e-3
+#: From where an object is shown: from the front and a little above, in directions of the world.
+FRONT = np.array([0.35, -1.0, 0.45])
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,17 @@ def look_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) ->
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
     pose[:3, 3] = position
     return pose
+
+
+def front_view(
+    low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], fov_deg: float, spare: float = 1.0
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Position and target of a camera that sees the ball about a box whole, times `spare`, from the front and a little
+    above.
+    """
+    target, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    distance = spare * radius / np.sin(np.radians(fov_deg / 2))
+    return target + distance * FRONT / np.linalg.norm(FRONT), target
 
 
 def reflect(

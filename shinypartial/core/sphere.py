@@ -83,6 +83,14 @@ def cube_solid_angles(resolution: int) -> Float[np.ndarray, "L L"]:
     return corner[1:, 1:] - corner[:-1, 1:] - corner[1:, :-1] + corner[:-1, :-1]
 
 
+def fibonacci_directions(count: int) -> Float[np.ndarray, "N 3"]:
+    """So many unit directions evenly over the sphere, from +Z to −Z: each is turned on by the golden angle."""
+    index = np.arange(count) + 0.5
+    height, azimuth = 1 - 2 * index / count, np.pi * (1 + 5**0.5) * index
+    level = np.sqrt(1 - height**2)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), height], 1)
+
+
 def sample_latlong(
     latlong: Float[np.ndarray, "H W C"], directions: Float[np.ndarray, "... 3"]
 ) -> Float[np.ndarray, "... C"]:

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from panoless.capture.rays import pixel_rays, pose_of, reflect
 from panoless.environment.surroundings import FAR, Surroundings
-from panoless.geometry.base import SurfaceBuffers, buffers_from_arrays
+from panoless.geometry.base import SurfaceBuffers, beside_outline, buffers_from_arrays
 from panoless.kernels.rasterize import RasterCamera
 from shinypartial.core.conventions import PIXEL_CENTER
 
@@ -68,7 +68,7 @@ def sphere_buffers(sphere: Sphere, camera: RasterCamera, samples: int) -> Surfac
     everything = np.arange(camera.height * camera.width)
     hits = sphere.hits(*pixel_rays(camera, everything))
     alpha = hits.met.astype(np.float64)
-    mixed = np.flatnonzero(_beside_outline(hits.met.reshape(shape)))
+    mixed = np.flatnonzero(beside_outline(hits.met.reshape(shape)))
     alpha[mixed] = met_within(sphere, camera, mixed, samples).mean(1)
     covered = alpha > 0
     depth = ((hits.points - center) @ rotation[2]) * covered
@@ -102,10 +102,3 @@ def _mirrored_at(
     hits = sphere.hits(origins, directions)
     outgoing = reflect(directions / np.linalg.norm(directions, axis=1, keepdims=True), hits.normals)
     return sphere.surroundings.looked_up(hits.points, outgoing), hits.met
-
-
-def _beside_outline(met: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    from scipy.ndimage import maximum_filter, minimum_filter
-
-    found: np.ndarray = maximum_filter(met, 3, mode="nearest") & ~minimum_filter(met, 3, mode="nearest")
-    return found

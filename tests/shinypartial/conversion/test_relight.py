@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shinypartial.blender.relight import AWAY, BALLS, VIEW_DEG, PictureOptions, render_in_lights
+from shinypartial.blender.relight import BALLS, VIEW_DEG, PictureOptions, render_in_lights
 from shinypartial.blender.runtime import import_blender, quiet
 from shinypartial.cli import main
 from shinypartial.conversion.gltf import write_glb
 from shinypartial.conversion.relight import psnr
-from shinypartial.core.camera import Camera, look_at, project
+from shinypartial.core.camera import FRONT, Camera, look_at, project
 from shinypartial.core.errors import InputError
 from shinypartial.io.images import read_png, write_exr_rgb
 from shinypartial.prediction.surface import surface_of
@@ -28,7 +28,7 @@ def test_the_mirror_ball_shows_the_light_at_the_camera(tmp_path: Path) -> None:
     write_exr_rgb(tmp_path / "light.exr", direction_colors(64))
     picture = render_in_lights(None, {"light": tmp_path / "light.exr"}, OPTIONS)["light"]
     high = np.array([1.6, 0.5, 0.5])
-    away = np.linalg.norm(high) / np.sin(np.radians(VIEW_DEG / 2)) * AWAY / np.linalg.norm(AWAY)
+    away = np.linalg.norm(high) / np.sin(np.radians(VIEW_DEG / 2)) * FRONT / np.linalg.norm(FRONT)
     focal = 32 / np.tan(np.radians(VIEW_DEG / 2))
     camera = Camera(look_at(away, np.zeros(3)), focal, focal, 32, 32, 64, 64)
     center = np.array([BALLS[0][0], 0.0, 0.0])
