@@ -86,8 +86,10 @@ def fit_free_form(
         pull = pose_pull(solved, stage, options) if held_out and options.poses == "auto" else 0.0
         if pull > options.least_pose_pull:
             settled, free = _settled(solved, stage, options.pose_steps, options), _with_poses(solved, start, options)
-            untold = pull > options.outline_pull and error(settled) > options.unexplained_error
-            stage = free if untold else better(settled, free, options.least_pose_gain)
+            settled_error = error(settled)
+            untold = pull > options.outline_pull and settled_error > options.unexplained_error
+            gained = untold or error(free) < (1 - options.least_pose_gain) * settled_error
+            stage = free if gained else settled
         if held_out and options.finer:
             stage = keep_if_better(_stages(solved, stage, options, progress), error, options.least_held_out_gain)
         assert stage.settings is not None, "a fit has rounds"
