@@ -97,6 +97,15 @@ class Footprints:
     trace_others: Callable[[], PixelFootprints]
     """Traces those of a sample of the other pixels, which bend the light much or reflect it often."""
 
+    @classmethod
+    def of(cls, parts: Sequence[PixelFootprints]) -> "Footprints | None":
+        """All of them in one batch, which stands for other pixels as well; None where there are none."""
+        parts = [part for part in parts if len(part.radiance)]
+        if not parts:
+            return None
+        areas = PixelFootprints.joined(parts)
+        return cls([areas], lambda: areas)
+
 
 def deblur_map(
     footprints: Footprints,

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Protocol, TypeVar, get_args, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -43,6 +43,19 @@ class SurfaceBuffers:
         rays = unit_rays_camera(camera).to(self.alpha.device)
         cosines = -(normalize(self.normals_camera, dim=0) * rays).sum(0)
         return torch.where(self.alpha > 0, cosines.clamp(0, 1), 1.0)
+
+
+def beside_outline(met: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Pixels among whose eight neighbors and themselves some hit a surface and some miss it."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    found: np.ndarray = maximum_filter(met, 3, mode="nearest") & ~minimum_filter(met, 3, mode="nearest")
+    return found
+
+
+def overlap(alpha: Float[Tensor, "H W"], mask: Float[Tensor, "H W"]) -> float:
+    """Intersection over union, Σ min / Σ max; zero where both are empty."""
+    return float(alpha.minimum(mask).sum() / alpha.maximum(mask).sum().clamp(min=1e-9))
 
 
 def buffers_from_arrays(

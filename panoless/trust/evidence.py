@@ -23,7 +23,7 @@ from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints, deblur_map, thinned
 from panoless.environment.resolution import densest_resolution
 from panoless.environment.solve import solve_environment
-from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, pixel_areas, usable_views
+from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, overlap, pixel_areas, usable_views
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.robust import NORMAL_MEDIAN, bounded_error
 from panoless.trust.options import TrustOptions
@@ -264,19 +264,18 @@ def _silhouette(view: TrainView, surface: SurfaceBuffers) -> tuple[float, float,
 
     A pixel near the fitted contour has the mask's signed distance less the fitted one; a shift t changes it by n·t.
     """
-    mask, alpha = view.mask.cpu().numpy(), surface.alpha.cpu().numpy()
-    overlap = float(np.minimum(mask, alpha).sum() / max(np.maximum(mask, alpha).sum(), 1e-9))
+    mask, alpha, shared = view.mask.cpu().numpy(), surface.alpha.cpu().numpy(), overlap(surface.alpha, view.mask)
     if min(mask.max(), alpha.max()) < MASK_LEVEL or max(mask.min(), alpha.min()) > MASK_LEVEL:
-        return float(max(mask.shape)), float(max(mask.shape)), overlap
+        return float(max(mask.shape)), float(max(mask.shape)), shared
     of_mask, of_fit = mask_distance_px(mask), mask_distance_px(alpha)
     rows, columns = np.gradient(of_fit)
     near = np.abs(of_fit) < 1
     near[[0, -1]], near[:, [0, -1]] = False, False
     if not near.any():
-        return float(max(mask.shape)), float(max(mask.shape)), overlap
+        return float(max(mask.shape)), float(max(mask.shape)), shared
     normals, away = np.stack([columns[near], rows[near]], 1), (of_mask - of_fit)[near]
     shift = np.linalg.lstsq(normals, away, rcond=None)[0]
-    return float(np.median(np.abs(away))), float(np.linalg.norm(shift)), overlap
+    return float(np.median(np.abs(away))), float(np.linalg.norm(shift)), shared
 
 
 def _noise(view: TrainView) -> float:

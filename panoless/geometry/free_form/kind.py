@@ -96,11 +96,7 @@ class FreeFormMirror(ExactGeometry):
             directions = torch.from_numpy(sights.outgoing[kept]).float().to(view.radiance.device)
             chosen = pixels[torch.from_numpy(kept).to(pixels.device)]
             found.append(PixelFootprints(directions, view.radiance_at(chosen)))
-        parts = [part for part in found if len(part.radiance)]
-        if not parts:
-            return None
-        areas = PixelFootprints.joined(parts)
-        return Footprints([areas], lambda: areas)
+        return Footprints.of(found)
 
     def shade(
         self,

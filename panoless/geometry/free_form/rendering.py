@@ -4,11 +4,11 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.rays import pose_of
-from panoless.geometry.base import SurfaceBuffers, buffers_from_arrays
+from panoless.geometry.base import SurfaceBuffers, beside_outline, buffers_from_arrays
 from panoless.geometry.exact import shade_centers
 from panoless.geometry.free_form.observations import PixelRays
 from panoless.geometry.free_form.options import FreeFormOptions
@@ -31,7 +31,7 @@ def free_form_buffers(surface: LevelSet, camera: RasterCamera, options: FreeForm
     hits = surface.hits(rays.origins, rays.directions)
     distance, normals = np.where(hits.met, hits.distance, 0.0), hits.normals
     alpha = hits.met.astype(np.float64)
-    mixed = np.flatnonzero(_beside_outline(hits.met.reshape(shape)))
+    mixed = np.flatnonzero(beside_outline(hits.met.reshape(shape)))
     alpha[mixed] = coverage(surface, camera, mixed, options.render_samples)
     missed = mixed[(alpha[mixed] > 0) & ~hits.met[mixed]]
     near = surface.nearest(rays.origins[missed], rays.directions[missed])
@@ -58,14 +58,6 @@ def _grid_of_rays(
     """Through the centers of so many parts of pixels a side."""
     for down, across in np.ndindex(samples, samples):
         yield PixelRays.through(camera, column + (across + 0.5) / samples, row + (down + 0.5) / samples)
-
-
-def _beside_outline(met: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Pixels among whose eight neighbors and themselves some hit and some miss."""
-    from scipy.ndimage import maximum_filter, minimum_filter
-
-    found: np.ndarray = maximum_filter(met, 3, mode="nearest") & ~minimum_filter(met, 3, mode="nearest")
-    return found
 
 
 def free_form_light(

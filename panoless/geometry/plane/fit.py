@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from panoless.capture.rays import pose_of, project
 from panoless.capture.silhouettes import MaskContours, mask_contours
 from panoless.capture.views import TrainView, Views
+from panoless.geometry.base import overlap
 from panoless.geometry.plane.model import Plane, plane_buffers
 from panoless.geometry.plane.options import BoundaryRound, PlaneOptions
 from panoless.geometry.plane.silhouette import (
@@ -29,6 +30,7 @@ from panoless.geometry.plane.silhouette import (
 )
 from panoless.numeric.gauss_newton import accept_step, damped_step, normal_equations
 from shinypartial.core.errors import InputError
+from shinypartial.core.sphere import fibonacci_directions
 
 
 @dataclass(frozen=True)
@@ -94,13 +96,8 @@ def _starts(views: Views, options: PlaneOptions) -> list[Plane]:
     """The best few of many planes through the object that face as many cameras as a plane can."""
     centers = np.stack([view.position for view in views.train])
     centers /= np.linalg.norm(centers, axis=1, keepdims=True)
-    index = np.arange(options.start_directions) + 0.5
-    height, azimuth = 1 - 2 * index / options.start_directions, np.pi * (1 + 5**0.5) * index
-    level = np.sqrt(1 - height**2)
     # The mean view direction joins the lattice: with few cameras it can be the only one that all of them face.
-    directions = np.concatenate(
-        [centers.mean(0, keepdims=True), np.stack([level * np.cos(azimuth), level * np.sin(azimuth), height], 1)]
-    )
+    directions = np.concatenate([centers.mean(0, keepdims=True), fibonacci_directions(options.start_directions)])
     facing = (directions @ centers.T > options.start_cosine).sum(1)
     voters = _spread(views.train, options.start_views)
     planes = [_plane(n, offset) for n in directions[facing == facing.max()] for offset in options.start_offsets]
@@ -314,6 +311,5 @@ def _score(views: Views, contours: MaskContours, plane: Plane, sigma_deg: float,
         if len(own):
             median_px[index] = np.median(own)
         alpha = plane_buffers(plane, view.camera).alpha
-        both, either = alpha.minimum(view.mask).sum(), alpha.maximum(view.mask).sum()
-        iou[index] = float(both / either) if either > 0 else 0.0
+        iou[index] = overlap(alpha, view.mask)
     return PlaneFit(plane, sigma_deg, median_px, iou)

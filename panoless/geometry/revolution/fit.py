@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from panoless.capture.views import TrainView, Views, split_held_out
+from panoless.geometry.base import overlap
 from panoless.geometry.revolution.floor import fit_floor, floor_pixels
 from panoless.geometry.revolution.footprints import has_edges, informative_pixels, refine_by_footprints
 from panoless.geometry.revolution.interior import end_pixels, search_interior
@@ -88,7 +89,7 @@ def _propose(
     overlaps = []
     for view in views.train[:: max(1, len(views.train) // own.scored_views)]:
         alpha = revolution_buffers(surface, view.camera).alpha
-        overlaps.append(float(alpha.minimum(view.mask).sum() / alpha.maximum(view.mask).sum().clamp(min=1e-9)))
+        overlaps.append(overlap(alpha, view.mask))
     return RevolutionProposal(surface, medians, np.array(overlaps))
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 from panoless.capture.silhouettes import mask_contours
 from panoless.capture.views import Views
+from panoless.geometry.base import overlap
 from panoless.geometry.sphere.model import Sphere, sphere_buffers
 from panoless.geometry.sphere.options import SphereOptions
 from panoless.numeric.gauss_newton import accept_step, damped_step
@@ -185,8 +186,7 @@ def fit_sphere(views: Views, options: SphereOptions, *, asked: bool) -> SphereFi
     overlaps = []
     for view in views.train:
         alpha = sphere_buffers(sphere, view.camera, options.samples).alpha.to(view.mask)
-        both, either = alpha.minimum(view.mask).sum(), alpha.maximum(view.mask).sum()
-        overlaps.append(float(both / either) if either > 0 else 0.0)
+        overlaps.append(overlap(alpha, view.mask))
     return SphereFit(sphere, np.array(medians), np.array(overlaps))
 
 

@@ -25,6 +25,7 @@ from panoless.geometry.surfels.placement import surfels_at
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.rasterize import RasterCamera
 from shinypartial.core.errors import InputError
+from shinypartial.core.sphere import fibonacci_directions
 from shinypartial.io.records import read_record, write_record
 
 MERIDIANS = 128
@@ -81,17 +82,13 @@ class SphereMirror(ExactGeometry):
         for view in views.train:
             corners, met = mirrored(self.sphere, view.camera, view.solid.cpu().numpy(), parts_of_pixel(2))
             kept = met.all(1) & (_spans(corners) < self.options.widest_footprint_rad**2)
-            if kept.any():
-                pixels = view.solid[torch.from_numpy(kept).to(view.solid.device)]
-                trust = self._trust_by_return(view, corners[kept].mean(1))
-                directions, trusted = (
-                    torch.from_numpy(each).float().to(view.radiance.device) for each in (corners[kept], trust)
-                )
-                found.append(PixelFootprints(directions, view.radiance_at(pixels), trusted))
-        if not found:
-            return None
-        areas = PixelFootprints.joined(found)
-        return Footprints([areas], lambda: areas)
+            pixels = view.solid[torch.from_numpy(kept).to(view.solid.device)]
+            trust = self._trust_by_return(view, corners[kept].mean(1))
+            directions, trusted = (
+                torch.from_numpy(each).float().to(view.radiance.device) for each in (corners[kept], trust)
+            )
+            found.append(PixelFootprints(directions, view.radiance_at(pixels), trusted))
+        return Footprints.of(found)
 
     def shade(
         self,
@@ -113,7 +110,7 @@ class SphereMirror(ExactGeometry):
     def to_surfels(self, config: FitConfig) -> SurfelMirror:
         """Surfels all over it on a Fibonacci lattice, curved as it is."""
         count, radius = config.surfels.count, self.sphere.radius
-        normals = _lattice(count)
+        normals = fibonacci_directions(count)
         helper = np.eye(3)[np.abs(normals).argmin(1)]
         across = np.cross(helper, normals)
         across /= np.linalg.norm(across, axis=1, keepdims=True)
@@ -163,14 +160,6 @@ def _trust_by_span(corners: Float[np.ndarray, "P 4 3"]) -> Float[np.ndarray, "P"
     """1/(1 + a/ā) of the square angles a of pixels with the median ā: beside the outline one spans a wide strip."""
     spans = _spans(corners)
     return 1 / (1 + spans / np.median(spans)) if len(spans) else spans
-
-
-def _lattice(count: int) -> Float[np.ndarray, "K 3"]:
-    """Points evenly on the unit sphere."""
-    index = np.arange(count) + 0.5
-    height, azimuth = 1 - 2 * index / count, np.pi * (1 + 5**0.5) * index
-    level = np.sqrt(1 - height**2)
-    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), height], 1)
 
 
 class SphereFamily(ExactFamily):
