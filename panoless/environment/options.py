@@ -5,6 +5,8 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
+from shinypartial.io.records import NonEmpty
+
 
 @dataclass(frozen=True)
 class FootprintMapOptions:
@@ -77,7 +79,7 @@ class SurroundingsOptions:
     least_pull: float = 0.0003
     """Share of the cost that this step has to promise. It is 0.024 and 0.017 in rooms of vase at 5 and 10 radii, 0.063
     and 0.028 in those of sculpture, 0.0005 in one of mirror at 20 radii, and up to 0.0001 in their far worlds."""
-    resolutions: tuple[int, ...] = (8, 8, 16, 16, 16, 32, 32, 32, 64, 64, 64)
+    resolutions: NonEmpty[int] = (8, 8, 16, 16, 16, 32, 32, 32, 64, 64, 64)
     """Texels along a face side of the maps of all steps."""
     stretch: float = 1.7
     """Factor of a step: it lets each texel follow by the mean of its rays, as a map does not quite."""

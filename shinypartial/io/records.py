@@ -25,6 +25,8 @@ NonNegative = Annotated[float, Meta(ge=0)]
 Positive = Annotated[float, Meta(gt=0)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 Text = Annotated[str, Meta(pattern=r"\S")]
+Item = TypeVar("Item")
+NonEmpty = Annotated[tuple[Item, ...], Meta(min_length=1)]
 
 NOUNS = {int: "a whole number", float: "a number", str: "a text", bool: "true or false", Path: "a path"}
 
@@ -43,7 +45,8 @@ def read_record(
 
     Fields may be dataclasses, tuples, Literals, Paths, numbers and texts, each also `| None`. A union of dataclasses is
     told apart by the field `kind`, whose default names the class. Keys that are missing take the field's default
-    (`complete`: every key must be there); unknown keys are refused unless `allow_unknown`.
+    (`complete`: every key must be there); unknown keys are refused unless `allow_unknown`, and empty lists where a
+    field is `NonEmpty`.
 
     Raises InputError that names the field, such as `camera.azimuth_deg.0` (`place` may word that), and what is allowed
     there, for values that are missing, unknown, of another type, not finite or out of range.
@@ -91,7 +94,10 @@ class _Reader:
             return self._record(self._choose(records, content, path), content, path)
         sequence = next((option for option in options if typing.get_origin(option) is tuple), None)
         if sequence is not None:
-            return self._tuple(typing.get_args(sequence), content, path)
+            found = self._tuple(typing.get_args(sequence), content, path)
+            if not found and _metas(hint):
+                raise self._error(path, _description(hint), "an empty list")
+            return found
         try:
             found = msgspec.convert(content, hint, dec_hook=_path)
         except (msgspec.ValidationError, TypeError):
@@ -158,6 +164,11 @@ def _options(hint: Any) -> tuple[Any, ...]:
     return typing.get_args(hint) if typing.get_origin(hint) in (types.UnionType, typing.Union) else (hint,)
 
 
+def _metas(hint: Any) -> list[Meta]:
+    """The ranges at a field; a list's can only be that it is not empty."""
+    return [extra for extra in getattr(hint, "__metadata__", ()) if isinstance(extra, Meta)]
+
+
 def _path(kind: Any, content: Any) -> Any:
     if kind is Path and isinstance(content, str | Path):
         return Path(content)
@@ -167,8 +178,8 @@ def _path(kind: Any, content: Any) -> Any:
 def _description(hint: Any) -> str:
     """What a field takes, in words: `a whole number of at least 1`, `one of plane, surfels`."""
     if typing.get_origin(hint) is Annotated:
-        kind, *extras = typing.get_args(hint)
-        return _description(kind) + "".join(_range(extra) for extra in extras if isinstance(extra, Meta))
+        kind = typing.get_args(hint)[0]
+        return _description(kind) + "".join(map(_range, _metas(hint)))
     if typing.get_origin(hint) is Literal:
         return f"one of {', '.join(map(str, typing.get_args(hint)))}"
     options = _options(hint)

@@ -3,24 +3,26 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from shinypartial.io.records import Count, NonEmpty, NonNegative, Positive
+
 
 @dataclass(frozen=True)
 class FreeFormRound:
     """Gauss–Newton steps on one grid and one map."""
 
-    cells: int
+    cells: Count
     """Cells along the longest side of the box, of which the object takes about three quarters."""
-    resolution: int
+    resolution: Count
     """Texels along a face side of the map."""
-    robust_scale: float
+    robust_scale: Positive
     """Residual (linear radiance) beyond which a pixel loses its vote."""
-    samples: int
+    samples: Literal[1, 4]
     """Mirrored rays over a pixel, 1 or 4."""
-    rays: int
+    rays: Count
     """About so many pixels of all views take part."""
-    smoothing: float
+    smoothing: NonNegative
     """Weight λ of the integral of |D³φ|² in the normalized frame, against `counted_rays` pixels."""
-    steps: int
+    steps: Count
     """Most steps."""
     photon_share: float = 0.75
     """Share of a pixel's variance that grows with what it shows, in [0, 1). It takes normals from 0.43° to 0.22° on
@@ -52,9 +54,9 @@ class ConcaveOptions:
     """Reflections that a ray is followed through. Half the pixels of a deep bowl need two or more."""
     scale: float = 0.3
     """Color (linear radiance) beyond which disagreement counts no more: wide, so that the score falls early."""
-    resolutions: tuple[int, ...] = (6, 8, 12)
+    resolutions: NonEmpty[int] = (6, 8, 12)
     """Cells along a face side in which directions are compared, from coarse to fine."""
-    evaluations: tuple[int, ...] = (160, 200, 260)
+    evaluations: NonEmpty[int] = (160, 200, 260)
     """Candidates of the descent at each of them."""
     descents: int = 3
     """Best first guesses that are followed at the first resolution."""
@@ -69,11 +71,11 @@ class ConcaveOptions:
     """A patch of which at least this share is unexplained is the lid of one hollow; else each part of it may be."""
     lid_angle_deg: float = 40.0
     """A patch is what lies within so much of its mean normal."""
-    insets: tuple[float, ...] = (1.0, 0.93, 0.86, 0.79)
+    insets: NonEmpty[float] = (1.0, 0.93, 0.86, 0.79)
     """Sizes of the first guesses, in those of the patch."""
-    depths: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.3)
+    depths: NonEmpty[float] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.3)
     """Depths of the first guesses, in mean radii of the patch: right ones are told from wrong ones within a tenth."""
-    exponents: tuple[float, ...] = (1.3, 1.7, 2.0, 2.5, 4.0)
+    exponents: NonEmpty[float] = (1.3, 1.7, 2.0, 2.5, 4.0)
     """Exponents p of their profiles ρᵖ + δᵖ = 1: from nearly a cone to nearly a box."""
     rounding_cells: float = 0.7
     """Width over which hollow and surface melt together at the rim."""
@@ -95,7 +97,7 @@ class ConcaveOptions:
     """A hollow is kept if it lowers the disagreement under it by this share…"""
     standard_errors: float = 4.0
     """…and by so many standard errors of the views' differences."""
-    rounds: tuple[FreeFormRound, ...] = (
+    rounds: NonEmpty[FreeFormRound] = (
         FreeFormRound(28, 16, 0.30, 1, 40_000, 30.0, 5),
         FreeFormRound(28, 32, 0.20, 1, 40_000, 30.0, 5),
         FreeFormRound(36, 32, 0.20, 1, 60_000, 30.0, 3),
@@ -142,7 +144,7 @@ class FreeFormOptions:
     nothing else is said, a value was chosen on these; "not tuned" is what only has to be large or small enough.
     """
 
-    rounds: tuple[FreeFormRound, ...] = (
+    rounds: NonEmpty[FreeFormRound] = (
         FreeFormRound(20, 16, 0.30, 1, 40_000, 100.0, 5),
         FreeFormRound(20, 32, 0.20, 1, 40_000, 100.0, 5),
         FreeFormRound(28, 32, 0.20, 1, 60_000, 30.0, 3),
@@ -160,7 +162,7 @@ class FreeFormOptions:
     """With fewer views none is held out, and model selection leaves the kind out. Not tuned."""
     start_cells: int = 40
     """Cells along the longest side of the first surface, before its first round. Not tuned."""
-    start_tensions: tuple[float, ...] = (0.0, 10.0, 30.0, 100.0)
+    start_tensions: NonEmpty[float] = (0.0, 10.0, 30.0, 100.0)
     """Tensions τ of the plate between contacts (1/length² in the normalized frame) among which the pixels choose. On
     chrome-block over a dark ground the normals of the start are wrong by 9.6°, 6.5°, 3.0° and 4.5° in the median, and
     by 9.1°, 3.8°, 0.5° and 1.1° after the first rounds; sculpture ends within 0.02° from all of them."""

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from panoless.geometry.plane.options import PlaneOptions
+from shinypartial.io.records import NonEmpty
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class HeightFieldOptions:
     """Cells of the spline along the longer side of the boundary. Chosen on the development scenes."""
     max_points: int = 20_000
     """Most contour points of all views. Not tuned."""
-    edge_scales_px: tuple[float, ...] = (2.0, 1.0, 1.0, 0.5, 0.5, 0.5)
+    edge_scales_px: NonEmpty[float] = (2.0, 1.0, 1.0, 0.5, 0.5, 0.5)
     """Robust scales, in pixels, of the first steps, which ask contours only. Not tuned."""
     edge_bending: float = 1e-2
     """Weight of the bending energy in these steps, against the mean diagonal of the data: contours say nothing of the
@@ -47,7 +48,7 @@ class HeightFieldOptions:
     """Standard deviation of a pixel (linear radiance). Chosen on the development scenes."""
     bending: float = 1e-4
     """Weight of the bending energy beside photographs. Chosen on the development scenes."""
-    rounds: tuple[HeightFieldRound, ...] = (
+    rounds: NonEmpty[HeightFieldRound] = (
         HeightFieldRound(16, 0.5, 60_000, 4),
         HeightFieldRound(32, 0.3, 60_000, 3),
         HeightFieldRound(64, 0.3, 60_000, 3),

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from shinypartial.io.records import NonEmpty
+
 
 @dataclass(frozen=True)
 class BoundaryRound:
@@ -33,7 +35,7 @@ class PlaneOptions:
 
     start_directions: int = 200
     """Normals that are tried, evenly over the sphere. Not tuned."""
-    start_offsets: tuple[float, ...] = (-0.2, 0.0, 0.2)
+    start_offsets: NonEmpty[float] = (-0.2, 0.0, 0.2)
     """Offsets that are tried with each, in radii of the object. Not tuned."""
     start_cosine: float = 0.15
     """A plane faces a camera if the cosine between its normal and the direction to it is above this. Not tuned."""

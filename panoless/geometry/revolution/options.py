@@ -7,6 +7,8 @@ number was chosen on the development scenes Vase (open, smooth) and Cola (closed
 import math
 from dataclasses import dataclass
 
+from shinypartial.io.records import NonEmpty
+
 
 @dataclass(frozen=True)
 class SilhouetteOptions:
@@ -18,11 +20,11 @@ class SilhouetteOptions:
     """Contour points of a coarse fit."""
     start_cell_px: float = 3.0
     """Spacing of the profile in a coarse fit."""
-    start_scales_px: tuple[float, ...] = (16.0, 16.0, 16.0, 16.0)
+    start_scales_px: NonEmpty[float] = (16.0, 16.0, 16.0, 16.0)
     """Robust scales of the steps of a coarse fit."""
     points: int = 30_000
     """Contour points of the final fit."""
-    scales_px: tuple[float, ...] = (4.0, 2.0, 1.0, 1.0, 0.5, 0.5)
+    scales_px: NonEmpty[float] = (4.0, 2.0, 1.0, 1.0, 0.5, 0.5)
     """Robust scales of its steps."""
     noise_multiple: float = 3.0
     """Robust scales are at least this many medians of the distances."""
@@ -71,9 +73,9 @@ class Round:
 class PhotometricOptions:
     """Axis and profile by what single rays through pixel centers mirror."""
 
-    coarse: tuple[Round, ...] = (Round(64, 0.3, 3.0, 2), Round(128, 0.3, 2.0, 2))
+    coarse: NonEmpty[Round] = (Round(64, 0.3, 3.0, 2), Round(128, 0.3, 2.0, 2))
     """Rounds before the mouth is opened."""
-    fine: tuple[Round, ...] = (
+    fine: NonEmpty[Round] = (
         Round(128, 0.2, 1.5, 2),
         Round(256, 0.2, 1.5, 2),
         Round(256, 0.1, 1.0, 2),
@@ -191,7 +193,7 @@ class LipOptions:
     """Fewer tell nothing."""
     refined_steps: int = 3
     """Gauss–Newton steps of the refinement."""
-    lengths: tuple[float, ...] = (4.0, 2.0, 1.0, 0.5)
+    lengths: NonEmpty[float] = (4.0, 2.0, 1.0, 0.5)
     """Of a step, tried in turn: radiance that changes by leaps makes steps too short."""
     difference_px: float = 0.05
     """Of the derivatives."""
@@ -209,7 +211,7 @@ class FootprintOptions:
 
     spacing_px: float = 1 / 3
     """Of the vertices: an edge is as sharp as they are dense."""
-    rounds: tuple[Round, ...] = (
+    rounds: NonEmpty[Round] = (
         Round(32, 0.5, 1.5, 4),
         Round(64, 0.4, 1.5, 4),
         Round(128, 0.3, 1.0, 4),

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from shinypartial.io.records import Count, NonNegative, Positive, Share
+from shinypartial.io.records import Count, NonEmpty, NonNegative, Positive, Share
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class SphereOptions:
     0.98 is by 0.005 when seen from the side. On the rendered ball it is 0.0002."""
     cone_rounds: Count = 6
     """Rounds of robust weights that a cone is found in. Not tuned."""
-    scales_px: tuple[Positive, ...] = (4.0, 2.0, 1.0, 0.5, 0.5)
+    scales_px: NonEmpty[Positive] = (4.0, 2.0, 1.0, 0.5, 0.5)
     """Robust scales, in pixels, of the steps by all outlines. Not tuned."""
     noise_scale: Positive = 3.0
     """A robust scale is no less than so many medians of the distances. Not tuned."""

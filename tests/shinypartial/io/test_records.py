@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from msgspec import Meta
 
 from shinypartial.core.errors import InputError
-from shinypartial.io.records import Count, NonNegative, Share, Text, check_record, read_record, write_record
+from shinypartial.io.records import Count, NonEmpty, NonNegative, Share, Text, check_record, read_record, write_record
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Recipe:
     loud: bool = False
     gain: Share | None = None
     steps: tuple[NonNegative, ...] = ()
-    outline: tuple[tuple[float, float], ...] = ((0.0, 1.0),)
+    outline: NonEmpty[tuple[float, float]] = ((0.0, 1.0),)
     shape: Ball | Box = Ball()
     parts: tuple[Ball | Box, ...] = ()
     options: Options = field(default_factory=Options)
@@ -61,7 +61,7 @@ recipes = st.builds(
     loud=st.booleans(),
     gain=st.none() | shares,
     steps=st.lists(st.floats(0, 1e300)).map(tuple),
-    outline=st.lists(st.tuples(shares, shares)).map(tuple),
+    outline=st.lists(st.tuples(shares, shares), min_size=1).map(tuple),
     shape=st.builds(Ball, radius=shares) | st.builds(Box, size=st.tuples(shares, shares)),
     parts=st.lists(st.builds(Ball, radius=shares) | st.just(Box())).map(tuple),
     options=st.builds(Options, rays=st.integers(8, 100), decay=st.floats(0, 0.99)),
@@ -91,6 +91,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str, str, str]] = {
     "no path": ({"folder": 3}, "`folder`", "a path", "3"),
     "length": ({"outline": [[0, 1], [1, 2, 3]]}, "`outline.1`", "2 values", "3"),
     "no list": ({"outline": "ab"}, "`outline`", "a list", "'ab'"),
+    "empty list": ({"outline": []}, "`outline`", "a list that is not empty", "an empty list"),
     "in a tuple of a union": ({"shape": {"kind": "box", "size": [0, 2]}}, "`shape.size.1`", "from 0 to 1", "2"),
     "kind": ({"parts": [{"kind": "cone"}]}, "`parts.0.kind`", "one of ball, box", "'cone'"),
     "no kind": ({"parts": [{}]}, "`parts.0.kind`", "one of ball, box", "None"),
