@@ -1,5 +1,5 @@
-"""What photographs get wrong, taken back: masks too small or too large in all views, exposures that differ, and a focal
-length that is not what it is said to be.
+"""What photographs get wrong, taken back: masks too small or too large in all views, exposures and white balances that
+differ, and a focal length that is not what it is said to be.
 
 Views are corrected when they are loaded; what a fit found about them is a few numbers.
 """
@@ -31,11 +31,18 @@ class Corrections:
     """The focal length of all views over what is said of it."""
     focal_uncertainty: float | None = None
     """Standard deviation of that factor; None where it was not found."""
+    balances: Float[np.ndarray, "V 3"] | None = None
+    """Gains of each view's channels against its exposure; None: white balance is the same in all views."""
 
     @property
     def exposure_stops(self) -> float | None:
         """Standard deviation of log₂ of the gains; None where they are all alike."""
         return None if self.gains is None else float(np.log2(self.gains).std())
+
+    @property
+    def white_balance_stops(self) -> float | None:
+        """Standard deviation of log₂ of the balances; None where they are all alike."""
+        return None if self.balances is None else float(np.log2(self.balances).std())
 
     def applied(self, views: Views, config: FitConfig) -> Views:
         """The views as they would be without these errors; themselves where there are none."""
@@ -45,8 +52,13 @@ class Corrections:
         if self.mask_offset_px:
             train = tuple(with_outline_moved(view, self.mask_offset_px) for view in train)
         if self.gains is not None:
-            encoding, exposed = encoding_of(config), zip(train, self.gains.tolist(), strict=True)
-            train = tuple(replace(view, radiance=encoding.without_gain(view.radiance, gain)) for view, gain in exposed)
+            balances = np.ones((1, 3)) if self.balances is None else self.balances
+            gains = torch.from_numpy(self.gains[:, None] * balances).float()[..., None, None]
+            encoding, exposed = encoding_of(config), zip(train, gains, strict=True)
+            train = tuple(
+                replace(view, radiance=encoding.without_gain(view.radiance, gain.to(view.radiance)))
+                for view, gain in exposed
+            )
         return replace(views, train=train)
 
 

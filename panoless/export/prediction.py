@@ -249,6 +249,7 @@ def _model_selection(selection: Selection) -> ModelSelection:
             camera_turn_deg=each.camera_turn_deg,
             mask_offset_px=each.corrections.mask_offset_px or None,
             exposure_stops=each.corrections.exposure_stops,
+            white_balance_stops=each.corrections.white_balance_stops,
             focal_factor=None if each.corrections.focal_uncertainty is None else each.corrections.focal_factor,
             focal_uncertainty=each.corrections.focal_uncertainty,
         )

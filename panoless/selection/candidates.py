@@ -78,6 +78,8 @@ def describe(candidate: Candidate) -> str:
         parts.append(f"masks moved outward by {candidate.corrections.mask_offset_px:.2g} px")
     if candidate.corrections.exposure_stops is not None:
         parts.append(f"exposures differ by {candidate.corrections.exposure_stops:.2g} stops")
+    if candidate.corrections.white_balance_stops is not None:
+        parts.append(f"white balances differ by {candidate.corrections.white_balance_stops:.2g} stops")
     if candidate.corrections.focal_uncertainty is not None:
         change, sigma = 100 * (candidate.corrections.focal_factor - 1), 100 * candidate.corrections.focal_uncertainty
         parts.append(f"focal length changed by {change:+.2f} ± {sigma:.2f} %")

@@ -1,4 +1,4 @@
-"""Exposures that differ from view to view, where held-out views ask for them."""
+"""Exposures and white balances that differ from view to view, where held-out views ask for them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,7 +12,7 @@ from panoless.capture.corrections import Corrections
 from panoless.capture.encoding import SATURATED, encoding_of
 from panoless.capture.views import Views
 from panoless.config import FitConfig
-from panoless.environment.exposure import exposure_gains
+from panoless.environment.exposure import EXPOSURE, WHITE_BALANCE, Groups, exposure_gains
 from panoless.environment.rays import Rays
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
@@ -28,21 +28,30 @@ def earned_exposures(
 ) -> tuple[Corrections, Float[np.ndarray, "V"]] | None:
     """Gains of all views by the geometry of a fit, and what is unexplained then of the pixels that `errors` are of.
 
-    None where these are not clearly better explained.
+    None where these are not clearly better explained. A gain a view is asked first, then a gain a channel.
 
-    The map is that of the other views at equal exposure; a held-out view's other pixels tell its own gain.
+    The map is that of the other views at equal exposure; a held-out view's other pixels tell its own gains.
     """
-    corrections = equal_exposures(views, fitted, config)
-    if (corrections.exposure_stops or 0.0) < config.corrections.least_stops:
-        return None
-    solved, tested = _halves(views, fitted, config)
-    with torch.no_grad():
-        gains = _gains(solved, config)
-        environment = solve_environment(_divided(solved, gains, config), config.selection.trial_resolution)
-        own = [_gain(rays.every(2, 0), environment, config) for rays in tested]
-        equal = _divided([rays.every(2, 1) for rays in tested], np.array(own), config)
-        free = np.array([prediction_error([rays], environment) for rays in equal])
-    return (corrections, free) if is_clearly_lower(free, errors, config.selection) else None
+    halves: tuple[list[Rays], list[Rays]] | None = None
+    earned = None
+    for groups in (EXPOSURE, WHITE_BALANCE):
+        corrections = equal_exposures(views, fitted, config, groups)
+        if (_spread(corrections, groups) or 0.0) < config.corrections.least_stops:
+            continue
+        solved, tested = halves = halves or _halves(views, fitted, config)
+        with torch.no_grad():
+            gains = _gains(solved, config, groups)
+            environment = solve_environment(_divided(solved, gains, config), config.selection.trial_resolution)
+            own = [_own_gains(rays.every(2, 0), environment, config, groups) for rays in tested]
+            equal = _divided([rays.every(2, 1) for rays in tested], np.array(own), config)
+            free = np.array([prediction_error([rays], environment) for rays in equal])
+        if is_clearly_lower(free, errors, config.selection):
+            earned, errors = (corrections, free), free
+    return earned
+
+
+def _spread(corrections: Corrections, groups: Groups) -> float | None:
+    return corrections.exposure_stops if groups == EXPOSURE else corrections.white_balance_stops
 
 
 def fitted_to_equal_exposures(views: Views, fitted: Fitted, config: FitConfig, refit: Refit) -> Fitted:
@@ -58,13 +67,17 @@ def fitted_to_equal_exposures(views: Views, fitted: Fitted, config: FitConfig, r
     return replace(again, corrections=fitted.corrections)
 
 
-def equal_exposures(views: Views, fitted: Fitted, config: FitConfig) -> Corrections:
-    """The corrections of a fit with gains by its geometry."""
-    bare = replace(fitted.corrections, gains=None)
+def equal_exposures(views: Views, fitted: Fitted, config: FitConfig, groups: Groups | None = None) -> Corrections:
+    """The corrections of a fit with gains by its geometry, for the channels that share one, as in the fit."""
+    if groups is None:
+        groups = EXPOSURE if fitted.corrections.white_balance_stops is None else WHITE_BALANCE
+    bare = replace(fitted.corrections, gains=None, balances=None)
     usable = fewer_pixels(bare.applied(views, config), 2 * config.corrections.rays)
     with torch.no_grad():
         seen = observe_views(usable_views(usable, fitted.geometry), fitted.geometry, config.corrections.rays)
-        return replace(bare, gains=_gains(list(seen), config))
+        gains = _gains(list(seen), config, groups)
+    of_views = np.exp(np.log(gains).mean(1))
+    return replace(bare, gains=of_views, balances=None if groups == EXPOSURE else gains / of_views[:, None])
 
 
 def examined(views: Views, fitted: Fitted, config: FitConfig) -> Float[np.ndarray, "V"]:
@@ -85,25 +98,38 @@ def _halves(views: Views, fitted: Fitted, config: FitConfig) -> tuple[list[Rays]
     return solved, tested
 
 
-def _divided(views: Sequence[Rays], gains: Float[np.ndarray, "V"], config: FitConfig) -> list[Rays]:
-    encoding, seen = encoding_of(config), zip(views, gains.tolist(), strict=True)
-    return [replace(rays, radiance=encoding.without_gain(rays.radiance.T, gain).T.contiguous()) for rays, gain in seen]
+def _divided(views: Sequence[Rays], gains: Float[np.ndarray, "V 3"], config: FitConfig) -> list[Rays]:
+    encoding, seen = encoding_of(config), zip(views, torch.from_numpy(gains).float()[..., None], strict=True)
+    return [
+        replace(rays, radiance=encoding.without_gain(rays.radiance.T, gain.to(rays.radiance)).T.contiguous())
+        for rays, gain in seen
+    ]
 
 
-def _gains(views: Sequence[Rays], config: FitConfig) -> Float[np.ndarray, "V"]:
+def _gains(views: Sequence[Rays], config: FitConfig, groups: Groups) -> Float[np.ndarray, "V 3"]:
     options = config.corrections
     saturation = encoding_of(config).saturation
-    return exposure_gains(views, saturation, options.resolution, options.gain_scale, options.rounds)
+    return exposure_gains(views, saturation, options.resolution, options.gain_scale, options.rounds, groups)
 
 
-def _gain(rays: Rays, environment: Float[Tensor, "6 3 L L"], config: FitConfig) -> float:
+def _own_gains(
+    rays: Rays, environment: Float[Tensor, "6 3 L L"], config: FitConfig, groups: Groups
+) -> Float[np.ndarray, "3"]:
+    """The gains of one view under a map."""
+    gains, shown = np.ones(3), sample_cubemap(environment, rays.directions)
+    for group in groups:
+        gains[list(group)] = _gain(rays, shown, list(group), config)
+    return gains
+
+
+def _gain(rays: Rays, shown: Float[Tensor, "P 3"], group: list[int], config: FitConfig) -> float:
     """Σ w m c/Σ w m² of colors c and what a map predicts, m, with weights by the residuals under the gain before; 1
     where no pixel tells. Saturated pixels have no say.
     """
-    gain, shown = 1.0, sample_cubemap(environment, rays.directions)
-    clear = (rays.radiance < SATURATED * encoding_of(config).saturation.to(shown)).all(1) * rays.initial_weight()
+    gain, radiance, shown = 1.0, rays.radiance[:, group], shown[:, group]
+    clear = (radiance < SATURATED * encoding_of(config).saturation.to(shown)[group]).all(1) * rays.initial_weight()
     for _ in range(config.corrections.rounds):
-        weight = clear * robust_weight(rays.radiance - gain * shown, config.corrections.gain_scale)
-        products, squares = ((weight * (shown * each).sum(1)).sum().item() for each in (rays.radiance, shown))
+        weight = clear * robust_weight(radiance - gain * shown, config.corrections.gain_scale)
+        products, squares = ((weight * (shown * each).sum(1)).sum().item() for each in (radiance, shown))
         gain = products / squares if products > 0 else 1.0
     return gain

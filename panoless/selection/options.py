@@ -40,7 +40,7 @@ class CorrectionOptions:
     masks: Literal["auto", "off"] = "auto"
     """Whether all masks may be too small or too large by one distance."""
     exposure: Literal["auto", "off"] = "auto"
-    """Whether views may be exposed differently; never in a high dynamic range."""
+    """Whether views, or their channels, may be exposed differently; never in a high dynamic range."""
     lens: Literal["auto", "on", "off"] = "auto"
     """Whether the focal length of all views may be wrong by one factor: where photographs pull a fit and held-out views
     gain by it, whenever it is found, or never."""

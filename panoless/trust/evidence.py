@@ -72,6 +72,8 @@ class Evidence:
     """By which the fit moved the outlines of all masks outward."""
     exposure_stops: float = 0.0
     """Standard deviation of the exposures of the views, as far as the fit took it back."""
+    white_balance_stops: float = 0.0
+    """That of the channels from the exposure of their view."""
     focal_factor: float = 1.0
     """The focal length that the fit found over what is said of it."""
     roughness: float = 0.0
@@ -114,6 +116,7 @@ def gather_evidence(
         views=len(seen),
         mask_offset_px=corrections.mask_offset_px,
         exposure_stops=corrections.exposure_stops or 0.0,
+        white_balance_stops=corrections.white_balance_stops or 0.0,
         focal_factor=corrections.focal_factor,
         roughness=roughness or 0.0,
     )

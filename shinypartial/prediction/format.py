@@ -50,7 +50,8 @@ class Candidate:
     `held_out_error` its error on views that were left out of the fit, `alternative_error` that of the
     freer kind that it was compared with, `camera_turn_deg` by how much it turned the cameras in the median, where their
     poses were unknowns, `mask_offset_px` by how much it moved the outlines of all masks outward, and `exposure_stops`
-    the standard deviation of the views' exposures where it found them. `focal_factor` is the focal length of all views
+    the standard deviation of the views' exposures where it found them, `white_balance_stops` that of their channels
+    from the mean of a view. `focal_factor` is the focal length of all views
     over what is said of it where that was an unknown, `focal_uncertainty` its standard deviation. `verdict` is a word
     such as "chosen" or "rejected", `reason` says why.
     """
@@ -65,6 +66,7 @@ class Candidate:
     camera_turn_deg: NonNegative | None = None
     mask_offset_px: float | None = None
     exposure_stops: NonNegative | None = None
+    white_balance_stops: NonNegative | None = None
     focal_factor: NonNegative | None = None
     focal_uncertainty: NonNegative | None = None
 

@@ -60,9 +60,12 @@ def test_gains_are_divided_out_but_for_saturated_pixels() -> None:
     for config in (FitConfig(), FitConfig(tint=(0.8, 1.0, 0.5))):
         largest = encoding_of(config).saturation[:, None, None]
         radiance = view.radiance * largest
-        for gain in (0.7, 1.4):
-            taken = replace(view, radiance=torch.minimum(radiance * gain, largest))
-            (found,) = Corrections(gains=np.array([gain])).applied(views_of(taken), config).train
+        for gain, balance in ((0.7, None), (1.4, None), (0.9, (0.7, 1.0, 1.4))):
+            of_channels = gain * torch.tensor(balance or (1.0, 1.0, 1.0)).reshape(3, 1, 1)
+            taken = replace(view, radiance=torch.minimum(radiance * of_channels, largest))
+            balances = None if balance is None else np.array([balance])
+            corrections = Corrections(gains=np.array([gain]), balances=balances)
+            (found,) = corrections.applied(views_of(taken), config).train
             saturated = taken.radiance >= 0.998 * largest
             assert torch.allclose(found.radiance[~saturated], radiance[~saturated], atol=1e-6)
             assert torch.equal(found.radiance[saturated], largest.expand_as(radiance)[saturated])
@@ -72,4 +75,8 @@ def test_no_corrections_leave_views_alone() -> None:
     views = views_of(disk(12.0))
     assert NO_CORRECTIONS.applied(views, FitConfig()).train[0] is views.train[0]
     assert NO_CORRECTIONS.exposure_stops is None
-    assert Corrections(gains=np.array([0.5, 2.0])).exposure_stops == pytest.approx(1.0)
+    alike = Corrections(gains=np.array([0.5, 2.0]))
+    assert alike.exposure_stops == pytest.approx(1.0)
+    assert alike.white_balance_stops is None
+    balanced = replace(alike, balances=np.array([[0.5, 1.0, 2.0], [2.0, 1.0, 0.5]]))
+    assert balanced.white_balance_stops == pytest.approx((2 / 3) ** 0.5)

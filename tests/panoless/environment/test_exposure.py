@@ -11,6 +11,7 @@ from panoless.kernels.cubemap import cubemap_directions
 RESOLUTION = 8
 GAINS = np.array([0.7, 1.1, 0.9, 1.5, 1.0])
 GAINS /= np.exp(np.log(GAINS).mean())
+GAINS_OF_CHANNELS = np.repeat(GAINS[:, None], 3, 1)
 
 
 def rays_of(gains: np.ndarray, saturation: float = np.inf) -> list[Rays]:
@@ -30,11 +31,11 @@ def gains_from(rays: list[Rays], saturation: float = np.inf) -> np.ndarray:
 
 def test_views_in_a_chain_tell_their_gains() -> None:
     """Without noise exactly, though the first sees nothing of what the last does."""
-    assert gains_from(rays_of(GAINS)) == pytest.approx(GAINS, rel=1e-3)
+    assert gains_from(rays_of(GAINS)) == pytest.approx(GAINS_OF_CHANNELS, rel=1e-3)
 
 
 def test_saturated_pixels_have_no_say() -> None:
-    assert gains_from(rays_of(GAINS, saturation=0.6), saturation=0.6) == pytest.approx(GAINS, rel=1e-3)
+    assert gains_from(rays_of(GAINS, saturation=0.6), saturation=0.6) == pytest.approx(GAINS_OF_CHANNELS, rel=1e-3)
 
 
 def test_some_wrong_pixels_change_little() -> None:
@@ -42,7 +43,7 @@ def test_some_wrong_pixels_change_little() -> None:
     rays = rays_of(GAINS)
     for each in rays:
         each.radiance[::10] = 0.9
-    assert gains_from(rays) == pytest.approx(GAINS, rel=0.02)
+    assert gains_from(rays) == pytest.approx(GAINS_OF_CHANNELS, rel=0.02)
 
 
 def test_a_view_that_shares_nothing_keeps_the_mean() -> None:
@@ -50,5 +51,6 @@ def test_a_view_that_shares_nothing_keeps_the_mean() -> None:
     rays = rays_of(GAINS)
     alone = Rays(-torch.tensor([[0.1, 0.2, 1.0]]), torch.tensor([[0.3, 0.3, 0.3]]))
     found = gains_from([*rays[:2], alone])
-    assert found[0] / found[1] == pytest.approx(GAINS[0] / GAINS[1], rel=1e-3)
-    assert 0.5 < found[2] < 2
+    assert found[0] / found[1] == pytest.approx(np.full(3, GAINS[0] / GAINS[1]), rel=1e-3)
+    assert (found[2] > 0.5).all()
+    assert (found[2] < 2).all()

@@ -37,8 +37,9 @@ def unsaturated() -> Views:
     return replace(views, train=tuple(replace(view, radiance=view.radiance / 2) for view in views.train))
 
 
-def exposed(views: Views) -> Views:
-    seen = zip(views.train, GAINS.tolist(), strict=True)
+def exposed(views: Views, gains: np.ndarray) -> Views:
+    """By one gain a view, or one a channel."""
+    seen = zip(views.train, torch.from_numpy(gains.reshape(len(gains), -1, 1, 1)).float(), strict=True)
     return replace(
         views, train=tuple(replace(view, radiance=(view.radiance * gain).clamp(max=1)) for view, gain in seen)
     )
@@ -59,11 +60,22 @@ def test_exposures_are_corrected_only_where_they_differ() -> None:
     """Then the corrected views are those that were exposed alike."""
     views = unsaturated()
     assert as_found(views).corrections is NO_CORRECTIONS
-    corrections = as_found(exposed(views)).corrections
+    corrections = as_found(exposed(views, GAINS)).corrections
     assert corrections.mask_offset_px == 0
     assert corrections.exposure_stops == pytest.approx(np.log2(GAINS).std(), rel=0.05)
     # Few pixels of a view share a texel with other views.
+    assert corrections.white_balance_stops is None
     assert corrections.gains == pytest.approx(GAINS, rel=0.04)
+
+
+def test_white_balances_are_corrected_where_channels_differ() -> None:
+    """To half of their spread: what changes along the arc within a texel of a map is taken for gains in part."""
+    gains = np.exp2(np.random.default_rng(5).normal(size=(10, 3)) * 0.2)
+    gains /= np.exp(np.log(gains).mean(0))
+    corrections = as_found(exposed(unsaturated(), gains)).corrections
+    assert corrections.balances is not None
+    assert corrections.gains is not None
+    assert np.log2(corrections.gains[:, None] * corrections.balances / gains).std() < np.log2(gains).std() / 2
 
 
 def silhouettes_plane(views: Views, before: Fitted | None = None, *, anew: bool = False) -> Fitted:
