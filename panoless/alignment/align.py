@@ -13,7 +13,7 @@ from torch import Tensor
 from panoless.alignment.adjustment import adjusting_step
 from panoless.alignment.equations import PoseRows, light_rows, outline_rows
 from panoless.alignment.options import PoseOptions
-from panoless.capture.poses import Poses, moved_view
+from panoless.capture.poses import Poses, StatedCameras, moved_view
 from panoless.capture.silhouettes import mask_distance_px
 from panoless.capture.views import TrainView, Views
 from panoless.environment.solve import solve_environment
@@ -35,6 +35,11 @@ class Scene:
         return 3 if self.environment is None else 6
 
 
+def pose_prior(options: PoseOptions) -> Float[np.ndarray, "6"]:
+    """1/σ² of turns (rad) and shifts."""
+    return np.repeat([np.radians(options.turn_deg) ** -2, options.shift**-2], 3)
+
+
 @dataclass(frozen=True)
 class Alignment:
     """The views as they are said to be, and what finds their poses."""
@@ -42,10 +47,10 @@ class Alignment:
     views: Views
     options: PoseOptions
 
-    @cached_property
+    @property
     def prior(self) -> Float[np.ndarray, "6"]:
-        """1/σ² of turns (rad) and shifts."""
-        return np.repeat([np.radians(self.options.turn_deg) ** -2, self.options.shift**-2], 3)
+        """Weights of squared turns and shifts."""
+        return pose_prior(self.options)
 
     @cached_property
     def _seen(self) -> "list[_SeenView]":
@@ -107,8 +112,7 @@ class Alignment:
 
     def without_common(self, poses: Poses) -> Poses:
         """The poses less what turns, shifts and scales all cameras alike."""
-        centers = np.array([view.position for view in self.views.train])
-        return poses.without_common(centers, self.prior)[1]
+        return poses.without_common(StatedCameras.of(self.views), self.prior)[1]
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 What all cameras share is no error of theirs: no photograph of a far world tells it, so it can be found and taken back.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from panoless.capture.rays import pose_of
 from panoless.capture.views import TrainView, Views
+
+#: A principal point is taken for wrong where what turns and shifts leave to it and to common motions together is less
+#: than this share of what they leave to common motions alone. Of single cameras' errors it is 0.99.
+LENS_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -29,6 +34,20 @@ class Similarity:
     def undone(self, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
         """The inverse."""
         return (points - self.shift) @ self.rotation / self.scale
+
+
+@dataclass(frozen=True)
+class StatedCameras:
+    """Where cameras are said to be: centers (normalized frame) and rotations from the world to a camera's axes."""
+
+    centers: Float[np.ndarray, "V 3"]
+    rotations: Float[np.ndarray, "V 3 3"]
+
+    @classmethod
+    def of(cls, views: Views) -> "StatedCameras":
+        """Those of the views."""
+        rotations, centers = zip(*(pose_of(view.camera) for view in views.train), strict=True)
+        return cls(np.array(centers), np.array(rotations))
 
 
 @dataclass(frozen=True)
@@ -58,23 +77,53 @@ class Poses:
         turns = Rotation.from_rotvec(change[:, :3]) * Rotation.from_rotvec(self.turns)
         return Poses(turns.as_rotvec(), self.shifts + change[:, 3:])
 
-    def without_common(
-        self, centers: Float[np.ndarray, "V 3"], prior: Float[np.ndarray, "6"]
-    ) -> tuple[Similarity, "Poses"]:
+    def without_common(self, cameras: "StatedCameras", prior: Float[np.ndarray, "6"]) -> tuple[Similarity, "Poses"]:
         """What turns, shifts and scales all cameras alike, by least squares under the weights of the prior, and the
         poses in a world from which that was taken back.
 
-        For cameras at o these are (θ, θ × o), (0, t) and (0, σ o). No photograph of a far world tells them.
+        For cameras at o these are (θ, θ × o), (0, t) and (0, σ o). No photograph of a far world tells them. A principal
+        point that is wrong in all views looks like turns by the same angles about the axes of each camera. On an arc of
+        views these are nearly a common turn: where they explain most of what common motions leave, they stay in the
+        poses.
         """
-        axes, count = np.eye(3), len(centers)
+        found = self._alike(cameras, prior)[0]
+        common = Similarity(1 + float(found[6]), Rotation.from_rotvec(found[:3]).as_matrix(), found[3:6])
+        turns = Rotation.from_matrix(common.rotation.T) * Rotation.from_rotvec(self.turns)
+        return common, Poses(turns.as_rotvec(), common.undone(cameras.centers + self.shifts) - cameras.centers)
+
+    def lens_turn(self, cameras: "StatedCameras", prior: Float[np.ndarray, "6"]) -> Float[np.ndarray, "2"] | None:
+        """By how much every camera is turned about its own x and y axis (rad), as by a wrong principal point.
+
+        None where that explains little.
+        """
+        return self._alike(cameras, prior)[1]
+
+    def principal_point_px(self, views: Views, prior: Float[np.ndarray, "6"]) -> tuple[float, float] | None:
+        """By how much the principal point lies to the right and below of where it is said to be, in all views alike;
+        None where that is not told.
+        """
+        turn = self.lens_turn(StatedCameras.of(views), prior)
+        if turn is None:
+            return None
+        fx, fy = (float(np.median([getattr(view.camera, name) for view in views.train])) for name in ("fx", "fy"))
+        return -fx * math.tan(turn[1]), fy * math.tan(turn[0])
+
+    def _alike(
+        self, cameras: "StatedCameras", prior: Float[np.ndarray, "6"]
+    ) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "2"] | None]:
+        """θ, t and σ, and the turns about own axes if these leave less than `LENS_SHARE` of the squares."""
+        axes, centers, count = np.eye(3), cameras.centers, len(cameras.centers)
         turned = np.concatenate([np.tile(axes, (count, 1, 1)), np.cross(axes, centers[:, None])], 2)
         shifted = np.concatenate([np.zeros((count, 3, 3)), np.tile(axes, (count, 1, 1))], 2)
         scaled = np.concatenate([np.zeros((count, 1, 3)), centers[:, None]], 2)
-        basis = (np.concatenate([turned, shifted, scaled], 1) * np.sqrt(prior)).transpose(0, 2, 1).reshape(-1, 7)
-        found = np.linalg.lstsq(basis, (self.stacked * np.sqrt(prior)).ravel(), rcond=None)[0]
-        common = Similarity(1 + float(found[6]), Rotation.from_rotvec(found[:3]).as_matrix(), found[3:6])
-        turns = Rotation.from_matrix(common.rotation.T) * Rotation.from_rotvec(self.turns)
-        return common, Poses(turns.as_rotvec(), common.undone(centers + self.shifts) - centers)
+        own = np.concatenate([cameras.rotations[:, :2], np.zeros((count, 2, 3))], 2)
+        basis = (np.concatenate([turned, shifted, scaled, own], 1) * np.sqrt(prior)).transpose(0, 2, 1).reshape(-1, 9)
+        stacked = (self.stacked * np.sqrt(prior)).ravel()
+        fits = [np.linalg.lstsq(basis[:, :columns], stacked, rcond=None)[0] for columns in (7, 9)]
+        left = [float(((stacked - basis[:, : len(fit)] @ fit) ** 2).sum()) for fit in fits]
+        if left[1] < LENS_SHARE * left[0]:
+            return fits[1][:7], fits[1][7:]
+        return fits[0], None
 
     def moved(self, views: Views) -> Views:
         """The views with their cameras there."""

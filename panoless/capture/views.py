@@ -10,11 +10,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from panoless.capture.encoding import LDR, RadianceEncoding, encoding_of
+from panoless.capture.encoding import LDR, RadianceEncoding
 from panoless.capture.masks import MASK_LEVEL, estimate_object_frame, without_specks
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import pose_of, raster_camera, unit_rays_camera
-from panoless.config import FitConfig
 from panoless.kernels.objective import MirrorView
 from panoless.kernels.rasterize import RasterCamera, tiles_of
 from shinypartial.core.camera import Camera
@@ -106,6 +105,18 @@ class TrainView:
 
 
 @dataclass(frozen=True)
+class MaskRepairs:
+    """What other views contradicted in masks, and was mended."""
+
+    holes: int = 0
+    """Holes that were filled."""
+    pieces: int = 0
+    """Pieces that were removed."""
+    views: int = 0
+    """Views in which that was done."""
+
+
+@dataclass(frozen=True)
 class Views:
     """All training views of a dataset and the frame they live in."""
 
@@ -113,6 +124,7 @@ class Views:
     object_frame: ObjectFrame
     near: float
     """Near plane in normalized units: a tenth of the smallest camera distance."""
+    repairs: MaskRepairs = MaskRepairs()
 
     @property
     def num_solid(self) -> int:
@@ -163,18 +175,6 @@ def load_views(
             remedy="Correct these masks, or remove their frames from transforms_train.json.",
         )
     return views_of(photographs, known_radius)
-
-
-def configured_views(dataset: Dataset, config: FitConfig) -> Views:
-    """The training split as a configuration wants to see it."""
-    return load_views(
-        dataset,
-        config.crop_margin_px,
-        config.downscale,
-        encoding_of(config),
-        least_object_px=config.least_object_px,
-        known_radius=config.sphere.radius,
-    )
 
 
 def _object_px(dataset: Dataset) -> float:

@@ -14,9 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from panoless import __version__
+from panoless.capture.configured import configured_views
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import raster_camera
-from panoless.capture.views import configured_views
 from panoless.config import FitConfig
 from panoless.environment.surroundings import FAR, Surroundings
 from panoless.export.mesh_files import write_ply
@@ -247,6 +247,7 @@ def _model_selection(selection: Selection) -> ModelSelection:
             reason=each.reason,
             alternative_error=each.surfels_error,
             camera_turn_deg=each.camera_turn_deg,
+            principal_point_px=each.principal_point_px,
             mask_offset_px=each.corrections.mask_offset_px or None,
             exposure_stops=each.corrections.exposure_stops,
             white_balance_stops=each.corrections.white_balance_stops,

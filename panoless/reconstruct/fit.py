@@ -5,7 +5,8 @@ from pathlib import Path
 
 import torch
 
-from panoless.capture.views import Views, configured_views
+from panoless.capture.configured import configured_views
+from panoless.capture.views import Views
 from panoless.config import FitConfig, check_config
 from panoless.geometry.base import usable_views
 from panoless.geometry.registry import FAMILIES
@@ -52,6 +53,7 @@ def fit(
             views = configured_views(dataset, config).to(device)
         if state is None:
             with timed(seconds, "initialize"):
+                _tell_repairs(views)
                 state = begin(views, config)
             state.seconds, state.device = seconds, device_name(device)
             print(f"Model: {state.selection.sentence}", file=sys.stderr)
@@ -68,6 +70,17 @@ def fit(
         note_peak_memory(state)
         save_state(folder, state)
         return state.to(MAIN_MEMORY)
+
+
+def _tell_repairs(views: Views) -> None:
+    """A line on standard error where masks contradicted each other."""
+    repairs = views.repairs
+    if repairs.views:
+        print(
+            f"warning: the masks of {repairs.views} of {len(views.train)} views contradict the others: {repairs.holes} "
+            f"holes filled, {repairs.pieces} stray pieces left out.",
+            file=sys.stderr,
+        )
 
 
 def begin(views: Views, config: FitConfig) -> FitState:

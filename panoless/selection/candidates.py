@@ -38,6 +38,9 @@ class Candidate:
     """By how much the cameras were turned, median over views; None where they were believed."""
     corrections: Corrections = NO_CORRECTIONS
     """Of the photographs that it was fitted to."""
+    principal_point_px: tuple[float, float] | None = None
+    """By how much the principal point lies to the right and below of where it is said to be; None where that is not
+    told."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,9 @@ def describe(candidate: Candidate) -> str:
         parts.append(text)
     if candidate.camera_turn_deg is not None:
         parts.append(f"cameras turned by {candidate.camera_turn_deg:.2g}°")
+    if candidate.principal_point_px is not None:
+        right, down = candidate.principal_point_px
+        parts.append(f"principal point moved by {right:+.1f}, {down:+.1f} px")
     if candidate.corrections.mask_offset_px:
         parts.append(f"masks moved outward by {candidate.corrections.mask_offset_px:.2g} px")
     if candidate.corrections.exposure_stops is not None:

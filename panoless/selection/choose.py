@@ -6,7 +6,9 @@ every picture as it was, so surfels drift.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
+from panoless.alignment.align import pose_prior
 from panoless.alignment.search import PosedProposal, align_proposal, fit_at, fit_with_poses
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
 from panoless.capture.views import Views
@@ -203,8 +205,8 @@ def _fit_asked(views: Views, config: FitConfig) -> tuple[Geometry, Selection]:
         family.kind,
         Verdict.CHOSEN,
         "asked for",
-        camera_turn_deg=_turn_deg(fitted.geometry),
         corrections=fitted.corrections,
+        **_found_cameras(fitted.geometry, views, config),
     )
     return fitted.geometry, Selection(family.kind, (asked_for,))
 
@@ -241,9 +243,15 @@ def _examine(
     if unexplained and not better:
         reason = "leaves too much unexplained"
     errors = float(own.mean()), float(free.mean())
-    figures = (*evidence, *errors, _turn_deg(geometry), fitted.corrections)
-    return Candidate(family.kind, verdict, reason, *figures), geometry
+    cameras = _found_cameras(geometry, views, config)
+    figures = (*evidence, *errors)
+    return Candidate(family.kind, verdict, reason, *figures, corrections=fitted.corrections, **cameras), geometry
 
 
-def _turn_deg(geometry: Geometry) -> float | None:
-    return None if geometry.poses is None else geometry.poses.turn_deg
+def _found_cameras(geometry: Geometry, views: Views, config: FitConfig) -> dict[str, Any]:
+    """What a candidate states of cameras whose poses were unknowns."""
+    poses = geometry.poses
+    if poses is None:
+        return {}
+    principal = poses.principal_point_px(views, pose_prior(config.poses))
+    return {"camera_turn_deg": poses.turn_deg, "principal_point_px": principal}

@@ -25,7 +25,7 @@ from panoless.environment.resolution import densest_resolution
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, overlap, pixel_areas, usable_views
 from panoless.kernels.cubemap import sample_cubemap
-from panoless.numeric.robust import NORMAL_MEDIAN, bounded_error
+from panoless.numeric.robust import NORMAL_MEDIAN, bounded_error, robust_scale, robust_weight
 from panoless.trust.options import TrustOptions
 
 LIGHT_FIGURES = ("unexplained", "one_color", "matte", "unexplained_part", "noise", "error_in_noise", "rank_correlation")
@@ -78,6 +78,8 @@ class Evidence:
     """The focal length that the fit found over what is said of it."""
     roughness: float = 0.0
     """Of the object, as the fit found it."""
+    repaired_views: int = 0
+    """Number of views whose masks had holes or stray pieces that the others contradict."""
 
 
 def gather_evidence(
@@ -100,7 +102,7 @@ def gather_evidence(
     looked_at = [_evenly(part, options.views) for part in split_held_out(usable.train)]
     surfaces = [[(view, geometry.buffers(view.camera)) for view in part] for part in looked_at]
     light = _light(usable, surfaces, geometry, visibility, config)
-    silhouettes = [_silhouette(*each) for part in surfaces for each in part]
+    silhouettes = [_silhouette(*each, options) for part in surfaces for each in part]
     distance, shift, overlap = (np.array([each[i] for each in silhouettes]) for i in range(3))
     focal = np.array([view.camera.fx for part in looked_at for view in part])
     return Evidence(
@@ -119,6 +121,7 @@ def gather_evidence(
         white_balance_stops=corrections.white_balance_stops or 0.0,
         focal_factor=corrections.focal_factor,
         roughness=roughness or 0.0,
+        repaired_views=views.repairs.views,
     )
 
 
@@ -262,7 +265,7 @@ class _Cells:
         return (grid[0] * self.side + grid[1]) * self.side + grid[2]
 
 
-def _silhouette(view: TrainView, surface: SurfaceBuffers) -> tuple[float, float, float]:
+def _silhouette(view: TrainView, surface: SurfaceBuffers, options: TrustOptions) -> tuple[float, float, float]:
     """Median distance (px) of the two contours, the shift (px) that explains most of it, and intersection over union.
 
     A pixel near the fitted contour has the mask's signed distance less the fitted one; a shift t changes it by n·t.
@@ -277,8 +280,20 @@ def _silhouette(view: TrainView, surface: SurfaceBuffers) -> tuple[float, float,
     if not near.any():
         return float(max(mask.shape)), float(max(mask.shape)), shared
     normals, away = np.stack([columns[near], rows[near]], 1), (of_mask - of_fit)[near]
-    shift = np.linalg.lstsq(normals, away, rcond=None)[0]
-    return float(np.median(np.abs(away))), float(np.linalg.norm(shift)), shared
+    return float(np.median(np.abs(away))), float(np.linalg.norm(_shift(normals, away, options))), shared
+
+
+def _shift(
+    normals: Float[np.ndarray, "P 2"], away: Float[np.ndarray, "P"], options: TrustOptions
+) -> Float[np.ndarray, "2"]:
+    """min Σ ρ(a − n·t) over shifts t (px): a dent that a wrong mask has in a part of its outline is no shift."""
+    weight, shift = np.ones_like(away), np.zeros(2)
+    for _ in range(options.shift_rounds):
+        root = np.sqrt(weight)
+        shift = np.linalg.lstsq(root[:, None] * normals, root * away, rcond=None)[0]
+        left = away - normals @ shift
+        weight = robust_weight(left, robust_scale(left, options.shift_scale_px, options.shift_medians))
+    return shift
 
 
 def _noise(view: TrainView) -> float:

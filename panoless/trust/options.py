@@ -31,6 +31,12 @@ class TrustOptions:
     """Radiance from which a pixel is saturated."""
     views: Count = 20
     """Most views of either part, kept and held out, whose silhouettes and places are looked at."""
+    shift_scale_px: Positive = 0.5
+    """Distance of outlines after a shift beyond which they lose their say in it, or…"""
+    shift_medians: Positive = 3.0
+    """…so many times the median distance. Not tuned."""
+    shift_rounds: Count = 5
+    """Rounds of such weights. Not tuned."""
     largest_view_shift_px: Positive = 0.8
     """Root mean square shift of single silhouettes from which a fit is doubted."""
     largest_silhouette_px: Positive = 1.0

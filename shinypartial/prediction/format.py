@@ -51,9 +51,9 @@ class Candidate:
     freer kind that it was compared with, `camera_turn_deg` by how much it turned the cameras in the median, where their
     poses were unknowns, `mask_offset_px` by how much it moved the outlines of all masks outward, and `exposure_stops`
     the standard deviation of the views' exposures where it found them, `white_balance_stops` that of their channels
-    from the mean of a view. `focal_factor` is the focal length of all views
-    over what is said of it where that was an unknown, `focal_uncertainty` its standard deviation. `verdict` is a word
-    such as "chosen" or "rejected", `reason` says why.
+    from the mean of a view. `focal_factor` is the focal length of all views over what is said of it where that was an
+    unknown, `focal_uncertainty` its standard deviation, and `principal_point_px` how far to the right and below of what
+    is said it found the principal point. `verdict` is a word such as "chosen" or "rejected", `reason` says why.
     """
 
     kind: Text
@@ -69,6 +69,7 @@ class Candidate:
     white_balance_stops: NonNegative | None = None
     focal_factor: NonNegative | None = None
     focal_uncertainty: NonNegative | None = None
+    principal_point_px: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

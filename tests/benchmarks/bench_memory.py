@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from panoless.capture.views import configured_views
+from panoless.capture.configured import configured_views
 from panoless.config import FitConfig
 from panoless.geometry.surfels.kind import SurfelFamily
 from panoless.geometry.surfels.mirror import SurfelMirror

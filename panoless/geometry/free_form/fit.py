@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from panoless.capture.poses import Poses
-from panoless.capture.rays import pose_of
+from panoless.capture.poses import Poses, StatedCameras
 from panoless.capture.views import Views, split_held_out
 from panoless.environment.rays import Rays
 from panoless.environment.resolution import prediction_error
@@ -219,7 +218,7 @@ def take_round(
     if solution.poses is None:
         return found
     # The map follows with the next round, which starts it anew.
-    common, poses = solution.poses.without_common(task.centers, solution.pose_prior)
+    common, poses = solution.poses.without_common(task.cameras, solution.pose_prior)
     return replace(found, surface=solution.surface.taken_back(common), poses=poses, environment=None)
 
 
@@ -230,9 +229,8 @@ def make_task(views: Views, settings: FreeFormRound, options: FreeFormOptions) -
     chosen = outlines.chosen(slice(None, None, max(1, -(-len(outlines.size) // options.outline_points))))
     share = options.counted_rays / options.radiance_sigma**2 / max(len(pixels.inner_px), 1)
     density = options.counted_rays / total * len(outlines.size) / max(len(chosen.size), 1)
-    rotations, centers = (np.array(each) for each in zip(*(pose_of(view.camera) for view in views.train), strict=True))
     outlined, brightness = density / options.outline_sigma_px**2, max(float(pixels.radiance.mean()), LEAST_BRIGHTNESS)
-    return Task(pixels, chosen, share, outlined, settings, options, centers, rotations[:, 2], brightness)
+    return Task(pixels, chosen, share, outlined, settings, options, StatedCameras.of(views), brightness)
 
 
 def take_steps(

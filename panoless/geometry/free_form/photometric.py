@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from panoless.capture.poses import Poses
+from panoless.capture.poses import Poses, StatedCameras
 from panoless.capture.views import concatenated
 from panoless.capture.zoom import farther_motion
 from panoless.environment.cubemap import resample
@@ -69,10 +69,8 @@ class Task:
     """Of an outline's point."""
     settings: FreeFormRound
     options: FreeFormOptions
-    centers: Float[np.ndarray, "V 3"]
-    """Of the cameras of all views."""
-    axes: Float[np.ndarray, "V 3"]
-    """Their optical axes."""
+    cameras: StatedCameras
+    """Of all views."""
     brightness: float
     """Mean over all pixels and channels (linear radiance)."""
     anchor: Float[np.ndarray, "A B C"] | None = None
@@ -80,7 +78,7 @@ class Task:
 
     def seen_from(self, rays: PixelRays, poses: Poses | None, focal: float | None) -> PixelRays:
         """Rays where their cameras are, through the lens that they have."""
-        rays = rays if focal is None else rays.zoomed(focal, self.axes[rays.view])
+        rays = rays if focal is None else rays.zoomed(focal, self.cameras.rotations[rays.view, 2])
         return rays if poses is None else rays.moved(poses)
 
 
@@ -318,7 +316,7 @@ class Solution:
         if self.focal is not None:
             rays = self.rays, concatenated(list(self._silhouette_rays))
             for found, of, by_pose in zip((seen, outlined), rays, self.pose_rows, strict=True):
-                motion = farther_motion(of.origins, of.directions, self.task.axes[of.view])
+                motion = farther_motion(of.origins, of.directions, self.task.cameras.rotations[of.view, 2])
                 found.append(np.matmul(by_pose.rows, motion[..., None]))
         rows = np.concatenate(seen, 2) * (photographs.weights > 0)[:, None, None]
         beyond = np.stack([self.beyond_map(np.ascontiguousarray(column)) for column in np.moveaxis(rows, 2, 0)], 2)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from panoless.alignment.align import Alignment
+from panoless.alignment.align import Alignment, pose_prior
 from panoless.alignment.options import PoseOptions
 from panoless.alignment.search import PosedProposal, align_proposal, fit_with_poses
-from panoless.capture.poses import Poses
+from panoless.capture.poses import Poses, Similarity, StatedCameras
 from panoless.capture.rays import pose_of
 from panoless.capture.views import Views
 from panoless.config import FitConfig
@@ -121,3 +121,25 @@ def test_a_motion_that_all_cameras_share_is_taken_back() -> None:
     found = Alignment(views, CONFIG.poses).without_common(common)
     # Least squares are those of small turns: squares of 0.01 rad are left.
     np.testing.assert_allclose(found.stacked, 0, atol=5e-4)
+
+
+def test_a_wrong_principal_point_is_told_from_a_motion_that_all_cameras_share() -> None:
+    """Turns by 1° about the cameras' own axes look much like a turn of the world, from an arc of views. They stay, with
+    the errors of single cameras, where a turn, a shift and a scale of all of them were added.
+    """
+    views = flat_views()
+    stated, rng = StatedCameras.of(views), np.random.default_rng(3)
+    count = len(stated.centers)
+    own = Rotation.from_rotvec(np.array([-0.012, 0.016, 0]) @ stated.rotations)
+    single = Poses(own.as_rotvec() + 1e-3 * rng.normal(size=(count, 3)), 1e-3 * rng.normal(size=(count, 3)))
+    turn = Rotation.from_rotvec([0.003, -0.002, 0.004])
+    common = Similarity(1.002, turn.as_matrix(), np.array([0.01, 0.0, -0.01]))
+    shifted = common(stated.centers + single.shifts) - stated.centers
+    seen = Poses((turn * Rotation.from_rotvec(single.turns)).as_rotvec(), shifted)
+    prior = pose_prior(CONFIG.poses)
+    found = seen.without_common(stated, prior)[1]
+    np.testing.assert_allclose(found.stacked, single.stacked, atol=1.5e-3)
+    right, down = found.principal_point_px(views, prior) or (0.0, 0.0)
+    camera = views.train[0].camera
+    assert right == pytest.approx(-camera.fx * np.tan(0.016), rel=0.1)
+    assert down == pytest.approx(-camera.fy * np.tan(0.012), rel=0.1)

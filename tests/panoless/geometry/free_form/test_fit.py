@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from panoless.capture.corrections import with_focal_factor
-from panoless.capture.poses import Poses, Similarity
-from panoless.capture.rays import pose_of
+from panoless.capture.poses import Poses, Similarity, StatedCameras
 from panoless.capture.views import Views, views_of
 from panoless.config import FitConfig, SurfelConfig
 from panoless.environment.surroundings import Surroundings
@@ -319,17 +318,18 @@ def test_flat_faces_that_no_outline_shows_are_found_by_a_descent() -> None:
 def test_what_all_cameras_share_is_taken_back() -> None:
     """A turn of 0.6°, a shift and a scale of cameras leave the poses that they had apart from it."""
     cameras = body_views(ellipsoid(), 8, 24)
-    centers = np.array([pose_of(view.camera)[1] for view in cameras.train])
+    stated = StatedCameras.of(cameras)
     rng, prior = np.random.default_rng(2), np.full(6, 1e4)
     own = Poses(1e-3 * rng.normal(size=(8, 3)), 1e-3 * rng.normal(size=(8, 3)))
-    own = own.without_common(centers, prior)[1]
+    own = own.without_common(stated, prior)[1]
     turn = Rotation.from_rotvec([0.004, -0.008, 0.005])
     common = Similarity(1.003, turn.as_matrix(), np.array([0.01, 0.0, -0.02]))
-    shifted = common(centers + own.shifts) - centers
+    shifted = common(stated.centers + own.shifts) - stated.centers
     both = Poses((turn * Rotation.from_rotvec(own.turns)).as_rotvec(), shifted)
-    found = both.without_common(centers, prior)[1]
+    found = both.without_common(stated, prior)[1]
     # The least squares are those of small changes, so squares of these are left.
     np.testing.assert_allclose(found.stacked, own.stacked, atol=5e-4)
+    assert found.lens_turn(stated, prior) is None
 
 
 @pytest.mark.slow

@@ -1,0 +1,87 @@
+"""Masks of a ring that is traced analytically: its own gap stays, and what no other view confirms is mended."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from panoless.capture.masks import MASK_LEVEL
+from panoless.capture.options import MaskRepairOptions
+from panoless.capture.repair import with_repaired_masks
+from panoless.capture.views import MaskRepairs, TrainView, Views
+from shinypartial.core.conventions import SOLID_ALPHA
+from tests.support.mirror_body import body_views, torus
+
+OPTIONS = MaskRepairOptions()
+
+
+@pytest.fixture(scope="module")
+def ring() -> Views:
+    return body_views(torus(), 24, 48)
+
+
+def painted(views: Views, index: int, row: int, column: int, radius: int, alpha: float) -> Views:
+    """A disk of that alpha in the mask of one view."""
+    view = views.train[index]
+    rows, columns = np.indices(view.mask.shape)
+    mask = view.mask.clone()
+    mask[torch.from_numpy(np.hypot(rows - row, columns - column) <= radius)] = alpha
+    solid = torch.nonzero(mask.flatten() > SOLID_ALPHA)[:, 0]
+    train = (*views.train[:index], replace(view, mask=mask, solid=solid), *views.train[index + 1 :])
+    return replace(views, train=train)
+
+
+def solid_middle(view: TrainView) -> tuple[int, int]:
+    """The pixel deepest inside the mask."""
+    from scipy.ndimage import distance_transform_edt
+
+    depth = distance_transform_edt(view.mask.numpy() >= MASK_LEVEL)
+    row, column = np.unravel_index(depth.argmax(), depth.shape)
+    return int(row), int(column)
+
+
+def test_a_gap_of_the_object_stays(ring: Views) -> None:
+    assert any(_has_hole(view) for view in ring.train)
+    assert with_repaired_masks(ring, OPTIONS).repairs == MaskRepairs()
+
+
+def _has_hole(view: TrainView) -> bool:
+    from scipy.ndimage import label
+
+    return bool(label(view.mask.numpy() < MASK_LEVEL)[1] > 1)
+
+
+def test_a_hole_in_one_mask_is_filled_and_tells_no_color(ring: Views) -> None:
+    row, column = solid_middle(ring.train[5])
+    wrong = painted(ring, 5, row, column, 3, 0.0)
+    mended = with_repaired_masks(wrong, OPTIONS)
+    assert mended.repairs == MaskRepairs(holes=1, pieces=0, views=1)
+    assert (mended.train[5].mask >= MASK_LEVEL).equal(ring.train[5].mask >= MASK_LEVEL)
+    assert mended.train[5].solid.equal(wrong.train[5].solid)
+    assert all(
+        after is before for k, (after, before) in enumerate(zip(mended.train, wrong.train, strict=True)) if k != 5
+    )
+
+
+def test_a_stray_piece_is_left_out(ring: Views) -> None:
+    """With the half of its rim's pixels, and nothing of the object."""
+    before = ring.train[9].mask
+    row, column = (0, 0) if float(before[:9, :9].sum()) == 0 else (before.shape[0] - 1, 0)
+    wrong = painted(ring, 9, row, column, 4, 1.0)
+    mended = with_repaired_masks(wrong, OPTIONS)
+    assert mended.repairs == MaskRepairs(holes=0, pieces=1, views=1)
+    assert mended.train[9].mask.equal(before)
+    assert mended.train[9].solid.equal(ring.train[9].solid)
+
+
+def test_few_views_contradict_nothing(ring: Views) -> None:
+    row, column = solid_middle(ring.train[5])
+    few = replace(painted(ring, 5, row, column, 3, 0.0), train=ring.train[:6])
+    assert with_repaired_masks(few, OPTIONS) is few
+
+
+def test_off_means_off(ring: Views) -> None:
+    row, column = solid_middle(ring.train[5])
+    wrong = painted(ring, 5, row, column, 3, 0.0)
+    assert with_repaired_masks(wrong, replace(OPTIONS, mode="off")) is wrong
