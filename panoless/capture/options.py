@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from shinypartial.io.records import Count, NonNegative, Share
+from shinypartial.io.records import Count, NonNegative, Positive, Share
 
 
 @dataclass(frozen=True)
 class MaskRepairOptions:
-    """When a hole in a mask is filled, and a piece beside the object removed: where the other views contradict it.
+    """When a part is added to a mask, or taken from it: where the other views contradict it.
 
     "Not tuned" is what only has to be large or small enough.
     """
@@ -17,20 +17,24 @@ class MaskRepairOptions:
     """Whether masks are repaired at all."""
     least_views: Count = 20
     """With fewer views a gap of the object may be seen by one of them alone: on sculpture and a torus with 12 or 16."""
-    least_radius_px: NonNegative = 2.5
-    """Holes in which no larger disk fits are left alone: gaps of sculpture and of a torus as narrow are seen by one
-    view of 50."""
     contradicted_share: Share = 0.04
     """A point counts as the object's where no more than this share of the other views sees it beside their masks: they
-    may have holes of their own. On sculpture and a torus at least 3 of 49 do at the gaps of the object, and 0 or 1 at
-    holes of masks that lost 3 % of their area."""
+    may be wrong themselves. On sculpture and a torus at least 3 of 49 do at the gaps of the object, and 0 or 1 at holes
+    of masks that lost 3 % of their area."""
     near_views: Count = 4
-    """Of so many views nearest in direction, none may see that point of a hole beside its mask: a gap of the object
-    shows in all of them. Not tuned."""
-    margin_px: NonNegative = 4.0
-    """A piece stays where a point of it lies no farther than this beside the masks of the others: wrong poses shift
-    what a mask shows. Not tuned."""
-    ray_samples: Count = 96
-    """Points along a ray through the object's ball. Not tuned."""
-    rays: Count = 16
-    """Rays that stand for a piece. Not tuned."""
+    """Of so many views nearest in direction, none may see a point beside its mask that a view lacks: a gap of the
+    object shows in all of them. Not tuned."""
+    margin_px: NonNegative = 2.0
+    """What stands out lies farther than this beside the masks of the others."""
+    least_radius_px: NonNegative = 3.0
+    """Parts in which no larger disk fits are left alone: gaps of sculpture and of a torus as narrow are seen by one
+    view of 50."""
+    largest_length: Positive = 6.0
+    """Parts longer than so many times the radius of that disk are left alone: wrong poses make crescents."""
+    least_share: Share = 0.75
+    """Share that parts which are not long have of all that is as wide and contradicts, at least. It is 1.0 with holes
+    and stray pieces, 0.01 to 0.3 with wrong poses and masks that are too small."""
+    cells: Count = 48
+    """Points along a side of the grid that views vote on."""
+    rounds: Count = 4
+    """Most rounds: masks that were mended tell more about others."""

@@ -1,8 +1,8 @@
-"""Masks that the other views contradict: holes inside the object are filled, and pieces beside it removed.
+"""Masks that the other views contradict: what they lack of the object is filled, and what stands out from it removed.
 
-A segmentation program that takes a lamp's reflection for background leaves a hole, and one that takes a second shiny
-thing for the object a stray piece. Both cost the whole shape: a hole carves a tunnel through the visual hull, and a
-stray piece has an outline to which no surface can attach.
+A segmentation program that takes a lamp's reflection for background leaves a hole or a dent, and one that takes a
+second shiny thing for the object a stray piece. Both cost the whole shape: a hole carves a tunnel through the visual
+hull, and a stray piece has an outline to which no surface can attach.
 """
 
 from collections.abc import Sequence
@@ -10,151 +10,191 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from panoless.capture.masks import MASK_LEVEL
 from panoless.capture.options import MaskRepairOptions
-from panoless.capture.silhouettes import MaskDistance, mask_distance
+from panoless.capture.rays import project
+from panoless.capture.silhouettes import mask_distance
 from panoless.capture.views import MaskRepairs, TrainView, Views
 from shinypartial.core.conventions import SOLID_ALPHA
 
-Labels = Int[np.ndarray, "H W"]
-#: Rays are followed through the ball about the object with this much more than its radius.
+Image = Bool[np.ndarray, "H W"]
+#: The grid holds the ball about the object with this much more than its radius.
 SPARE = 1.1
+#: Pixels that touch at a corner are connected.
+SQUARE = np.ones((3, 3), bool)
 
 
 def with_repaired_masks(views: Views, options: MaskRepairOptions) -> Views:
-    """The views with masks in which no hole and no piece contradicts the others.
+    """The views with masks from which nothing as large as a blob is missing, and nothing stands out, by what the others
+    say.
 
-    What is filled is on the object, but no photograph shows it whole, so it tells no color. What hangs together with
-    the object's largest piece, or with the background around it, stays as it is.
+    What is filled is on the object, but no photograph shows it whole, so it tells no color. Crescents along an outline
+    stay: wrong poses make them, and masks that are too small. Where these are most of what contradicts, nothing is
+    mended. What is missing is filled first: holes in other masks look as if a view showed too much.
     """
     if options.mode == "off" or len(views.train) < options.least_views:
         return views
-    found = [(_holes(view, options), _pieces(view)) for view in views.train]
-    if not any(part.any() for parts in found for part in parts):
-        return views
-    seen = _Seen.of(views, options)
-    train, holes, pieces, changed = [], 0, 0, 0
-    for index, (view, (of_holes, of_pieces)) in enumerate(zip(views.train, found, strict=True)):
-        wrong_holes = [
-            label for label in range(1, of_holes.max() + 1) if seen.is_object(index, _deepest(of_holes == label))
-        ]
-        wrong_pieces = [
-            label
-            for label in range(1, of_pieces.max() + 1)
-            if seen.is_beside(index, _some(of_pieces == label, options))
-        ]
-        holes, pieces = holes + len(wrong_holes), pieces + len(wrong_pieces)
-        changed += bool(wrong_holes or wrong_pieces)
-        train.append(_repaired(view, np.isin(of_holes, wrong_holes), np.isin(of_pieces, wrong_pieces)))
-    return replace(views, train=tuple(train), repairs=MaskRepairs(holes, pieces, changed))
+    holes, pieces, points = 0, 0, _points(views, options)
+    changed: set[int] = set()
+    for _ in range(options.rounds):
+        votes = _Votes.of(views, points, options)
+        inside = [view.mask.cpu().numpy() >= MASK_LEVEL for view in views.train]
+        lacking = _Contradicted.of([~each & votes.shown(index) for index, each in enumerate(inside)], options)
+        excess = _Contradicted.of([each & ~votes.allowed(index) for index, each in enumerate(inside)], options)
+        blobs = lacking.count + excess.count
+        if not blobs or lacking.area + excess.area < options.least_share * (lacking.wide + excess.wide):
+            break
+        chosen, mended = (lacking, _filled) if lacking.count else (excess, _without)
+        train = (mended(view, part, options) for view, part in zip(views.train, chosen.blobs, strict=True))
+        changed |= {index for index, part in enumerate(chosen.blobs) if part.any()}
+        holes, pieces = holes + lacking.count, pieces + (0 if lacking.count else excess.count)
+        views = replace(views, train=tuple(train), repairs=MaskRepairs(holes, pieces, len(changed)))
+    return views
 
 
-def _holes(view: TrainView, options: MaskRepairOptions) -> Labels:
-    """Numbers from 1 on for each piece of background that does not reach the border of the picture; else 0."""
-    from scipy.ndimage import distance_transform_edt, label
-
-    outside = view.mask.cpu().numpy() < MASK_LEVEL
-    pieces, count = label(outside)
-    border = np.concatenate([pieces[0], pieces[-1], pieces[:, 0], pieces[:, -1]])
-    enclosed = np.setdiff1d(np.arange(1, count + 1), border)
-    if not len(enclosed):
-        return np.zeros_like(pieces)
-    wide = np.unique(pieces[distance_transform_edt(outside) >= options.least_radius_px])
-    return _numbered(pieces, np.intersect1d(enclosed, wide))
-
-
-def _pieces(view: TrainView) -> Labels:
-    """Numbers from 1 on for each piece of the mask but the largest; else 0."""
-    from scipy.ndimage import label
-
-    pieces, count = label(view.mask.cpu().numpy() >= MASK_LEVEL, np.ones((3, 3)))
-    if count < 2:
-        return np.zeros_like(pieces)
-    largest = 1 + int(np.bincount(pieces[pieces > 0] - 1).argmax())
-    return _numbered(pieces, np.setdiff1d(np.arange(1, count + 1), [largest]))
-
-
-def _numbered(pieces: Labels, kept: Int[np.ndarray, "K"]) -> Labels:
-    numbers = np.zeros(int(pieces.max()) + 1, pieces.dtype)
-    numbers[kept] = np.arange(1, len(kept) + 1)
-    return numbers[pieces]
-
-
-def _deepest(inside: Bool[np.ndarray, "H W"]) -> Int[Tensor, "1"]:
-    """The pixel (flat index) farthest from the edge."""
-    from scipy.ndimage import distance_transform_edt
-
-    return torch.tensor([int(distance_transform_edt(inside).argmax())])
-
-
-def _some(inside: Bool[np.ndarray, "H W"], options: MaskRepairOptions) -> Int[Tensor, "P"]:
-    pixels = np.flatnonzero(inside)
-    return torch.from_numpy(pixels[:: -(-len(pixels) // options.rays)])
-
-
-def _repaired(view: TrainView, filled: Bool[np.ndarray, "H W"], removed: Bool[np.ndarray, "H W"]) -> TrainView:
-    """Pixels beside a removed piece that belong to it in part go with it."""
-    from scipy.ndimage import binary_dilation
-
-    if not (filled.any() or removed.any()):
-        return view
-    alpha = view.mask.cpu().numpy()
-    square = np.ones((3, 3), bool)
-    rim = binary_dilation(filled, square) & (alpha >= MASK_LEVEL)
-    mended = np.where(filled | rim, np.maximum(alpha, np.float32(SOLID_ALPHA)), alpha)
-    fringe = binary_dilation(removed, square) & (alpha < MASK_LEVEL)
-    mask = torch.from_numpy(np.where(removed | fringe, np.float32(0), mended)).to(view.mask)
-    solid = view.solid[mask.flatten()[view.solid] > SOLID_ALPHA]
-    return replace(view, mask=mask, solid=solid)
+def _points(views: Views, options: MaskRepairOptions) -> Float[Tensor, "P 3"]:
+    """A grid in the ball about the object."""
+    reach = SPARE * max(1.0, views.object_frame.reach)
+    side = torch.linspace(-reach, reach, options.cells)
+    points = torch.stack(torch.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3)
+    return points[points.norm(dim=1) <= reach].to(views.train[0].mask.device)
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """The masks of all views as signed distances, and which views look from near each other."""
+class _Votes:
+    """Which views see each point of the grid beside their masks, and which see it farther off than a margin."""
 
     views: Views
-    outlines: Sequence[MaskDistance]
-    nearest: Int[np.ndarray, "V V"]
-    """All views by the angle between their directions to the object's center, from each on."""
+    points: Float[Tensor, "P 3"]
+    outside: Bool[np.ndarray, "V P"]
+    beyond: Bool[np.ndarray, "V P"]
+    nearest: Int[np.ndarray, "V K"]
+    """The views that look from nearest to each."""
     options: MaskRepairOptions
 
     @classmethod
-    def of(cls, views: Views, options: MaskRepairOptions) -> "_Seen":
+    def of(cls, views: Views, points: Float[Tensor, "P 3"], options: MaskRepairOptions) -> "_Votes":
+        outlines = [mask_distance(view) for view in views.train]
+        away = [(outline.distances(points) / outline.pixel).cpu().numpy() for outline in outlines]
         centers = np.array([view.position for view in views.train])
         sights = centers / np.linalg.norm(centers, axis=1, keepdims=True)
-        return cls(
-            views, [mask_distance(view) for view in views.train], np.argsort(-sights @ sights.T, axis=1), options
-        )
+        order = np.argsort(-(sights @ sights.T) - 2 * np.eye(len(sights)), axis=1)[:, 1 : 1 + options.near_views]
+        outside, beyond = (np.array([each > margin for each in away]) for margin in (0.0, options.margin_px))
+        return cls(views, points, outside, beyond, order, options)
 
-    def is_object(self, index: int, pixels: Int[Tensor, "P"]) -> bool:
-        """Whether the others show the object at some point of these rays."""
-        outside = self._outside(index, pixels, 0.0)
-        near = outside[: self.options.near_views].any(0)
-        return bool((~near & (outside.sum(0) <= self._allowed)).any())
+    def shown(self, index: int) -> Image:
+        """Where a view has to show the object: nearly all others, and all those nearest, have it inside their masks."""
+        near = self.outside[self.nearest[index]].any(0)
+        return self._seen(index, ~near & self._is_inside(self.outside, index))
 
-    def is_beside(self, index: int, pixels: Int[Tensor, "P"]) -> bool:
-        """Whether more of the others than may be wrong show something else at every point of these rays."""
-        return bool((self._outside(index, pixels, self.options.margin_px).sum(0) > self._allowed).all())
+    def allowed(self, index: int) -> Image:
+        """Where it may: nearly all others have it inside their masks, or a margin beside them."""
+        return self._seen(index, self._is_inside(self.beyond, index))
 
-    @property
-    def _allowed(self) -> int:
-        return int(self.options.contradicted_share * (len(self.outlines) - 1))
+    def _is_inside(self, outside: Bool[np.ndarray, "V P"], index: int) -> Bool[np.ndarray, "P"]:
+        wrong = int(self.options.contradicted_share * (len(outside) - 1))
+        found: np.ndarray = outside.sum(0) - outside[index] <= wrong
+        return found
 
-    def _outside(self, index: int, pixels: Int[Tensor, "P"], margin_px: float) -> Bool[np.ndarray, "W Q"]:
-        """Whether points of the rays lie farther than that beside the masks of the other views, the nearest first."""
-        view = self.views.train[index]
-        center = view.position
-        middle = float(np.linalg.norm(center))
-        reach = SPARE * max(1.0, self.views.object_frame.reach)
-        depths = torch.linspace(max(middle - reach, view.camera.near), middle + reach, self.options.ray_samples)
-        rays = view.directions_world(pixels.to(view.mask.device)).cpu()
-        points = (torch.from_numpy(center).float() + depths[:, None, None] * rays).reshape(-1, 3)
-        others = [other for other in self.nearest[index] if other != index]
-        distances = [
-            self.outlines[other].distances(points.to(view.mask.device)) > margin_px * self.outlines[other].pixel
-            for other in others
-        ]
-        return torch.stack(distances).cpu().numpy()
+    def _seen(self, index: int, chosen: Bool[np.ndarray, "P"]) -> Image:
+        """Pixels that show some of the chosen points, which lie closer than its gaps are closed."""
+        from scipy.ndimage import binary_closing
+
+        camera, points = self.views.train[index].camera, self.points[torch.from_numpy(chosen).to(self.points.device)]
+        points_camera = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        columns, rows = (each.cpu().numpy() for each in project(camera, points_camera, first_center=0))
+        spacing = 2 * SPARE * max(1.0, self.views.object_frame.reach) / (self.options.cells - 1)
+        gap = int(np.ceil(spacing * camera.fx / (2 * points_camera[:, 2].min().item()))) if len(points) else 1
+        image = np.zeros((camera.height + 2 * gap, camera.width + 2 * gap), bool)
+        rows, columns = (np.rint(each).astype(int) + gap for each in (rows, columns))
+        within = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1])
+        image[rows[within], columns[within]] = True
+        closed: np.ndarray = binary_closing(image, np.ones((2 * gap + 1, 2 * gap + 1), bool))
+        return closed[gap:-gap, gap:-gap]
+
+
+@dataclass(frozen=True)
+class _Contradicted:
+    """Of the region of each view that others contradict, the parts that are as wide as the least disk and not long."""
+
+    blobs: list[Image]
+    count: int
+    """Of these parts."""
+    area: int
+    """Of these parts, in pixels…"""
+    wide: int
+    """…and of all that is as wide."""
+
+    @classmethod
+    def of(cls, regions: Sequence[Image], options: MaskRepairOptions) -> "_Contradicted":
+        from scipy.ndimage import find_objects, label
+
+        blobs, count, wide = [np.zeros_like(region) for region in regions], 0, 0
+        for region, blob in zip(regions, blobs, strict=True):
+            depth, opened = _opened(region, options.least_radius_px)
+            parts, _ = label(opened, SQUARE)
+            for number, box in enumerate(find_objects(parts), start=1):
+                part = parts == number
+                longest = max(side.stop - side.start for side in box)
+                if longest <= options.largest_length * depth[part].max():
+                    blob |= part
+                    count += 1
+            wide += int(opened.sum())
+        return cls(blobs, count, sum(int(blob.sum()) for blob in blobs), wide)
+
+
+def _opened(region: Image, radius: float) -> tuple[Float[np.ndarray, "H W"], Image]:
+    """Depth of each pixel in a region, and the disks of that radius that fit into it."""
+    from scipy.ndimage import distance_transform_edt
+
+    depth = distance_transform_edt(np.pad(region, 1))[1:-1, 1:-1]
+    core = depth >= radius
+    return depth, region & (distance_transform_edt(~core) <= radius) if core.any() else core
+
+
+def _filled(view: TrainView, part: Image, options: MaskRepairOptions) -> TrainView:
+    """With that part on the object, and narrow gaps beside it."""
+    from scipy.ndimage import binary_fill_holes
+
+    if not part.any():
+        return view
+    alpha = view.mask.cpu().numpy()
+    inside = (alpha >= MASK_LEVEL) | part
+    part = part | _narrow_beside(binary_fill_holes(inside) & ~inside, part, options)
+    return _with_mask(
+        view, np.where(_grown(part) & (alpha >= MASK_LEVEL) | part, np.maximum(alpha, SOLID_ALPHA), alpha)
+    )
+
+
+def _without(view: TrainView, part: Image, options: MaskRepairOptions) -> TrainView:
+    """With that part, and narrow pieces and half pixels beside it, off the object."""
+    if not part.any():
+        return view
+    alpha = view.mask.cpu().numpy()
+    part = part | _narrow_beside((alpha >= MASK_LEVEL) & ~part, part, options)
+    return _with_mask(view, np.where(part | _grown(part) & (alpha < MASK_LEVEL), 0, alpha))
+
+
+def _narrow_beside(region: Image, part: Image, options: MaskRepairOptions) -> Image:
+    """Pieces of a region that touch a part and into which no disk of the least radius fits."""
+    from scipy.ndimage import label
+
+    pieces, _ = label(region, SQUARE)
+    wide = pieces[_opened(region, options.least_radius_px)[1]]
+    found: np.ndarray = np.isin(pieces, np.setdiff1d(pieces[_grown(part)], [0, *wide]))
+    return found
+
+
+def _grown(part: Image) -> Image:
+    from scipy.ndimage import binary_dilation
+
+    found: np.ndarray = binary_dilation(part, SQUARE)
+    return found
+
+
+def _with_mask(view: TrainView, alpha: Float[np.ndarray, "H W"]) -> TrainView:
+    mask = torch.from_numpy(alpha.astype(np.float32)).to(view.mask)
+    return replace(view, mask=mask, solid=view.solid[mask.flatten()[view.solid] > SOLID_ALPHA])

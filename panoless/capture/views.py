@@ -125,6 +125,8 @@ class Views:
     near: float
     """Near plane in normalized units: a tenth of the smallest camera distance."""
     repairs: MaskRepairs = MaskRepairs()
+    blur_px: float = 0.0
+    """Standard deviation of a Gaussian that blurred the pictures, in pixels of the views."""
 
     @property
     def num_solid(self) -> int:

@@ -8,7 +8,7 @@ above s is told by pixels that see a lamp in part.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import torch
@@ -49,6 +49,18 @@ class PixelFootprints:
         part = slice(first, None, stride)
         trust = None if self.trust is None else self.trust[part]
         return PixelFootprints(self.directions[part].contiguous(), self.radiance[part].contiguous(), trust)
+
+    def widened(self, blur_px: float) -> "PixelFootprints":
+        """Areas as wide as those of pixels of a picture that was blurred by a Gaussian of that standard deviation σ.
+
+        To first order a direction is a linear function of the place in the pixel, whose variance is 1/12 + σ² in place
+        of 1/12 px².
+        """
+        if not blur_px:
+            return self
+        middle = self.directions.mean(1, keepdim=True)
+        wider = middle + math.sqrt(1 + 12 * blur_px**2) * (self.directions - middle)
+        return replace(self, directions=normalize(wider, dim=2).contiguous())
 
     @classmethod
     def joined(cls, parts: "Sequence[PixelFootprints]") -> "PixelFootprints":
@@ -96,6 +108,10 @@ class Footprints:
     """Of pixels that see the environment smoothly, a few views to a batch."""
     trace_others: Callable[[], PixelFootprints]
     """Traces those of a sample of the other pixels, which bend the light much or reflect it often."""
+
+    def widened(self, blur_px: float) -> "Footprints":
+        """Those of a picture that was blurred."""
+        return Footprints([each.widened(blur_px) for each in self.smooth], lambda: self.trace_others().widened(blur_px))
 
     @classmethod
     def of(cls, parts: Sequence[PixelFootprints]) -> "Footprints | None":

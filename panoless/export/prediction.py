@@ -119,6 +119,7 @@ def export_prediction(
         surroundings=_near_surroundings(around, state.frame),
         reflectance=None if state.reflectance is None else state.reflectance.tint,
         roughness=state.roughness,
+        blur_px=state.blur_px,
         iteration=state.iteration if snapshot else None,
     )
     write_info(folder, info)

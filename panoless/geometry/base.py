@@ -337,5 +337,5 @@ def pixel_areas(views: Views, geometry: Geometry, max_rays: int) -> list[PixelFo
     """
     footprints = geometry.footprints(views, max_rays)
     if footprints is not None:
-        return footprints.smooth
+        return footprints.widened(views.blur_px).smooth
     return [PixelFootprints.centers(rays) for rays in observe_views(views, geometry, max_rays)]

@@ -65,7 +65,9 @@ class ExactGeometry:
         if not encoding.high_dynamic_range:
             footprints = self.footprints(views, config.environment.rays)
             if footprints is not None:
-                environment = deblur_map(footprints, environment, encoding.saturation, config.footprint_map)
+                environment = deblur_map(
+                    footprints.widened(views.blur_px), environment, encoding.saturation, config.footprint_map
+                )
         return environment, rays
 
     def shade(

@@ -16,14 +16,14 @@ from panoless.environment.solve import solve_environment
 from panoless.environment.visibility import agreement, visibility_from_agreement, visibility_from_evidence
 from panoless.geometry.base import Geometry, observe_views, pixel_areas, usable_views
 from panoless.reconstruct.state import FitState
-from panoless.selection.material import as_perfect_mirror, earned_reflectance, earned_roughness
+from panoless.selection.material import Softness, as_perfect_mirror, earned_reflectance, earned_softness
 
 GRAY = 0.5
 
 
 def complete(state: FitState, views: Views, config: FitConfig) -> Views:
-    """Set reflectance, roughness, environment and visibility of a state from its geometry and corrected photographs.
-    These are returned as a mirror of all light would have shown them.
+    """Set reflectance, roughness, blur, environment and visibility of a state from its geometry and corrected
+    photographs. These are returned as a mirror of all light would have shown them.
 
     The map is solved in closed form, unless the configuration keeps that of an iterative fit, which knows no material.
     Only kinds in closed form are asked for a roughness: wrong normals blur a map as well.
@@ -36,9 +36,10 @@ def complete(state: FitState, views: Views, config: FitConfig) -> Views:
         shown = zip(usable.train, views.train, strict=True)
         usable = replace(usable, train=tuple(replace(part, radiance=view.radiance) for part, view in shown))
         config = replace(config, tint=state.reflectance.tint)
-    state.roughness = earned_roughness(usable, state.geometry, config) if state.training is None else None
-    _solve(state, usable, config)
-    return views
+    softness = earned_softness(usable, state.geometry, config) if state.training is None else Softness()
+    state.roughness, state.blur_px = softness.roughness, softness.blur_px
+    _solve(state, replace(usable, blur_px=state.blur_px or 0.0), config)
+    return replace(views, blur_px=state.blur_px or 0.0)
 
 
 def _solve(state: FitState, views: Views, config: FitConfig) -> None:

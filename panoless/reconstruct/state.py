@@ -45,6 +45,8 @@ class FitState:
     """Of the object, where held-out views ask for one; None: it mirrors all light."""
     roughness: float | None = None
     """Of the object, where held-out views ask for one; None: it is smooth."""
+    blur_px: float | None = None
+    """Standard deviation of a Gaussian that blurred the pictures, where held-out views ask for one."""
     verdict: Trust | None = None
     """How far it is to be trusted; None before the end, and in runs of an earlier version."""
 

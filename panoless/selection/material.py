@@ -1,11 +1,11 @@
 """What the mirror is made of, by what a finished geometry explains: a metal's color, which pales at grazing angles, and
-how rough it is.
+how rough it is; or how blurred the pictures are that look as if it were.
 
 It is taken for a perfect mirror until held-out views speak against it.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -83,42 +83,53 @@ def as_perfect_mirror(views: Views, posed: Views, geometry: Geometry, reflectanc
     return replace(views, train=tuple(train))
 
 
-def earned_roughness(views: Views, geometry: Geometry, config: FitConfig) -> float | None:
-    """The roughness of the object in (0, 0.5], if held-out views are clearly better explained by it; else None. Views
-    are those of usable pixels.
+@dataclass(frozen=True)
+class Softness:
+    """What blurs the mirrored light on its way to the pixels."""
 
-    Four fifths of the views make the maps by which the others are judged: one that is shown as it is, and others that a
-    lobe blurs, after the same steps from the same start, and on areas of pixels, because a map that knows of none is
-    better blurred for that. A first roughness tells whether to search on (Brent 1973). Nobody asks where it is
-    known, or in a high dynamic range, in which a mean of encoded values is not the encoding of the mean.
+    roughness: float | None = None
+    """Of the object, in (0, 0.5]; None: it is smooth."""
+    blur_px: float | None = None
+    """Standard deviation of a Gaussian over the pictures; None: they are sharp."""
+
+
+def earned_softness(views: Views, geometry: Geometry, config: FitConfig) -> Softness:
+    """Roughness of the object or blur of the pictures, if held-out views are clearly better explained by one of them.
+    Views are those of usable pixels.
+
+    Four fifths of the views make the maps by which the others are judged: one that is shown as it is, one that a lobe
+    blurs, and one under wider pixels, after the same steps from the same start, and on areas of pixels, because a map
+    that knows of none is better blurred for that. A first value of each tells whether to search on, and for which
+    (Brent 1973). A lobe blurs all directions alike, a wider pixel those that a curved part spreads. Nobody asks where
+    the roughness is known, or in a high dynamic range, in which a mean of encoded values is not the encoding of the
+    mean.
     """
-    from scipy.optimize import minimize_scalar
-
     options, encoding = config.material, encoding_of(config)
-    if options.roughness == "off" or encoding.high_dynamic_range:
-        return None
-    if options.known_roughness > 0:
-        return options.known_roughness
+    if encoding.high_dynamic_range or options.roughness == options.blur == "off":
+        return Softness()
+    if options.roughness == "auto" and options.known_roughness > 0:
+        return Softness(options.known_roughness)
     with torch.no_grad():
-        trial = _RoughnessTrial.of(views, geometry, config)
+        trial = _SoftnessTrial.of(views, geometry, config)
         if trial is None:
-            return None
-        rounds = options.judged_rounds
-        smooth, first = trial.errors(None, rounds), trial.errors(options.first_roughness, rounds)
-        clearly = replace(config.selection, least_gain=options.least_roughness_gain)
-        if not is_clearly_lower(first, smooth, clearly):
-            return None
-        found = minimize_scalar(
-            lambda logarithm: float(trial.errors(math.exp(logarithm), options.sharpening_rounds).mean()),
-            bounds=np.log(options.roughnesses),
-            method="bounded",
-            options={"maxiter": options.roughness_trials},
-        )
-        return math.exp(found.x)
+            return Softness()
+        rounds, clearly = options.judged_rounds, replace(config.selection, least_gain=options.least_roughness_gain)
+        sharp, asked = trial.errors(Softness(), rounds), []
+        if options.roughness == "auto":
+            asked.append(Softness(roughness=options.first_roughness))
+        if options.blur == "auto":
+            asked.append(Softness(blur_px=options.first_blur_px))
+        errors = [trial.errors(each, rounds) for each in asked]
+        best = int(np.argmin([each.mean() for each in errors]))
+        if not is_clearly_lower(errors[best], sharp, clearly):
+            return Softness()
+        if asked[best].roughness is None:
+            return Softness(blur_px=trial.searched(lambda value: Softness(blur_px=value), options.blurs_px))
+        return Softness(roughness=trial.searched(lambda value: Softness(roughness=value), options.roughnesses))
 
 
 @dataclass(frozen=True)
-class _RoughnessTrial:
+class _SoftnessTrial:
     """Areas of pixels of the views that make a map, those of each other view, and the start of that map."""
 
     known: list[PixelFootprints]
@@ -128,7 +139,7 @@ class _RoughnessTrial:
     options: MaterialOptions
 
     @classmethod
-    def of(cls, views: Views, geometry: Geometry, config: FitConfig) -> "_RoughnessTrial | None":
+    def of(cls, views: Views, geometry: Geometry, config: FitConfig) -> "_SoftnessTrial | None":
         """None where there are too few views."""
         parts, options = held_out_parts(views), config.material
         if parts is None:
@@ -142,12 +153,31 @@ class _RoughnessTrial:
         start = solve_environment([each.rays() for each in known], options.judged_resolution)
         return cls(known, held_out, start, encoding_of(config).saturation, options)
 
-    def errors(self, roughness: float | None, rounds: int) -> Float[np.ndarray, "V"]:
-        """Mean of ‖e‖²/(‖e‖² + s²) of each held-out view with that roughness, None being none, after so many rounds."""
-        lobe, options = Lobe.of(roughness, self.start.shape[-1]), self.options
-        found = sharpened_map(self.start, self.known, lobe, self.saturation, options, rounds)
+    def errors(self, softness: Softness, rounds: int) -> Float[np.ndarray, "V"]:
+        """Mean of ‖e‖²/(‖e‖² + s²) of each held-out view with that softness, after so many rounds."""
+        lobe, blur_px, options = (
+            Lobe.of(softness.roughness, self.start.shape[-1]),
+            softness.blur_px or 0.0,
+            self.options,
+        )
+        known = [each.widened(blur_px) for each in self.known]
+        found = sharpened_map(self.start, known, lobe, self.saturation, options, rounds)
         shown, found_errors = lobe.blurred(found), []
         for view in self.held_out:
-            error = [each.seen(shown).minimum(self.saturation.to(shown)) - each.radiance for each in view]
+            wider = [each.widened(blur_px) for each in view]
+            error = [each.seen(shown).minimum(self.saturation.to(shown)) - each.radiance for each in wider]
             found_errors.append(float(bounded_error(torch.cat(error), ERROR_SCALE).mean()) if error else 0.0)
         return np.array(found_errors)
+
+    def searched(self, softness: Callable[[float], Softness], bounds: tuple[float, float]) -> float:
+        """The value between bounds that leaves the least error after the steps of the exported map; by logarithms."""
+        from scipy.optimize import minimize_scalar
+
+        options = self.options
+        found = minimize_scalar(
+            lambda logarithm: float(self.errors(softness(math.exp(logarithm)), options.sharpening_rounds).mean()),
+            bounds=np.log(bounds),
+            method="bounded",
+            options={"maxiter": options.roughness_trials},
+        )
+        return math.exp(found.x)

@@ -78,6 +78,8 @@ class Evidence:
     """The focal length that the fit found over what is said of it."""
     roughness: float = 0.0
     """Of the object, as the fit found it."""
+    blur_px: float = 0.0
+    """Of the pictures, as the fit found it: standard deviation of a Gaussian."""
     repaired_views: int = 0
     """Number of views whose masks had holes or stray pieces that the others contradict."""
 
@@ -121,6 +123,7 @@ def gather_evidence(
         white_balance_stops=corrections.white_balance_stops or 0.0,
         focal_factor=corrections.focal_factor,
         roughness=roughness or 0.0,
+        blur_px=views.blur_px,
         repaired_views=views.repairs.views,
     )
 

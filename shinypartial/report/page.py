@@ -312,6 +312,7 @@ def _provenance(info: PredictionInfo, scores: Scores) -> list[tuple[str, str]]:
         ("method", info.method),
         *([("model", info.model)] if info.model else []),
         *([("roughness", f"{info.roughness:.2g}")] if info.roughness is not None else []),
+        *([("blur of the pictures", f"{info.blur_px:.2g} px")] if info.blur_px is not None else []),
     ]
 
 

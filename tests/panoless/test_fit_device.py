@@ -61,6 +61,7 @@ def test_a_fit_on_another_device_mixes_nothing_and_ends_the_same(
         assert there.curves[name] == pytest.approx(series), name
 
 
+@pytest.mark.slow
 def test_the_same_kind_is_chosen_on_another_device(tmp_path: Path, definition_only: None) -> None:
     dataset = make_plane_dataset(tmp_path / "plane", plane_of(RECTANGLE), size=32, train=4, test=1)
     config = shortest_config("default")

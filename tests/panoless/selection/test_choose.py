@@ -238,7 +238,7 @@ def plane_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return make_plane_dataset(tmp_path_factory.mktemp("datasets") / "plane", plane_of(RECTANGLE))
 
 
-@pytest.mark.parametrize("preset", ["default", "paper"])
+@pytest.mark.parametrize("preset", ["default", pytest.param("paper", marks=pytest.mark.slow)])
 def test_a_plane_has_a_solved_map_whatever_the_preset(tmp_path: Path, plane_dataset: Dataset, preset: str) -> None:
     """No steps are taken with it, so what gradient descent left or accumulated online would say nothing."""
     believed = CorrectionOptions(masks="off", exposure="off", lens="off")

@@ -11,7 +11,7 @@ from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.options import MaterialOptions
 from panoless.geometry.revolution.kind import RevolutionMirror
-from panoless.selection.material import earned_roughness
+from panoless.selection.material import Softness, earned_softness
 from tests.support.mirror_revolution import around, goblet, rays_of, revolution_views
 
 ROUGHNESS = 0.3
@@ -55,16 +55,39 @@ def views_of(roughness: float) -> Views:
 def test_a_rough_mirror_is_found_and_a_smooth_one_stays_smooth() -> None:
     """It comes out too low, as steps end before edges are sharp."""
     config = FitConfig(material=OPTIONS)
-    found = earned_roughness(views_of(ROUGHNESS), MIRROR, config)
-    assert found is not None
-    assert 0.4 * ROUGHNESS < found < 1.2 * ROUGHNESS
-    assert earned_roughness(views_of(1e-3), MIRROR, config) is None
+    found = earned_softness(views_of(ROUGHNESS), MIRROR, config)
+    assert found.blur_px is None
+    assert found.roughness is not None
+    assert 0.4 * ROUGHNESS < found.roughness < 1.2 * ROUGHNESS
+    assert earned_softness(views_of(1e-3), MIRROR, config) == Softness()
+
+
+@pytest.mark.slow
+def test_blurred_pictures_are_told_from_a_rough_mirror() -> None:
+    """It comes out too low: fields of the checkered world are narrower than such a pixel in these views."""
+    plain = views_of(1e-3)
+    soft = tuple(replace(view, radiance=_blurred(view, 1.0)) for view in plain.train)
+    found = earned_softness(replace(plain, train=soft), MIRROR, FitConfig(material=OPTIONS))
+    assert found.roughness is None
+    assert found.blur_px is not None
+    assert 0.3 < found.blur_px < 1.2
+
+
+def _blurred(view: TrainView, sigma_px: float) -> torch.Tensor:
+    from scipy.ndimage import gaussian_filter
+
+    weight = np.maximum(gaussian_filter(view.mask.numpy(), sigma_px), 1e-3)
+    planes = [gaussian_filter((plane * view.mask).numpy(), sigma_px) / weight for plane in view.radiance]
+    return torch.from_numpy(np.stack(planes)).float()
 
 
 @pytest.mark.parametrize(
     ("options", "expected"),
-    [(MaterialOptions(roughness="off", known_roughness=0.2), None), (MaterialOptions(known_roughness=0.2), 0.2)],
+    [
+        (MaterialOptions(roughness="off", blur="off", known_roughness=0.2), None),
+        (MaterialOptions(known_roughness=0.2), 0.2),
+    ],
 )
 def test_nobody_asks_where_roughness_is_off_or_known(options: MaterialOptions, expected: float | None) -> None:
     views = revolution_views(MIRROR.surface, around(5, size=16))
-    assert earned_roughness(views, MIRROR, FitConfig(material=options)) == expected
+    assert earned_softness(views, MIRROR, FitConfig(material=options)) == Softness(roughness=expected)

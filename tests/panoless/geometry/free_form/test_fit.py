@@ -80,9 +80,10 @@ def ring() -> tuple[Views, FreeFormMirror]:
 
 @pytest.mark.parametrize(
     "body",
-    [ellipsoid(), pytest.param(sphere(), marks=pytest.mark.slow), pytest.param(wavy_ball(), marks=pytest.mark.slow)],
+    [ellipsoid(), sphere(), wavy_ball()],
     ids=["ellipsoid", "sphere", "wavy"],
 )
+@pytest.mark.slow
 def test_a_body_is_recovered_from_its_visual_hull(body: Body) -> None:
     views = body_views(body, VIEWS, SIZE_PX)
     errors = normal_errors_deg(fitted(views), body, views, cameras_around(7, 60)[1::2])
@@ -175,6 +176,7 @@ def test_smoothness_of_an_anchored_round_is_asked_of_the_change_alone(solution: 
     assert anchored.cost(anchored) < solution.cost(solution) == free.cost(free)
 
 
+@pytest.mark.slow
 def test_a_start_that_descended_is_taken_where_pixels_agree_better() -> None:
     """Not a hull with waves but what the hull leads to; and the hull itself where no gain is enough."""
     views = body_views(sphere(), 8, 32)

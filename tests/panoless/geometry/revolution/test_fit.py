@@ -120,6 +120,7 @@ def test_no_rotation_of_the_world_changes_the_fit(seed: int) -> None:
     assert_equivariant(surface, normal_errors_deg(photographs, surface), turn)
 
 
+@pytest.mark.slow
 def test_both_ends_are_tried_where_cameras_see_both() -> None:
     """From a start that is upside down, with cameras that see both ends, the pictures find the mouth."""
     photographs = photograph(cut_bowl(), VIEWS, SIZE, elevations_deg=(-40.0, 8.0, 25.0, 45.0))
