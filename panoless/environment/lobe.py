@@ -33,19 +33,26 @@ CUT = 3.0
 """Standard deviations where a blur ends."""
 
 
-def lobe_weights(roughness: float) -> Float[np.ndarray, "K"]:
+def lobe_weights(roughness: float, by_cosine: bool = False) -> Float[np.ndarray, "K"]:
     """The weights wⱼ of the blurs for a roughness in (0, 0.5], nonnegative with the sum 1.
 
     By least squares of the light in rings about the mirrored direction, each in units of the root of what it holds.
+    With `by_cosine` light counts by cos ψ where that is positive, as the first sum of Karis (2013) has it, and a
+    roughness may be up to 1: the light within any angle is met to 0.02 up to 0.5, and to 0.1 at 1.
     """
     from scipy.optimize import nnls
 
     alpha = roughness**2
     angles = np.concatenate([[0], np.geomspace(alpha / 8, 0.999 * math.pi, 60)])
     rings = -np.diff(alpha**2 / (alpha**2 + np.tan(angles / 2) ** 2))
+    if by_cosine:
+        rings = rings * np.cos((angles[1:] + angles[:-1]) / 2).clip(0)
+        rings /= rings.sum()
+    # Rings below the horizon hold nothing then; blurs can't avoid them.
+    least = 1e-2 if by_cosine else 1e-4
     precision = 1 / np.array(WIDTHS_RAD) ** 2
     blurs = -np.diff(np.exp((np.cos(angles)[:, None] - 1) * precision), axis=0) / -np.expm1(-2 * precision)
-    unit = 1 / np.sqrt(rings + 1e-4)
+    unit = 1 / np.sqrt(rings + least)
     weights = nnls(unit[:, None] * blurs, unit * rings)[0]
     found: np.ndarray = weights / weights.sum()
     return found
@@ -115,6 +122,42 @@ class Lobe:
     def gathered(self, image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "6 C L L"]:
         """Bᵀ E, the adjoint."""
         return torch.stack([w * each.gathered(image) for w, each in zip(self.weights, self.blurs, strict=True)]).sum(0)
+
+
+@dataclass(frozen=True)
+class Lobes:
+    """What mirrors of several roughnesses show of maps of one size: their lobes weigh the same blurs."""
+
+    blurs: tuple[_Blur, ...]
+    weights: Float[np.ndarray, "N K"]
+    """Of every blur, the last of them none, in each of the lobes."""
+
+    @classmethod
+    def by_cosine(cls, roughnesses: tuple[float, ...], resolution: int) -> "Lobes":
+        """Of roughnesses in [0, 1] and maps as in `Lobe.of`, light counted by the cosine (see `lobe_weights`)."""
+        smooth = np.eye(1 + len(WIDTHS_RAD))[-1]
+        rows = [smooth if each == 0 else np.append(lobe_weights(each, by_cosine=True), 0.0) for each in roughnesses]
+        blurs = (*(_blur(width, resolution) for width in WIDTHS_RAD), _Blur(resolution, resolution, None))
+        return cls(blurs, np.stack(rows))
+
+    def blurred(self, image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "6 N C L L"]:
+        """B E of each."""
+        found = image.new_zeros(6, len(self.weights), *image.shape[1:])
+        for blur, weights in zip(self.blurs, self.weights.T, strict=True):
+            shown = blur.blurred(image)
+            for lobe in np.flatnonzero(weights):
+                found[:, lobe] += float(weights[lobe]) * shown
+        return found
+
+    def gathered(self, images: Float[Tensor, "6 N C L L"]) -> Float[Tensor, "6 C L L"]:
+        """Σ Bᵀ E over them, the adjoint."""
+        found = torch.zeros_like(images[:, 0])
+        for blur, weights in zip(self.blurs, self.weights.T, strict=True):
+            used = np.flatnonzero(weights)
+            if len(used):
+                mixed = torch.stack([float(weights[lobe]) * images[:, lobe] for lobe in used]).sum(0)
+                found += blur.gathered(mixed)
+        return found
 
 
 def _as_rows(image: Float[Tensor, "6 C M M"]) -> Float[np.ndarray, "P C"]:
