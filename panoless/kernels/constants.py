@@ -76,3 +76,9 @@ SHORTEST_DIRECTION = 1e-30
 
 SUB_PIXELS = {1: ((0.0, 0.0),), 4: ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))}
 """Places of one and of four rays of a pixel, from its center, in pixels."""
+
+SPLAT_DILATION = 0.3
+"""Variance, in square pixels, that is added to every splat, so that none falls between pixels (Kerbl et al. 2023)."""
+
+SPLAT_TANGENT_SHARE = 1.3
+"""The slope at which a Gaussian is projected ends at so many times that of the picture's edges (Kerbl et al. 2023)."""
