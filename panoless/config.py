@@ -51,6 +51,8 @@ class SurfelConfig:
     """Voxels along a side of the cube in which the hull is carved; outlines count below the size of a voxel."""
     hull_votes: Share = 0.96
     """Least share of the views whose mask must keep a point of the hull; all views count unless they contradict."""
+    shading: Literal["mirror", "3dgs-dr", "gaussian-shader", "ref-gaussian", "material-refgs"] = "mirror"
+    """`mirror`: each pixel mirrors the environment; else as another method shades its primitives."""
     tuned: Tuned[SurfelOptions] = field(default_factory=SurfelOptions)
 
 
@@ -62,6 +64,10 @@ class EnvironmentConfig:
     """Texels along a face side during the optimization."""
     activation: Literal["clamp", "sigmoid"] = "clamp"
     """`sigmoid`: Eq. 7 of the paper, started at random logits; `clamp`: radiance itself, kept in [0, 1]."""
+    gray: Share = 0.5
+    """Radiance that it starts with…"""
+    noise: NonNegative = 5.0
+    """…and how far its logits may be from that at random; read for `sigmoid`."""
     range: Literal["ldr", "hdr"] = "ldr"
     """`ldr`: views are clipped to [0, 1], as photographs are; `hdr`: radiance above 1 is fitted, too (EXR, HDR)."""
     warmup: Share = 0.06
@@ -103,6 +109,8 @@ class LossConfig:
     """Scale the specular term by a learned (1 − ρ)², the ablation of the paper's Table 3."""
     random_background: bool = False
     """Composite over a new random color at each step instead of black."""
+    white_background: bool = False
+    """Composite over white."""
 
 
 @dataclass(frozen=True)
@@ -129,8 +137,12 @@ class DensityConfig:
     """Share of the iterations between two opacity resets."""
     propagate_every: Share = 1000 / 45000
     """Share of the iterations between two rounds of normal propagation; 0 turns it off."""
+    propagate_from: Share = 0.0
+    """Share of the iterations before which there is none."""
     propagate_until: Share = 3000 / 45000
     """Share of the iterations after which there is none: it widens outlines, which only the silhouette term undoes."""
+    opacities_rest: Share = 0.0
+    """Share of the iterations after each propagation in which opacities hold still."""
     max_surfels: Count = 100_000
     """Growth stops at this number."""
 
@@ -147,6 +159,10 @@ class RateConfig:
     albedo: NonNegative = 2.5e-3
     curvatures: NonNegative = 3e-2
     roughness_logits: NonNegative = 1e-2
+    harmonics: NonNegative = 2.5e-3
+    strength_logits: NonNegative = 6e-3
+    base_color_logits: NonNegative = 7.5e-3
+    normal_residuals: NonNegative = 5e-3
     environment: NonNegative = 3e-2
     drop_at: Share = 0.4
     """Share of the iterations after which every rate falls geometrically."""
@@ -272,6 +288,7 @@ def check_config(config: FitConfig) -> None:
     """Raise InputError for a value outside the range of its field, and for options that exclude each other."""
     check_record(config, "the configuration", place=_option, remedy="See `panoless fit --help` for what it means.")
     linear = config.albedo or config.loss.photometric == "paper" or config.environment.activation == "sigmoid"
+    linear = linear or config.surfels.shading != "mirror"
     if config.environment.range == "hdr" and linear:
         raise InputError(
             expected="a mirror without diffuse color, the masked photometric term and the activation `clamp` for hdr",

@@ -9,10 +9,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from panoless.config import FitConfig
+from shinypartial.core.color import linear_to_srgb, srgb_to_linear
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Frame, View
 
 NO_TINT = (1.0, 1.0, 1.0)
+LEAST_ALPHA = 1e-6
+"""Premultiplied radiance is divided by alpha, but at least by this."""
 SATURATED = 0.998
 """Of the largest value, from which a pixel is saturated: below the last step of 8-bit sRGB, 0.991, none is."""
 
@@ -28,6 +31,8 @@ class RadianceEncoding:
 
     high_dynamic_range: bool = False
     tint: tuple[float, float, float] = NO_TINT
+    srgb: bool = False
+    """f is the curve of sRGB instead: values as they stand in an 8-bit image, in which other methods compute."""
 
     def clipped(self, frame: Frame, view: View) -> Float[np.ndarray, "H W 3"]:
         """Radiance of a view, not encoded, without what its range excludes.
@@ -42,10 +47,15 @@ class RadianceEncoding:
             )
         return np.clip(view.radiance, 0, None if self.high_dynamic_range else 1)
 
-    def encoded(self, radiance: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
-        """f(c/F)."""
+    def encoded(
+        self, radiance: Float[np.ndarray, "H W 3"], alpha: Float[np.ndarray, "H W"] | float = 1.0
+    ) -> Float[np.ndarray, "H W 3"]:
+        """f(c/F). With sRGB α f(c/(α F)) of radiance c that is premultiplied by alpha, as such an image holds it."""
         if self.tint != NO_TINT:
             radiance = radiance / np.array(self.tint, radiance.dtype)
+        if self.srgb:
+            share = np.asarray(alpha, radiance.dtype)[..., None]
+            return share * linear_to_srgb((radiance / np.maximum(share, LEAST_ALPHA)).clip(0, 1))
         if not self.high_dynamic_range:
             return radiance
         return np.where(radiance > 1, 1 + np.log(np.maximum(radiance, 1)), radiance)
@@ -64,8 +74,14 @@ class RadianceEncoding:
         """The largest encoded radiance that a view can show: 1/F, or ∞ with a high dynamic range."""
         return torch.full((3,), math.inf) if self.high_dynamic_range else 1 / torch.tensor(self.tint)
 
-    def decoded(self, environment: Float[Tensor, "6 3 L L"]) -> Float[Tensor, "6 3 L L"]:
+    def shown(self, radiance: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:
+        """f of radiance in [0, 1] of a mirror without tint; without a gradient."""
+        return torch.from_numpy(linear_to_srgb(radiance.cpu().numpy())).to(radiance) if self.srgb else radiance
+
+    def decoded(self, environment: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:
         """f⁻¹ of a map: the radiance of the environment itself, before any mirror."""
+        if self.srgb:
+            return torch.from_numpy(srgb_to_linear(environment.cpu().numpy())).to(environment)
         if not self.high_dynamic_range:
             return environment
         return torch.where(environment > 1, torch.exp(environment.clamp(min=1) - 1), environment)
@@ -77,4 +93,4 @@ LDR = RadianceEncoding()
 
 def encoding_of(config: FitConfig) -> RadianceEncoding:
     """The encoding that a configuration asks for."""
-    return RadianceEncoding(config.environment.range == "hdr", config.tint)
+    return RadianceEncoding(config.environment.range == "hdr", config.tint, config.surfels.shading != "mirror")

@@ -164,7 +164,7 @@ def load_views(
         view = read_view(frame)
         alpha = _block_means(np.clip(view.alpha, 0, 1), downscale)
         if (alpha >= MASK_LEVEL).any():
-            radiance = encoding.encoded(_block_means(encoding.clipped(frame, view), downscale))
+            radiance = encoding.encoded(_block_means(encoding.clipped(frame, view), downscale), alpha)
             photographs.append(cropped(frame.camera.downscaled(downscale), radiance, alpha, crop_margin_px))
         else:
             empty.append(frame.name)

@@ -14,15 +14,17 @@ from shinypartial.core.sphere import directions_to_cube
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-INITIAL_LOGIT = 5.0
+LEAST_GRAY = 1e-6
+"""Of a map that starts through the sigmoid, so that its logits are finite."""
 
 
 def initial_environment(config: EnvironmentConfig, generator: torch.Generator) -> Float[Tensor, "6 3 L L"]:
-    """Gray radiance for `clamp`; logits uniform in ±5 for `sigmoid`."""
+    """Gray radiance for `clamp`; its logits and noise for `sigmoid`."""
     shape = (6, 3, config.resolution, config.resolution)
     if config.activation == "sigmoid":
-        return (torch.rand(shape, generator=generator) * 2 - 1) * INITIAL_LOGIT
-    return torch.full(shape, 0.5)
+        middle = torch.logit(torch.tensor(config.gray), eps=LEAST_GRAY)
+        return (torch.rand(shape, generator=generator) * 2 - 1) * config.noise + middle
+    return torch.full(shape, config.gray)
 
 
 def look_up(

@@ -77,6 +77,17 @@ class _Blur:
             coarse = _as_map(self.matrix @ _as_rows(coarse), image)
         return coarse if ratio == 1 else _as_map(sample_cubemap(coarse, _centers(self.fine).to(image)), image)
 
+    def shrunk(self, image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "6 C M M"]:
+        """G E on the coarser texels. Gradient: to the map."""
+        coarse, ratio = image, self.fine // self.coarse
+        if ratio > 1:
+            area = self._area(image)
+            coarse = avg_pool2d(image * area, ratio) / avg_pool2d(area, ratio)
+        if self.matrix is not None:
+            rows = coarse.permute(0, 2, 3, 1)
+            coarse = _Product.apply(self.matrix, rows.flatten(0, 2)).view(rows.shape).permute(0, 3, 1, 2).contiguous()
+        return coarse
+
     def gathered(self, image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "6 C L L"]:
         """Gᵀ E."""
         coarse, ratio = image, self.fine // self.coarse
@@ -138,26 +149,27 @@ class Lobes:
         smooth = np.eye(1 + len(WIDTHS_RAD))[-1]
         rows = [smooth if each == 0 else np.append(lobe_weights(each, by_cosine=True), 0.0) for each in roughnesses]
         blurs = (*(_blur(width, resolution) for width in WIDTHS_RAD), _Blur(resolution, resolution, None))
-        return cls(blurs, np.stack(rows))
+        weights = np.stack(rows)
+        used = weights.any(0)
+        return cls(tuple(blur for blur, use in zip(blurs, used, strict=True) if use), weights[:, used])
 
-    def blurred(self, image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "6 N C L L"]:
-        """B E of each."""
-        found = image.new_zeros(6, len(self.weights), *image.shape[1:])
-        for blur, weights in zip(self.blurs, self.weights.T, strict=True):
-            shown = blur.blurred(image)
-            for lobe in np.flatnonzero(weights):
-                found[:, lobe] += float(weights[lobe]) * shown
-        return found
+    def pyramid(self, image: Float[Tensor, "6 C L L"]) -> list[Float[Tensor, "6 C M M"]]:
+        """The map by each blur, with as few texels as that leaves. Gradient: to the map."""
+        return [blur.shrunk(image) for blur in self.blurs]
 
-    def gathered(self, images: Float[Tensor, "6 N C L L"]) -> Float[Tensor, "6 C L L"]:
-        """Σ Bᵀ E over them, the adjoint."""
-        found = torch.zeros_like(images[:, 0])
-        for blur, weights in zip(self.blurs, self.weights.T, strict=True):
-            used = np.flatnonzero(weights)
-            if len(used):
-                mixed = torch.stack([float(weights[lobe]) * images[:, lobe] for lobe in used]).sum(0)
-                found += blur.gathered(mixed)
-        return found
+
+class _Product(torch.autograd.Function):
+    """A sparse matrix times rows."""
+
+    @staticmethod
+    def forward(ctx, matrix, rows):
+        ctx.matrix = matrix
+        return torch.as_tensor(matrix @ rows.detach().cpu().numpy()).to(rows)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, cotangent):
+        return None, torch.as_tensor(ctx.matrix.T @ cotangent.cpu().numpy()).to(cotangent)
 
 
 def _as_rows(image: Float[Tensor, "6 C M M"]) -> Float[np.ndarray, "P C"]:

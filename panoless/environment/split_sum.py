@@ -10,11 +10,12 @@ r the mirrored direction. P is what the lobe seen from the front shows of the ma
 0 P is the map itself and F₀ A + B Schlick's F₀ + (1 − F₀)(1 − cos θ)⁵.
 """
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.environment.lobe import Lobes
@@ -29,22 +30,19 @@ TABLE_SAMPLES = 512
 """Facets drawn for each entry of the table, which they bring to within 0.01."""
 
 
-class _Prefiltered(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, lobes, environment):
-        ctx.lobes = lobes
-        return lobes.blurred(environment.detach())
+@dataclass(frozen=True)
+class Prefiltered:
+    """A map by the blurs that lobes of all roughnesses are made of."""
 
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, cotangent):
-        return None, ctx.lobes.gathered(cotangent)
+    maps: list[Tensor]
+    weights: Float[Tensor, "N K"]
+    """Of the blurs at each of the `LEVELS`."""
 
 
-def prefiltered(environment: Float[Tensor, "6 3 L L"]) -> Float[Tensor, "6 N 3 L L"]:
-    """P of a map of radiance at each of the `LEVELS`; L is 4 times a power of two or below 8. Gradient: to the map."""
-    levels: Tensor = _Prefiltered.apply(_lobes(environment.shape[-1]), environment)
-    return levels
+def prefiltered(environment: Float[Tensor, "6 3 L L"]) -> Prefiltered:
+    """A map of radiance, blurred; L is 4 times a power of two or below 8. Gradient: to the map."""
+    lobes = _lobes(environment.shape[-1])
+    return Prefiltered(lobes.pyramid(environment), torch.from_numpy(lobes.weights).to(environment))
 
 
 @lru_cache(maxsize=4)
@@ -63,11 +61,12 @@ def hat_weights(places: Float[Tensor, "P"], knots: tuple[float, ...]) -> Float[T
 
 
 def look_up_rough(
-    levels: Float[Tensor, "6 N 3 L L"], directions: Float[Tensor, "P 3"], roughness: Float[Tensor, "P"]
+    light: Prefiltered, directions: Float[Tensor, "P 3"], roughness: Float[Tensor, "P"]
 ) -> Float[Tensor, "P 3"]:
     """P(ω, roughness), bilinear and seamless over directions and linear between levels. Gradients: to all three."""
-    sampled = sample_cubemap(levels.flatten(1, 2), directions).unflatten(1, (len(LEVELS), 3))
-    return (hat_weights(roughness, LEVELS)[..., None] * sampled).sum(1)
+    shares = hat_weights(roughness, LEVELS) @ light.weights
+    parts = [shares[:, k, None] * sample_cubemap(image, directions) for k, image in enumerate(light.maps)]
+    return torch.stack(parts).sum(0)
 
 
 @lru_cache(maxsize=1)
@@ -92,10 +91,20 @@ def brdf_table() -> Float[np.ndarray, "S S 2"]:
 
 def split_sum_factors(cosines: Float[Tensor, "P"], roughness: Float[Tensor, "P"]) -> Float[Tensor, "P 2"]:
     """(A, B) of cos θ and roughness in [0, 1], bilinear in `brdf_table`. Gradients: to both."""
-    table = torch.from_numpy(brdf_table()).to(cosines)
-    knots = tuple(np.linspace(0, 1, TABLE_SIDE).tolist())
-    by_roughness = (hat_weights(cosines, knots) @ table.flatten(1)).unflatten(1, (TABLE_SIDE, 2))
-    return (hat_weights(roughness, knots)[..., None] * by_roughness).sum(1)
+    table = torch.from_numpy(brdf_table()).to(cosines).flatten(0, 1)
+    (row, down), (column, along) = (_cell(each) for each in (cosines, roughness))
+    corner = row * TABLE_SIDE + column
+    upper, lower = (
+        table[at] * (1 - along)[:, None] + table[at + 1] * along[:, None] for at in (corner, corner + TABLE_SIDE)
+    )
+    return upper * (1 - down)[:, None] + lower * down[:, None]
+
+
+def _cell(places: Float[Tensor, "P"]) -> tuple[Int[Tensor, "P"], Float[Tensor, "P"]]:
+    """Between which two of the steps of the table a place in [0, 1] lies, and where between them."""
+    scaled = places.clamp(0, 1) * (TABLE_SIDE - 1)
+    first = scaled.detach().floor().clamp(max=TABLE_SIDE - 2)
+    return first.long(), scaled - first
 
 
 def specular_share(

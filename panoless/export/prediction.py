@@ -23,6 +23,7 @@ from panoless.export.mesh_files import write_ply
 from panoless.export.pictures import crop_to_object, decomposition_pictures
 from panoless.export.render import Decomposition, render
 from panoless.geometry.registry import FAMILIES
+from panoless.geometry.surfels.shading.registry import LEFT_OUT
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.reconstruct.final_map import complete
 from panoless.reconstruct.recorder import timed
@@ -120,6 +121,7 @@ def export_prediction(
         reflectance=None if state.reflectance is None else state.reflectance.tint,
         roughness=state.roughness,
         blur_px=state.blur_px,
+        left_out=LEFT_OUT.get(config.surfels.shading),
         iteration=state.iteration if snapshot else None,
     )
     write_info(folder, info)

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from panoless.capture.encoding import encoding_of
 from panoless.capture.object_frame import ObjectFrame
 from panoless.config import FitConfig
 from panoless.environment.reflectance import Reflectance
@@ -40,10 +41,11 @@ def render(
     reflectance: Reflectance | None = None,
 ) -> Decomposition:
     """Render one camera with an environment as the surface shows it (radiance, not logits) in a mirror of that
-    reflectance, else of the configured tint.
+    reflectance, else of the configured tint. Shading computes in sRGB where the fit did.
     """
     with torch.no_grad():
-        buffers = geometry.buffers(camera)
+        encoding = encoding_of(config)
+        environment, buffers = encoding.shown(environment), geometry.buffers(camera)
         rotation = camera.world_to_camera[:3, :3].T
         pixels = torch.nonzero(buffers.alpha.flatten() > ALPHA_FLOOR)[:, 0]
         normals_camera = buffers.normals_camera.flatten(1)[:, pixels]
@@ -53,9 +55,14 @@ def render(
         tint = specular.new_tensor(config.tint)[:, None, None]
         if reflectance is not None:
             tint = reflectance.share(buffers.cosines(camera))
+        radiance, albedo = compose(buffers.albedo, specular, buffers.alpha, config.alpha_applied), buffers.albedo
+        if encoding.srgb:
+            alpha = buffers.alpha.clamp(min=ALPHA_FLOOR)
+            radiance, albedo = (alpha * encoding.decoded((part / alpha).clamp(0, 1)) for part in (radiance, albedo))
+            specular = (radiance - albedo) / alpha
         return Decomposition(
-            radiance=tint * compose(buffers.albedo, specular, buffers.alpha, config.alpha_applied),
-            albedo=tint * buffers.albedo,
+            radiance=tint * radiance,
+            albedo=tint * albedo,
             specular=tint * specular,
             alpha=buffers.alpha,
             normals_world=normals,

@@ -136,8 +136,8 @@ class PredictionInfo:
     share of the light (linear red, green, blue) it found the object to mirror at normal incidence, where that is not
     all of it; `roughness` how rough, in units of Blender's principled shader, where it is not smooth; `blur_px` by how
     much it found the pictures blurred (standard deviation of a Gaussian), where they are not sharp; `masks` is
-    "dataset" where the method wrote none and its test views were cut out by the dataset's. Each is None where it is
-    unknown or has no meaning.
+    "dataset" where the method wrote none and its test views were cut out by the dataset's; `left_out` names the parts
+    of a published method that its re-implementation lacks. Each is None where it is unknown or has no meaning.
     """
 
     method: str
@@ -160,6 +160,7 @@ class PredictionInfo:
     roughness: Share | None = None
     blur_px: NonNegative | None = None
     masks: Literal["dataset"] | None = None
+    left_out: tuple[str, ...] | None = None
 
     @property
     def hardware_text(self) -> str:

@@ -11,7 +11,7 @@ import pytest
 import panoless
 from panoless.cli import main
 from panoless.config import FitConfig, RateConfig, check_config, config_from_dict, renamed_arguments
-from panoless.geometry.surfels.model import Surfels
+from panoless.geometry.surfels.model import ShadedSurfels
 from panoless.presets import PRESETS
 from shinypartial.core.errors import InputError
 from shinypartial.io.records import write_record
@@ -62,7 +62,7 @@ def reads() -> set[tuple[str, str]]:
 def test_every_option_is_read(section: str) -> None:
     kind = SECTIONS[section] if section else FitConfig
     owners = {"config", section, "options"} if section else {"config"}
-    looked_up_by_name = {item.name for item in fields(Surfels)} | {"environment"} if kind is RateConfig else set()
+    looked_up_by_name = {item.name for item in fields(ShadedSurfels)} | {"environment"} if kind is RateConfig else set()
     seen = {name for owner, name in reads() if owner in owners}
     assert {item.name for item in fields(kind)} - looked_up_by_name - seen == set()  # type: ignore[arg-type]
 
@@ -70,7 +70,7 @@ def test_every_option_is_read(section: str) -> None:
 def test_every_parameter_has_a_rate() -> None:
     rates = {item.name for item in fields(RateConfig)}
     others = {"drop_at", "drop_factor", "means_fall_until", "square_memory"}
-    assert rates - others == {item.name for item in fields(Surfels)} | {"environment"}
+    assert rates - others == {item.name for item in fields(ShadedSurfels)} | {"environment"}
 
 
 def with_value(config: FitConfig, name: str, value: Any) -> FitConfig:

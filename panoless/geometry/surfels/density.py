@@ -75,7 +75,7 @@ def grow_and_prune(
     kept = torch.nonzero(stays)[:, 0]
     children = splits.repeat(SPLIT_INTO)
     parts = (surfels.select(kept), surfels.select(clones), _split(surfels.select(children), generator))
-    merged = Surfels(**{name: torch.cat([part.named()[name] for part in parts]) for name in surfels.named()})
+    merged = type(surfels)(**{name: torch.cat([part.named()[name] for part in parts]) for name in surfels.named()})
     source = torch.cat([kept, clones, children])
     unchanged = torch.arange(len(source), device=source.device) < len(kept)
     alive = merged.scales.amax(1) < config.prune_share
@@ -87,9 +87,12 @@ def grow_and_prune(
 
 
 def _split(children: Surfels, generator: torch.Generator) -> Surfels:
-    local = torch.randn(children.count, 2, generator=generator).to(children.scales) * children.scales
+    axes = children.scales.shape[1]
+    local = torch.randn(children.count, axes, generator=generator).to(children.scales) * children.scales
     rotation = rotation_matrices(children.quats)
-    offset = rotation[:, :, 0] * local[:, :1] + rotation[:, :, 1] * local[:, 1:]
+    offset = rotation[:, :, 0] * local[:, :1]
+    for axis in range(1, axes):
+        offset = offset + rotation[:, :, axis] * local[:, axis : axis + 1]
     return replace(children, means=children.means + offset, log_scales=children.log_scales - math.log(SPLIT_SHRINK))
 
 

@@ -11,6 +11,7 @@ from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, Proposal, Training, TrainingObserver, observe_views
 from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.geometry.surfels.placement import initial_surfels
+from panoless.geometry.surfels.shading.geometry import ShadedMirror
 from panoless.geometry.surfels.train import train_surfels
 
 
@@ -35,10 +36,10 @@ class SurfelFamily:
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """Those that the steps begin with: on a geometry that was proposed, else on the first surface."""
         if proposal.shape is not None:
-            start: Geometry = proposal.shape.to_surfels(config).with_poses(proposal.shape.poses)
-            return start.to(views.train[0].mask.device)
+            start = cast(SurfelMirror, proposal.shape.to_surfels(config).with_poses(proposal.shape.poses))
+            return ShadedMirror.begun(start, config).to(views.train[0].mask.device)
         surfels = initial_surfels(views, config.surfels, config.seed, config.first_surface)
-        return SurfelMirror.of(surfels, config)
+        return ShadedMirror.begun(SurfelMirror.of(surfels, config), config)
 
     def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
         """None: what surfels are trained on is believed."""

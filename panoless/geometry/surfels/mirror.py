@@ -28,7 +28,8 @@ from panoless.geometry.base import (
     to_plain,
 )
 from panoless.geometry.exact import mirrored_directions, shade_centers
-from panoless.geometry.surfels.model import Surfels
+from panoless.geometry.surfels.model import ShadedSurfels, Surfels
+from panoless.geometry.surfels.objective import MirrorObjective, StepObjective
 from panoless.geometry.surfels.options import SurfelOptions
 from panoless.geometry.surfels.rendering import ALPHA_FLOOR, rasterize_surfels, surface_buffers, tiles_of
 from panoless.kernels.cubemap import sample_cubemap
@@ -156,6 +157,14 @@ class SurfelMirror:
         """The map where the blended normals mirror the pixels' centers to (Eqs. 5–7)."""
         return shade_centers(environment, camera, pixels, normals_camera)
 
+    def objective(self, views: Views, config: FitConfig) -> StepObjective:
+        """What the steps of its fit minimize."""
+        return MirrorObjective(config)
+
+    def at(self, surfels: Surfels, share: float) -> "SurfelMirror":
+        """With its surfels as they are when that share of the steps is taken."""
+        return replace(self, surfels=surfels)
+
     def to_surfels(self, config: FitConfig) -> "SurfelMirror":
         """Itself."""
         return self
@@ -171,7 +180,7 @@ class SurfelMirror:
             **_columns(("nx", "ny", "nz"), normals),
             **_columns(("f_dc_0", "f_dc_1", "f_dc_2"), (surfels.albedo - 0.5) / SH_DEGREE_0),
             "opacity": surfels.opacity_logits,
-            **_columns(("scale_0", "scale_1"), surfels.log_scales + math.log(frame.radius)),
+            **_columns(("scale_0", "scale_1", "scale_2"), surfels.log_scales + math.log(frame.radius)),
             **_columns(("rot_0", "rot_1", "rot_2", "rot_3"), normalize(surfels.quats, dim=1)),
             **_columns(("curvature_a", "curvature_b", "curvature_c"), surfels.curvatures / frame.radius),
         }
@@ -196,16 +205,18 @@ class SurfelMirror:
     def from_state_dict(cls, content: dict[str, Any]) -> "SurfelMirror":
         """The geometry that `state_dict` was taken from."""
         from panoless.geometry.registry import FAMILIES
+        from panoless.geometry.surfels.shading.geometry import ShadedMirror
 
         start = content["started_on"]
         started_on = None if start is None else FAMILIES[start[0]].geometry.from_state_dict(start[1])
         poses = poses_from_plain(content)
-        surfels = Surfels(**content["surfels"])
-        return cls(**{**content, "surfels": surfels, "started_on": started_on, "poses": poses})
+        kind, primitives = (ShadedMirror, ShadedSurfels) if "shading" in content else (cls, Surfels)
+        surfels = primitives(**content["surfels"])
+        return kind(**{**content, "surfels": surfels, "started_on": started_on, "poses": poses})
 
 
 def _columns(names: Sequence[str], matrix: Tensor) -> dict[str, Tensor]:
-    return {name: matrix[:, index] for index, name in enumerate(names)}
+    return dict(zip(names, matrix.unbind(1), strict=False))
 
 
 def surfel_trust(

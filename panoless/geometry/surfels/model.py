@@ -1,10 +1,14 @@
 """The surfel set: its parameters and the physical quantities that they stand for."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+Set = TypeVar("Set", bound="Surfels")
 
 
 @dataclass(frozen=True)
@@ -19,7 +23,7 @@ class Surfels:
 
     means: Float[Tensor, "K 3"]
     quats: Float[Tensor, "K 4"]
-    log_scales: Float[Tensor, "K 2"]
+    log_scales: Float[Tensor, "K D"]
     opacity_logits: Float[Tensor, "K"]
     albedo: Float[Tensor, "K 3"]
     curvatures: Float[Tensor, "K 3"]
@@ -31,8 +35,8 @@ class Surfels:
         return self.means.shape[0]
 
     @property
-    def scales(self) -> Float[Tensor, "K 2"]:
-        """Radii s_u, s_v > 0 along the tangents."""
+    def scales(self) -> Float[Tensor, "K D"]:
+        """Radii s_u, s_v > 0 along the tangents; of 3D Gaussians one along the third axis, too."""
         return self.log_scales.exp()
 
     @property
@@ -44,14 +48,34 @@ class Surfels:
         """Parameters by name, in the order of the fields."""
         return {item.name: getattr(self, item.name) for item in fields(self)}
 
-    def select(self, index: Tensor) -> "Surfels":
+    def mapped(self: Set, change: Callable[[Tensor], Tensor]) -> Set:
+        """What becomes of every parameter."""
+        return type(self)(**{name: change(value) for name, value in self.named().items()})
+
+    def select(self: Set, index: Tensor) -> Set:
         """The surfels of an index or boolean mask."""
-        return Surfels(**{name: value[index] for name, value in self.named().items()})
+        return self.mapped(lambda value: value[index])
 
-    def to(self, device: torch.device) -> "Surfels":
+    def to(self: Set, device: torch.device) -> Set:
         """The same numbers on a device."""
-        return Surfels(**{name: value.to(device) for name, value in self.named().items()})
+        return self.mapped(lambda value: value.to(device))
 
-    def detached(self) -> "Surfels":
+    def detached(self: Set) -> Set:
         """The same numbers without gradients."""
-        return Surfels(**{name: value.detach() for name, value in self.named().items()})
+        return self.mapped(torch.Tensor.detach)
+
+
+@dataclass(frozen=True)
+class ShadedSurfels(Surfels):
+    """Surfels, or 3D Gaussians where there are three scales, with what other methods shade them by.
+
+    What a method does not learn stays as it is. `harmonics` are coefficients of diffuse light that depends on where it
+    is seen from, in the order of `shinypartial.core.harmonics`; `strength_logits` of how strongly a primitive reflects,
+    or of its metalness; `base_color_logits` of its reflectance; `normal_residuals` are added to its normal where its
+    front and where its back is seen.
+    """
+
+    harmonics: Float[Tensor, "K B 3"]
+    strength_logits: Float[Tensor, "K"]
+    base_color_logits: Float[Tensor, "K 3"]
+    normal_residuals: Float[Tensor, "K 2 3"]

@@ -26,7 +26,7 @@ class SurfelOptimizer:
         self._betas = MOMENTUM, rates.square_memory
         self._rates = {"opacity_logits": rates.opacity_logits, **asdict(rates)}
         self._state: dict[str, dict[str, Tensor]] = {}
-        self.surfels = Surfels(**{name: _leaf(value) for name, value in surfels.named().items()})
+        self.surfels = surfels.mapped(_leaf)
         """The surfel parameters, leaves of the graph."""
         self.environment = _leaf(environment)
         """The environment parameters, a leaf of the graph."""
@@ -66,7 +66,7 @@ class SurfelOptimizer:
                 kept = keep_moments.view(-1, *[1] * (value.dim() - 1)).to(value.dtype)
                 moments = {key: self._state[name][key][source] * kept for key in MOMENTS}
                 self._state[name] = {**self._state[name], **moments}
-        self.surfels = Surfels(**{name: _leaf(value) for name, value in surfels.named().items()})
+        self.surfels = surfels.mapped(_leaf)
 
     def set_values(self, surfels: Surfels) -> None:
         """Take the values of as many surfels. Parameters that change restart their moments, the others keep them."""
@@ -77,7 +77,12 @@ class SurfelOptimizer:
             leaves[name] = _leaf(value)
             if name in self._state:
                 self._state[name] = {**self._state[name], **{key: torch.zeros_like(value) for key in MOMENTS}}
-        self.surfels = Surfels(**leaves)
+        self.surfels = type(surfels)(**leaves)
+
+    def set_environment(self, environment: Tensor) -> None:
+        """Take another map, whose moments restart."""
+        self.environment = _leaf(environment)
+        self._state.pop(ENVIRONMENT, None)
 
     def state_dict(self) -> dict[str, Any]:
         """Moments and step counts by name, for a checkpoint."""

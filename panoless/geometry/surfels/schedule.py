@@ -69,8 +69,16 @@ class Schedule:
     def propagation(self, iteration: int) -> bool:
         """Whether normals are propagated after this iteration; an opacity reset has precedence."""
         density = self.config.density
-        active = self._density_active(iteration) and iteration < self._iteration(density.propagate_until)
+        begun = iteration >= self._iteration(density.propagate_from)
+        active = self._density_active(iteration) and begun and iteration < self._iteration(density.propagate_until)
         return active and self._due(iteration, density.propagate_every) and not self.opacity_reset(iteration)
+
+    def resting(self, iteration: int) -> frozenset[str]:
+        """The parameters that hold still in this iteration: opacities for a while after a propagation."""
+        rest = self._iteration(self.config.density.opacities_rest)
+        since = iteration % max(self._iteration(self.config.density.propagate_every), 1)
+        rests = 0 < since <= rest and self.propagation(iteration - since)
+        return frozenset({"opacity_logits"}) if rests else frozenset()
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,14 @@ from panoless.config import FitConfig
 from panoless.environment.cubemap import look_up
 from panoless.export.render import render
 from panoless.geometry.base import Geometry, Training
-from panoless.geometry.surfels import train as train_module
+from panoless.geometry.surfels import objective
 from panoless.geometry.surfels.kind import SurfelFamily
 from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.geometry.surfels.model import Surfels
+from panoless.geometry.surfels.objective import LossTerms
 from panoless.geometry.surfels.placement import initial_surfels
-from panoless.geometry.surfels.train import LossTerms, SurfelTrainer, train_surfels
+from panoless.geometry.surfels.schedule import phase_of
+from panoless.geometry.surfels.train import SurfelTrainer, train_surfels
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.kernels.objective import Objective
 from panoless.presets import PRESETS
@@ -239,12 +241,11 @@ def test_pixels_that_no_term_reads_change_nothing(
     config = replace(config, loss=loss)
     view = load_views(sphere_dataset, config.crop_margin_px).train[0]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SurfelTrainer, "_active_tiles", lambda *_: None)
+        patch.setattr(objective, "_active_tiles", lambda *_: None)
         everywhere = fit(sphere_dataset, config, tmp_path / "everywhere")
     only_needed = fit(sphere_dataset, config, tmp_path / "needed")
     assert_same(only_needed, everywhere)
-    trainer = trainer_of(load_views(sphere_dataset, config.crop_margin_px), config)
-    tiles = trainer._active_tiles(view, 10)
+    tiles = objective._active_tiles(view, phase_of(config, True, 0.0))
     assert tiles is not None
     assert tiles.any()
     assert not tiles.all() or tiles.numel() <= 4
@@ -292,13 +293,13 @@ def test_rates_and_sizes_are_those_of_the_scene_that_they_are_shares_of(views: V
 
 
 def test_a_loss_that_is_not_finite_stops_the_fit(tmp_path: Path, sphere_dataset: Dataset, monkeypatch) -> None:
-    objective = train_module.mirror_objective
+    usual = objective.mirror_objective
 
     def spoiled(*arguments) -> Objective:
-        found = objective(*arguments)
+        found = usual(*arguments)
         return replace(found, total=found.total * float("nan"))
 
-    monkeypatch.setattr(train_module, "mirror_objective", spoiled)
+    monkeypatch.setattr(objective, "mirror_objective", spoiled)
     with pytest.raises(InputError, match="nan at iteration 0"):
         fit(sphere_dataset, tiny_config(iterations=5, count=60), tmp_path / "run")
     assert load_state(tmp_path / "run") is None

@@ -14,7 +14,8 @@ from panoless.cli import main
 from panoless.export.prediction import export_prediction, export_snapshots
 from panoless.geometry.base import Training
 from panoless.geometry.surfels.mirror import SurfelMirror
-from panoless.geometry.surfels.train import LossTerms, SurfelTrainer
+from panoless.geometry.surfels.objective import LossTerms
+from panoless.geometry.surfels.train import SurfelTrainer
 from panoless.reconstruct import recorder as recorder_module
 from panoless.reconstruct.final_map import complete
 from panoless.reconstruct.fit import fit

@@ -1,0 +1,87 @@
+"""Primitives that another method shades, as a geometry."""
+
+from dataclasses import dataclass, replace
+from typing import cast
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from panoless.capture.views import TrainView, Views
+from panoless.config import FitConfig
+from panoless.environment.rays import Rays
+from panoless.geometry.base import SOLID_SURFACE_ALPHA, SurfaceBuffers
+from panoless.geometry.exact import mirrored_directions
+from panoless.geometry.surfels.mirror import SurfelMirror
+from panoless.geometry.surfels.model import ShadedSurfels, Surfels
+from panoless.geometry.surfels.objective import StepObjective, generator_of
+from panoless.geometry.surfels.rendering import ALPHA_FLOOR
+from panoless.geometry.surfels.shading.base import Seen
+from panoless.geometry.surfels.shading.objective import ShadedObjective, learned_by
+from panoless.geometry.surfels.shading.registry import SHADINGS
+from panoless.kernels.rasterize import RasterCamera
+
+
+@dataclass(frozen=True)
+class ShadedMirror(SurfelMirror):
+    """A set of primitives, and the method that shades them. Its images are in the encoding of the fit."""
+
+    shading: str = ""
+    """The method's name."""
+    share: float = 0.0
+    """Of the steps that were taken, which methods go by."""
+
+    @classmethod
+    def begun(cls, mirror: SurfelMirror, config: FitConfig) -> SurfelMirror:
+        """Primitives of the configured method where surfels are; the surfels themselves where they mirror."""
+        if config.surfels.shading not in SHADINGS:
+            return mirror
+        generator = generator_of(config.seed, 5)
+        random = config.surfels.initial == "random" and mirror.started_on is None
+        surfels = SHADINGS[config.surfels.shading].begun(mirror.surfels, generator, random=random)
+        return cls(**{**vars(mirror), "surfels": surfels, "curved": False, "shading": config.surfels.shading})
+
+    @property
+    def num_parameters(self) -> int:
+        """Of all that is learned."""
+        learned = learned_by(SHADINGS[self.shading])
+        return sum(value.numel() for name, value in self.surfels.named().items() if name in learned)
+
+    def objective(self, views: Views, config: FitConfig) -> StepObjective:
+        """That of its method."""
+        return ShadedObjective(SHADINGS[self.shading], views, config)
+
+    def at(self, surfels: Surfels, share: float) -> "ShadedMirror":
+        """With its primitives as they are when that share of the steps is taken."""
+        return replace(self, surfels=surfels, share=share)
+
+    def observe_covered(self, view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Rays, Int[Tensor, "Q"]]:
+        """The rays of pixels that primitives cover, less what is diffuse without surroundings."""
+        buffers = self.buffers(view.camera)
+        pixels = pixels[buffers.alpha.flatten()[pixels] > SOLID_SURFACE_ALPHA]
+        radiance = view.radiance_at(pixels) - buffers.albedo.flatten(1)[:, pixels].T
+        directions = mirrored_directions(view.camera, pixels, buffers.normals_camera.flatten(1)[:, pixels])
+        return Rays(directions, radiance, incoming=view.directions_world(pixels)), pixels
+
+    def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
+        """Blended over the primitives; the albedo is what they show without surroundings."""
+        seen = self._seen(camera, self.surfels.means.new_zeros(6, 3, 4, 4))
+        surface = seen.surface
+        return SurfaceBuffers(surface.alpha, surface.normals_camera, surface.depth, seen.diffuse)
+
+    def shade(
+        self,
+        environment: Float[Tensor, "6 3 L L"],
+        camera: RasterCamera,
+        pixels: Int[Tensor, "P"],
+        normals_camera: Float[Tensor, "3 P"],
+    ) -> Float[Tensor, "P 3"]:
+        """What surroundings add, by the method; it blends its normals itself."""
+        dark, seen = self.buffers(camera), self._seen(camera, environment)
+        added = (seen.diffuse + seen.specular - dark.albedo).flatten(1)[:, pixels]
+        return (added / dark.alpha.flatten()[pixels].clamp(min=ALPHA_FLOOR)).T
+
+    def _seen(self, camera: RasterCamera, environment: Float[Tensor, "6 3 L L"]) -> Seen:
+        with torch.no_grad():
+            surfels = cast(ShadedSurfels, self.surfels.detached())
+            return SHADINGS[self.shading].seen(surfels, camera, environment, self.share)

@@ -1,0 +1,129 @@
+"""Ref-Gaussian (Yao et al. 2024): surfels with a base color, a metalness and a roughness, under the split sum.
+
+Primitives are shaded one by one at first, then the pixels that they blend to; between the two, materials and map begin
+anew. Occlusion and what the object mirrors of itself, which it traces by a mesh of its surface, are left out.
+"""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from panoless.capture.views import TrainView
+from panoless.environment.split_sum import LEVELS, look_up_rough, prefiltered, specular_share
+from panoless.geometry.surfels.model import ShadedSurfels, Surfels
+from panoless.geometry.surfels.shading.base import (
+    Blended,
+    Seen,
+    SurfacePixels,
+    blend_surfels,
+    facing,
+    harmonic_color,
+    logit,
+    mirrored,
+    propagated,
+    seen_from,
+    shaded,
+    surfel_normals,
+)
+from panoless.kernels.rasterize import RasterCamera
+
+DIELECTRIC = 0.04
+"""Reflectance at normal incidence of what is no metal."""
+
+
+@dataclass(frozen=True)
+class RefGaussian:
+    """The published constants; shares are of its 50,000 steps."""
+
+    learned: ClassVar[frozenset[str]] = frozenset(
+        {"harmonics", "strength_logits", "roughness_logits", "base_color_logits"}
+    )
+    restarts_at: float = 18_000 / 50_000
+    """Share of the steps that shade primitives, not pixels."""
+    harmonics_from: float = 5_000 / 50_000
+    """Share of the steps after which diffuse light depends on direction."""
+    metalness: float = 0.01
+    roughness: float = 0.1
+    base_color: float = 0.5
+    propagated_metalness: float = 0.02
+    """Surfels of at least this metalness…"""
+    propagated_roughness: float = 0.1
+    """…and at most this roughness are enlarged to spread their normals."""
+    disturbance: float = 0.4
+    """Diffuse color of the others changes at random by up to so much, once pixels are shaded."""
+
+    def begun(self, surfels: Surfels, generator: torch.Generator, *, random: bool) -> ShadedSurfels:
+        """Gray, hardly metallic, rather smooth."""
+        return shaded(surfels, surfels.log_scales, self.metalness, self.roughness, self.base_color)
+
+    def seen(
+        self,
+        surfels: ShadedSurfels,
+        camera: RasterCamera,
+        environment: Float[Tensor, "6 3 L L"],
+        share: float,
+        offsets: Float[Tensor, "K 2"] | None = None,
+    ) -> Seen:
+        """By primitives first, then by pixels."""
+        levels = prefiltered(environment)
+        if share < self.restarts_at:
+            return self._by_primitives(surfels, camera, levels, offsets)
+        return self._by_pixels(surfels, camera, levels, share, offsets)
+
+    def penalty(
+        self, seen: Seen, surfels: ShadedSurfels, view: TrainView, neighbor: RasterCamera, share: float
+    ) -> Tensor | None:
+        """None."""
+        return None
+
+    def restarted(self, surfels: ShadedSurfels) -> ShadedSurfels:
+        """Materials as at the start."""
+        fresh = self.begun(surfels, torch.Generator(), random=False)
+        return replace(surfels, **{name: getattr(fresh, name) for name in self.learned})
+
+    def propagated(self, surfels: ShadedSurfels, share: float, generator: torch.Generator) -> ShadedSurfels:
+        """All more opaque, smooth metals larger, and later the diffuse color of the others disturbed."""
+        reflects = torch.sigmoid(surfels.strength_logits) >= self.propagated_metalness
+        reflects &= torch.sigmoid(surfels.roughness_logits) <= self.propagated_roughness
+        return propagated(surfels, reflects, generator, self.disturbance * (share >= self.restarts_at))
+
+    def revived(self, surfels: ShadedSurfels) -> ShadedSurfels:
+        """A metalness of at least that of the start."""
+        return replace(surfels, strength_logits=surfels.strength_logits.clamp(min=logit(self.metalness)))
+
+    def _by_primitives(self, surfels, camera, levels, offsets) -> Seen:
+        views = seen_from(camera, surfels.means)
+        normals = facing(surfel_normals(surfels), views)
+        metal, rough = torch.sigmoid(surfels.strength_logits), torch.sigmoid(surfels.roughness_logits)
+        color = torch.sigmoid(surfels.base_color_logits)
+        around = look_up_rough(levels, normals, torch.full_like(rough, LEVELS[-1]))
+        diffuse = around * color * (1 - metal)[:, None]
+        cosines = -(views * normals).sum(1).clamp(-1, 0)
+        at_normal = DIELECTRIC * (1 - metal)[:, None] + color * metal[:, None]
+        specular = look_up_rough(levels, mirrored(views, normals), rough) * specular_share(at_normal, cosines, rough)
+        surface = blend_surfels(surfels, camera, torch.cat([diffuse, specular], 1), offsets)
+        return Seen(surface, surface.attributes[:3], surface.attributes[3:])
+
+    def blended(
+        self, surfels: ShadedSurfels, camera: RasterCamera, share: float, offsets: Float[Tensor, "K 2"] | None
+    ) -> Blended:
+        """Diffuse and base color, metalness and roughness, eight channels in that order."""
+        views = seen_from(camera, surfels.means)
+        metal, rough = torch.sigmoid(surfels.strength_logits), torch.sigmoid(surfels.roughness_logits)
+        color = torch.sigmoid(surfels.base_color_logits)
+        diffuse = harmonic_color(surfels.harmonics, views, 3 if share >= self.harmonics_from else 0)
+        diffuse = diffuse * (1 - metal)[:, None]
+        attributes = torch.cat([diffuse, color, metal[:, None], rough[:, None]], 1)
+        return blend_surfels(surfels, camera, attributes, offsets)
+
+    def _by_pixels(self, surfels, camera, levels, share, offsets) -> Seen:
+        surface = self.blended(surfels, camera, share, offsets)
+        at = SurfacePixels.of(surface, camera)
+        color, metal, rough = at.of_image(surface.attributes[3:]).split((3, 1, 1), 1)
+        rough = rough[:, 0].clamp(0, 1)
+        at_normal = DIELECTRIC * (1 - metal) + color * metal
+        specular = look_up_rough(levels, at.mirrored, rough) * specular_share(at_normal, at.cosines, rough)
+        return Seen(surface, surface.attributes[:3], at.image(specular, surface.attributes))

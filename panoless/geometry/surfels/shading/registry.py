@@ -1,0 +1,25 @@
+"""The methods by the names that `surfels.shading` takes."""
+
+from panoless.geometry.surfels.shading.base import Shading
+from panoless.geometry.surfels.shading.gaussian_shader import GaussianShader
+from panoless.geometry.surfels.shading.material_refgs import MaterialRefGS
+from panoless.geometry.surfels.shading.ref_gaussian import RefGaussian
+from panoless.geometry.surfels.shading.reflection_strength import ReflectionStrength
+
+LEFT_OUT: dict[str, tuple[str, ...]] = {
+    "ref-gaussian": ("occlusion and light of the object on itself, by a mesh that is traced",),
+    "material-refgs": (
+        "normals and masks that a network predicts",
+        "the perceptual loss",
+        "surroundings of Gaussians that are traced",
+        "patches of 7 × 7 pixels where two views are compared",
+    ),
+}
+"""What a method publishes and its shading lacks, as predictions state it."""
+
+SHADINGS: dict[str, Shading] = {
+    "3dgs-dr": ReflectionStrength(),
+    "gaussian-shader": GaussianShader(),
+    "ref-gaussian": RefGaussian(),
+    "material-refgs": MaterialRefGS(),
+}
