@@ -288,6 +288,12 @@ def check_config(config: FitConfig) -> None:
     """Raise InputError for a value outside the range of its field, and for options that exclude each other."""
     check_record(config, "the configuration", place=_option, remedy="See `panoless fit --help` for what it means.")
     linear = config.albedo or config.loss.photometric == "paper" or config.environment.activation == "sigmoid"
+    if config.surfels.shading != "mirror" and config.environment.solve:
+        raise InputError(
+            expected="the map that the steps leave, where primitives are shaded as another method does",
+            found=f"--config.surfels.shading {config.surfels.shading} with a map that is solved for a mirror",
+            remedy="Use that method's preset, or add --config.environment.no-solve.",
+        )
     linear = linear or config.surfels.shading != "mirror"
     if config.environment.range == "hdr" and linear:
         raise InputError(

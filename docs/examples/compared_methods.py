@@ -20,7 +20,7 @@ from shinypartial.prediction.format import read_info
 PAGE = Path("docs/results/compared-methods.md")
 NUMBERS = Path("docs/results/compared-methods.json")
 PREDICTIONS = Path("predictions/compared-methods")
-STEPS = 2000
+STEPS = 1000
 SHARED = (
     *("--config.iterations", str(STEPS)),
     *("--config.surfels.count", "3000"),
@@ -56,7 +56,6 @@ class Figures:
     method: str
     start: str
     observed: float | None
-    resolved: float | None
     normal_median: float | None
     normal_mean: float | None
     render: float
@@ -71,8 +70,8 @@ def rows(datasets: list[str]) -> list[Row]:
         found.append(Row(dataset, "panoless", "chosen kind", ("--preset", "fast")))
         found.append(Row(dataset, "panoless", "surfels", ("--preset", "fast", "--model", "surfels")))
     for start in STARTS:
-        for dataset in datasets:
-            for method in METHODS:
+        for method in METHODS:
+            for dataset in datasets:
                 arguments = ("--preset", method, *SHARED, "--config.surfels.initial", start)
                 found.append(Row(dataset, method, start, arguments))
     return found
@@ -91,23 +90,18 @@ def made(row: Row, folder: Path) -> Figures:
     seconds = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
     subprocess.run(["shinypartial", "evaluate", str(prediction)], check=True)
     scores, info = read_scores(prediction), read_info(prediction)
-    regions, normals = scores.environment.as_predicted, scores.normals
+    observed, normals = scores.environment.as_predicted.observed, scores.normals
     return Figures(
         dataset=row.dataset,
         method=row.method,
         start=row.start,
-        observed=_psnr(regions.observed),
-        resolved=_psnr(regions.resolved),
+        observed=None if observed is None else observed.psnr_linear,
         normal_median=None if normals is None else normals.median_angular_error_deg,
         normal_mean=None if normals is None else normals.mean_angular_error_deg,
         render=scores.render.psnr,
         cpu_seconds=round(seconds, 1),
         primitives=info.primitives or 0,
     )
-
-
-def _psnr(region) -> float | None:
-    return None if region is None else region.psnr_linear
 
 
 def page(figures: list[Figures]) -> str:
@@ -120,7 +114,7 @@ def page(figures: list[Figures]) -> str:
         "[What the methods are](../explanation/compared-methods.md).",
         f"Others take {STEPS:,} steps by schedules that are scaled to them, with 3,000 primitives at the start",
         "and 8,000 at most, on images of half the size and with a map of 64 texels a face side. Their presets",
-        "take 15 to 30 times as many steps; nothing here says how well they do then. `panoless` is the preset `fast`.",
+        "take 30 to 61 times as many steps; nothing here says how well they do then. `panoless` is the preset `fast`.",
         "Times are CPU seconds of one core of a shared machine, with the start of the program, export and verdict.",
         "`python docs/examples/compared_methods.py --datasets FOLDER` makes this page from",
         "[compared-methods.json](compared-methods.json).",
@@ -130,13 +124,13 @@ def page(figures: list[Figures]) -> str:
         lines += [
             f"## {TITLES.get(dataset, dataset)}",
             "",
-            "| Method | Start | Environment, observed dB | resolved dB | Normals, median ° | mean ° | Render dB "
+            "| Method | Start | Environment, observed dB | Normals, median ° | mean ° | Render dB "
             "| CPU s | Primitives |",
-            "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+            "| --- | --- | --- | --- | --- | --- | --- | --- |",
         ]
         for each in figures:
             if each.dataset == dataset:
-                numbers = each.observed, each.resolved, each.normal_median, each.normal_mean, each.render
+                numbers = each.observed, each.normal_median, each.normal_mean, each.render
                 cells = ["–" if number is None else f"{number:.2f}" for number in numbers]
                 start = STARTS.get(each.start, each.start)
                 row = (each.method, start, *cells, f"{each.cpu_seconds:.0f}", f"{each.primitives:,}")

@@ -110,6 +110,11 @@ def test_a_value_out_of_range_is_named_as_the_command_line_names_it(name: str, v
         check_config(with_value(PRESETS["default"], name, value))
 
 
+def test_a_map_of_mirrors_is_not_solved_for_other_shading() -> None:
+    with pytest.raises(InputError, match=r"no-solve"):
+        check_config(with_value(PRESETS["default"], "surfels.shading", "3dgs-dr"))
+
+
 @pytest.mark.parametrize(("name", "value"), [("loss.lambda_distortion", 1000.0), ("crop_margin_px", -1), ("seed", -5)])
 def test_unusual_values_are_allowed(name: str, value: float) -> None:
     check_config(with_value(PRESETS["default"], name, value))

@@ -7,12 +7,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.rays import Rays
-from panoless.geometry.base import SOLID_SURFACE_ALPHA, SurfaceBuffers
+from panoless.geometry.base import SOLID_SURFACE_ALPHA, Mesh, SurfaceBuffers
 from panoless.geometry.exact import mirrored_directions
-from panoless.geometry.surfels.mirror import SurfelMirror
+from panoless.geometry.surfels.mirror import SH_DEGREE_0, SurfelMirror
 from panoless.geometry.surfels.model import ShadedSurfels, Surfels
 from panoless.geometry.surfels.objective import StepObjective, generator_of
 from panoless.geometry.surfels.rendering import ALPHA_FLOOR
@@ -80,6 +81,12 @@ class ShadedMirror(SurfelMirror):
         dark, seen = self.buffers(camera), self._seen(camera, environment)
         added = (seen.diffuse + seen.specular - dark.albedo).flatten(1)[:, pixels]
         return (added / dark.alpha.flatten()[pixels].clamp(min=ALPHA_FLOOR)).T
+
+    def mesh(self, frame: ObjectFrame) -> Mesh:
+        """The cloud of a mirror, with diffuse color as viewers of splats know it."""
+        surfels = cast(ShadedSurfels, self.surfels)
+        albedo = 0.5 + SH_DEGREE_0 * surfels.harmonics[:, 0]
+        return super(ShadedMirror, replace(self, surfels=replace(surfels, albedo=albedo))).mesh(frame)
 
     def _seen(self, camera: RasterCamera, environment: Float[Tensor, "6 3 L L"]) -> Seen:
         with torch.no_grad():

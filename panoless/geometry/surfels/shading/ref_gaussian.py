@@ -50,7 +50,7 @@ class RefGaussian:
     base_color: float = 0.5
     propagated_metalness: float = 0.02
     """Surfels of at least this metalness…"""
-    propagated_roughness: float = 0.1
+    propagated_roughness: float = 0.01
     """…and at most this roughness are enlarged to spread their normals."""
     disturbance: float = 0.4
     """Diffuse color of the others changes at random by up to so much, once pixels are shaded."""

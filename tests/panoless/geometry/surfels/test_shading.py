@@ -228,7 +228,25 @@ def test_a_method_takes_its_steps_and_survives_its_file(preset: str, views: View
     first, second = (each.shade(world(), camera, pixels, unread) for each in (mirror, again))
     assert torch.equal(first, second)
     assert again.num_parameters == mirror.num_parameters > 0
+    columns = mirror.mesh(views.object_frame).columns
+    assert columns["f_dc_1"] == pytest.approx(mirror.surfels.harmonics[:, 0, 1].numpy(), abs=1e-5)  # type: ignore[attr-defined]
 
 
 def test_logits_are_those_of_shares() -> None:
     assert torch.sigmoid(torch.tensor(logit(0.02))) == pytest.approx(0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", METHODS)
+def test_a_method_learns_a_mirror_ball(preset: str, views: Views) -> None:
+    """From our first surface, in 300 steps without density control and resets; the loss of the first and last views."""
+    config = method_config(preset, iterations=300, count=400)
+    config = replace(config, density=replace(config.density, enabled=False))
+    family = SurfelFamily()
+    start = family.fit(views, Proposal(None, 0.0, 1.0), config)
+    trainer = SurfelTrainer(views, start, family.begin(views, start, config), config, Unobserved())  # type: ignore[arg-type]
+    losses = [trainer.step().photometric for _ in range(config.iterations)]
+    count = len(views.train)
+    first, last = sum(losses[:count]) / count, sum(losses[-count:]) / count
+    # 0.43 measured for 3dgs-dr, whose strength has far to go, 0.14 to 0.28 for the others.
+    assert last < 0.6 * first
