@@ -42,7 +42,7 @@ def find_fragment(splats, k, pixels):
 
 
 @triton.jit
-def blend_forward(
+def splats_forward(
     splats, attributes, entries, starts, channels, alphas, width, height, count, TILE: tl.constexpr, WIDE: tl.constexpr
 ):
     """Write the images of one tile; `WIDE` is a power of two of at least `count` channels."""
@@ -70,7 +70,7 @@ def blend_forward(
 
 
 @triton.jit
-def blend_back(
+def splats_back(
     splats,
     attributes,
     entries,
@@ -152,7 +152,7 @@ class _BlendSplats(torch.autograd.Function):
         count = attributes.shape[1]
         channels, alphas = splats.new_empty(count, height, width), splats.new_empty(height, width)
         ctx.setting = width, height, count, tile, triton.next_power_of_2(count)
-        _launch(blend_forward, ctx.setting, splats, attributes, entries, starts, channels, alphas)
+        _launch(splats_forward, ctx.setting, splats, attributes, entries, starts, channels, alphas)
         ctx.save_for_backward(splats, attributes, entries, starts, channels, alphas)
         return channels, alphas
 
@@ -163,7 +163,7 @@ class _BlendSplats(torch.autograd.Function):
         totals = (channels * channel_cotangents).sum(0) + alphas * alpha_cotangents
         cotangents = channel_cotangents.contiguous(), alpha_cotangents.contiguous(), totals
         found, pulled = torch.zeros_like(splats), torch.zeros_like(attributes)
-        _launch(blend_back, ctx.setting, splats, attributes, entries, starts, *cotangents, found, pulled)
+        _launch(splats_back, ctx.setting, splats, attributes, entries, starts, *cotangents, found, pulled)
         return found[:, :2], found[:, 2:5], found[:, 5], pulled, None, None, None, None
 
 

@@ -12,6 +12,7 @@ import torch
 
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.image import depth_normals, ssim
+from tests.support.splat_scenes import blended, random_splats
 from tests.support.surfel_scenes import IMAGES, random_scene, tilted_camera
 from tests.support.triton_compilation import ARCHITECTURES, Launch, launch_of
 
@@ -33,7 +34,10 @@ ELEMENTWISE = {
     "chain": 1,
 }
 TILES = {"blend": 2, "blend_backward": 2}
-"""Kernels and in how many variants they are launched: flat and curved."""
+"""Kernels and in how many variants they are launched: surfels are flat and curved."""
+SPLATS = {"splats_forward": 1, "splats_back": 1}
+SPLAT_CHANNELS = 12
+"""As many as the widest method blends."""
 
 
 def run_every_operator() -> None:
@@ -42,6 +46,10 @@ def run_every_operator() -> None:
         scene = random_scene(2, 1, curved, tilted_camera(width=9, height=7)).cast(torch.float32)
         buffers = scene.render("gpu")
         sum(getattr(buffers, name).sum() for name in IMAGES).backward()
+    splats = random_splats(2, 1, channels=SPLAT_CHANNELS)
+    leaves = {name: value.float().requires_grad_() for name, value in splats.items()}
+    images = blended(leaves, "gpu", torch.tensor([1.0, 2.0]))
+    (images.channels.sum() + images.alpha.sum()).backward()
     cubemap = torch.ones(6, 3, 2, 2, requires_grad=True)
     directions = torch.ones(3, 3, requires_grad=True)
     depth = torch.ones(4, 4, requires_grad=True)
@@ -52,7 +60,7 @@ def run_every_operator() -> None:
 
 
 def test_every_kernel_compiles_for_real_gpus_without_spilling(device: torch.device, monkeypatch: pytest.MonkeyPatch):
-    """For sm_80 and sm_90; no kernel spills registers, and the tile kernels, one warp each, wait at no barrier."""
+    """For sm_80 and sm_90; no kernel spills registers, and the tile kernels of surfels, one warp each, wait at no barrier."""
     if device.type != "cpu":
         pytest.skip("on a GPU the other tests compile the kernels")
     from triton.runtime.interpreter import InterpretedFunction
@@ -70,7 +78,7 @@ def test_every_kernel_compiles_for_real_gpus_without_spilling(device: torch.devi
     monkeypatch.setattr(InterpretedFunction, "run", record)
     run_every_operator()
     names = [launch.name for launch in launches]
-    assert {name: names.count(name) for name in names} == ELEMENTWISE | TILES
+    assert {name: names.count(name) for name in names} == ELEMENTWISE | TILES | SPLATS
 
     environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
     done = subprocess.run(
