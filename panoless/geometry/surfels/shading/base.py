@@ -64,7 +64,7 @@ class Shading(Protocol):
         """Share of the steps after which materials and map begin anew; 0: they never do."""
         ...
 
-    def begun(self, surfels: Surfels, generator: torch.Generator, *, random: bool) -> ShadedSurfels:
+    def begun(self, surfels: Surfels, *, random: bool) -> ShadedSurfels:
         """Its primitives where surfels lie, which were placed at random or on a surface."""
         ...
 
@@ -85,10 +85,6 @@ class Shading(Protocol):
         """What the objective has beyond the image, consistent normals and the silhouette; the neighbor is the camera of
         another view, the nearest one.
         """
-        ...
-
-    def restarted(self, surfels: ShadedSurfels) -> ShadedSurfels:
-        """With materials as at the start."""
         ...
 
     def propagated(self, surfels: ShadedSurfels, share: float, generator: torch.Generator) -> ShadedSurfels:

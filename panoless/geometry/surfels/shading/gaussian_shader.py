@@ -47,7 +47,7 @@ class GaussianShader:
     least_opacity: float = 1e-3
     """Opacities are taken to be this far inside (0, 1) in that."""
 
-    def begun(self, surfels: Surfels, generator: torch.Generator, *, random: bool) -> ShadedSurfels:
+    def begun(self, surfels: Surfels, *, random: bool) -> ShadedSurfels:
         """Half a mirror's tint, rather rough."""
         return shaded(surfels, solid_scales(surfels, random=random), 0.5, self.roughness, self.tint)
 
@@ -79,10 +79,6 @@ class GaussianShader:
         spread = (opacities.log() + (1 - opacities).log()).mean()
         lengths = (surfels.normal_residuals.square().sum(2) + 1e-12).sqrt().mean()
         return self.predicted_normal * agreement + self.binary * spread + self.residual * lengths
-
-    def restarted(self, surfels: ShadedSurfels) -> ShadedSurfels:
-        """Never called."""
-        return surfels
 
     def propagated(self, surfels: ShadedSurfels, share: float, generator: torch.Generator) -> ShadedSurfels:
         """As they are: it has no propagation."""

@@ -15,7 +15,7 @@ from panoless.geometry.base import SOLID_SURFACE_ALPHA, Mesh, SurfaceBuffers
 from panoless.geometry.exact import mirrored_directions
 from panoless.geometry.surfels.mirror import SH_DEGREE_0, SurfelMirror
 from panoless.geometry.surfels.model import ShadedSurfels, Surfels
-from panoless.geometry.surfels.objective import StepObjective, generator_of
+from panoless.geometry.surfels.objective import StepObjective
 from panoless.geometry.surfels.rendering import ALPHA_FLOOR
 from panoless.geometry.surfels.shading.base import Seen
 from panoless.geometry.surfels.shading.objective import ShadedObjective, learned_by
@@ -37,9 +37,8 @@ class ShadedMirror(SurfelMirror):
         """Primitives of the configured method where surfels are; the surfels themselves where they mirror."""
         if config.surfels.shading not in SHADINGS:
             return mirror
-        generator = generator_of(config.seed, 5)
         random = config.surfels.initial == "random" and mirror.started_on is None
-        surfels = SHADINGS[config.surfels.shading].begun(mirror.surfels, generator, random=random)
+        surfels = SHADINGS[config.surfels.shading].begun(mirror.surfels, random=random)
         return cls(**{**vars(mirror), "surfels": surfels, "curved": False, "shading": config.surfels.shading})
 
     @property

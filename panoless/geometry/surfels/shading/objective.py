@@ -1,5 +1,6 @@
 """What the steps of other methods minimize: their image beside the photograph, and what a method adds to that."""
 
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -77,8 +78,9 @@ class ShadedObjective:
         return 0 < iteration == round(self._shading.restarts_at * self._config.iterations)
 
     def restarted(self, surfels: Surfels) -> Surfels:
-        """With the method's first materials."""
-        return self._shading.restarted(cast(ShadedSurfels, surfels))
+        """With the method's first materials; shapes stay."""
+        fresh = self._shading.begun(surfels, random=False).named()
+        return replace(surfels, **{name: fresh[name] for name in self._shading.learned})
 
     def revived(self, surfels: Surfels) -> Surfels:
         """After opacities were reset."""

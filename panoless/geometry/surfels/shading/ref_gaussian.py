@@ -55,7 +55,7 @@ class RefGaussian:
     disturbance: float = 0.4
     """Diffuse color of the others changes at random by up to so much, once pixels are shaded."""
 
-    def begun(self, surfels: Surfels, generator: torch.Generator, *, random: bool) -> ShadedSurfels:
+    def begun(self, surfels: Surfels, *, random: bool) -> ShadedSurfels:
         """Gray, hardly metallic, rather smooth."""
         return shaded(surfels, surfels.log_scales, self.metalness, self.roughness, self.base_color)
 
@@ -78,11 +78,6 @@ class RefGaussian:
     ) -> Tensor | None:
         """None."""
         return None
-
-    def restarted(self, surfels: ShadedSurfels) -> ShadedSurfels:
-        """Materials as at the start."""
-        fresh = self.begun(surfels, torch.Generator(), random=False)
-        return replace(surfels, **{name: getattr(fresh, name) for name in self.learned})
 
     def propagated(self, surfels: ShadedSurfels, share: float, generator: torch.Generator) -> ShadedSurfels:
         """All more opaque, smooth metals larger, and later the diffuse color of the others disturbed."""

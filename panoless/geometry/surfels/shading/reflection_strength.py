@@ -43,7 +43,7 @@ class ReflectionStrength:
     disturbance: float = 0.4
     """The color of the others changes at random by up to so much."""
 
-    def begun(self, surfels: Surfels, generator: torch.Generator, *, random: bool) -> ShadedSurfels:
+    def begun(self, surfels: Surfels, *, random: bool) -> ShadedSurfels:
         """Gray, hardly reflecting."""
         return shaded(surfels, solid_scales(surfels, random=random), self.strength, 0.5)
 
@@ -74,10 +74,6 @@ class ReflectionStrength:
     ) -> Tensor | None:
         """None."""
         return None
-
-    def restarted(self, surfels: ShadedSurfels) -> ShadedSurfels:
-        """Never called."""
-        return surfels
 
     def propagated(self, surfels: ShadedSurfels, share: float, generator: torch.Generator) -> ShadedSurfels:
         """All more opaque, those that reflect larger, the color of the others disturbed."""

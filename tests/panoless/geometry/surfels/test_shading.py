@@ -53,7 +53,7 @@ def sphere(name: str, views: Views) -> ShadedSurfels:
     frame = views.object_frame
     surfels = sphere_surfels(900, 1 / frame.radius)
     surfels = replace(surfels, means=surfels.means - torch.from_numpy(frame.center / frame.radius).float())
-    return SHADINGS[name].begun(surfels, torch.Generator().manual_seed(0), random=False)
+    return SHADINGS[name].begun(surfels, random=False)
 
 
 def mirrors(primitives: ShadedSurfels) -> ShadedSurfels:
@@ -123,7 +123,7 @@ def test_gradients_of_materials(name: str, views: Views, view: TrainView) -> Non
 
 def test_propagation_spreads_what_reflects() -> None:
     flat = sphere_surfels(50, 1.0)
-    primitives = SHADINGS["3dgs-dr"].begun(flat, torch.Generator(), random=False)
+    primitives = SHADINGS["3dgs-dr"].begun(flat, random=False)
     reflects = torch.arange(50) < 20
     found = propagated(primitives, reflects, torch.Generator().manual_seed(1), disturbance=0.4)
     assert (found.opacities >= 0.9 - 1e-6).all()

@@ -60,7 +60,7 @@ def run_every_operator() -> None:
 
 
 def test_every_kernel_compiles_for_real_gpus_without_spilling(device: torch.device, monkeypatch: pytest.MonkeyPatch):
-    """For sm_80 and sm_90; no kernel spills registers, and the tile kernels of surfels, one warp each, wait at no barrier."""
+    """For sm_80 and sm_90; none spills registers, and those of tiles of surfels, one warp each, meet no barrier."""
     if device.type != "cpu":
         pytest.skip("on a GPU the other tests compile the kernels")
     from triton.runtime.interpreter import InterpretedFunction
