@@ -167,7 +167,11 @@ def fit_in_pieces(dataset: Dataset, config: FitConfig, folder: Path, stops: tupl
     return fit(dataset, config, folder)
 
 
-@pytest.mark.parametrize("preset", ["default", "paper", "paper-rho-weighted"])
+#: One that begins materials anew between the stops, and one of 3D Gaussians.
+COMPARED = [pytest.param(preset, marks=pytest.mark.slow) for preset in ("ref-gaussian", "3dgs-dr")]
+
+
+@pytest.mark.parametrize("preset", ["default", "paper", "paper-rho-weighted", *COMPARED])
 def test_an_interrupted_fit_ends_as_an_uninterrupted_one(preset: str, tmp_path: Path, sphere_dataset: Dataset) -> None:
     config = tiny_config(preset, iterations=40, count=120)
     whole = fit(sphere_dataset, config, tmp_path / "whole")
