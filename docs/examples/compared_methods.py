@@ -20,7 +20,7 @@ from shinypartial.prediction.format import read_info
 PAGE = Path("docs/results/compared-methods.md")
 NUMBERS = Path("docs/results/compared-methods.json")
 PREDICTIONS = Path("predictions/compared-methods")
-STEPS = {"vase": 3000, "mirror": 1000, "tiny-vase": 1000}
+STEPS = {"vase": (1000, 3000), "mirror": (1000,), "tiny-vase": (1000,)}
 SHARED = (
     *("--config.surfels.count", "3000"),
     *("--config.density.max-surfels", "8000"),
@@ -40,11 +40,18 @@ class Row:
     method: str
     start: str
     arguments: tuple[str, ...]
+    steps: int = 0
+    """Zero where a preset says how many."""
 
     @property
     def name(self) -> str:
         """Of its folder."""
-        return f"{self.dataset}-{self.method}-{self.start}".replace(" ", "-")
+        return f"{self.dataset}-{self.method}-{self.start}-{self.steps}".replace(" ", "-")
+
+    @property
+    def key(self) -> tuple[str, str, str, int]:
+        """What tells its figures from others."""
+        return self.dataset, self.method, self.start, self.steps
 
 
 @dataclass(frozen=True)
@@ -54,12 +61,18 @@ class Figures:
     dataset: str
     method: str
     start: str
+    steps: int
     observed: float | None
     normal_median: float | None
     normal_mean: float | None
     render: float
     cpu_seconds: float
     primitives: int
+
+    @property
+    def key(self) -> tuple[str, str, str, int]:
+        """As that of its row."""
+        return self.dataset, self.method, self.start, self.steps
 
 
 def rows(datasets: list[str]) -> list[Row]:
@@ -71,9 +84,9 @@ def rows(datasets: list[str]) -> list[Row]:
     for start in STARTS:
         for method in METHODS:
             for dataset in datasets:
-                steps = "--config.iterations", str(STEPS[dataset])
-                arguments = ("--preset", method, *SHARED, *steps, "--config.surfels.initial", start)
-                found.append(Row(dataset, method, start, arguments))
+                for steps in STEPS[dataset]:
+                    how = "--config.iterations", str(steps), "--config.surfels.initial", start
+                    found.append(Row(dataset, method, start, ("--preset", method, *SHARED, *how), steps))
     return found
 
 
@@ -95,6 +108,7 @@ def made(row: Row, folder: Path) -> Figures:
         dataset=row.dataset,
         method=row.method,
         start=row.start,
+        steps=row.steps,
         observed=None if observed is None else observed.psnr_linear,
         normal_median=None if normals is None else normals.median_angular_error_deg,
         normal_mean=None if normals is None else normals.mean_angular_error_deg,
@@ -124,18 +138,17 @@ def page(figures: list[Figures]) -> str:
         lines += [
             f"## {TITLES[dataset]}",
             "",
-            f"{STEPS[dataset]:,} steps.",
-            "",
-            "| Method | Start | Environment, observed dB | Normals, median ° | mean ° | Render dB "
+            "| Method | Start | Steps | Environment, observed dB | Normals, median ° | mean ° | Render dB "
             "| CPU s | Primitives |",
-            "| --- | --- | --- | --- | --- | --- | --- | --- |",
+            "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
         ]
         for each in figures:
             if each.dataset == dataset:
                 numbers = each.observed, each.normal_median, each.normal_mean, each.render
                 cells = ["–" if number is None else f"{number:.2f}" for number in numbers]
                 start = STARTS.get(each.start, each.start)
-                row = (each.method, start, *cells, f"{each.cpu_seconds:.0f}", f"{each.primitives:,}")
+                steps = f"{each.steps:,}" if each.steps else "–"
+                row = (each.method, start, steps, *cells, f"{each.cpu_seconds:.0f}", f"{each.primitives:,}")
                 lines.append("| " + " | ".join(row) + " |")
         lines.append("")
     return "\n".join(lines)
@@ -157,7 +170,7 @@ def main() -> None:
     arguments = parser.parse_args()
     known = [Figures(**each) for each in read_json(NUMBERS, "the figures")] if NUMBERS.exists() else []
     for row in [] if arguments.collect else rows(arguments.rows):
-        if not any((each.dataset, each.method, each.start) == (row.dataset, row.method, row.start) for each in known):
+        if row.key not in {each.key for each in known}:
             known.append(made(row, arguments.datasets))
             write(known)
     write(known)
