@@ -242,7 +242,8 @@ class PrintBoard:
 
     def run(self) -> None:
         """Write the file and say how to print it."""
-        from panoless.photographs.board import BOARDS, write_board
+        from panoless.photographs.board import write_board
+        from shinypartial.core.board import BOARDS
 
         board = BOARDS[self.paper]
         write_board(board, self.output)

@@ -4,17 +4,20 @@ The only module that joins the Blender room to the dataset room. A run that is k
 started again: files appear whole or not at all, and a frame that is there is not rendered twice.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from shinypartial import __version__
 from shinypartial.blender.runtime import check_blender
 from shinypartial.blender.worker_pool import PoolClosed, WorkerPool, open_pool
 from shinypartial.core.sphere import latlong_directions
-from shinypartial.core.trajectory import plan_cameras
+from shinypartial.core.trajectory import Trajectory, plan_cameras
 from shinypartial.dataset.camera_plot import CAMERA_PLOT, plot_cameras
 from shinypartial.dataset.schema import (
     CHECKSUMS,
@@ -44,6 +47,9 @@ from shinypartial.release.contact_sheet import write_contact_sheet
 from shinypartial.release.statistics import dataset_statistics
 from shinypartial.scene import FileWorld, SceneSpec, older_recipe
 
+FRAME_NAME = "r_{:03d}"
+#: Directions along each side of a texel of the map for what a near sheet shows there.
+GROUND_SAMPLES = 4
 STUDIO_LIGHT_SOURCE = "Blender's studio lights, by Greg Zaal (Poly Haven, https://polyhaven.com)"
 
 
@@ -56,15 +62,29 @@ class Generated:
     kept: int
 
 
-def generate(spec: SceneSpec, root: Path) -> Generated:
+@dataclass(frozen=True)
+class Shots:
+    """Cameras of another origin than the recipe's path, how the training views are named, and what the recipe adds."""
+
+    trajectory: Trajectory
+    train_name: str
+    recipe: dict[str, Any]
+
+
+def generate(spec: SceneSpec, root: Path, shots: Shots | None = None) -> Generated:
     """Make the dataset of a recipe in the folder `root`, or finish what an earlier run began there.
+
+    Cameras are those of the recipe's path unless `shots` are given.
 
     Raises InputError when the folder holds something else or Blender can't run; OSError when it can't be written.
     """
-    trajectory = plan_cameras(spec.camera, spec.render.resolution)
-    frames = {split: make_frames(root, split, getattr(trajectory, split)) for split in SPLITS}
+    shots = shots or Shots(plan_cameras(spec.camera, spec.render.resolution), FRAME_NAME, {})
+    trajectory = shots.trajectory
+    names = {"train": shots.train_name, "test": FRAME_NAME}
+    frames = {split: make_frames(root, split, getattr(trajectory, split), names[split]) for split in SPLITS}
     every = [frame for split in SPLITS for frame in frames[split]]
-    recipe = _as_begun(root, {**spec.recipe(), "hemisphere_axis": trajectory.hemisphere_axis.tolist()})
+    begun = {**spec.recipe(), **shots.recipe, "hemisphere_axis": trajectory.hemisphere_axis.tolist()}
+    recipe = _as_begun(root, begun)
     if not _is_complete(root, every):
         check_blender()
     with folder_lock(root):
@@ -80,11 +100,17 @@ def generate(spec: SceneSpec, root: Path) -> Generated:
             plot_cameras(root / CAMERA_PLOT, trajectory)
         missing = [frame for frame in every if not is_rendered(frame)]
         if missing:
-            _render_frames(spec, missing, len(every))
+            render_frames(spec, missing, len(every), _make_frame)
         write_contact_sheet(root, frames["train"], read_exr_rgb(root / ENVIRONMENT_LATLONG))
         statistics = dataset_statistics(frames["train"], frames["test"])
-        complete_dataset(root, licenses(spec), {**statistics, "object_radius": spec.extent})
+        complete_dataset(root, licenses(spec), {**statistics, **_places(spec)})
     return Generated(root, len(missing), len(every) - len(missing))
+
+
+def _places(spec: SceneSpec) -> dict[str, Any]:
+    """What scores need to know of the scene: how far the object reaches, and where the world of its board begins."""
+    corner = spec.ground.board_corner if spec.ground else None
+    return {"object_radius": spec.extent} | ({"board_corner": list(corner)} if corner else {})
 
 
 def _generator() -> dict[str, Any]:
@@ -112,11 +138,17 @@ def _is_complete(root: Path, frames: Sequence[Frame]) -> bool:
     return (root / CHECKSUMS).exists() and all(map(is_rendered, frames))
 
 
-def _render_frames(spec: SceneSpec, frames: Sequence[Frame], total: int) -> None:
+def render_frames(
+    spec: SceneSpec,
+    frames: Sequence[Frame],
+    total: int,
+    make: Callable[[WorkerPool, Frame], None],
+    title: str = "Rendering",
+) -> None:
     """Render and write; while a thread writes its frame, another's is being rendered."""
-    progress = Progress("Rendering", total, total - len(frames))
+    progress = Progress(title, total, total - len(frames))
     with open_pool(spec) as pool, ThreadPoolExecutor(pool.plan.workers + 1) as writers:
-        results = [writers.submit(_make_frame, pool, frame) for frame in frames]
+        results = [writers.submit(_closing, make, pool, frame) for frame in frames]
         try:
             for done in as_completed(results):
                 done.result()
@@ -131,18 +163,23 @@ def _render_frames(spec: SceneSpec, frames: Sequence[Frame], total: int) -> None
 
 
 def _make_frame(pool: WorkerPool, frame: Frame) -> None:
-    """One frame from camera to files; where it fails nothing else is begun."""
+    """One frame from camera to files."""
+    rendered = pool.render(frame.camera, frame.name)
+    view = View(
+        rendered.radiance,
+        rendered.alpha,
+        rendered.normals_world,
+        rendered.depth,
+        high_dynamic_range=True,
+        self_reflection=rendered.self_reflection,
+    )
+    write_view(frame, view)
+
+
+def _closing(make: Callable[[WorkerPool, Frame], None], pool: WorkerPool, frame: Frame) -> None:
+    """Make a frame; where that fails nothing else is begun."""
     try:
-        rendered = pool.render(frame.camera, frame.name)
-        view = View(
-            rendered.radiance,
-            rendered.alpha,
-            rendered.normals_world,
-            rendered.depth,
-            high_dynamic_range=True,
-            self_reflection=rendered.self_reflection,
-        )
-        write_view(frame, view)
+        make(pool, frame)
     except BaseException:
         pool.close()
         raise
@@ -153,10 +190,26 @@ def _write_ground_truth(spec: SceneSpec, root: Path) -> None:
     from shinypartial.blender.assemble import world_radiance
 
     if not (root / ENVIRONMENT_LATLONG_Y_UP).exists():
-        write_environment(root, world_radiance(spec.world, spec.render.exposure))
-    if spec.room and not (root / ENVIRONMENT_INVERSE_DISTANCE).exists():
+        write_environment(root, _environment(spec, world_radiance(spec.world, spec.render.exposure)))
+    if (spec.room or spec.ground) and not (root / ENVIRONMENT_INVERSE_DISTANCE).exists():
         height = read_exr_rgb(root / ENVIRONMENT_LATLONG).shape[0]
-        write_inverse_distance(root, spec.room.inverse_distance(latlong_directions(height)))
+        directions = latlong_directions(height)
+        inverse_distance = spec.inverse_distance(directions.reshape(-1, 3))
+        write_inverse_distance(root, inverse_distance.reshape(directions.shape[:2]))
+
+
+def _environment(spec: SceneSpec, world: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
+    """What arrives at the origin: the world, and the ground before it, which is averaged over each texel."""
+    if spec.ground is None:
+        return world
+    height = world.shape[0]
+    fine = latlong_directions(GROUND_SAMPLES * height).reshape(-1, 3)
+    meets, points = spec.ground.seen_from_origin(fine)
+    light = np.zeros((len(fine), 3), np.float32)
+    light[meets] = spec.ground.radiance_at(points[:, :2]) * np.float32(2.0**spec.render.exposure)
+    blocks = height, GROUND_SAMPLES, 2 * height, GROUND_SAMPLES
+    share = meets.reshape(blocks).mean((1, 3))[..., None].astype(np.float32)
+    return (1 - share) * world + light.reshape(*blocks, 3).mean((1, 3))
 
 
 def licenses(spec: SceneSpec) -> list[dict[str, str]]:

@@ -1,59 +1,33 @@
-"""A ChArUco board under the object: to print, and as the measure of cameras.
-
-The pattern is made of cells of a third of a centimeter less: nine to a square, seven to a marker, so that it prints as
-rectangles.
-"""
+"""A ChArUco board under the object: to print, and as the measure of cameras."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from panoless.photographs.frames import Frames
 from panoless.photographs.lens import Lens, opencv
 from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import PosedView, Poses, as_rows
+from shinypartial.core.board import CELLS_OF_MARKER, CELLS_OF_SQUARE, MM, Board
 from shinypartial.core.errors import InputError
 from shinypartial.io.files import atomic_write, write_text
 from shinypartial.io.images import read_png
 
-CELLS_OF_SQUARE, CELLS_OF_MARKER = 9, 7
 #: From the board's axes (x right, y down, z into it) to the world's: x right, y up the sheet, z out of it.
 BOARD_TO_WORLD = np.diag([1.0, -1.0, -1.0, 1.0])
 OUTLIER_ROUNDS = 3
-MM, POINTS_PER_MM = 1e-3, 72 / 25.4
+POINTS_PER_MM = 72 / 25.4
 
 
-@dataclass(frozen=True)
-class Board:
-    """A chessboard with markers in its white squares, and the paper that it is printed on."""
-
-    columns: int
-    rows: int
-    paper_mm: tuple[float, float]
-    square_mm: float = 27.0
-
-    def drawn_by_opencv(self) -> Any:
-        """The board as OpenCV has it, in meters."""
-        aruco = opencv().aruco
-        side = self.square_mm * MM
-        dictionary = aruco.getPredefinedDictionary(aruco.DICT_5X5_100)
-        return aruco.CharucoBoard((self.columns, self.rows), side, side * CELLS_OF_MARKER / CELLS_OF_SQUARE, dictionary)
-
-    def cells(self) -> Bool[np.ndarray, "rows columns"]:
-        """Which cells are black."""
-        size = (self.columns * CELLS_OF_SQUARE, self.rows * CELLS_OF_SQUARE)
-        return self.drawn_by_opencv().generateImage(size, marginSize=0) < 128
-
-
-#: By the name of the paper. All have squares of 27 mm, and margins that printers leave.
-BOARDS = {
-    "A4": Board(7, 10, (210.0, 297.0)),
-    "Letter": Board(7, 9, (215.9, 279.4)),
-    "A3": Board(10, 14, (297.0, 420.0)),
-}
+def drawn_by_opencv(board: Board) -> Any:
+    """The board as OpenCV has it, in meters."""
+    aruco = opencv().aruco
+    side = board.square_mm * MM
+    dictionary = aruco.getPredefinedDictionary(aruco.DICT_5X5_100)
+    return aruco.CharucoBoard((board.columns, board.rows), side, side * CELLS_OF_MARKER / CELLS_OF_SQUARE, dictionary)
 
 
 def write_board(board: Board, path: Path) -> None:
@@ -134,7 +108,7 @@ def find_board(board: Board, frames: Frames, folder: Path, options: CaptureOptio
     cv2 = opencv()
     parameters = cv2.aruco.CharucoParameters()
     parameters.minMarkers = 1  # The object hides markers; corners that are found wrong are outliers.
-    detector = cv2.aruco.CharucoDetector(board.drawn_by_opencv(), parameters)
+    detector = cv2.aruco.CharucoDetector(drawn_by_opencv(board), parameters)
     sightings = []
     for photograph in frames.photographs:
         gray = cv2.cvtColor(read_png(folder / f"{photograph.name}.png")[..., :3].copy(), cv2.COLOR_RGB2GRAY)
@@ -202,7 +176,7 @@ class _Adjusted:
 
 def _points_and_places(board: Board, sightings: list[Sighting]) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Corners in meters on the board and in pixels, as OpenCV takes them."""
-    points = np.asarray(board.drawn_by_opencv().getChessboardCorners(), np.float32)
+    points = np.asarray(drawn_by_opencv(board).getChessboardCorners(), np.float32)
     places = [sighting.places_px.astype(np.float32) for sighting in sightings]
     return [points[sighting.corners] for sighting in sightings], places
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from panoless.photographs.board import BOARDS, Board, poses_from_board
+from panoless.photographs.board import poses_from_board
 from panoless.photographs.frames import Frames, block_means, make_frames, source_files
 from panoless.photographs.hull import nearest_point
 from panoless.photographs.masks import Box, Masks, find_masks, given_mask, overlaps_of
@@ -16,6 +16,7 @@ from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import PosedView, Poses, without_the_rest
 from panoless.photographs.stage import stage
 from panoless.photographs.structure import REMEDY, poses_from_structure
+from shinypartial.core.board import BOARDS, Board, Paper
 from shinypartial.core.errors import InputError
 from shinypartial.core.trajectory import Trajectory
 from shinypartial.dataset.camera_plot import plot_cameras
@@ -39,7 +40,7 @@ class Request:
     """A folder of photographs, or a video."""
     output: Path
     colmap: Path | None = None
-    board: str | None = None
+    board: Paper | None = None
     square_mm: float | None = None
     """As measured on the print; None for what was meant to be printed."""
     masks: Path | None = None

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from shinypartial.blender.cameras import add_camera
 from shinypartial.blender.geometry import make_mesh
+from shinypartial.blender.ground import add_ground
 from shinypartial.blender.materials import environment_color, make_room_material
 from shinypartial.blender.objects import mesh_of, place_objects
 from shinypartial.blender.output import add_passes, set_file
@@ -18,6 +19,7 @@ from shinypartial.core.errors import InputError
 from shinypartial.io.images import read_exr_rgb
 from shinypartial.scene import FileWorld, Render, Room, SceneSpec, Sphere, StudioWorld
 
+ROOM = "room"
 #: Measured in Blender's own maps: −0.0022 (forest), beside radiance up to 1400.
 LOWEST_RADIANCE = -1e-2
 
@@ -32,6 +34,8 @@ def assemble(bpy: Any, spec: SceneSpec) -> str:
     _set_output(scene, spec.render)
     place_objects(bpy, scene, spec)
     _surround(bpy, scene, spec)
+    if spec.ground:
+        add_ground(bpy, scene, spec.ground, spec.render.exposure)
     add_camera(bpy, scene, spec)
     assemble_probe(bpy)
     return device
@@ -98,7 +102,7 @@ def _surround(bpy: Any, scene: Any, spec: SceneSpec) -> None:
     _background(scene.world, spec.light_factor).inputs["Color"].default_value = (0, 0, 0, 1)
     mesh = _room_mesh(bpy, spec.room)
     mesh.materials.append(make_room_material(bpy, image, spec.light_factor))
-    room = bpy.data.objects.new("room", mesh)
+    room = bpy.data.objects.new(ROOM, mesh)
     room.visible_camera = False
     scene.collection.objects.link(room)
 

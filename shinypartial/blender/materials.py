@@ -2,6 +2,9 @@
 
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from shinypartial.scene import Material
 
 DEPTH_PASS = "z_depth"
@@ -80,6 +83,33 @@ def make_light_material(bpy: Any, radiance: float) -> Any:
     links.new(light.outputs["Emission"], nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
     material.cycles.emission_sampling = "NONE"
     return material
+
+
+def make_printed_material(bpy: Any, image: Any, size: tuple[float, float], strength: float, exact: bool) -> Any:
+    """Light of an image that is spread over a horizontal rectangle about the z axis; `exact` pixels are not mixed."""
+    material, nodes, links = _empty(bpy, "print")
+    light, texture = nodes.new("ShaderNodeEmission"), nodes.new("ShaderNodeTexImage")
+    light.inputs["Strength"].default_value = strength
+    texture.image, texture.interpolation, texture.extension = image, "Closest" if exact else "Linear", "EXTEND"
+    place = nodes.new("ShaderNodeVectorMath")
+    place.operation = "MULTIPLY_ADD"
+    links.new(nodes.new("ShaderNodeNewGeometry").outputs["Position"], place.inputs[0])
+    place.inputs[1].default_value, place.inputs[2].default_value = (1 / size[0], 1 / size[1], 0), (0.5, 0.5, 0)
+    links.new(place.outputs["Vector"], texture.inputs["Vector"])
+    links.new(texture.outputs["Color"], light.inputs["Color"])
+    links.new(light.outputs["Emission"], nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
+    return material
+
+
+def image_of(bpy: Any, name: str, rgba: Float[np.ndarray, "H W 4"]) -> Any:
+    """An image of Blender's, in which the first row is the lowest, of linear numbers in single precision."""
+    height, width = rgba.shape[:2]
+    image = bpy.data.images.new(name, width, height, alpha=True, float_buffer=True)
+    image.colorspace_settings.name = "Non-Color"
+    image.use_half_precision = False  # It would round columns beyond 2048.
+    image.pixels.foreach_set(rgba[::-1].ravel())
+    image.update()
+    return image
 
 
 def environment_color(nodes: Any, links: Any, image: Any, direction: Any = None) -> Any:

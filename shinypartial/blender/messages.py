@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
+from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
 from shinypartial.scene import SceneSpec
 
@@ -17,6 +18,13 @@ class Start:
     folder: Path
     """Its own folder for temporary files, which it removes when its parent ends."""
     threads: int
+
+
+@dataclass(frozen=True)
+class BackdropOf:
+    """In place of a camera: what it sees around the object is asked for."""
+
+    camera: Camera
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from shinypartial.blender.assemble import assemble, world_radiance
+from shinypartial.blender.backdrop import render_backdrop, set_size, show_backdrop
 from shinypartial.blender.cameras import set_view
 from shinypartial.blender.directions import (
     GRID,
@@ -85,14 +86,30 @@ class Renderer:
     """What a perfectly mirroring object is rendered with; None where every pixel is path traced."""
 
     def render(self, camera: Camera) -> RenderedView:
-        """Render one view from a camera with the recipe's lens and resolution."""
-        set_view(self.bpy, camera, self.spec)
+        """Render one view with the recipe's lens; its size may be another where every pixel is path traced."""
         region = image_region(camera, self.body_vertices_world)
+        with self._at(camera, backdrop=False):
+            if self.mirror and (depth := nearest_depth(camera, self.mirror.vertices_world)) > SMALLEST_DEPTH:
+                return self._reflected(self.mirror, camera, region, depth)
+            return self._path_traced(camera, region)
+
+    def render_backdrop(self, camera: Camera) -> Float[np.ndarray, "H W 3"]:
+        """Radiance of what a camera sees around the object and, where that stands, behind it."""
+        path = self.scratch / "backdrop.exr"
+        with self._at(camera, backdrop=True):
+            render_backdrop(self.bpy, path)
+        return stacked(read_passes(path, COLOR_CHANNELS), COLOR_CHANNELS)
+
+    @contextlib.contextmanager
+    def _at(self, camera: Camera, *, backdrop: bool) -> Iterator[None]:
+        """Move the camera there, and raise InputError where Blender fails within the block."""
+        set_view(self.bpy, camera, self.spec)
+        show_backdrop(self.bpy, backdrop)
+        if not self.mirror:
+            set_size(self.bpy, camera.width, camera.height)
         try:
             with interrupts_deferred(), quiet():
-                if self.mirror and (depth := nearest_depth(camera, self.mirror.vertices_world)) > SMALLEST_DEPTH:
-                    return self._reflected(self.mirror, camera, region, depth)
-                return self._path_traced(camera, region)
+                yield
         except RuntimeError as error:
             raise InputError(
                 expected=f"Blender to render a view and to write it to {self.scratch}",

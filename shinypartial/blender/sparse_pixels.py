@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from shinypartial.blender.materials import image_of
 from shinypartial.blender.passes import PASSES, read_passes
 from shinypartial.core.camera import Camera, project
 from shinypartial.core.trajectory import CameraPath
@@ -57,24 +58,13 @@ def render_sparse(
     places[: len(rows), 0], places[: len(rows), 1] = columns, rows
     nodes = bpy.data.materials[PORTAL].node_tree.nodes
     # Cycles knows images by their address: the one before may go only when this one has another.
-    before, nodes["places"].image = nodes["places"].image, _upload(bpy, places.reshape(height, width, 4))
+    before, nodes["places"].image = nodes["places"].image, image_of(bpy, PIXELS, places.reshape(height, width, 4))
     if before:
         bpy.data.images.remove(before)
     nodes["size"].inputs[1].default_value = (width, height, 0)
     scene.render.filepath = str(path)
     bpy.ops.render.render(write_still=True, scene=SPARSE)
     return {name: channel.ravel()[: len(rows)] for name, channel in read_passes(path, PASSES).items()}
-
-
-def _upload(bpy: Any, places: Float[np.ndarray, "h w 4"]) -> Any:
-    """An image of Blender's, in which the first row is the lowest."""
-    height, width = places.shape[:2]
-    image = bpy.data.images.new(PIXELS, width, height, alpha=True, float_buffer=True)
-    image.colorspace_settings.name = "Non-Color"
-    image.use_half_precision = False  # It would round columns beyond 2048.
-    image.pixels.foreach_set(places[::-1].ravel())
-    image.update()
-    return image
 
 
 def _send_rays_on(material: Any, resolution: int, spec: CameraPath) -> None:

@@ -13,7 +13,7 @@ import threading
 from pathlib import Path
 from typing import IO, Any
 
-from shinypartial.blender.messages import Ready, Refused, Start, receive, send
+from shinypartial.blender.messages import BackdropOf, Ready, Refused, Start, receive, send
 from shinypartial.blender.render import open_renderer
 from shinypartial.core.errors import InputError, from_os_error
 
@@ -33,7 +33,9 @@ def main() -> None:
         with open_renderer(start.spec, threads=start.threads, folder=start.folder) as renderer:
             send(replies, Ready(renderer.device))
             while True:
-                send(replies, renderer.render(cameras.get()))
+                asked = cameras.get()
+                backdrop = isinstance(asked, BackdropOf)
+                send(replies, renderer.render_backdrop(asked.camera) if backdrop else renderer.render(asked))
     except (InputError, OSError) as error:
         refusal = from_os_error(error) if isinstance(error, OSError) else error
         send(replies, Refused(refusal.expected, refusal.found, refusal.remedy))

@@ -14,8 +14,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 import shinypartial
-from shinypartial.blender.messages import Ready, Refused, Start, receive, send
+from shinypartial.blender.messages import BackdropOf, Ready, Refused, Start, receive, send
 from shinypartial.blender.render import RenderedView
 from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
@@ -105,7 +108,17 @@ class WorkerPool:
         self._seats.put(None)
 
     def render(self, camera: Camera, name: str) -> RenderedView:
-        """Render one view; a process that dies is replaced, once for each view.
+        """Render one view of the object; see `_ask`."""
+        view: RenderedView = self._ask(camera, name)
+        return view
+
+    def render_backdrop(self, camera: Camera, name: str) -> Float[np.ndarray, "H W 3"]:
+        """Radiance of what stands around the object in one view; see `_ask`."""
+        backdrop: np.ndarray = self._ask(BackdropOf(camera), name)
+        return backdrop
+
+    def _ask(self, message: Camera | BackdropOf, name: str) -> Any:
+        """A process's answer; one that dies is replaced, once for each question.
 
         Raises InputError, which names the view, when the second process dies as well, or when Blender refuses;
         PoolClosed when the pool is closed.
@@ -113,7 +126,7 @@ class WorkerPool:
         died: list[str] = []
         while len(died) < ATTEMPTS:
             try:
-                return self._render_once(camera)
+                return self._ask_once(message)
             except _WorkerDied as death:
                 died.append(str(death))
         raise InputError(
@@ -133,17 +146,17 @@ class WorkerPool:
         for worker in live:
             worker.end()
 
-    def _render_once(self, camera: Camera) -> RenderedView:
+    def _ask_once(self, message: Any) -> Any:
         worker = self._seats.get()
         try:
             if worker is None:
                 worker = self._start()
-            view: RenderedView = worker.ask(camera)
+            answer = worker.ask(message)
             worker.rendered += 1
             if worker.rendered >= self.plan.frames_per_worker:
                 self._dismiss(worker)
                 worker = None
-            return view
+            return answer
         except BaseException as error:
             if worker is not None:
                 self._dismiss(worker)

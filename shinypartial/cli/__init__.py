@@ -5,17 +5,19 @@ from collections.abc import Sequence
 import tyro
 
 from shinypartial.cli.converting import Convert, Import, Relight
-from shinypartial.cli.datasets import ExportCameras, Perturb, Release, Subset, Validate
+from shinypartial.cli.datasets import Align, ExportCameras, Perturb, Release, Subset, Validate
 from shinypartial.cli.presenting import Chart, Leaderboard, Report
-from shinypartial.cli.scenes import Generate
+from shinypartial.cli.scenes import Film, Generate
 from shinypartial.cli.scoring import Compare, Evaluate, Oracle, Postprocess, Weights
 from shinypartial.cli.stability import Stability
 from shinypartial.core.errors import parse_and_run
 
 Command = (
     Generate
+    | Film
     | Subset
     | Perturb
+    | Align
     | ExportCameras
     | Validate
     | Evaluate

@@ -83,6 +83,32 @@ class Perturb:
 
 
 @dataclass(frozen=True)
+class Align:
+    """Move a captured dataset into the world of its truth and say how far its cameras and masks are off.
+
+    The copy has the truth's test cameras, so that a fit of it can be scored against the truth.
+    """
+
+    captured: tyro.conf.Positional[Path]
+    """Dataset that `panoless capture`, or another program, made of a film; it is only read."""
+    truth: Path
+    """Folder `truth` of that film."""
+    output: Path
+    """Folder to write."""
+    gauge: Literal["board", "similarity"] | None = None
+    """By the board's known place, which estimates nothing, or by the similarity that brings camera centers together;
+    `board` where the film has one, when not given."""
+
+    def run(self) -> None:
+        """Write the copy and say what was measured."""
+        from shinypartial.dataset.same_world import align
+
+        made = align(self.captured, self.truth, self.output, self.gauge)
+        print(made.summary())
+        print(f"Next: panoless fit {self.output}, then shinypartial evaluate --dataset {self.truth}")
+
+
+@dataclass(frozen=True)
 class ExportCameras:
     """Write the cameras of a dataset for other programs: a COLMAP model, or nerfstudio's transforms.json."""
 

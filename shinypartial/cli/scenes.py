@@ -115,3 +115,41 @@ class Generate:
         else:
             print(f"Complete: all {made.kept} views are in {made.root}")
         print("Next: panoless fit")
+
+
+@dataclass(frozen=True)
+class Film:
+    """Render what a phone would record of a scene, with the truth beside it; run again to continue."""
+
+    scene: str
+    """Name of a film in blender_scenes/films, or the path of its .toml file."""
+    output: Path | None = None
+    """Folder to write; films/NAME-WIDTH when not given."""
+    resolution: int | None = None
+    """Width of the film in pixels; the recipe's when not given."""
+    frames: int | None = None
+    """Frames of the film; the recipe's when not given."""
+    test: int | None = None
+    """Views by a steady pinhole for scores; the recipe's when not given."""
+    samples: int | None = None
+    """Samples per pixel; the recipe's when not given."""
+
+    def run(self) -> None:
+        """Make the film and say how to capture it."""
+        from dataclasses import replace
+
+        from shinypartial.film.film import DEFAULT_FOLDER, MASKS, TRUTH, VIDEO, film
+        from shinypartial.scene import load_film, override
+
+        spec = load_film(self.scene)
+        scene = override(
+            spec.scene, resolution=self.resolution, samples=self.samples, train=self.frames, test=self.test
+        )
+        varied = replace(spec, scene=scene)
+        root = self.output or DEFAULT_FOLDER / f"{Path(self.scene).stem}-{varied.size[0]}"
+        made = film(varied, root)
+        kept = f" (and kept {made.kept} that were there)" if made.kept else ""
+        print(f"Recorded {made.recorded} frames{kept} into {root / VIDEO}; truth in {root / TRUTH}")
+        board = varied.scene.ground.board if varied.scene.ground else None
+        words = [f"panoless capture {root / VIDEO} --output datasets/{root.name} --masks {root / MASKS}"]
+        print("Next:", " ".join([*words, *([f"--board {board}"] if board else [])]))

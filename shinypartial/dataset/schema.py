@@ -139,6 +139,14 @@ class Dataset:
         radius = statistics.get("object_radius") if isinstance(statistics, dict) else None
         return float(radius) if isinstance(radius, int | float) and 0 < radius < math.inf else None
 
+    @property
+    def board_corner(self) -> tuple[float, float, float] | None:
+        """Where the world of the scene's board has its origin; its axes are parallel. None where there is no board."""
+        statistics = self.manifest.get("statistics")
+        corner = statistics.get("board_corner") if isinstance(statistics, dict) else None
+        numbers = corner if isinstance(corner, list) and len(corner) == 3 else None
+        return (float(numbers[0]), float(numbers[1]), float(numbers[2])) if numbers else None
+
     def split(self, split: str) -> tuple[Frame, ...]:
         """Frames of `train` or `test`."""
         return self.train if split == "train" else self.test

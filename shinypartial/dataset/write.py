@@ -35,9 +35,10 @@ from shinypartial.io.files import PARTIAL_PREFIX, read_json, sha256_of, write_js
 from shinypartial.io.images import read_exr_rgb, write_exr, write_exr_rgb, write_png
 
 
-def make_frames(root: Path, split: str, cameras: Sequence[Camera]) -> tuple[Frame, ...]:
-    """Frames `SPLIT/r_000 …` of a dataset at `root`."""
-    return tuple(Frame(f"{split}/r_{i:03d}", camera, root / split / f"r_{i:03d}") for i, camera in enumerate(cameras))
+def make_frames(root: Path, split: str, cameras: Sequence[Camera], name: str = "r_{:03d}") -> tuple[Frame, ...]:
+    """Frames of a split of a dataset at `root`, named by their numbers."""
+    stems = [root / split / name.format(i) for i in range(len(cameras))]
+    return tuple(Frame(f"{split}/{stem.name}", camera, stem) for stem, camera in zip(stems, cameras, strict=True))
 
 
 def claim_folder(root: Path, recipe: dict[str, Any], generator: dict[str, Any], format_minor: int = 0) -> bool:

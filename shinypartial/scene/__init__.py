@@ -1,14 +1,20 @@
 """Scene recipes: `blender_scenes/NAME/scene.toml` read into frozen dataclasses, strictly.
 
-`shapes`, `room` and `spec` say what a recipe may hold and in which range, `check` refuses values that contradict each
-other, and `recipes` finds, loads and varies scenes. The same checks hold for values that the command line overrides.
+`shapes`, `room`, `ground`, `spec` and `film` say what a recipe may hold and in which range, `check` refuses values that
+contradict each other, and `recipes` finds, loads and varies scenes. The same checks hold for values that the command
+line overrides.
 Imports io and core; never dataset, blender or bpy.
 """
 
+from shinypartial.scene.film import FilmSpec, Phone
+from shinypartial.scene.ground import Ground
 from shinypartial.scene.recipes import (
+    FILMS,
     SCENES,
+    film_names,
     find_scene,
     from_blend_file,
+    load_film,
     load_scene,
     older_recipe,
     override,
@@ -49,6 +55,7 @@ from shinypartial.scene.spec import (
 
 __all__ = [
     "DEVELOPMENT",
+    "FILMS",
     "HELD_OUT",
     "SCENES",
     "SPLITS",
@@ -58,10 +65,13 @@ __all__ = [
     "Blob",
     "Deformation",
     "FileWorld",
+    "FilmSpec",
     "Frame",
+    "Ground",
     "Material",
     "Operator",
     "Part",
+    "Phone",
     "Plane",
     "RadialHarmonics",
     "Render",
@@ -75,8 +85,10 @@ __all__ = [
     "Superquadric",
     "SurfaceOfRevolution",
     "Tube",
+    "film_names",
     "find_scene",
     "from_blend_file",
+    "load_film",
     "load_scene",
     "older_recipe",
     "override",

@@ -49,6 +49,9 @@ def check_scene(spec: SceneSpec, place: Place) -> None:
     if spec.camera.focus_distance is not None and spec.camera.f_number is None:
         found = f"{spec.camera.focus_distance} for a pinhole"
         raise place.below("camera").below("focus_distance").error("an f_number with it", found)
+    cameras = np.array(spec.camera.target) + path_offsets(spec.camera, spec.camera.train + spec.camera.test)
+    if spec.ground and cameras[:, 2].min() <= spec.ground.height:
+        raise place.below("ground").below("height").error("a sheet below every camera", f"{spec.ground.height}")
     if spec.operator:
         _check_operator(spec, spec.operator, around, place.below("operator"))
 

@@ -9,10 +9,12 @@ from shinypartial.core.errors import InputError
 from shinypartial.core.trajectory import SWEPT_PATHS
 from shinypartial.io.records import read_record
 from shinypartial.scene.check import Place, check_scene
+from shinypartial.scene.film import FilmSpec
 from shinypartial.scene.shapes import BlendFile, Material
 from shinypartial.scene.spec import DEVELOPMENT, HELD_OUT, STUDIO_LIGHTS, FileWorld, SceneSpec, World
 
 SCENES = Path(__file__).resolve().parents[2] / "blender_scenes"
+FILMS = SCENES / "films"
 RECIPE = "scene.toml"
 BLEND = ".blend"
 #: Keys of a recipe that the first datasets don't have, and what they mean there.
@@ -25,6 +27,7 @@ ADDED_KEYS = {
     "room": "sphere",
     "proportions": [1.6, 1.3, 1.0],
     "operator": None,
+    "ground": None,
     "f_number": None,
     "focus_distance": None,
     "motion_deg": 0.0,
@@ -67,16 +70,45 @@ def load_scene(scene: str) -> SceneSpec:
             found=f"'{scene}'",
             remedy=f"Correct --scene, or add {SCENES / scene / RECIPE}.",
         )
+    return _with_files(parse_scene(_read_toml(path), str(path)), path)
+
+
+def film_names() -> list[str]:
+    """Names of the films that come with the repository."""
+    return sorted(path.stem for path in FILMS.glob("*.toml"))
+
+
+def load_film(film: str) -> FilmSpec:
+    """Read a film by name, or by the path of its TOML file; its tables are `scene`, `hand` and `phone`.
+
+    Raises InputError as `load_scene` does, and for a hand or a phone that is wrong.
+    """
+    path = Path(film) if film.endswith(".toml") else FILMS / f"{film}.toml"
+    if not path.is_file():
+        raise InputError(
+            expected=f"one of the films {', '.join(film_names()) or '(none found)'}, or the path of a .toml file",
+            found=f"'{film}'",
+            remedy="Correct --scene.",
+        )
+    spec = read_record(FilmSpec, _read_toml(path), str(path))
+    check_scene(spec.scene, Place(str(path)).below("scene"))
+    return replace(spec, scene=_with_files(spec.scene, path))
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(
             expected=f"{path} to be TOML",
             found=str(error),
             remedy="Correct the file; docs/how-to/add-a-scene.md helps.",
         ) from None
-    spec = parse_scene(table, str(path))
-    remedy = "Correct the path; it is relative to the folder of scene.toml."
+
+
+def _with_files(spec: SceneSpec, path: Path) -> SceneSpec:
+    """The files that a recipe names, found beside it."""
+    remedy = "Correct the path; it is relative to the folder of the recipe."
     if isinstance(spec.world, FileWorld):
         file = _require(path.parent / spec.world.path, ".exr", f"`world.path` of {path} to name an EXR file", remedy)
         spec = replace(spec, world=replace(spec.world, path=str(file)))

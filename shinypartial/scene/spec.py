@@ -6,9 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
+import numpy as np
+from jaxtyping import Float
+
 from shinypartial.core.trajectory import CameraPath, Seed, limits
 from shinypartial.io.files import sha256_of
 from shinypartial.io.records import Text
+from shinypartial.scene.ground import Ground
 from shinypartial.scene.room import Room, RoomShape
 from shinypartial.scene.shapes import Assembly, BlendFile, Length, Material, Part, Shape
 
@@ -129,6 +133,7 @@ class SceneSpec:
     """Enlarges object and props about the origin."""
     camera: CameraPath = CameraPath()
     operator: Operator | None = None
+    ground: Ground | None = None
     render: Render = Render()
     format: Annotated[int, limits(FORMAT_VERSION, FORMAT_VERSION)] = FORMAT_VERSION
 
@@ -149,10 +154,19 @@ class SceneSpec:
         distance = world.distance if world.distance_radii is None else world.distance_radii * self.extent
         return None if distance is None else Room(world.room, distance, world.proportions)
 
+    def inverse_distance(self, directions: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
+        """1/D from the origin to walls or ground in unit directions; zero where light comes from infinitely far."""
+        found = np.zeros(len(directions)) if self.room is None else self.room.inverse_distance(directions)
+        if self.ground:
+            meets, points = self.ground.seen_from_origin(directions)
+            found[meets] = np.maximum(found[meets], 1 / np.linalg.norm(points, axis=-1))
+        return found
+
     @property
     def mirrors_directions(self) -> bool:
         """Whether what a perfect mirror shows depends on direction alone, and a pixel on one point of view."""
-        return self.room is None and self.operator is None and self.camera.is_ideal
+        near = self.room or self.operator or self.ground
+        return near is None and self.camera.is_ideal
 
     def recipe(self) -> dict[str, Any]:
         """The specification as JSON holds it; files are named by their content, so that they may move."""

@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from panoless.photographs.board import BOARDS, poses_from_board, write_board
+from panoless.photographs.board import drawn_by_opencv, poses_from_board, write_board
 from panoless.photographs.frames import Frames, Photograph
 from panoless.photographs.options import CaptureOptions
+from shinypartial.core.board import BOARDS
 from shinypartial.core.errors import InputError
 from shinypartial.io.images import read_png, write_png
 from tests.support.photographed_planes import arc, photograph
@@ -36,10 +37,16 @@ def svg_bars(path: Path) -> list[tuple[float, ...]]:
 def test_the_printed_page_is_the_board_that_is_looked_for(tmp_path: Path) -> None:
     write_board(BOARD, tmp_path / "board.svg")
     page = painted(svg_bars(tmp_path / "board.svg"))
-    places, corners, _, _ = cv2.aruco.CharucoDetector(BOARD.drawn_by_opencv()).detectBoard(page)
+    places, corners, _, _ = cv2.aruco.CharucoDetector(drawn_by_opencv(BOARD)).detectBoard(page)
     assert len(corners) == (BOARD.columns - 1) * (BOARD.rows - 1)
     steps = np.linalg.norm(np.diff(places[: BOARD.columns - 1, 0], axis=0), axis=1) / MM_PX
     np.testing.assert_allclose(steps, BOARD.square_mm, atol=0.1)  # A tenth of a millimeter: half a pixel.
+
+
+@pytest.mark.parametrize("paper", BOARDS)
+def test_the_cells_are_those_that_opencv_draws(paper: str) -> None:
+    cells = BOARDS[paper].cells()
+    np.testing.assert_array_equal(cells, drawn_by_opencv(BOARDS[paper]).generateImage(cells.shape[::-1]) < 128)
 
 
 @pytest.mark.parametrize("paper", BOARDS)
@@ -75,8 +82,7 @@ def photographed(tmp_path_factory: pytest.TempPathFactory):
     """A folder of photographs of the board, their frames, and the cameras that took them."""
     folder = tmp_path_factory.mktemp("board")
     picture = np.where(np.kron(BOARD.cells(), np.ones((CELL_PX, CELL_PX), bool)), 20, 235).astype(np.uint8)
-    width, height = (count * BOARD.square_mm * 1e-3 for count in (BOARD.columns, BOARD.rows))
-    corners = np.array([[0, 0, 0], [width, 0, 0], [width, -height, 0], [0, -height, 0]])
+    (width, height), corners = BOARD.size_m, BOARD.corners_world()
     cameras = arc(9, DISTANCE_M, SIZE, 900.0, (width / 2, -height / 2, 0.0))
     frames = []
     for index, camera in enumerate(cameras):

@@ -130,7 +130,7 @@ def test_a_dataset_tells_the_split_of_its_scene_and_an_older_one_continues(tmp_p
 def test_an_older_recipe_lacks_what_later_versions_added_and_nothing_else() -> None:
     recipe = load_scene("cola").recipe()
     older = older_recipe(recipe)
-    assert recipe.keys() - older.keys() == {"split", "operator"}
+    assert recipe.keys() - older.keys() == {"split", "operator", "ground"}
     assert recipe["world"].keys() - older["world"].keys() == {"distance_radii", "room", "proportions"}
     assert recipe["camera"].keys() - older["camera"].keys() == {"f_number", "focus_distance", "motion_deg"}
     assert recipe["render"].keys() - older["render"].keys() == {"max_bounces"}

@@ -1,0 +1,179 @@
+"""A captured dataset beside its truth: both in one world, and how far cameras and masks are off.
+
+What photographs tell has a gauge: cameras that structure from motion finds are right up to a similarity, those from a
+board in the board's own world. Poses are moved, pictures and masks stay as they are.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from shinypartial.core.camera import Camera
+from shinypartial.core.conventions import PIXEL_CENTER
+from shinypartial.core.errors import InputError
+from shinypartial.dataset.read import open_dataset, read_view
+from shinypartial.dataset.schema import SPLITS, Dataset, Frame
+from shinypartial.dataset.write import write_transforms
+from shinypartial.io.files import copy_or_link, folder_lock, write_json
+from shinypartial.io.records import write_record
+
+GaugeKind = Literal["board", "similarity"]
+ALIGNMENT = "alignment.json"
+#: Camera centers that span less than this share of their spread in two directions tell no rotation.
+LEAST_SPREAD = 1e-3
+FEWEST_CAMERAS = 3
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """The similarity x ↦ s R x + t from one world to another."""
+
+    scale: float
+    rotation: Float[np.ndarray, "3 3"]
+    shift: Float[np.ndarray, "3"]
+
+    def pose(self, camera_to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+        """A rigid pose of the same camera in the other world."""
+        moved = np.eye(4)
+        moved[:3, :3] = self.rotation @ camera_to_world[:3, :3]
+        moved[:3, 3] = self.scale * self.rotation @ camera_to_world[:3, 3] + self.shift
+        return moved
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Errors of a captured dataset after its gauge is taken out, view by view."""
+
+    gauge: GaugeKind
+    scale: float
+    """Length of the truth's world over that of the captured one; 1 where a board gives meters."""
+    views: tuple[str, ...]
+    rotation_deg: tuple[float, ...]
+    """Angle between the captured and the true orientation."""
+    distance_share: tuple[float, ...]
+    """How far the camera is off, as a share of its true distance from the object's center, the origin."""
+    focal_share: float
+    """Captured focal length over the true one, less 1; with pictures of another size, by angle of view."""
+    mask_overlap: tuple[float, ...]
+    """Intersection over union of captured and true mask."""
+
+    def summary(self) -> str:
+        """Medians and worst values in a line."""
+        turn, share = (np.array(each) for each in (self.rotation_deg, self.distance_share))
+        return (
+            f"{len(self.views)} views by {self.gauge}: turned by {np.median(turn):.3f}° (at most {turn.max():.3f}°), "
+            f"moved by {np.median(share):.3%} of the distance (at most {share.max():.3%}), "
+            f"focal length {self.focal_share:+.3%}, "
+            f"masks overlap by {np.median(self.mask_overlap):.3f} (at least {min(self.mask_overlap):.3f})"
+        )
+
+
+def similarity(captured: Float[np.ndarray, "V 3"], true: Float[np.ndarray, "V 3"]) -> Gauge:
+    """The one that brings captured camera centers nearest to the true ones in least squares (Umeyama 1991).
+
+    Raises InputError for fewer than three, and for centers on a line, which leave a turn about it open.
+    """
+    spread = np.linalg.svd(captured - captured.mean(0), compute_uv=False) if len(captured) else np.zeros(1)
+    if len(captured) < FEWEST_CAMERAS or spread[1] < LEAST_SPREAD * spread[0]:
+        raise InputError(
+            expected="at least three captured cameras that do not stand on a line",
+            found=f"{len(captured)}" + (" on a line" if len(captured) >= FEWEST_CAMERAS else ""),
+            remedy="Capture more frames, at two heights.",
+        )
+    ours, theirs = captured - captured.mean(0), true - true.mean(0)
+    left, values, right = np.linalg.svd(theirs.T @ ours)
+    proper = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    rotation = left @ np.diag(proper) @ right
+    scale = float((values * proper).sum() / np.sum(ours**2))
+    return Gauge(scale, rotation, true.mean(0) - scale * rotation @ captured.mean(0))
+
+
+def align(captured: Path, truth: Path, output: Path, gauge: GaugeKind | None = None) -> Alignment:
+    """Write a copy of a captured dataset whose cameras are in the truth's world, with the truth's test cameras.
+
+    Frames of the same name belong together. `board` shifts by the known place of the board's corner and estimates
+    nothing; `similarity` is estimated from camera centers. When not given, it is `board` where the truth has a board.
+    The test views have cameras and no pictures. Raises InputError for frames that the truth doesn't know.
+    """
+    ours, theirs = open_dataset(captured), open_dataset(truth)
+    pairs = _pairs(ours, theirs)
+    kind = gauge or ("similarity" if theirs.board_corner is None else "board")
+    found = _gauge(kind, pairs, theirs)
+    output.mkdir(parents=True, exist_ok=True)
+    with folder_lock(output):
+        moved = [_moved(frame, output, found) for frame, _ in pairs]
+        result = _compare(kind, found.scale, [(new, true) for new, (_, true) in zip(moved, pairs, strict=True)])
+        write_transforms(output, SPLITS[0], moved)
+        if theirs.test:
+            write_transforms(output, SPLITS[1], theirs.test)
+        write_json(output / ALIGNMENT, write_record(result))
+    return result
+
+
+def _pairs(ours: Dataset, theirs: Dataset) -> list[tuple[Frame, Frame]]:
+    true = {frame.stem.name: frame for frame in theirs.train}
+    unknown = [frame.stem.name for frame in ours.train if frame.stem.name not in true]
+    if unknown:
+        raise InputError(
+            expected=f"frames that {theirs.root} knows, such as {next(iter(true))}",
+            found=", ".join(unknown[:3]),
+            remedy="Name the truth of the film that was captured.",
+        )
+    return [(frame, true[frame.stem.name]) for frame in ours.train]
+
+
+def _gauge(kind: GaugeKind, pairs: Sequence[tuple[Frame, Frame]], truth: Dataset) -> Gauge:
+    if kind == "similarity":
+        centers = np.array([[frame.camera.position_world for frame in pair] for pair in pairs])
+        return similarity(centers[:, 0], centers[:, 1])
+    if truth.board_corner is None:
+        raise InputError(
+            expected=f"a board in the scene of {truth.root}",
+            found="none",
+            remedy="Leave out --gauge board, or film a scene that has one.",
+        )
+    return Gauge(1.0, np.eye(3), np.array(truth.board_corner))
+
+
+def _moved(frame: Frame, output: Path, gauge: Gauge) -> Frame:
+    """The frame in the new folder, with links to its files."""
+    stem = output / SPLITS[0] / frame.stem.name
+    for old in frame.stem.parent.glob(f"{frame.stem.name}*"):
+        if old.name.removeprefix(frame.stem.name)[:1] in (".", "_"):
+            copy_or_link(old, stem.parent / old.name, False)
+    camera = frame.camera
+    pose = gauge.pose(camera.camera_to_world)
+    there = Camera(pose, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+    return Frame(f"{SPLITS[0]}/{stem.name}", there, stem)
+
+
+def _compare(kind: GaugeKind, scale: float, pairs: Sequence[tuple[Frame, Frame]]) -> Alignment:
+    turns, shares, focals, overlaps = [], [], [], []
+    for new, true in pairs:
+        ours, theirs = new.camera, true.camera
+        turn = ours.camera_to_world[:3, :3].T @ theirs.camera_to_world[:3, :3]
+        skew = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+        turns.append(float(np.degrees(np.arctan2(np.linalg.norm(skew), np.trace(turn) - 1))))
+        off = ours.position_world - theirs.position_world
+        shares.append(float(np.linalg.norm(off) / np.linalg.norm(theirs.position_world)))
+        focals.append(ours.fx / ours.width * theirs.width / theirs.fx - 1)
+        overlaps.append(_overlap(new, true))
+    names = tuple(true.stem.name for _, true in pairs)
+    return Alignment(kind, scale, names, tuple(turns), tuple(shares), float(np.median(focals)), tuple(overlaps))
+
+
+def _overlap(new: Frame, true: Frame) -> float:
+    """Of masks, the true one looked up where the captured pinhole's pixels look."""
+    ours, theirs = new.camera, true.camera
+    mask, truth = read_view(new).alpha >= 0.5, read_view(true).alpha >= 0.5
+    row, column = np.indices(mask.shape) + PIXEL_CENTER
+    x = np.floor((column - ours.cx) / ours.fx * theirs.fx + theirs.cx).astype(int)
+    y = np.floor((row - ours.cy) / ours.fy * theirs.fy + theirs.cy).astype(int)
+    within = (x >= 0) & (y >= 0) & (x < theirs.width) & (y < theirs.height)
+    there = within & truth[np.where(within, y, 0), np.where(within, x, 0)]
+    union = np.count_nonzero(mask | there)
+    return np.count_nonzero(mask & there) / union if union else 1.0

@@ -1,0 +1,100 @@
+"""Captured cameras in the world of their truth: a similarity is taken out, an error is not."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from shinypartial.core.camera import Camera
+from shinypartial.core.errors import InputError
+from shinypartial.dataset.read import open_dataset
+from shinypartial.dataset.same_world import Gauge, align, similarity
+from shinypartial.dataset.schema import MANIFEST, Frame
+from shinypartial.dataset.write import write_transforms
+from shinypartial.io.files import read_json, write_json
+from tests.support.synthetic_dataset import make_sphere_dataset
+
+RANDOM = np.random.default_rng(4)
+WORLD = Gauge(0.3, Rotation.from_rotvec([0.4, -1.2, 0.7]).as_matrix(), np.array([3.0, -1.0, 2.0]))
+
+
+def test_a_similarity_is_found_again() -> None:
+    points = RANDOM.normal(size=(7, 3))
+    found = similarity(points, WORLD.scale * points @ WORLD.rotation.T + WORLD.shift)
+    assert found.scale == pytest.approx(WORLD.scale)
+    np.testing.assert_allclose(found.rotation, WORLD.rotation, atol=1e-12)
+    np.testing.assert_allclose(found.shift, WORLD.shift, atol=1e-12)
+
+
+def test_cameras_on_a_line_tell_no_world() -> None:
+    line = np.arange(5)[:, None] * np.array([1.0, 2.0, 3.0])
+    with pytest.raises(InputError, match="on a line"):
+        similarity(line, line)
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("truth") / "data"
+    make_sphere_dataset(root, resolution=32, train=6, test=2)
+    return root
+
+
+def captured(truth: Path, root: Path, world: Gauge, turn_deg: float = 0.0) -> Path:
+    """The training views with their cameras in another world, each turned by an angle about its own x-axis."""
+    dataset = open_dataset(truth)
+    own = np.eye(4)
+    own[:3, :3] = Rotation.from_rotvec([np.radians(turn_deg), 0, 0]).as_matrix()
+    frames = []
+    for frame in dataset.train:
+        shutil.copytree(truth / "train", root / "train", dirs_exist_ok=True)
+        old = frame.camera
+        there = Camera(world.pose(old.camera_to_world) @ own, old.fx, old.fy, old.cx, old.cy, old.width, old.height)
+        frames.append(Frame(frame.name, there, root / frame.name))
+    write_transforms(root, "train", frames)
+    return root
+
+
+def test_another_world_is_no_error(truth: Path, tmp_path: Path) -> None:
+    made = align(captured(truth, tmp_path / "captured", WORLD), truth, tmp_path / "aligned")
+    assert (made.gauge, len(made.views)) == ("similarity", 6)
+    assert made.scale == pytest.approx(1 / WORLD.scale)
+    assert max(*made.rotation_deg, *made.distance_share, abs(made.focal_share)) < 1e-6
+    assert min(made.mask_overlap) == 1.0
+    before, after = open_dataset(truth), open_dataset(tmp_path / "aligned")
+    for old, new in zip((*before.train, *before.test), (*after.train, *after.test), strict=True):
+        np.testing.assert_allclose(new.camera.camera_to_world, old.camera.camera_to_world, atol=1e-9)
+
+
+def test_turned_cameras_are_told(truth: Path, tmp_path: Path) -> None:
+    made = align(captured(truth, tmp_path / "captured", WORLD, 0.7), truth, tmp_path / "aligned")
+    np.testing.assert_allclose(made.rotation_deg, 0.7, atol=1e-6)
+    assert "0.700°" in made.summary()
+
+
+def test_a_board_is_believed_and_no_world_estimated(truth: Path, tmp_path: Path) -> None:
+    corner = np.array([-0.1, 0.2, -0.3])
+    with_board = tmp_path / "truth"
+    shutil.copytree(truth, with_board)
+    manifest = read_json(with_board / MANIFEST, "the manifest")
+    write_json(with_board / MANIFEST, manifest | {"statistics": {"board_corner": corner.tolist()}})
+    in_board = Gauge(1.0, np.eye(3), -corner)
+    off = Gauge(1.0, np.eye(3), -corner + [0.0, 0.0, 0.04])
+    made = align(captured(truth, tmp_path / "right", in_board), with_board, tmp_path / "one")
+    assert (made.gauge, made.scale) == ("board", 1.0)
+    assert max(made.distance_share) < 1e-9
+    wrong = align(captured(truth, tmp_path / "off", off), with_board, tmp_path / "two")
+    np.testing.assert_allclose(wrong.distance_share, 0.01, rtol=1e-6)  # Of the distance 4.
+    with pytest.raises(InputError, match="a board"):
+        align(tmp_path / "right", truth, tmp_path / "three", "board")
+
+
+def test_frames_of_another_film_are_refused(truth: Path, tmp_path: Path) -> None:
+    root = captured(truth, tmp_path / "captured", WORLD)
+    content = read_json(root / "transforms_train.json", "cameras")
+    (root / "train" / "r_000.png").rename(root / "train" / "frame_7.png")
+    content["frames"][0]["file_path"] = "./train/frame_7"
+    write_json(root / "transforms_train.json", content)
+    with pytest.raises(InputError, match="frame_7"):
+        align(root, truth, tmp_path / "aligned")
