@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from panoless.photographs.frames import Frames
+from panoless.photographs.corners import Sighting, corners_of, locate_corners
+from panoless.photographs.frames import Frames, luminance
 from panoless.photographs.lens import Lens, opencv
 from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import PosedView, Poses, as_rows
@@ -92,17 +93,6 @@ def _write_pdf(board: Board, path: Path) -> None:
         temporary.write_bytes(file.encode("ascii"))
 
 
-@dataclass(frozen=True)
-class Sighting:
-    """Corners of the board that a frame shows."""
-
-    name: str
-    corners: Int[np.ndarray, "P"]
-    """Their numbers on the board."""
-    places_px: Float[np.ndarray, "P 2"]
-    """Where they are, in OpenCV's pixels."""
-
-
 def find_board(board: Board, frames: Frames, folder: Path, options: CaptureOptions) -> list[Sighting]:
     """The frames that show enough corners, not all on one line."""
     cv2 = opencv()
@@ -147,10 +137,13 @@ def poses_from_board(board: Board, frames: Frames, folder: Path, options: Captur
         )
     start = cv2.initCameraMatrix2D(*_points_and_places(board, sightings), size, 1.0)[0, 0]
     lens = Lens(float(start), float(start), size[0] / 2, size[1] / 2, *size)
-    adjusted = _adjust(board, sightings, lens)
-    for _ in range(OUTLIER_ROUNDS):
-        sightings = _without_outliers(sightings, adjusted.residuals_px, options)
-        adjusted = _adjust(board, sightings, lens)
+    sightings, adjusted = _robust(board, sightings, lens, options, OUTLIER_ROUNDS)
+    pictures = {one.name: folder / f"{one.name}.png" for one in frames.photographs}
+    for blur_px in options.corner_blurs_px:
+        sightings = _located(board, sightings, adjusted, pictures, blur_px, options)
+        if len(sightings) < options.least_views:
+            break
+        sightings, adjusted = _robust(board, sightings, adjusted.lens, options, 1)
     if not adjusted.focal_error < options.most_focal_error:
         raise InputError(
             expected=f"frames that tell the focal length to {options.most_focal_error:.0%}",
@@ -176,7 +169,7 @@ class _Adjusted:
 
 def _points_and_places(board: Board, sightings: list[Sighting]) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Corners in meters on the board and in pixels, as OpenCV takes them."""
-    points = np.asarray(drawn_by_opencv(board).getChessboardCorners(), np.float32)
+    points = corners_of(board).astype(np.float32)
     places = [sighting.places_px.astype(np.float32) for sighting in sightings]
     return [points[sighting.corners] for sighting in sightings], places
 
@@ -202,6 +195,35 @@ def _adjust(board: Board, sightings: list[Sighting], lens: Lens) -> _Adjusted:
     found_lens = Lens(focal, focal, lens.cx, lens.cy, *size, k1=k1)
     # The deviation stands at one of fx and fy, which are the same.
     return _Adjusted(found_lens, float(deviations[:2].max()) / focal, tuple(poses), tuple(residuals))
+
+
+def _robust(
+    board: Board, sightings: list[Sighting], lens: Lens, options: CaptureOptions, rounds: int
+) -> tuple[list[Sighting], _Adjusted]:
+    """The adjustment of what is left when outliers are gone."""
+    adjusted = _adjust(board, sightings, lens)
+    for _ in range(rounds):
+        sightings = _without_outliers(sightings, adjusted.residuals_px, options)
+        adjusted = _adjust(board, sightings, lens)
+    return sightings, adjusted
+
+
+def _located(
+    board: Board,
+    sightings: list[Sighting],
+    adjusted: _Adjusted,
+    pictures: dict[str, Path],
+    blur_px: float,
+    options: CaptureOptions,
+) -> list[Sighting]:
+    """The corners found anew by all of the print around them, in the frames that still show enough."""
+    found = []
+    for sighting, pose in zip(sightings, adjusted.poses, strict=True):
+        light = luminance(read_png(pictures[sighting.name])[..., :3])
+        located = locate_corners(board, sighting.name, light, adjusted.lens, pose, blur_px, options)
+        if len(located.corners) >= options.least_corners:
+            found.append(located)
+    return found
 
 
 def _without_outliers(

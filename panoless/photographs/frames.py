@@ -158,11 +158,12 @@ def _sharpness(image: UInt8[np.ndarray, "H W 3"]) -> float:
     """Variance of the Laplacian of linear luminance over its squared mean, at a small size."""
     cv2 = opencv()
     scale = min(1.0, JUDGED_WIDTH_PX / image.shape[1])
-    luminance = _luminance(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)[..., ::-1])
-    return float(cv2.Laplacian(luminance, cv2.CV_32F).var() / max(float(luminance.mean()) ** 2, 1e-8))
+    light = luminance(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)[..., ::-1])
+    return float(cv2.Laplacian(light, cv2.CV_32F).var() / max(float(light.mean()) ** 2, 1e-8))
 
 
-def _luminance(image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
+def luminance(image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
+    """Of linear light, from sRGB codes."""
     return srgb_to_linear(unit_values(image)) @ LUMINANCE
 
 
@@ -175,9 +176,9 @@ def _write_frame(
     side = -(-max(height, width) // options.longest_side_px)
     small = block_means(image, side)
     write_png(folder / f"{name}.png", np.ascontiguousarray(small))
-    luminance = _luminance(small[..., :3])
-    blur = float(blur_effect(luminance))
-    return Photograph(name, source, small.shape[1], small.shape[0], side, width, height, blur, float(luminance.mean()))
+    light = luminance(small[..., :3])
+    blur = float(blur_effect(light))
+    return Photograph(name, source, small.shape[1], small.shape[0], side, width, height, blur, float(light.mean()))
 
 
 def block_means(image: UInt8[np.ndarray, "H W *C"], side: int) -> UInt8[np.ndarray, "h w *C"]:

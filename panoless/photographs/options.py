@@ -5,7 +5,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from shinypartial.io.records import Count, Positive, Share
+from shinypartial.io.records import Count, NonNegative, Positive, Share
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,15 @@ class CaptureOptions:
     *sculpture* before their surroundings have 0.42, 0.67 after a Gaussian blur of 2 pixels, and 0.78 after 3."""
     least_corners: Annotated[int, Meta(ge=6)] = 8
     """Corners of the board that a frame must show; a pose needs four, and more make it certain."""
+    corner_blurs_px: tuple[NonNegative, ...] = (1.5, 0.7, 0.7)
+    """Rounds in which corners are found anew by the print around them, each with a blur of both. On a
+    film of *sculpture*, 480 pixels wide, cameras are then off by 0.01° in the median, in place of 0.25°."""
+    corner_window: Positive = 0.7
+    """Half side of the window around a corner, in squares of the board."""
+    corner_reach: Share = 0.15
+    """How far a corner may be from where the present pose has it, in squares: a marker's cell is 0.11."""
+    least_match: Share = 0.8
+    """Share of the window's variance that the print must explain; what something hides is not explained."""
     most_focal_error: Share = 0.02
     """Standard deviation of the focal length, as a share of it, above which the frames do not determine it."""
     exhaustive_frames: Count = 60

@@ -95,9 +95,9 @@ class Align:
     """Folder `truth` of that film."""
     output: Path
     """Folder to write."""
-    gauge: Literal["board", "similarity"] | None = None
-    """By the board's known place, which estimates nothing, or by the similarity that brings camera centers together;
-    `board` where the film has one, when not given."""
+    gauge: Literal["board", "similarity", "same"] | None = None
+    """By the board's known place, which estimates nothing; by the similarity that brings camera centers together; or
+    not at all, where cameras are in the truth's world. By the board, where the film has one, when not given."""
 
     def run(self) -> None:
         """Write the copy and say what was measured."""

@@ -21,7 +21,7 @@ from shinypartial.dataset.write import write_transforms
 from shinypartial.io.files import copy_or_link, folder_lock, write_json
 from shinypartial.io.records import write_record
 
-GaugeKind = Literal["board", "similarity"]
+GaugeKind = Literal["board", "similarity", "same"]
 ALIGNMENT = "alignment.json"
 #: Camera centers that span less than this share of their spread in two directions tell no rotation.
 LEAST_SPREAD = 1e-3
@@ -96,8 +96,9 @@ def align(captured: Path, truth: Path, output: Path, gauge: GaugeKind | None = N
     """Write a copy of a captured dataset whose cameras are in the truth's world, with the truth's test cameras.
 
     Frames of the same name belong together. `board` shifts by the known place of the board's corner and estimates
-    nothing; `similarity` is estimated from camera centers. When not given, it is `board` where the truth has a board.
-    The test views have cameras and no pictures. Raises InputError for frames that the truth doesn't know.
+    nothing; `similarity` is estimated from camera centers; with `same` the captured world is the truth's. When not
+    given, it is `board` where the truth has a board, else `similarity`. The test views have cameras and no pictures.
+    Raises InputError for frames that the truth doesn't know.
     """
     ours, theirs = open_dataset(captured), open_dataset(truth)
     pairs = _pairs(ours, theirs)
@@ -130,6 +131,8 @@ def _gauge(kind: GaugeKind, pairs: Sequence[tuple[Frame, Frame]], truth: Dataset
     if kind == "similarity":
         centers = np.array([[frame.camera.position_world for frame in pair] for pair in pairs])
         return similarity(centers[:, 0], centers[:, 1])
+    if kind == "same":
+        return Gauge(1.0, np.eye(3), np.zeros(3))
     if truth.board_corner is None:
         raise InputError(
             expected=f"a board in the scene of {truth.root}",
