@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 from panoless.photographs.corners import Sighting, corners_of, locate_corners
-from panoless.photographs.frames import Frames, luminance
+from panoless.photographs.frames import Frames
 from panoless.photographs.lens import Lens, opencv
 from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import PosedView, Poses, as_rows
+from panoless.photographs.video import luminance
 from shinypartial.core.board import CELLS_OF_MARKER, CELLS_OF_SQUARE, MM, Board
 from shinypartial.core.errors import InputError
 from shinypartial.io.files import atomic_write, write_text

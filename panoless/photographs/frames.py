@@ -5,22 +5,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
-from panoless.photographs.lens import opencv
 from panoless.photographs.options import CaptureOptions
+from panoless.photographs.standstill import StillCheck
+from panoless.photographs.video import VIDEO_SUFFIXES, decoded_video, luminance
 from shinypartial.core.color import srgb_to_linear, to_display
 from shinypartial.core.errors import InputError
 from shinypartial.io.images import PICTURE_SUFFIXES, read_as_stored, read_upright, unit_values, write_png
 from shinypartial.io.progress import Progress
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-#: Luminance of linear light (IEC 61966-2-1).
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 #: What programs write beside a picture; no photograph of its own.
 COMPANIONS = ("_alpha", "_mask", "_normal", "_self", "_depth")
-#: Sharpness for the choice within a video is judged at this width.
-JUDGED_WIDTH_PX = 480
 
 
 @dataclass(frozen=True)
@@ -81,7 +77,8 @@ def make_frames(files: list[Path], folder: Path, upright: bool, options: Capture
     progress = Progress("frames", total)
     photographs = []
     names: dict[str, Path] = {}
-    for name, file, image in _decoded_video(files[0], total) if video else _decoded(files, upright):
+    borders = StillCheck()
+    for name, file, image in decoded_video(files[0], total) if video else _decoded(files, upright):
         if name in names:
             raise InputError(
                 expected="photographs with names of their own",
@@ -90,6 +87,7 @@ def make_frames(files: list[Path], folder: Path, upright: bool, options: Capture
             )
         names[name] = file
         photographs.append(_write_frame(name, file, image, folder, options))
+        borders.add(image)
         progress.advance()
     if len(photographs) < options.least_views:
         raise InputError(
@@ -104,6 +102,7 @@ def make_frames(files: list[Path], folder: Path, upright: bool, options: Capture
             found=f"{blur:.2f}",
             remedy="Lock the focus on the object, take more light or a tripod, and move slowly.",
         )
+    borders.require_motion(options)
     return Frames(tuple(photographs))
 
 
@@ -118,53 +117,6 @@ def _decoded(files: list[Path], upright: bool) -> Iterator[tuple[str, Path, UInt
             )
         levels = image if image.dtype == np.uint8 else np.rint(unit_values(image) * 255).astype(np.uint8)
         yield file.stem, file, np.repeat(levels, 3, 2) if levels.shape[2] == 1 else levels
-
-
-def _decoded_video(file: Path, count: int) -> Iterator[tuple[str, Path, UInt8[np.ndarray, "H W C"]]]:
-    """The sharpest frames: each is found among those between half a step and one and a half after the last one."""
-    sharpness = np.array([_sharpness(image) for image in _video(file)])
-    chosen = set(sharpest_frames(sharpness, count)) if len(sharpness) else set()
-    for index, image in enumerate(_video(file)):
-        if index in chosen:
-            yield f"frame_{index:05d}", file, np.ascontiguousarray(image[..., ::-1])
-
-
-def sharpest_frames(sharpness: Float[np.ndarray, "T"], count: int) -> list[int]:
-    """About `count` of T frames, each the sharpest of its window, and none further from the last than 1.5 T / count."""
-    step = max(len(sharpness) / count, 1.0)
-    chosen = [int(np.argmax(sharpness[: max(int(step), 1)]))]
-    while True:
-        first = chosen[-1] + max(int(np.ceil(step / 2)), 1)
-        window = sharpness[first : chosen[-1] + int(1.5 * step) + 1]
-        if not len(window):
-            return chosen
-        chosen.append(first + int(np.argmax(window)))
-
-
-def _video(file: Path) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
-    """Frames, upright, blue first."""
-    video = opencv().VideoCapture(str(file))
-    try:
-        while True:
-            found, image = video.read()
-            if not found:
-                return
-            yield image
-    finally:
-        video.release()
-
-
-def _sharpness(image: UInt8[np.ndarray, "H W 3"]) -> float:
-    """Variance of the Laplacian of linear luminance over its squared mean, at a small size."""
-    cv2 = opencv()
-    scale = min(1.0, JUDGED_WIDTH_PX / image.shape[1])
-    light = luminance(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)[..., ::-1])
-    return float(cv2.Laplacian(light, cv2.CV_32F).var() / max(float(light.mean()) ** 2, 1e-8))
-
-
-def luminance(image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
-    """Of linear light, from sRGB codes."""
-    return srgb_to_linear(unit_values(image)) @ LUMINANCE
 
 
 def _write_frame(

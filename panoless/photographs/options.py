@@ -24,6 +24,12 @@ class CaptureOptions:
     most_blur: Share = 0.75
     """Blur (Crete et al. 2007, 0 to 1) of the median frame above which a capture is refused. *Vase*, *mirror* and
     *sculpture* before their surroundings have 0.42, 0.67 after a Gaussian blur of 2 pixels, and 0.78 after 3."""
+    least_contrast: Positive = 0.1
+    """Standard deviation of light at the border of the median frame, as a share of its mean, from which it can be told
+    whether the camera moved. A studio's plain background has less."""
+    least_change: Share = 0.25
+    """By which share of that contrast the border must change. It changes by 1.6 in a film of *sculpture* in a room, 0.6
+    where all borders show a patterned ground; before a camera that stands still by its noise."""
     least_corners: Annotated[int, Meta(ge=6)] = 8
     """Corners of the board that a frame must show; a pose needs four, and more make it certain."""
     corner_blurs_px: tuple[NonNegative, ...] = (1.5, 0.7, 0.7)

@@ -10,9 +10,10 @@ import pytest
 
 from panoless.photographs.board import BOARD_TO_WORLD, drawn_by_opencv, poses_from_board, write_board
 from panoless.photographs.corners import corners_of, locate_corners
-from panoless.photographs.frames import Frames, Photograph, luminance
+from panoless.photographs.frames import Frames, Photograph
 from panoless.photographs.lens import Lens
 from panoless.photographs.options import CaptureOptions
+from panoless.photographs.video import luminance
 from shinypartial.core.board import BOARDS
 from shinypartial.core.camera import project
 from shinypartial.core.errors import InputError

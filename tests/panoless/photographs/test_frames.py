@@ -1,5 +1,7 @@
 """Photographs and videos to frames."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -8,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from panoless.photographs.frames import block_means, make_frames, sharpest_frames, source_files
+from panoless.photographs.frames import block_means, make_frames, source_files
 from panoless.photographs.options import CaptureOptions
+from panoless.photographs.video import sharpest_frames
 from shinypartial.core.errors import InputError
 from shinypartial.io.images import read_png, write_png
 
@@ -42,7 +45,7 @@ def test_the_sharpest_frames_of_a_video_are_taken(tmp_path: Path) -> None:
     for index in range(48):
         writer.write(TEXTURE if index in sharp else cv2.GaussianBlur(TEXTURE, (0, 0), 3))
     writer.release()
-    found = make_frames(source_files(path), tmp_path / "frames", True, CaptureOptions(video_frames=9))
+    found = make_frames(source_files(path), tmp_path / "frames", True, CaptureOptions(video_frames=9, least_change=0))
     assert {int(one.name.removeprefix("frame_")) for one in found.photographs} <= sharp
     # JPEG of chroma at half the resolution; red and blue in their places.
     first = read_png(tmp_path / "frames" / f"{found.photographs[0].name}.png").astype(int)
@@ -89,3 +92,82 @@ def test_portraits_are_turned_as_their_tag_says(tmp_path: Path) -> None:
     assert np.abs(turned - np.rot90(TEXTURE, -1)).mean() < 6  # What JPEG leaves.
     kept = make_frames(source_files(folder), tmp_path / "stored", False, CaptureOptions()).photographs[-1]
     assert (kept.width, kept.height) == (128, 96)
+
+
+def write_video(path: Path, count: int, size: tuple[int, int] = (128, 96)) -> None:
+    """A texture that moves along."""
+    writer = cv2.VideoWriter(
+        str(path), cv2.VideoWriter_fourcc(*("MJPG" if path.suffix == ".avi" else "mp4v")), 12, size
+    )
+    for index in range(count):
+        writer.write(cv2.resize(np.roll(TEXTURE, 7 * index, 1), size))
+    writer.release()
+
+
+def test_a_video_that_ends_in_the_middle_is_used_as_far_as_it_goes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_video(tmp_path / "whole.avi", 40)
+    content = (tmp_path / "whole.avi").read_bytes()
+    (tmp_path / "cut.avi").write_bytes(content[: len(content) * 2 // 3])
+    found = make_frames([tmp_path / "cut.avi"], tmp_path / "frames", True, CaptureOptions())
+    assert 20 <= len(found.photographs) < 30
+    assert "ends after" in capsys.readouterr().err
+
+
+def test_a_video_without_its_end_where_the_index_stands_is_refused(tmp_path: Path) -> None:
+    """An MP4 that was cut off while it was recorded has no index, so that no frame can be decoded."""
+    write_video(tmp_path / "whole.mp4", 30)
+    content = (tmp_path / "whole.mp4").read_bytes()
+    (tmp_path / "cut.mp4").write_bytes(content[: content.rindex(b"moov") - 4])
+    with pytest.raises(InputError, match="no frame"):
+        make_frames([tmp_path / "cut.mp4"], tmp_path / "frames", True, CaptureOptions())
+
+
+@pytest.mark.parametrize(("transfer", "refused"), [(1, False), (16, True), (18, True)])
+def test_videos_of_high_dynamic_range_are_refused(tmp_path: Path, transfer: int, refused: bool) -> None:
+    """By the box `colr` of a container (ISO/IEC 14496-12, 12.1.5): primaries, transfer, matrix, range."""
+    path = tmp_path / "clip.mp4"
+    write_video(path, 12)
+    box = b"colr" + b"nclx" + b"".join(value.to_bytes(2, "big") for value in (9, transfer, 9)) + b"\x00"
+    path.write_bytes(path.read_bytes() + (len(box) + 4).to_bytes(4, "big") + box)
+    if refused:
+        with pytest.raises(InputError, match="high dynamic range"):
+            make_frames([path], tmp_path / "frames", True, CaptureOptions())
+    else:
+        assert len(make_frames([path], tmp_path / "frames", True, CaptureOptions()).photographs) == 12
+
+
+@pytest.mark.parametrize(("surroundings", "message"), [("textured", "turntable"), ("plain", None)])
+def test_a_turntable_is_told_by_surroundings_at_rest(tmp_path: Path, surroundings: str, message: str | None) -> None:
+    """An object that turns before a room at rest, with noise and drifting exposure; a plain studio tells nothing."""
+    room = TEXTURE if surroundings == "textured" else np.full_like(TEXTURE, 140)
+    random = np.random.default_rng(0)
+    for index in range(9):
+        image = room.astype(float) * (1 + 0.05 * np.sin(index)) + random.normal(0, 2, room.shape)
+        image[30:66, 40:88] = np.roll(TEXTURE, 11 * index, 1)[30:66, 40:88]
+        write_png(tmp_path / "photos" / f"p_{index}.png", np.clip(image, 0, 255).astype(np.uint8))
+    files = source_files(tmp_path / "photos")
+    if message:
+        with pytest.raises(InputError, match=message):
+            make_frames(files, tmp_path / "frames", True, CaptureOptions())
+    else:
+        make_frames(files, tmp_path / "frames", True, CaptureOptions())
+
+
+@pytest.mark.slow
+def test_pictures_of_twelve_megapixels_take_moderate_memory(tmp_path: Path) -> None:
+    """Below 4 GB: 0.75 GB were measured with all libraries loaded."""
+    big = cv2.resize(TEXTURE, (4000, 3000), interpolation=cv2.INTER_NEAREST)
+    for index in range(8):
+        path = tmp_path / "photos" / f"p_{index}.jpg"
+        path.parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(path), np.roll(big, 97 * index, 1))
+    program = (
+        "import resource, sys; from pathlib import Path; from panoless.photographs.frames import *;"
+        "make_frames(source_files(Path(sys.argv[1])), Path(sys.argv[2]), True, CaptureOptions());"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path / "photos"), str(tmp_path / "frames")]
+    kilobytes = int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    assert kilobytes < 4e6
