@@ -44,6 +44,8 @@ def decoded_video(file: Path, count: int) -> Iterator[tuple[str, Path, UInt8[np.
 
 def _require_standard_range(file: Path) -> None:
     """InputError where the container says that light is coded as PQ or HLG."""
+    if not file.stat().st_size:
+        return
     with file.open("rb") as opened, mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ) as content:
         at = content.find(COLOR_BOX)
         place = at + len(COLOR_BOX)

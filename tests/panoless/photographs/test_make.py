@@ -99,7 +99,8 @@ def test_a_missing_library_names_the_extra(
         return load(name, *rest, **named)
 
     monkeypatch.setattr(builtins, "__import__", without_opencv)
-    assert main(["board", "--output", str(tmp_path / "board.pdf")]) == 2
+    (tmp_path / "film.mp4").write_bytes(b"ftyp")
+    assert main(["capture", str(tmp_path / "film.mp4"), "--output", str(tmp_path / "out")]) == 2
     assert "panoless[capture]" in capsys.readouterr().err
 
 
