@@ -1,4 +1,5 @@
 # make demo    render a dataset, fit it, score it and write an HTML report: five minutes, installation included
+# make capture-demo  film a chrome ball, capture the film, fit and score it: three minutes on two cores
 # make test    every check: format, lint, types, import contracts, documentation, tests
 # make results the tables of README and docs: RESOLUTION=400 SCENES="vase cola"; run again to continue
 # make docs    build the documentation into build/site
@@ -13,7 +14,7 @@ NEED_PYTHON := expected Python 3.11 as python3.11 or python3 (the newest Blender
 PIP_INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 CODE := shinypartial panoless tests docs
 
-.PHONY: demo test lint kernels results docs format setup clean
+.PHONY: demo capture-demo test lint kernels results docs format setup clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/.installed-demo
@@ -21,6 +22,13 @@ demo: $(VENV)/.installed-demo
 	$(BIN)/panoless fit
 	$(BIN)/shinypartial evaluate
 	$(BIN)/shinypartial report
+
+capture-demo: $(VENV)/.installed-capture
+	$(BIN)/shinypartial film --scene chrome-ball-board --resolution 320 --frames 24 --test 6 --samples 8 --output films/demo
+	$(BIN)/panoless capture films/demo/film.mp4 --output datasets/film-demo --board A4 --masks films/demo/masks
+	$(BIN)/shinypartial align datasets/film-demo --truth films/demo/truth --output datasets/film-demo-aligned
+	$(BIN)/panoless fit datasets/film-demo-aligned --preset fast --output predictions/film-demo
+	$(BIN)/shinypartial evaluate predictions/film-demo --dataset films/demo/truth
 
 test: setup
 	@$(MAKE) --no-print-directory -j2 lint kernels
@@ -55,8 +63,9 @@ format: setup
 setup: $(VENV)/.installed-dev
 
 $(VENV)/.installed-demo: extras := fit,blender
+$(VENV)/.installed-capture: extras := fit,blender,capture
 $(VENV)/.installed-dev: extras := dev
-$(VENV)/.installed-demo $(VENV)/.installed-dev: pyproject.toml constraints.txt
+$(VENV)/.installed-demo $(VENV)/.installed-capture $(VENV)/.installed-dev: pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" && $(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { \
 	  echo "error: $(NEED_PYTHON)" >&2; \
 	  echo "       found    $$($(or $(PYTHON),python3) --version 2>&1 | head -n 1)" >&2; \

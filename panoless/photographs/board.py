@@ -21,6 +21,8 @@ from shinypartial.io.images import read_png
 #: From the board's axes (x right, y down, z into it) to the world's: x right, y up the sheet, z out of it.
 BOARD_TO_WORLD = np.diag([1.0, -1.0, -1.0, 1.0])
 OUTLIER_ROUNDS = 3
+#: Corners from which the pose of a frame can be found at all, to look for more of them.
+CORNERS_OF_POSE = 4
 POINTS_PER_MM = 72 / 25.4
 
 
@@ -94,8 +96,8 @@ def _write_pdf(board: Board, path: Path) -> None:
         temporary.write_bytes(file.encode("ascii"))
 
 
-def find_board(board: Board, frames: Frames, folder: Path, options: CaptureOptions) -> list[Sighting]:
-    """The frames that show enough corners, not all on one line."""
+def find_board(board: Board, frames: Frames, folder: Path) -> list[Sighting]:
+    """The frames that show corners enough for a pose, not all on one line."""
     cv2 = opencv()
     parameters = cv2.aruco.CharucoParameters()
     parameters.minMarkers = 1  # The object hides markers; corners that are found wrong are outliers.
@@ -104,7 +106,7 @@ def find_board(board: Board, frames: Frames, folder: Path, options: CaptureOptio
     for photograph in frames.photographs:
         gray = cv2.cvtColor(read_png(folder / f"{photograph.name}.png")[..., :3].copy(), cv2.COLOR_RGB2GRAY)
         places, corners, _, _ = detector.detectBoard(gray)
-        if corners is None or len(corners) < options.least_corners:
+        if corners is None or len(corners) < CORNERS_OF_POSE:
             continue
         numbers = corners[:, 0]
         columns, rows = numbers % (board.columns - 1), numbers // (board.columns - 1)
@@ -128,7 +130,8 @@ def poses_from_board(board: Board, frames: Frames, folder: Path, options: Captur
             remedy="Keep the zoom and the crop the same, and hold the camera the same way up.",
         )
     size = sizes.pop()
-    sightings = find_board(board, frames, folder, options)
+    seen = find_board(board, frames, folder)
+    sightings = [sighting for sighting in seen if len(sighting.corners) >= options.least_corners]
     origin = f"the board of {board.columns}×{board.rows} squares"
     if len(sightings) < options.least_views:
         raise InputError(
@@ -141,7 +144,11 @@ def poses_from_board(board: Board, frames: Frames, folder: Path, options: Captur
     sightings, adjusted = _robust(board, sightings, lens, options, OUTLIER_ROUNDS)
     pictures = {one.name: folder / f"{one.name}.png" for one in frames.photographs}
     for blur_px in options.corner_blurs_px:
-        sightings = _located(board, sightings, adjusted, pictures, blur_px, options)
+        known = dict(zip((sighting.name for sighting in sightings), adjusted.poses, strict=True))
+        near = {
+            sighting.name: known.get(sighting.name, _rough_pose(board, sighting, adjusted.lens)) for sighting in seen
+        }
+        sightings = _located(board, near, adjusted.lens, pictures, blur_px, options)
         if len(sightings) < options.least_views:
             break
         sightings, adjusted = _robust(board, sightings, adjusted.lens, options, 1)
@@ -189,9 +196,7 @@ def _adjust(board: Board, sightings: list[Sighting], lens: Lens) -> _Adjusted:
     for known, found, turn, shift in zip(points, places, turns, shifts, strict=True):
         seen = cv2.projectPoints(known, turn, shift, matrix, distortion)[0][:, 0]
         residuals.append(np.linalg.norm(seen - found, axis=1).astype(np.float64))
-        camera_from_board = np.eye(4)
-        camera_from_board[:3, :3], camera_from_board[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-        poses.append(np.linalg.inv(camera_from_board))
+        poses.append(_camera_to_board(turn, shift))
     focal, k1 = float(matrix[0, 0]), float(distortion.ravel()[0])
     found_lens = Lens(focal, focal, lens.cx, lens.cy, *size, k1=k1)
     # The deviation stands at one of fx and fy, which are the same.
@@ -209,19 +214,34 @@ def _robust(
     return sightings, adjusted
 
 
+def _rough_pose(board: Board, sighting: Sighting, lens: Lens) -> Float[np.ndarray, "4 4"]:
+    """Camera to board, of one frame by itself under a lens that is known."""
+    cv2 = opencv()
+    points, places = _points_and_places(board, [sighting])
+    _, turn, shift = cv2.solvePnP(points[0], places[0], lens.matrix, np.array(lens.distortion), flags=cv2.SOLVEPNP_IPPE)
+    return _camera_to_board(turn, shift)
+
+
+def _camera_to_board(turn: Float[np.ndarray, "3 1"], shift: Float[np.ndarray, "3 1"]) -> Float[np.ndarray, "4 4"]:
+    """The pose that OpenCV has as the board's rotation vector and place before the camera."""
+    board_to_camera = np.eye(4)
+    board_to_camera[:3, :3], board_to_camera[:3, 3] = opencv().Rodrigues(turn)[0], shift.ravel()
+    return np.linalg.inv(board_to_camera)
+
+
 def _located(
     board: Board,
-    sightings: list[Sighting],
-    adjusted: _Adjusted,
+    poses: dict[str, Float[np.ndarray, "4 4"]],
+    lens: Lens,
     pictures: dict[str, Path],
     blur_px: float,
     options: CaptureOptions,
 ) -> list[Sighting]:
-    """The corners found anew by all of the print around them, in the frames that still show enough."""
+    """The corners by all of the print around them, near where poses have them, in the frames that show enough."""
     found = []
-    for sighting, pose in zip(sightings, adjusted.poses, strict=True):
-        light = luminance(read_png(pictures[sighting.name])[..., :3])
-        located = locate_corners(board, sighting.name, light, adjusted.lens, pose, blur_px, options)
+    for name, pose in poses.items():
+        light = luminance(read_png(pictures[name])[..., :3])
+        located = locate_corners(board, name, light, lens, pose, blur_px, options)
         if len(located.corners) >= options.least_corners:
             found.append(located)
     return found

@@ -16,6 +16,8 @@ from shinypartial.core.board import CELLS_OF_SQUARE, MM, Board
 
 #: Pixels of the board's picture for each of its cells, and white cells that are added around it.
 PIXELS_OF_CELL, PAPER_CELLS = 6, 3
+#: Cells at the edge of the board that are left out, because blur brings in what lies beside it.
+EDGE_CELLS = 1
 #: Standard deviation of the blur that a pixel's own size makes, in pixels: that of a square and a good lens.
 PIXEL_BLUR_PX = 0.5
 TINY = 1e-12
@@ -62,8 +64,8 @@ def locate_corners(
     low = np.clip(np.floor(expected.min(0)).astype(int) - 2 * half, 0, [lens.width - 1, lens.height - 1])
     high = np.clip(np.ceil(expected.max(0)).astype(int) + 2 * half, low + 1, [lens.width, lens.height])
     part = light[low[1] : high[1], low[0] : high[0]].astype(np.float32)
-    picture = _expected_picture(board, lens, camera_to_board, square_px / CELLS_OF_SQUARE, low, high)
-    shifts, match = _shifts(_blurred(part, blur_px), _blurred(picture, blur_px), expected - low, half)
+    picture, known = _expected_picture(board, lens, camera_to_board, square_px / CELLS_OF_SQUARE, low, high)
+    shifts, match = _shifts(_blurred(part, blur_px), _blurred(picture, blur_px), known, expected - low, half)
     inside = (expected > half).all(1) & (expected < np.array([lens.width, lens.height]) - 1 - half).all(1)
     near = np.linalg.norm(shifts, axis=1) < options.corner_reach * square_px
     kept: Bool[np.ndarray, "P"] = inside & near & (match > options.least_match)
@@ -81,8 +83,8 @@ def _expected_picture(
     cell_px: float,
     low: Int[np.ndarray, "2"],
     high: Int[np.ndarray, "2"],
-) -> Float[np.ndarray, "H W"]:
-    """The board as a part of the frame would show it, 1 where it is white; what lies around it is white too."""
+) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
+    """The board as a part of the frame would show it, 1 where it is white, and 1 where that is known: not beside it."""
     cv2 = opencv()
     white = np.pad(~board.cells(), PAPER_CELLS, constant_values=True).astype(np.float32)
     print_px = np.repeat(np.repeat(white, PIXELS_OF_CELL, 0), PIXELS_OF_CELL, 1)
@@ -96,11 +98,19 @@ def _expected_picture(
     cells = meters / (board.square_mm * MM / CELLS_OF_SQUARE) + PAPER_CELLS
     places = np.where((along > 0)[:, None], cells * PIXELS_OF_CELL - 0.5, -1e3).astype(np.float32)
     columns, rows = places.reshape(size[1], size[0], 2).transpose(2, 0, 1)
-    return cv2.remap(print_px, columns.copy(), rows.copy(), cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, 1.0)
+    size_cells = np.array(board.cells().shape[::-1])
+    within = ((cells - PAPER_CELLS - EDGE_CELLS > 0) & (cells - PAPER_CELLS + EDGE_CELLS < size_cells)).all(1)
+    known = (within & (along > 0)).reshape(size[1], size[0]).astype(np.float32)
+    picture = cv2.remap(print_px, columns.copy(), rows.copy(), cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, 1.0)
+    return picture, known
 
 
 def _shifts(
-    image: Float[np.ndarray, "H W"], picture: Float[np.ndarray, "H W"], expected: Float[np.ndarray, "P 2"], half: int
+    image: Float[np.ndarray, "H W"],
+    picture: Float[np.ndarray, "H W"],
+    known: Float[np.ndarray, "H W"],
+    expected: Float[np.ndarray, "P 2"],
+    half: int,
 ) -> tuple[Float[np.ndarray, "P 2"], Float[np.ndarray, "P"]]:
     """Shift d of each window, and the share of its variance that is explained."""
     cv2 = opencv()
@@ -110,7 +120,7 @@ def _shifts(
     at = np.clip(np.rint(expected).astype(int), 0, np.array(image.shape[::-1]) - 1)
 
     def mean(product: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "P"]:
-        return cv2.boxFilter(product, cv2.CV_64F, (2 * half + 1,) * 2)[at[:, 1], at[:, 0]]
+        return cv2.boxFilter(known * product, cv2.CV_64F, (2 * half + 1,) * 2)[at[:, 1], at[:, 0]]
 
     products = np.empty((len(at), len(columns), len(columns)))
     for i, a in enumerate(columns):
@@ -118,7 +128,8 @@ def _shifts(
             products[:, i, j] = products[:, j, i] = mean(a * b)
     sides = np.stack([mean(a * image) for a in columns], -1)
     solved = np.einsum("pij,pj->pi", np.linalg.pinv(products, rcond=1e-9, hermitian=True), sides)
-    total = mean(image * image) - sides[:, 3] ** 2
-    explained = np.sum(solved * sides, -1) - sides[:, 3] ** 2
+    of_mean = sides[:, 3] ** 2 / np.maximum(products[:, 3, 3], TINY)
+    total = mean(image * image) - of_mean
+    explained = np.sum(solved * sides, -1) - of_mean
     contrast = solved[:, :1]
     return solved[:, 1:3] / np.where(contrast > TINY, contrast, np.inf), explained / np.maximum(total, TINY)

@@ -9,16 +9,17 @@ from shinypartial.blender.materials import image_of, make_printed_material
 from shinypartial.scene import Ground
 
 GROUND = "ground"
-#: How far a print lies above its sheet, as a share of the sheet's side: no ray meets both at once.
-PRINT_ABOVE = 2e-4
+#: How far a sheet lies below the board on it, as a share of its side: no ray meets both at once.
+SHEET_BELOW = 2e-4
 
 
 def add_ground(bpy: Any, scene: Any, ground: Ground, exposure: float) -> None:
     """Link the sheet and, where there is one, the board; cameras see through both."""
-    _add(bpy, scene, "sheet", ground.texture(), (ground.side, ground.side), ground.height, exposure, exact=False)
+    height = ground.height
     if ground.printed is not None:
-        height = ground.height + PRINT_ABOVE * ground.side
         _add(bpy, scene, "board", ground.print_texture(), ground.printed.size_m, height, exposure, exact=True)
+        height -= SHEET_BELOW * ground.side
+    _add(bpy, scene, "sheet", ground.texture(), (ground.side, ground.side), height, exposure, exact=False)
 
 
 def grounds(bpy: Any) -> list[Any]:

@@ -3,7 +3,7 @@
 A run that is killed at any moment continues when it is started again.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from shinypartial.film.recording import moments, recorded_mask, recorded_picture
 from shinypartial.generate import Shots, generate, render_frames
 from shinypartial.io.files import copy_or_link, folder_lock, read_json, remove_partial_files, write_json
 from shinypartial.io.images import write_jpeg, write_png
+from shinypartial.io.records import write_record
 from shinypartial.scene import FilmSpec
 
 RECIPE, VIDEO, TRUTH = "film.json", "film.mp4", "truth"
@@ -55,9 +56,10 @@ def film(spec: FilmSpec, root: Path) -> Filmed:
     _check_folder(spec, root)
     check_blender()
     with folder_lock(root):
+        further = {"film": {"hand": write_record(spec.hand), "phone": write_record(spec.phone)}}
         write_json(root / RECIPE, {"complete": False, "recipe": spec.recipe()})
         remove_partial_files(root)
-        generate(spec.scene, truth, Shots(trajectory, FRAME_NAME, {"film": {"phone": asdict(spec.phone)}}))
+        generate(spec.scene, truth, Shots(trajectory, FRAME_NAME, further))
         frames = open_dataset(truth).train
         missing = [frame for frame in frames if not _is_recorded(root, frame)]
         if missing:
