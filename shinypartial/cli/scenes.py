@@ -121,10 +121,10 @@ class Generate:
 class Film:
     """Render what a phone would record of a scene, with the truth beside it; run again to continue."""
 
-    scene: str
-    """Name of a film in blender_scenes/films, or the path of its .toml file."""
+    scene: str | None = None
+    """Name of a film in blender_scenes/films, or the path of its .toml file; all films there when not given."""
     output: Path | None = None
-    """Folder to write; films/NAME-WIDTH when not given."""
+    """Folder to write, or the parent of the folders of all films; below films/ when not given."""
     resolution: int | None = None
     """Width of the film in pixels; the recipe's when not given."""
     frames: int | None = None
@@ -135,18 +135,28 @@ class Film:
     """Samples per pixel; the recipe's when not given."""
 
     def run(self) -> None:
-        """Make the film and say how to capture it."""
+        """Make the film, or all of them, and say how to capture it."""
+        from shinypartial.film.film import DEFAULT_FOLDER
+        from shinypartial.scene import film_names
+
+        if self.scene:
+            self._film(self.scene, self.output)
+            return
+        for name in film_names():
+            self._film(name, (self.output or DEFAULT_FOLDER) / name)
+
+    def _film(self, name: str, output: Path | None) -> None:
         from dataclasses import replace
 
         from shinypartial.film.film import DEFAULT_FOLDER, MASKS, TRUTH, VIDEO, film
         from shinypartial.scene import load_film, override
 
-        spec = load_film(self.scene)
+        spec = load_film(name)
         scene = override(
             spec.scene, resolution=self.resolution, samples=self.samples, train=self.frames, test=self.test
         )
         varied = replace(spec, scene=scene)
-        root = self.output or DEFAULT_FOLDER / f"{Path(self.scene).stem}-{varied.size[0]}"
+        root = output or DEFAULT_FOLDER / Path(name).stem
         made = film(varied, root)
         kept = f" (and kept {made.kept} that were there)" if made.kept else ""
         print(f"Recorded {made.recorded} frames{kept} into {root / VIDEO}; truth in {root / TRUTH}")
