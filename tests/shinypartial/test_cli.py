@@ -15,6 +15,8 @@ from shinypartial.dataset.schema import Dataset
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = (
     "generate",
+    "film",
+    "align",
     "subset",
     "perturb",
     "validate",
