@@ -24,17 +24,20 @@ class MaskRepairOptions:
     near_views: Count = 4
     """Of so many views nearest in direction, none may see a point beside its mask that a view lacks: a gap of the
     object shows in all of them. Not tuned."""
-    margin_px: NonNegative = 2.0
-    """What stands out lies farther than this beside the masks of the others."""
+    cells: Count = 48
+    """Points along a side of the grid that views vote on, which holds the object."""
+    margin: NonNegative = 0.8
+    """What stands out lies farther than this beside the masks of the others, in spacings of the grid: 2.8 px in
+    pictures of 160 px. With 0.6, vase loses parts of its lip to masks that are 4 px too small."""
+    least_radius: NonNegative = 1.0
+    """Parts in which no larger disk fits are left alone, in spacings: gaps of sculpture as narrow are seen by one view
+    of 50."""
     least_radius_px: NonNegative = 3.0
-    """Parts in which no larger disk fits are left alone: gaps of sculpture and of a torus as narrow are seen by one
-    view of 50."""
+    """The same in pixels, where these are wider than a third of a spacing. Not tuned."""
     largest_length: Positive = 6.0
     """Parts longer than so many times the radius of that disk are left alone: wrong poses make crescents."""
     least_share: Share = 0.75
     """Share that parts which are not long have of all that is as wide and contradicts, at least. It is 1.0 with holes
     and stray pieces, 0.01 to 0.3 with wrong poses and masks that are too small."""
-    cells: Count = 48
-    """Points along a side of the grid that views vote on."""
     rounds: Count = 4
     """Most rounds: masks that were mended tell more about others."""

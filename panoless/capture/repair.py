@@ -5,6 +5,7 @@ second shiny thing for the object a stray piece. Both cost the whole shape: a ho
 hull, and a stray piece has an outline to which no surface can attach.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -37,30 +38,43 @@ def with_repaired_masks(views: Views, options: MaskRepairOptions) -> Views:
     """
     if options.mode == "off" or len(views.train) < options.least_views:
         return views
-    holes, pieces, points = 0, 0, _points(views, options)
+    holes, pieces, grid = 0, 0, _Grid.of(views, options)
     changed: set[int] = set()
     for _ in range(options.rounds):
-        votes = _Votes.of(views, points, options)
+        votes = _Votes.of(views, grid, options)
+        radii = [max(options.least_radius * grid.spacing_px(view), options.least_radius_px) for view in views.train]
         inside = [view.mask.cpu().numpy() >= MASK_LEVEL for view in views.train]
-        lacking = _Contradicted.of([~each & votes.shown(index) for index, each in enumerate(inside)], options)
-        excess = _Contradicted.of([each & ~votes.allowed(index) for index, each in enumerate(inside)], options)
+        lacking = _Contradicted.of([~each & votes.shown(index) for index, each in enumerate(inside)], radii, options)
+        excess = _Contradicted.of([each & ~votes.allowed(index) for index, each in enumerate(inside)], radii, options)
         blobs = lacking.count + excess.count
         if not blobs or lacking.area + excess.area < options.least_share * (lacking.wide + excess.wide):
             break
         chosen, mended = (lacking, _filled) if lacking.count else (excess, _without)
-        train = (mended(view, part, options) for view, part in zip(views.train, chosen.blobs, strict=True))
+        train = (mended(*each) for each in zip(views.train, chosen.blobs, radii, strict=True))
         changed |= {index for index, part in enumerate(chosen.blobs) if part.any()}
         holes, pieces = holes + lacking.count, pieces + (0 if lacking.count else excess.count)
         views = replace(views, train=tuple(train), repairs=MaskRepairs(holes, pieces, len(changed)))
     return views
 
 
-def _points(views: Views, options: MaskRepairOptions) -> Float[Tensor, "P 3"]:
-    """A grid in the ball about the object."""
-    reach = SPARE * max(1.0, views.object_frame.reach)
-    side = torch.linspace(-reach, reach, options.cells)
-    points = torch.stack(torch.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3)
-    return points[points.norm(dim=1) <= reach].to(views.train[0].mask.device)
+@dataclass(frozen=True)
+class _Grid:
+    """Points in the ball about the object, and how far apart they are."""
+
+    points: Float[Tensor, "P 3"]
+    spacing: float
+
+    @classmethod
+    def of(cls, views: Views, options: MaskRepairOptions) -> "_Grid":
+        reach = SPARE * max(1.0, views.object_frame.reach)
+        side = torch.linspace(-reach, reach, options.cells)
+        points = torch.stack(torch.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3)
+        inside = points[points.norm(dim=1) <= reach].to(views.train[0].mask.device)
+        return cls(inside, 2 * reach / (options.cells - 1))
+
+    def spacing_px(self, view: TrainView) -> float:
+        """In pixels of a view, at the object's center."""
+        return self.spacing * view.camera.fx / float(np.linalg.norm(view.position))
 
 
 @dataclass(frozen=True)
@@ -68,7 +82,7 @@ class _Votes:
     """Which views see each point of the grid beside their masks, and which see it farther off than a margin."""
 
     views: Views
-    points: Float[Tensor, "P 3"]
+    grid: _Grid
     outside: Bool[np.ndarray, "V P"]
     beyond: Bool[np.ndarray, "V P"]
     nearest: Int[np.ndarray, "V K"]
@@ -76,14 +90,15 @@ class _Votes:
     options: MaskRepairOptions
 
     @classmethod
-    def of(cls, views: Views, points: Float[Tensor, "P 3"], options: MaskRepairOptions) -> "_Votes":
-        outlines = [mask_distance(view) for view in views.train]
-        away = [(outline.distances(points) / outline.pixel).cpu().numpy() for outline in outlines]
+    def of(cls, views: Views, grid: _Grid, options: MaskRepairOptions) -> "_Votes":
+        away = [mask_distance(view).distances(grid.points).cpu().numpy() for view in views.train]
         centers = np.array([view.position for view in views.train])
         sights = centers / np.linalg.norm(centers, axis=1, keepdims=True)
         order = np.argsort(-(sights @ sights.T) - 2 * np.eye(len(sights)), axis=1)[:, 1 : 1 + options.near_views]
-        outside, beyond = (np.array([each > margin for each in away]) for margin in (0.0, options.margin_px))
-        return cls(views, points, outside, beyond, order, options)
+        outside, beyond = (
+            np.array([each > margin * grid.spacing for each in away]) for margin in (0.0, options.margin)
+        )
+        return cls(views, grid, outside, beyond, order, options)
 
     def shown(self, index: int) -> Image:
         """Where a view has to show the object: nearly all others, and all those nearest, have it inside their masks."""
@@ -103,11 +118,12 @@ class _Votes:
         """Pixels that show some of the chosen points, which lie closer than its gaps are closed."""
         from scipy.ndimage import binary_closing
 
-        camera, points = self.views.train[index].camera, self.points[torch.from_numpy(chosen).to(self.points.device)]
+        camera, points = self.views.train[index].camera, self.grid.points
+        points = points[torch.from_numpy(chosen).to(points.device)]
         points_camera = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
         columns, rows = (each.cpu().numpy() for each in project(camera, points_camera, first_center=0))
-        spacing = 2 * SPARE * max(1.0, self.views.object_frame.reach) / (self.options.cells - 1)
-        gap = int(np.ceil(spacing * camera.fx / (2 * points_camera[:, 2].min().item()))) if len(points) else 1
+        nearest = max(float(points_camera[:, 2].min()), camera.near) if len(points) else math.inf
+        gap = max(1, math.ceil(self.grid.spacing * camera.fx / (2 * nearest)))
         image = np.zeros((camera.height + 2 * gap, camera.width + 2 * gap), bool)
         rows, columns = (np.rint(each).astype(int) + gap for each in (rows, columns))
         within = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1])
@@ -129,12 +145,13 @@ class _Contradicted:
     """…and of all that is as wide."""
 
     @classmethod
-    def of(cls, regions: Sequence[Image], options: MaskRepairOptions) -> "_Contradicted":
+    def of(cls, regions: Sequence[Image], radii: Sequence[float], options: MaskRepairOptions) -> "_Contradicted":
+        """`radii` are those of the least disk in the pixels of each view."""
         from scipy.ndimage import find_objects, label
 
         blobs, count, wide = [np.zeros_like(region) for region in regions], 0, 0
-        for region, blob in zip(regions, blobs, strict=True):
-            depth, opened = _opened(region, options.least_radius_px)
+        for region, blob, radius in zip(regions, blobs, radii, strict=True):
+            depth, opened = _opened(region, radius)
             parts, _ = label(opened, SQUARE)
             for number, box in enumerate(find_objects(parts), start=1):
                 part = parts == number
@@ -155,35 +172,35 @@ def _opened(region: Image, radius: float) -> tuple[Float[np.ndarray, "H W"], Ima
     return depth, region & (distance_transform_edt(~core) <= radius) if core.any() else core
 
 
-def _filled(view: TrainView, part: Image, options: MaskRepairOptions) -> TrainView:
-    """With that part on the object, and narrow gaps beside it."""
+def _filled(view: TrainView, part: Image, radius: float) -> TrainView:
+    """With that part on the object, and gaps beside it that are narrower than a disk."""
     from scipy.ndimage import binary_fill_holes
 
     if not part.any():
         return view
     alpha = view.mask.cpu().numpy()
     inside = (alpha >= MASK_LEVEL) | part
-    part = part | _narrow_beside(binary_fill_holes(inside) & ~inside, part, options)
+    part = part | _narrow_beside(binary_fill_holes(inside) & ~inside, part, radius)
     return _with_mask(
         view, np.where(_grown(part) & (alpha >= MASK_LEVEL) | part, np.maximum(alpha, SOLID_ALPHA), alpha)
     )
 
 
-def _without(view: TrainView, part: Image, options: MaskRepairOptions) -> TrainView:
-    """With that part, and narrow pieces and half pixels beside it, off the object."""
+def _without(view: TrainView, part: Image, radius: float) -> TrainView:
+    """With that part, and half pixels and pieces beside it that are narrower than a disk, off the object."""
     if not part.any():
         return view
     alpha = view.mask.cpu().numpy()
-    part = part | _narrow_beside((alpha >= MASK_LEVEL) & ~part, part, options)
+    part = part | _narrow_beside((alpha >= MASK_LEVEL) & ~part, part, radius)
     return _with_mask(view, np.where(part | _grown(part) & (alpha < MASK_LEVEL), 0, alpha))
 
 
-def _narrow_beside(region: Image, part: Image, options: MaskRepairOptions) -> Image:
-    """Pieces of a region that touch a part and into which no disk of the least radius fits."""
+def _narrow_beside(region: Image, part: Image, radius: float) -> Image:
+    """Pieces of a region that touch a part and into which no disk of that radius fits."""
     from scipy.ndimage import label
 
     pieces, _ = label(region, SQUARE)
-    wide = pieces[_opened(region, options.least_radius_px)[1]]
+    wide = pieces[_opened(region, radius)[1]]
     found: np.ndarray = np.isin(pieces, np.setdiff1d(pieces[_grown(part)], [0, *wide]))
     return found
 
