@@ -19,6 +19,7 @@ from shinypartial.io.records import write_record
 from shinypartial.prediction.format import read_info
 
 TUNED = (
+    "mask_repair",
     "first_surface",
     "sphere",
     "plane",
