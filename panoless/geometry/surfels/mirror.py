@@ -34,7 +34,6 @@ from panoless.geometry.surfels.options import SurfelOptions
 from panoless.geometry.surfels.rendering import ALPHA_FLOOR, rasterize_surfels, surface_buffers, tiles_of
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.rasterize import Channels, RasterBuffers, RasterCamera
-from panoless.kernels.reference.rasterize import rotation_matrices
 from panoless.numeric.robust import robust_weight
 from shinypartial.core.conventions import SOLID_ALPHA
 
@@ -175,9 +174,8 @@ class SurfelMirror:
         Colors are degree-0 spherical harmonics of the albedo; curvature_a, _b, _c are the shape operator.
         """
         surfels = self.surfels.detached()
-        normals = rotation_matrices(surfels.quats)[:, :, 2]
         columns = {
-            **_columns(("nx", "ny", "nz"), normals),
+            **_columns(("nx", "ny", "nz"), surfels.normals),
             **_columns(("f_dc_0", "f_dc_1", "f_dc_2"), (surfels.albedo - 0.5) / SH_DEGREE_0),
             "opacity": surfels.opacity_logits,
             **_columns(("scale_0", "scale_1", "scale_2"), surfels.log_scales + math.log(frame.radius)),

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from panoless.kernels.reference.rasterize import rotation_matrices
+
 Set = TypeVar("Set", bound="Surfels")
 
 
@@ -38,6 +40,11 @@ class Surfels:
     def scales(self) -> Float[Tensor, "K D"]:
         """Radii s_u, s_v > 0 along the tangents; of 3D Gaussians one along the third axis, too."""
         return self.log_scales.exp()
+
+    @property
+    def normals(self) -> Float[Tensor, "K 3"]:
+        """Unit world normals of flat surfels: their third axes."""
+        return rotation_matrices(self.quats)[:, :, 2]
 
     @property
     def opacities(self) -> Float[Tensor, "K"]:

@@ -13,8 +13,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from panoless.capture.rays import unit_rays_camera
+from panoless.capture.rays import reflect, unit_rays_camera
 from panoless.capture.views import TrainView
+from panoless.environment.split_sum import LEVELS, Prefiltered, look_up_rough, specular_share
 from panoless.geometry.surfels.density import PROPAGATED_OPACITY, PROPAGATION_GROWTH
 from panoless.geometry.surfels.model import ShadedSurfels, Surfels
 from panoless.geometry.surfels.rendering import ALPHA_FLOOR
@@ -94,6 +95,29 @@ class Shading(Protocol):
     def revived(self, surfels: ShadedSurfels) -> ShadedSurfels:
         """What becomes of materials where opacities are reset."""
         ...
+
+
+class Unchanging:
+    """What a method without terms, propagation or resets of its own does about them: nothing."""
+
+    def penalty(
+        self, seen: Seen, surfels: ShadedSurfels, view: TrainView, neighbor: RasterCamera, share: float
+    ) -> Tensor | None:
+        """None."""
+        return None
+
+    def propagated(self, surfels: ShadedSurfels, share: float, generator: torch.Generator) -> ShadedSurfels:
+        """As they are."""
+        return surfels
+
+    def revived(self, surfels: ShadedSurfels) -> ShadedSurfels:
+        """As they are."""
+        return surfels
+
+
+def at_least(surfels: ShadedSurfels, strength: float) -> ShadedSurfels:
+    """Primitives that reflect at least so strongly."""
+    return replace(surfels, strength_logits=surfels.strength_logits.clamp(min=logit(strength)))
 
 
 def shaded(
@@ -192,14 +216,26 @@ def facing(normals: Float[Tensor, "K 3"], views: Float[Tensor, "K 3"]) -> Float[
     return normals * torch.where((normals * views).sum(1, keepdim=True) > 0, -1.0, 1.0)
 
 
-def surfel_normals(surfels: Surfels) -> Float[Tensor, "K 3"]:
-    """Unit world normals of surfels."""
-    return rotation_matrices(surfels.quats)[:, :, 2]
+def incidence_cosines(views: Float[Tensor, "P 3"], normals: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
+    """cos θ of unit directions from the camera; 0 where a normal is turned away."""
+    return -(views * normals).sum(1).clamp(-1, 0)
 
 
-def mirrored(views: Float[Tensor, "P 3"], normals: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-    """v − 2 (v·n) n of unit vectors (Eq. 5)."""
-    return views - 2 * (views * normals).sum(1, keepdim=True) * normals
+def split_sum_light(
+    light: Prefiltered,
+    views: Float[Tensor, "P 3"],
+    normals: Float[Tensor, "P 3"],
+    at_normal: Float[Tensor, "P 3"],
+    roughness: Float[Tensor, "P"],
+) -> Float[Tensor, "P 3"]:
+    """P(ω_r, ρ) (F₀ A + B) of surfaces with the reflectance F₀ at normal incidence, seen along unit directions."""
+    cosines, mirrored = incidence_cosines(views, normals), reflect(views, normals)
+    return look_up_rough(light, mirrored, roughness) * specular_share(at_normal, cosines, roughness)
+
+
+def ambient_light(light: Prefiltered, normals: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+    """P(n, 1), which diffuse surfaces are lit by."""
+    return look_up_rough(light, normals, torch.full_like(normals[:, 0], LEVELS[-1]))
 
 
 def harmonic_color(
@@ -233,16 +269,6 @@ class SurfacePixels:
         rays = unit_rays_camera(camera).to(alpha).flatten(1)[:, pixels]
         normals = normalize(to_world @ surface.normals_camera.flatten(1)[:, pixels], dim=0, eps=1e-8)
         return cls(pixels, alpha[pixels], normals.T, (to_world @ rays).T)
-
-    @property
-    def mirrored(self) -> Float[Tensor, "P 3"]:
-        """Where they mirror to."""
-        return mirrored(self.views, self.normals)
-
-    @property
-    def cosines(self) -> Float[Tensor, "P"]:
-        """cos θ of incidence."""
-        return -(self.views * self.normals).sum(1).clamp(-1, 0)
 
     def of_image(self, image: Float[Tensor, "C H W"]) -> Float[Tensor, "P C"]:
         """What a premultiplied image holds there, divided by alpha."""

@@ -9,18 +9,20 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from panoless.capture.views import TrainView
-from panoless.environment.split_sum import LEVELS, look_up_rough, prefiltered, specular_share
+from panoless.environment.split_sum import prefiltered
 from panoless.geometry.surfels.model import ShadedSurfels, Surfels
 from panoless.geometry.surfels.shading.base import (
     Seen,
+    Unchanging,
+    ambient_light,
     blend_gaussians,
     consistency_with_depth,
     facing,
-    mirrored,
     seen_from,
     shaded,
     shortest_axes,
     solid_scales,
+    split_sum_light,
 )
 from panoless.kernels.rasterize import RasterCamera
 
@@ -28,7 +30,7 @@ LN_3 = 1.0986123
 
 
 @dataclass(frozen=True)
-class GaussianShader:
+class GaussianShader(Unchanging):
     """The published constants."""
 
     learned: ClassVar[frozenset[str]] = frozenset(
@@ -63,10 +65,8 @@ class GaussianShader:
         levels, views = prefiltered(environment), seen_from(camera, surfels.means)
         normals = self._normals(surfels, views)
         tint, rough = torch.sigmoid(surfels.base_color_logits), torch.sigmoid(surfels.roughness_logits)
-        ambient = look_up_rough(levels, normals, torch.full_like(rough, LEVELS[-1]))
-        diffuse = torch.sigmoid(surfels.harmonics[:, 0] - LN_3) + ambient * (1 - tint)
-        cosines = -(views * normals).sum(1).clamp(-1, 0)
-        specular = look_up_rough(levels, mirrored(views, normals), rough) * specular_share(tint, cosines, rough)
+        diffuse = torch.sigmoid(surfels.harmonics[:, 0] - LN_3) + ambient_light(levels, normals) * (1 - tint)
+        specular = split_sum_light(levels, views, normals, tint, rough)
         surface = blend_gaussians(surfels, camera, torch.cat([diffuse, specular], 1), offsets, normals)
         return Seen(surface, surface.attributes[:3], surface.attributes[3:])
 
@@ -79,14 +79,6 @@ class GaussianShader:
         spread = (opacities.log() + (1 - opacities).log()).mean()
         lengths = (surfels.normal_residuals.square().sum(2) + 1e-12).sqrt().mean()
         return self.predicted_normal * agreement + self.binary * spread + self.residual * lengths
-
-    def propagated(self, surfels: ShadedSurfels, share: float, generator: torch.Generator) -> ShadedSurfels:
-        """As they are: it has no propagation."""
-        return surfels
-
-    def revived(self, surfels: ShadedSurfels) -> ShadedSurfels:
-        """As they are."""
-        return surfels
 
     def _normals(self, surfels: ShadedSurfels, views: Float[Tensor, "K 3"]) -> Float[Tensor, "K 3"]:
         """The shortest axis that faces the camera, and the residual of that side."""

@@ -4,29 +4,29 @@ Primitives are shaded one by one at first, then the pixels that they blend to; b
 anew. Occlusion and what the object mirrors of itself, which it traces by a mesh of its surface, are left out.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from panoless.capture.views import TrainView
-from panoless.environment.split_sum import LEVELS, look_up_rough, prefiltered, specular_share
+from panoless.environment.split_sum import prefiltered
 from panoless.geometry.surfels.model import ShadedSurfels, Surfels
 from panoless.geometry.surfels.shading.base import (
     Blended,
     Seen,
     SurfacePixels,
+    Unchanging,
+    ambient_light,
+    at_least,
     blend_surfels,
     facing,
     harmonic_color,
-    logit,
-    mirrored,
     propagated,
     seen_from,
     shaded,
-    surfel_normals,
+    split_sum_light,
 )
 from panoless.kernels.rasterize import RasterCamera
 
@@ -35,7 +35,7 @@ DIELECTRIC = 0.04
 
 
 @dataclass(frozen=True)
-class RefGaussian:
+class RefGaussian(Unchanging):
     """The published constants; shares are of its 50,000 steps."""
 
     learned: ClassVar[frozenset[str]] = frozenset(
@@ -73,12 +73,6 @@ class RefGaussian:
             return self._by_primitives(surfels, camera, levels, offsets)
         return self._by_pixels(surfels, camera, levels, share, offsets)
 
-    def penalty(
-        self, seen: Seen, surfels: ShadedSurfels, view: TrainView, neighbor: RasterCamera, share: float
-    ) -> Tensor | None:
-        """None."""
-        return None
-
     def propagated(self, surfels: ShadedSurfels, share: float, generator: torch.Generator) -> ShadedSurfels:
         """All more opaque, smooth metals larger, and later the diffuse color of the others disturbed."""
         reflects = torch.sigmoid(surfels.strength_logits) >= self.propagated_metalness
@@ -87,18 +81,16 @@ class RefGaussian:
 
     def revived(self, surfels: ShadedSurfels) -> ShadedSurfels:
         """A metalness of at least that of the start."""
-        return replace(surfels, strength_logits=surfels.strength_logits.clamp(min=logit(self.metalness)))
+        return at_least(surfels, self.metalness)
 
     def _by_primitives(self, surfels, camera, levels, offsets) -> Seen:
         views = seen_from(camera, surfels.means)
-        normals = facing(surfel_normals(surfels), views)
+        normals = facing(surfels.normals, views)
         metal, rough = torch.sigmoid(surfels.strength_logits), torch.sigmoid(surfels.roughness_logits)
         color = torch.sigmoid(surfels.base_color_logits)
-        around = look_up_rough(levels, normals, torch.full_like(rough, LEVELS[-1]))
-        diffuse = around * color * (1 - metal)[:, None]
-        cosines = -(views * normals).sum(1).clamp(-1, 0)
+        diffuse = ambient_light(levels, normals) * color * (1 - metal)[:, None]
         at_normal = DIELECTRIC * (1 - metal)[:, None] + color * metal[:, None]
-        specular = look_up_rough(levels, mirrored(views, normals), rough) * specular_share(at_normal, cosines, rough)
+        specular = split_sum_light(levels, views, normals, at_normal, rough)
         surface = blend_surfels(surfels, camera, torch.cat([diffuse, specular], 1), offsets)
         return Seen(surface, surface.attributes[:3], surface.attributes[3:])
 
@@ -120,5 +112,5 @@ class RefGaussian:
         color, metal, rough = at.of_image(surface.attributes[3:]).split((3, 1, 1), 1)
         rough = rough[:, 0].clamp(0, 1)
         at_normal = DIELECTRIC * (1 - metal) + color * metal
-        specular = look_up_rough(levels, at.mirrored, rough) * specular_share(at_normal, at.cosines, rough)
+        specular = split_sum_light(levels, at.views, at.normals, at_normal, rough)
         return Seen(surface, surface.attributes[:3], at.image(specular, surface.attributes))

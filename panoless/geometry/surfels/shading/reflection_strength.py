@@ -1,21 +1,22 @@
 """3DGS-DR (Ye et al. 2024): 3D Gaussians that blend a color, a normal and how strongly they reflect."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from panoless.capture.views import TrainView
+from panoless.capture.rays import reflect
 from panoless.geometry.surfels.model import ShadedSurfels, Surfels
 from panoless.geometry.surfels.shading.base import (
     Seen,
     SurfacePixels,
+    Unchanging,
+    at_least,
     blend_gaussians,
     facing,
     harmonic_color,
-    logit,
     propagated,
     seen_from,
     shaded,
@@ -27,7 +28,7 @@ from panoless.kernels.rasterize import RasterCamera
 
 
 @dataclass(frozen=True)
-class ReflectionStrength:
+class ReflectionStrength(Unchanging):
     """The published constants; shares are of its 61,000 steps."""
 
     learned: ClassVar[frozenset[str]] = frozenset({"harmonics", "strength_logits"})
@@ -66,14 +67,8 @@ class ReflectionStrength:
         if share < self.reflects_from:
             return Seen(surface, base, torch.zeros_like(base))
         at = SurfacePixels.of(surface, camera)
-        specular = at.of_image(reflected) * sample_cubemap(environment, at.mirrored)
+        specular = at.of_image(reflected) * sample_cubemap(environment, reflect(at.views, at.normals))
         return Seen(surface, (1 - reflected) * base, at.image(specular, base))
-
-    def penalty(
-        self, seen: Seen, surfels: ShadedSurfels, view: TrainView, neighbor: RasterCamera, share: float
-    ) -> Tensor | None:
-        """None."""
-        return None
 
     def propagated(self, surfels: ShadedSurfels, share: float, generator: torch.Generator) -> ShadedSurfels:
         """All more opaque, those that reflect larger, the color of the others disturbed."""
@@ -82,4 +77,4 @@ class ReflectionStrength:
 
     def revived(self, surfels: ShadedSurfels) -> ShadedSurfels:
         """A strength of at least that of the start."""
-        return replace(surfels, strength_logits=surfels.strength_logits.clamp(min=logit(self.strength)))
+        return at_least(surfels, self.strength)
