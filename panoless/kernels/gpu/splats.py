@@ -41,6 +41,30 @@ def find_fragment(splats, k, pixels):
     return Fragment(dx, dy, xx, xy, yy, gaussian, tl.load(row + 5) * gaussian)
 
 
+class Taken(NamedTuple):
+    """What pixels take of one splat behind all before it, and how much light they let through then."""
+
+    covered: Any
+    """Whether it adds to a pixel."""
+    alive: Any
+    alpha: Any
+    weight: Any
+    """Transmittance times alpha, zero where it adds nothing."""
+    transmittance: Any
+
+
+@triton.jit
+def take_fragment(seen, transmittance, alive):
+    """Blend one splat over the pixels that are not finished."""
+    alpha = tl.minimum(seen.uncapped, CAP)
+    after = transmittance - transmittance * alpha
+    covered = alive & (seen.uncapped >= LEAST)
+    alive = alive & ~(covered & (after < STOP))
+    covered = covered & (after >= STOP)
+    weight = tl.where(covered, transmittance * alpha, 0.0)
+    return Taken(covered, alive, alpha, weight, tl.where(covered, after, transmittance))
+
+
 @triton.jit
 def splats_forward(
     splats, attributes, entries, starts, channels, alphas, width, height, count, TILE: tl.constexpr, WIDE: tl.constexpr
@@ -55,15 +79,11 @@ def splats_forward(
     for entry in range(tl.load(starts + tile), tl.load(starts + tile + 1)):
         k = tl.load(entries + entry).to(tl.int64)
         seen = find_fragment(splats, k, pixels)
-        alpha = tl.minimum(seen.uncapped, CAP)
-        after = transmittance - transmittance * alpha
-        covered = alive & (seen.uncapped >= LEAST)
-        alive = alive & ~(covered & (after < STOP))
-        covered = covered & (after >= STOP)
-        weight = tl.where(covered, transmittance * alpha, 0.0)
+        taken = take_fragment(seen, transmittance, alive)
+        alive = taken.alive
         values = tl.load(attributes + k * count + each, mask=each < count, other=0.0)
-        sums += weight[:, None] * values[None, :]
-        transmittance = tl.where(covered, after, transmittance)
+        sums += taken.weight[:, None] * values[None, :]
+        transmittance = taken.transmittance
     places = each[None, :] * (width * height) + pixels.at[:, None]
     tl.store(channels + places, sums, mask=pixels.inside[:, None] & (each < count)[None, :])
     tl.store(alphas + pixels.at, 1.0 - transmittance, mask=pixels.inside)
@@ -100,17 +120,13 @@ def splats_back(
     for entry in range(tl.load(starts + tile), tl.load(starts + tile + 1)):
         k = tl.load(entries + entry).to(tl.int64)
         seen = find_fragment(splats, k, pixels)
-        alpha = tl.minimum(seen.uncapped, CAP)
-        after = transmittance - transmittance * alpha
-        covered = alive & (seen.uncapped >= LEAST)
-        alive = alive & ~(covered & (after < STOP))
-        covered = covered & (after >= STOP)
-        weight = tl.where(covered, transmittance * alpha, 0.0)
+        taken = take_fragment(seen, transmittance, alive)
+        alive = taken.alive
         values = tl.load(attributes + k * count + each, mask=each < count, other=0.0)
         worth = of_alpha + tl.sum(values[None, :] * cotangents, 1)
-        behind -= weight * worth
-        pull = transmittance * worth - behind / (1.0 - alpha)
-        pull = tl.where(covered & (seen.uncapped < CAP), pull, 0.0)
+        behind -= taken.weight * worth
+        pull = transmittance * worth - behind / (1.0 - taken.alpha)
+        pull = tl.where(taken.covered & (seen.uncapped < CAP), pull, 0.0)
         row = gradients + k * GEOMETRY
         tl.atomic_add(row + 5, tl.sum(pull * seen.gaussian))
         pull *= -0.5 * seen.uncapped
@@ -119,9 +135,9 @@ def splats_back(
         tl.atomic_add(row + 2, tl.sum(pull * seen.dx * seen.dx))
         tl.atomic_add(row + 3, tl.sum(2.0 * pull * seen.dx * seen.dy))
         tl.atomic_add(row + 4, tl.sum(pull * seen.dy * seen.dy))
-        pulled = tl.sum(weight[:, None] * cotangents, 0)
+        pulled = tl.sum(taken.weight[:, None] * cotangents, 0)
         tl.atomic_add(attribute_gradients + k * count + each, pulled, mask=each < count)
-        transmittance = tl.where(covered, after, transmittance)
+        transmittance = taken.transmittance
 
 
 def tile_lists(boxes: Tensor, depths: Tensor, height: int, width: int, tile: int) -> tuple[Tensor, Tensor]:
