@@ -69,20 +69,16 @@ class _Blur:
 
     def blurred(self, image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "6 C L L"]:
         """G E."""
-        coarse, ratio = image, self.fine // self.coarse
-        if ratio > 1:
-            area = self._area(image)
-            coarse = avg_pool2d(image * area, ratio) / avg_pool2d(area, ratio)
+        coarse = self._averaged(image)
         if self.matrix is not None:
             coarse = _as_map(self.matrix @ _as_rows(coarse), image)
-        return coarse if ratio == 1 else _as_map(sample_cubemap(coarse, _centers(self.fine).to(image)), image)
+        if self.coarse == self.fine:
+            return coarse
+        return _as_map(sample_cubemap(coarse, _centers(self.fine).to(image)), image)
 
     def shrunk(self, image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "6 C M M"]:
         """G E on the coarser texels. Gradient: to the map."""
-        coarse, ratio = image, self.fine // self.coarse
-        if ratio > 1:
-            area = self._area(image)
-            coarse = avg_pool2d(image * area, ratio) / avg_pool2d(area, ratio)
+        coarse = self._averaged(image)
         if self.matrix is not None:
             rows = coarse.permute(0, 2, 3, 1)
             coarse = _Product.apply(self.matrix, rows.flatten(0, 2)).view(rows.shape).permute(0, 3, 1, 2).contiguous()
@@ -101,6 +97,14 @@ class _Blur:
         area = self._area(image)
         share = coarse / (avg_pool2d(area, ratio) * ratio**2)
         return share.repeat_interleave(ratio, 2).repeat_interleave(ratio, 3) * area
+
+    def _averaged(self, image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "6 C M M"]:
+        """Means over the coarser texels, by solid angle."""
+        ratio = self.fine // self.coarse
+        if ratio == 1:
+            return image
+        area = self._area(image)
+        return avg_pool2d(image * area, ratio) / avg_pool2d(area, ratio)
 
     def _area(self, image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "1 1 L L"]:
         area = cubemap_solid_angles(self.fine).to(image)
