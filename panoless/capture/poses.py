@@ -13,27 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from panoless.capture.rays import pose_of
 from panoless.capture.views import TrainView, Views
+from shinypartial.core.camera import Similarity
 
 #: A principal point is taken for wrong where what turns and shifts leave to it and to common motions together is less
 #: than this share of what they leave to common motions alone. Of single cameras' errors it is 0.99.
 LENS_SHARE = 0.5
-
-
-@dataclass(frozen=True)
-class Similarity:
-    """x → s R x + t."""
-
-    scale: float
-    rotation: Float[np.ndarray, "3 3"]
-    shift: Float[np.ndarray, "3"]
-
-    def __call__(self, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
-        """Where points go."""
-        return self.scale * points @ self.rotation.T + self.shift
-
-    def undone(self, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
-        """The inverse."""
-        return (points - self.shift) @ self.rotation / self.scale
 
 
 @dataclass(frozen=True)

@@ -88,6 +88,30 @@ def project(camera: Camera, points_world: Float[np.ndarray, "P 3"]) -> Float[np.
     return np.stack([x, y, depth], -1)
 
 
+@dataclass(frozen=True)
+class Similarity:
+    """The map x ↦ s R x + t from one world to another."""
+
+    scale: float
+    rotation: Float[np.ndarray, "3 3"]
+    shift: Float[np.ndarray, "3"]
+
+    def __call__(self, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+        """Where points go."""
+        return self.scale * points @ self.rotation.T + self.shift
+
+    def undone(self, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+        """The inverse."""
+        return (points - self.shift) @ self.rotation / self.scale
+
+    def pose(self, camera_to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+        """The rigid pose of the same camera in the other world."""
+        moved = np.eye(4)
+        moved[:3, :3] = self.rotation @ camera_to_world[:3, :3]
+        moved[:3, 3] = self(camera_to_world[None, :3, 3])[0]
+        return moved
+
+
 def look_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
     """OpenCV camera-to-world pose at `position` that looks at `target` with world +Z up in the image."""
     forward = (target - position) / np.linalg.norm(target - position)

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from shinypartial.core.camera import Camera
+from shinypartial.core.camera import Camera, Similarity
 from shinypartial.core.conventions import PIXEL_CENTER
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import open_dataset, read_view
@@ -26,22 +26,6 @@ ALIGNMENT = "alignment.json"
 #: Camera centers that span less than this share of their spread in two directions tell no rotation.
 LEAST_SPREAD = 1e-3
 FEWEST_CAMERAS = 3
-
-
-@dataclass(frozen=True)
-class Gauge:
-    """The similarity x ↦ s R x + t from one world to another."""
-
-    scale: float
-    rotation: Float[np.ndarray, "3 3"]
-    shift: Float[np.ndarray, "3"]
-
-    def pose(self, camera_to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-        """A rigid pose of the same camera in the other world."""
-        moved = np.eye(4)
-        moved[:3, :3] = self.rotation @ camera_to_world[:3, :3]
-        moved[:3, 3] = self.scale * self.rotation @ camera_to_world[:3, 3] + self.shift
-        return moved
 
 
 @dataclass(frozen=True)
@@ -72,7 +56,7 @@ class Alignment:
         )
 
 
-def similarity(captured: Float[np.ndarray, "V 3"], true: Float[np.ndarray, "V 3"]) -> Gauge:
+def similarity(captured: Float[np.ndarray, "V 3"], true: Float[np.ndarray, "V 3"]) -> Similarity:
     """The one that brings captured camera centers nearest to the true ones in least squares (Umeyama 1991).
 
     Raises InputError for fewer than three, and for centers on a line, which leave a turn about it open.
@@ -89,7 +73,7 @@ def similarity(captured: Float[np.ndarray, "V 3"], true: Float[np.ndarray, "V 3"
     proper = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
     rotation = left @ np.diag(proper) @ right
     scale = float((values * proper).sum() / np.sum(ours**2))
-    return Gauge(scale, rotation, true.mean(0) - scale * rotation @ captured.mean(0))
+    return Similarity(scale, rotation, true.mean(0) - scale * rotation @ captured.mean(0))
 
 
 def align(captured: Path, truth: Path, output: Path, gauge: GaugeKind | None = None) -> Alignment:
@@ -127,22 +111,22 @@ def _pairs(ours: Dataset, theirs: Dataset) -> list[tuple[Frame, Frame]]:
     return [(frame, true[frame.stem.name]) for frame in ours.train]
 
 
-def _gauge(kind: GaugeKind, pairs: Sequence[tuple[Frame, Frame]], truth: Dataset) -> Gauge:
+def _gauge(kind: GaugeKind, pairs: Sequence[tuple[Frame, Frame]], truth: Dataset) -> Similarity:
     if kind == "similarity":
         centers = np.array([[frame.camera.position_world for frame in pair] for pair in pairs])
         return similarity(centers[:, 0], centers[:, 1])
     if kind == "same":
-        return Gauge(1.0, np.eye(3), np.zeros(3))
+        return Similarity(1.0, np.eye(3), np.zeros(3))
     if truth.board_corner is None:
         raise InputError(
             expected=f"a board in the scene of {truth.root}",
             found="none",
             remedy="Leave out --gauge board, or film a scene that has one.",
         )
-    return Gauge(1.0, np.eye(3), np.array(truth.board_corner))
+    return Similarity(1.0, np.eye(3), np.array(truth.board_corner))
 
 
-def _moved(frame: Frame, output: Path, gauge: Gauge) -> Frame:
+def _moved(frame: Frame, output: Path, gauge: Similarity) -> Frame:
     """The frame in the new folder, with links to its files."""
     stem = output / SPLITS[0] / frame.stem.name
     for old in frame.stem.parent.glob(f"{frame.stem.name}*"):
@@ -155,12 +139,13 @@ def _moved(frame: Frame, output: Path, gauge: Gauge) -> Frame:
 
 
 def _compare(kind: GaugeKind, scale: float, pairs: Sequence[tuple[Frame, Frame]]) -> Alignment:
+    from scipy.spatial.transform import Rotation
+
     turns, shares, focals, overlaps = [], [], [], []
     for new, true in pairs:
         ours, theirs = new.camera, true.camera
         turn = ours.camera_to_world[:3, :3].T @ theirs.camera_to_world[:3, :3]
-        skew = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-        turns.append(float(np.degrees(np.arctan2(np.linalg.norm(skew), np.trace(turn) - 1))))
+        turns.append(float(np.degrees(Rotation.from_matrix(turn).magnitude())))
         off = ours.position_world - theirs.position_world
         shares.append(float(np.linalg.norm(off) / np.linalg.norm(theirs.position_world)))
         focals.append(ours.fx / ours.width * theirs.width / theirs.fx - 1)

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from panoless.capture.poses import Similarity
 from panoless.environment.surroundings import FAR, Surroundings
 from panoless.first_surface.mesh import TriangleMesh
 from panoless.kernels.level_set import evaluate, first_hits, nearest_approach
+from shinypartial.core.camera import Similarity
 
 NEAREST = 6
 """Vertices whose tangent planes tell the distance from a mesh."""

@@ -9,13 +9,14 @@ from scipy.spatial.transform import Rotation
 from panoless.alignment.align import Alignment, pose_prior
 from panoless.alignment.options import PoseOptions
 from panoless.alignment.search import PosedProposal, align_proposal, fit_with_poses
-from panoless.capture.poses import Poses, Similarity, StatedCameras
+from panoless.capture.poses import Poses, StatedCameras
 from panoless.capture.rays import pose_of
 from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.geometry.base import Family
 from panoless.geometry.plane.kind import PlaneFamily
 from panoless.geometry.revolution.kind import RevolutionFamily
+from shinypartial.core.camera import Similarity
 from tests.support.mirror_plane import NORMAL, RECTANGLE, arc, plane_of, reflecting_views
 from tests.support.mirror_revolution import around, goblet, revolution_views
 

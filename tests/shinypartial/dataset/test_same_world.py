@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shinypartial.core.camera import Camera
+from shinypartial.core.camera import Camera, Similarity
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import open_dataset
-from shinypartial.dataset.same_world import Gauge, align, similarity
+from shinypartial.dataset.same_world import align, similarity
 from shinypartial.dataset.schema import MANIFEST, Frame
 from shinypartial.dataset.write import write_transforms
 from shinypartial.io.files import read_json, write_json
 from tests.support.synthetic_dataset import make_sphere_dataset
 
 RANDOM = np.random.default_rng(4)
-WORLD = Gauge(0.3, Rotation.from_rotvec([0.4, -1.2, 0.7]).as_matrix(), np.array([3.0, -1.0, 2.0]))
+WORLD = Similarity(0.3, Rotation.from_rotvec([0.4, -1.2, 0.7]).as_matrix(), np.array([3.0, -1.0, 2.0]))
 
 
 def test_a_similarity_is_found_again() -> None:
@@ -41,7 +41,7 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def captured(truth: Path, root: Path, world: Gauge, turn_deg: float = 0.0) -> Path:
+def captured(truth: Path, root: Path, world: Similarity, turn_deg: float = 0.0) -> Path:
     """The training views with their cameras in another world, each turned by an angle about its own x-axis."""
     dataset = open_dataset(truth)
     own = np.eye(4)
@@ -79,8 +79,8 @@ def test_a_board_is_believed_and_no_world_estimated(truth: Path, tmp_path: Path)
     shutil.copytree(truth, with_board)
     manifest = read_json(with_board / MANIFEST, "the manifest")
     write_json(with_board / MANIFEST, manifest | {"statistics": {"board_corner": corner.tolist()}})
-    in_board = Gauge(1.0, np.eye(3), -corner)
-    off = Gauge(1.0, np.eye(3), -corner + [0.0, 0.0, 0.04])
+    in_board = Similarity(1.0, np.eye(3), -corner)
+    off = Similarity(1.0, np.eye(3), -corner + [0.0, 0.0, 0.04])
     made = align(captured(truth, tmp_path / "right", in_board), with_board, tmp_path / "one")
     assert (made.gauge, made.scale) == ("board", 1.0)
     assert max(made.distance_share) < 1e-9

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from panoless.capture.corrections import with_focal_factor
-from panoless.capture.poses import Poses, Similarity, StatedCameras
+from panoless.capture.poses import Poses, StatedCameras
 from panoless.capture.views import Views, views_of
 from panoless.config import FitConfig, SurfelConfig
 from panoless.environment.surroundings import Surroundings
@@ -20,7 +20,7 @@ from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import full_trust
 from panoless.kernels.level_set import seen_with_slopes
 from panoless.kernels.reference.cubemap import padded_texels
-from shinypartial.core.camera import Camera
+from shinypartial.core.camera import Camera, Similarity
 from tests.support.mirror_body import (
     Body,
     block,
