@@ -32,6 +32,11 @@ def camera_rays(
     return np.stack([x, y, np.ones_like(x)], -1)
 
 
+def in_camera(camera: RasterCamera, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+    """Points of the normalized frame in the camera's axes."""
+    return points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+
+
 def project(
     camera: RasterCamera, points_camera: Vectors, first_center: float = PIXEL_CENTER
 ) -> tuple[Vectors, Vectors]:

@@ -8,6 +8,7 @@ hull, and a stray piece has an outline to which no surface can attach.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from panoless.capture.masks import MASK_LEVEL
 from panoless.capture.options import MaskRepairOptions
-from panoless.capture.rays import project
+from panoless.capture.rays import in_camera, project
 from panoless.capture.silhouettes import mask_distance
 from panoless.capture.views import MaskRepairs, TrainView, Views
 from shinypartial.core.conventions import SOLID_ALPHA
@@ -103,15 +104,26 @@ class _Votes:
     def shown(self, index: int) -> Image:
         """Where a view has to show the object: nearly all others, and all those nearest, have it inside their masks."""
         near = self.outside[self.nearest[index]].any(0)
-        return self._seen(index, ~near & self._is_inside(self.outside, index))
+        return self._seen(index, ~near & self._is_inside(self.outside[index], self.times_outside))
 
     def allowed(self, index: int) -> Image:
         """Where it may: nearly all others have it inside their masks, or a margin beside them."""
-        return self._seen(index, self._is_inside(self.beyond, index))
+        return self._seen(index, self._is_inside(self.beyond[index], self.times_beyond))
 
-    def _is_inside(self, outside: Bool[np.ndarray, "V P"], index: int) -> Bool[np.ndarray, "P"]:
-        wrong = int(self.options.contradicted_share * (len(outside) - 1))
-        found: np.ndarray = outside.sum(0) - outside[index] <= wrong
+    @cached_property
+    def times_outside(self) -> Int[np.ndarray, "P"]:
+        """How many views see each point beside their masks."""
+        return self.outside.sum(0)
+
+    @cached_property
+    def times_beyond(self) -> Int[np.ndarray, "P"]:
+        """How many see it farther off."""
+        return self.beyond.sum(0)
+
+    def _is_inside(self, own: Bool[np.ndarray, "P"], times: Int[np.ndarray, "P"]) -> Bool[np.ndarray, "P"]:
+        """Whether no more of the others than may be wrong are among those of all views."""
+        wrong = int(self.options.contradicted_share * (len(self.views.train) - 1))
+        found: np.ndarray = times - own <= wrong
         return found
 
     def _seen(self, index: int, chosen: Bool[np.ndarray, "P"]) -> Image:
@@ -119,10 +131,9 @@ class _Votes:
         from scipy.ndimage import binary_closing
 
         camera, points = self.views.train[index].camera, self.grid.points
-        points = points[torch.from_numpy(chosen).to(points.device)]
-        points_camera = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        points_camera = in_camera(camera, points[torch.from_numpy(chosen).to(points.device)])
         columns, rows = (each.cpu().numpy() for each in project(camera, points_camera, first_center=0))
-        nearest = max(float(points_camera[:, 2].min()), camera.near) if len(points) else math.inf
+        nearest = max(float(points_camera[:, 2].min()), camera.near) if len(points_camera) else math.inf
         gap = max(1, math.ceil(self.grid.spacing * camera.fx / (2 * nearest)))
         image = np.zeros((camera.height + 2 * gap, camera.width + 2 * gap), bool)
         rows, columns = (np.rint(each).astype(int) + gap for each in (rows, columns))

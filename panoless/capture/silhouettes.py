@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.masks import MASK_LEVEL, cut_sides
-from panoless.capture.rays import camera_rays, pose_of, project
+from panoless.capture.rays import camera_rays, in_camera, pose_of, project
 from panoless.capture.views import TrainView, Views, concatenated
 from panoless.kernels.rasterize import RasterCamera
 from shinypartial.core.conventions import PIXEL_CENTER
@@ -47,7 +47,7 @@ class MaskDistance:
         −∞ where the view doesn't tell: beyond the last pixel centers at a side of the picture that cuts the mask.
         """
         camera = self.camera
-        points_camera = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        points_camera = in_camera(camera, points)
         depth = points_camera[:, 2].clamp(min=camera.near)
         column, row = project(camera, points_camera, first_center=0)
         inner_column, inner_row = column.clamp(0, camera.width - 1), row.clamp(0, camera.height - 1)

@@ -33,9 +33,9 @@ def earned_exposures(
     The map is that of the other views at equal exposure; a held-out view's other pixels tell its own gains.
     """
     halves: tuple[list[Rays], list[Rays]] | None = None
-    earned = None
+    earned, seen = None, _observed(views, fitted, config)
     for groups in (EXPOSURE, WHITE_BALANCE):
-        corrections = equal_exposures(views, fitted, config, groups)
+        corrections = _with_gains(fitted, _gains(seen, config, groups), groups)
         if (_spread(corrections, groups) or 0.0) < config.corrections.least_stops:
             continue
         solved, tested = halves = halves or _halves(views, fitted, config)
@@ -67,17 +67,24 @@ def fitted_to_equal_exposures(views: Views, fitted: Fitted, config: FitConfig, r
     return replace(again, corrections=fitted.corrections)
 
 
-def equal_exposures(views: Views, fitted: Fitted, config: FitConfig, groups: Groups | None = None) -> Corrections:
-    """The corrections of a fit with gains by its geometry, for the channels that share one, as in the fit."""
-    if groups is None:
-        groups = EXPOSURE if fitted.corrections.white_balance_stops is None else WHITE_BALANCE
+def equal_exposures(views: Views, fitted: Fitted, config: FitConfig) -> Corrections:
+    """The corrections of a fit with gains found anew by its geometry, for the channels that share one in it."""
+    groups = EXPOSURE if fitted.corrections.balances is None else WHITE_BALANCE
+    return _with_gains(fitted, _gains(_observed(views, fitted, config), config, groups), groups)
+
+
+def _observed(views: Views, fitted: Fitted, config: FitConfig) -> list[Rays]:
+    """What views of unequal exposure observed of a fit, otherwise corrected as it has them."""
     bare = replace(fitted.corrections, gains=None, balances=None)
     usable = fewer_pixels(bare.applied(views, config), 2 * config.corrections.rays)
     with torch.no_grad():
-        seen = observe_views(usable_views(usable, fitted.geometry), fitted.geometry, config.corrections.rays)
-        gains = _gains(list(seen), config, groups)
+        return list(observe_views(usable_views(usable, fitted.geometry), fitted.geometry, config.corrections.rays))
+
+
+def _with_gains(fitted: Fitted, gains: Float[np.ndarray, "V 3"], groups: Groups) -> Corrections:
     of_views = np.exp(np.log(gains).mean(1))
-    return replace(bare, gains=of_views, balances=None if groups == EXPOSURE else gains / of_views[:, None])
+    balances = None if groups == EXPOSURE else gains / of_views[:, None]
+    return replace(fitted.corrections, gains=of_views, balances=balances)
 
 
 def examined(views: Views, fitted: Fitted, config: FitConfig) -> Float[np.ndarray, "V"]:
