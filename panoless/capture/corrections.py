@@ -59,7 +59,7 @@ class Corrections:
                 replace(view, radiance=encoding.without_gain(view.radiance, gain.to(view.radiance)))
                 for view, gain in exposed
             )
-        return replace(views, train=train)
+        return views if train is views.train else replace(views, train=train)
 
 
 NO_CORRECTIONS = Corrections()

@@ -1,10 +1,14 @@
 """What masks say before any surface: their pieces, the sides on which the picture cuts them, the object's frame."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.utils.weak import WeakIdKeyDictionary
 
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import camera_rays
@@ -27,6 +31,22 @@ REACH_QUANTILE = 0.95
 LEAST_SPREAD = 1e-4
 #: Where views leave the depth of the object open, it is at least this, in units of the world.
 LEAST_DEPTH = 1.0
+
+Found = TypeVar("Found")
+
+
+def remembered(find: Callable[[Tensor], Found]) -> Callable[[Tensor], Found]:
+    """A function of a mask that keeps what it found as long as the mask is there. Masks are never changed in place."""
+    known = WeakIdKeyDictionary()
+
+    @wraps(find)
+    def found(mask: Tensor) -> Found:
+        if mask not in known:
+            known[mask] = find(mask)
+        result: Found = known[mask]
+        return result
+
+    return found
 
 
 def largest_pieces(inside: Bool[np.ndarray, "H W"], share: float, gap_px: int = 0) -> Bool[np.ndarray, "H W"]:

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from panoless.capture.masks import MASK_LEVEL, cut_sides
+from panoless.capture.masks import MASK_LEVEL, cut_sides, remembered
 from panoless.capture.rays import camera_rays, in_camera, pose_of, project
 from panoless.capture.views import TrainView, Views, concatenated
 from panoless.kernels.rasterize import RasterCamera
@@ -71,8 +71,12 @@ class MaskDistance:
 
 def mask_distance(view: TrainView) -> MaskDistance:
     """The silhouette of a view as a signed distance."""
-    mask = view.mask.cpu().numpy()
-    return MaskDistance(view.camera, torch.from_numpy(mask_distance_px(mask)).to(view.mask.device), cut_sides(mask))
+    return MaskDistance(view.camera, _distance_px(view.mask), cut_sides(view.mask.cpu().numpy()))
+
+
+@remembered
+def _distance_px(mask: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+    return torch.from_numpy(mask_distance_px(mask.cpu().numpy())).to(mask.device)
 
 
 def mask_distance_px(mask: Float[np.ndarray, "H W"], band_px: float = EXACT_BAND_PX) -> Float[np.ndarray, "H W"]:
@@ -121,16 +125,22 @@ class MaskContours:
         return MaskContours(*(getattr(self, field.name)[::stride] for field in fields(self)))
 
 
+@remembered
+def _contours(mask: Float[Tensor, "H W"]) -> list[Float[np.ndarray, "_ 2"]]:
+    """All curves on which the interpolated mask is one half, as rows and columns."""
+    from skimage.measure import find_contours
+
+    found: list[np.ndarray] = find_contours(mask.cpu().numpy().astype(np.float64), MASK_LEVEL)
+    return found
+
+
 def mask_contours(views: Views, *, longest_only: bool = True) -> MaskContours:
     """The longest closed or open contour of each mask, or all of them, without what runs along a border that the mask
     touches.
     """
-    from skimage.measure import find_contours
-
     parts = []
     for index, view in enumerate(views.train):
-        mask, camera = view.mask.cpu().numpy(), view.camera
-        contours = find_contours(mask.astype(np.float64), MASK_LEVEL)
+        mask, camera, contours = view.mask.cpu().numpy(), view.camera, _contours(view.mask)
         if not contours:
             continue
         chosen = [max(contours, key=len)] if longest_only else contours

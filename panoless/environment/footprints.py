@@ -72,14 +72,11 @@ class PixelFootprints:
 
     def seen(self, environment: Float[Tensor, "6 C L L"]) -> Float[Tensor, "P C"]:
         """Means of the map over the areas."""
-        count = self.directions.shape[1]
-        return sample_cubemap(environment, self.directions.flatten(0, 1)).unflatten(0, (-1, count)).mean(1)
+        return sample_cubemap(environment, self.directions)
 
     def spread(self, values: Float[Tensor, "P C"], resolution: int) -> Float[Tensor, "6 C L L"]:
         """The adjoint of `seen`."""
-        count = self.directions.shape[1]
-        each = (values[:, None] / count).expand(-1, count, -1).flatten(0, 1).contiguous()
-        return scatter_cubemap(each, self.directions.flatten(0, 1), resolution)
+        return scatter_cubemap(values, self.directions, resolution)
 
     def weights(
         self, seen: Float[Tensor, "P 3"], saturation: Float[Tensor, "3"], scale: float, saturated: float

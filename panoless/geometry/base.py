@@ -1,5 +1,6 @@
 """What any mirror can do, and how a kind of mirror is proposed from silhouettes and fitted."""
 
+import weakref
 from collections.abc import Callable, Iterator
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from typing import Any, ClassVar, Protocol, TypeVar, get_args, runtime_checkable
@@ -23,6 +24,8 @@ from panoless.kernels.rasterize import RasterCamera
 Numbers = TypeVar("Numbers")
 SOLID_SURFACE_ALPHA = 0.9
 """A pixel with more alpha than this shows the surface."""
+LAST_USABLE = "_last_usable"
+"""Where a geometry keeps the views that it was asked for last, and the answer."""
 
 
 @dataclass(frozen=True)
@@ -319,10 +322,18 @@ def poses_from_plain(content: dict[str, Any]) -> Poses | None:
 
 
 def usable_views(views: Views, geometry: Geometry) -> Views:
-    """The views with their cameras as a geometry has them, and its usable pixels as their solid ones."""
-    views = geometry.corrected(views)
-    clear = tuple(replace(view, solid=geometry.usable_pixels(view)) for view in views.train)
-    return replace(views, train=clear)
+    """The views with their cameras as a geometry has them, and its usable pixels as their solid ones.
+
+    A geometry keeps the last answer, because pixels of the same views are asked for by selection, map and verdict.
+    """
+    last: tuple[Callable[[], Views | None], Views] | None = geometry.__dict__.get(LAST_USABLE)
+    if last is not None and last[0]() is views:
+        return last[1]
+    posed = geometry.corrected(views)
+    clear = tuple(replace(view, solid=geometry.usable_pixels(view)) for view in posed.train)
+    found = replace(posed, train=clear)
+    geometry.__dict__[LAST_USABLE] = weakref.ref(views), found
+    return found
 
 
 def observe_views(views: Views, geometry: Geometry, max_rays: int) -> Iterator[Rays]:

@@ -13,9 +13,10 @@ from panoless.kernels.reference import cubemap as reference
 
 
 def sample_cubemap(
-    cubemap: Float[Tensor, "6 C L L"], directions: Float[Tensor, "P 3"], *, backend: Backend = "auto"
+    cubemap: Float[Tensor, "6 C L L"], directions: Float[Tensor, "P *K 3"], *, backend: Backend = "auto"
 ) -> Float[Tensor, "P C"]:
-    """Look up a cubemap in the given directions, bilinearly and continuously across edges and corners.
+    """Look up a cubemap in the given directions, bilinearly and continuously across edges and corners; means over K
+    directions where there are so many for each value.
 
     value = Σ_k w_k(s, t)·texel_k over the four texel centers around (s, t) = (s_c, t_c)/|m|, the central projection of
     the direction to its dominant face (ties: x before y before z; table 8.19). A texel beyond the border of a face is
@@ -35,21 +36,24 @@ def sample_cubemap(
     _check_cubemap(cubemap)
     _check_directions(directions)
     chosen = choose_backend(backend, cubemap=cubemap, directions=directions)
+    if chosen == "cpu":
+        from panoless.kernels.cpu.cubemap import SampleCubemap
+
+        return SampleCubemap.apply(cubemap, directions)
+    each = directions.reshape(-1, 3)
     if chosen == "reference":
-        return reference.sample_cubemap(cubemap, directions)
-    if chosen == "gpu":
+        values = reference.sample_cubemap(cubemap, each)
+    else:
         from panoless.kernels.gpu.cubemap import SampleCubemap as SampleCubemapGpu
 
-        return SampleCubemapGpu.apply(cubemap, directions)
-    from panoless.kernels.cpu.cubemap import SampleCubemap
-
-    return SampleCubemap.apply(cubemap, directions)
+        values = SampleCubemapGpu.apply(cubemap, each)
+    return values if directions.ndim == 2 else values.unflatten(0, directions.shape[:2]).mean(1)
 
 
 @torch.no_grad()
 def scatter_cubemap(
     values: Float[Tensor, "P C"],
-    directions: Float[Tensor, "P 3"],
+    directions: Float[Tensor, "P *K 3"],
     resolution: int,
     *,
     backend: Backend = "auto",
@@ -70,12 +74,16 @@ def scatter_cubemap(
             f"found {tuple(values.shape)}."
         )
     chosen = choose_backend(backend, values=values, directions=directions)
+    if chosen == "cpu":
+        from panoless.kernels.cpu.cubemap import scatter_cubemap as scatter_means
+
+        return scatter_means(values, directions, resolution)
+    if directions.ndim == 3:
+        count = directions.shape[1]
+        values, directions = (values / count).repeat_interleave(count, 0), directions.reshape(-1, 3)
     if chosen == "reference":
         return reference.scatter_cubemap(values, directions, resolution)
-    if chosen == "gpu":
-        from panoless.kernels.gpu.cubemap import scatter_cubemap as scatter
-    else:
-        from panoless.kernels.cpu.cubemap import scatter_cubemap as scatter
+    from panoless.kernels.gpu.cubemap import scatter_cubemap as scatter
 
     return scatter(values, directions, resolution)
 
@@ -111,8 +119,10 @@ def _check_cubemap(cubemap: Tensor) -> None:
 
 
 def _check_directions(directions: Tensor) -> None:
-    if directions.ndim != 2 or directions.shape[1] != 3:
-        raise ValueError(f"expected directions (P, 3); found {tuple(directions.shape)}. Flatten image axes first.")
+    if directions.ndim not in (2, 3) or directions.shape[-1] != 3:
+        raise ValueError(
+            f"expected directions (P, 3) or (P, K, 3); found {tuple(directions.shape)}. Flatten image axes first."
+        )
 
 
 def _check_resolution(resolution: int) -> None:

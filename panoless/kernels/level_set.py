@@ -4,6 +4,8 @@ Places are in cells: knots lie at whole x in [0, A − 3], y in [0, B − 3] and
 has its peak at (i − 1, j − 1, k − 1). φ is negative inside. Every function raises ValueError for an unknown backend.
 """
 
+from functools import reduce
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -12,6 +14,11 @@ from panoless.kernels.constants import SUB_PIXELS
 
 VALUE, GRADIENT, HESSIAN = 0, slice(1, 4), slice(4, 10)
 """Columns of derivatives: φ; φ_x, φ_y, φ_z; φ_xx, φ_xy, φ_xz, φ_yy, φ_yz, φ_zz."""
+
+DIFFERENCE_ORDERS = tuple((i, j, 3 - i - j) for i in range(4) for j in range(4 - i))
+"""Of third differences, along x, y and z."""
+DIFFERENCE_TAPS = (0,), (0, 1), (-1, 0, 1), (-1, 0, 1, 2)
+"""The coefficients that a difference of each order takes along an axis."""
 
 
 def evaluate(
@@ -28,16 +35,19 @@ def first_hits(
     directions: Float[np.ndarray, "P 3"],
     *,
     leaving: bool = False,
+    empty: Int[np.ndarray, "a b c"] | None = None,
     backend: ArrayBackend = "cpu",
 ) -> Float[np.ndarray, "P"]:
     """Distance along rays of unit direction to where φ first falls through zero; infinite for a miss.
 
     φ = 0 is met to 1e-9 of the distance. Rays that start on the surface and are `leaving` it are followed from up to a
     quarter of a cell on. Where φ is near to zero steps are a quarter of a cell or more, so a part of the surface that a
-    ray crosses within less than that may be missed. Cells whose coefficients are all positive are passed at once.
+    ray crosses within less than that may be missed. Cells whose coefficients are all positive are passed at once:
+    `empty` are their `empty_cells`, counted anew where they are not given.
     """
     _check_coefficients(coefficients)
-    return array_kernels(backend, "level_set").first_hits(coefficients, origins, directions, leaving)
+    empty = empty_cells(coefficients) if empty is None else empty
+    return array_kernels(backend, "level_set").first_hits(coefficients, origins, directions, leaving, empty)
 
 
 def nearest_approach(
@@ -45,11 +55,31 @@ def nearest_approach(
     origins: Float[np.ndarray, "P 3"],
     directions: Float[np.ndarray, "P 3"],
     *,
+    empty: Int[np.ndarray, "a b c"] | None = None,
     backend: ArrayBackend = "cpu",
 ) -> Float[np.ndarray, "P"]:
-    """Distance along rays of unit direction to where φ is least; infinite for rays that pass the knots by."""
+    """Distance along rays of unit direction to where φ is least; infinite for rays that pass the knots by. `empty` as
+    for `first_hits`.
+    """
     _check_coefficients(coefficients)
-    return array_kernels(backend, "level_set").nearest_approach(coefficients, origins, directions)
+    empty = empty_cells(coefficients) if empty is None else empty
+    return array_kernels(backend, "level_set").nearest_approach(coefficients, origins, directions, empty)
+
+
+def empty_cells(coefficients: Float[np.ndarray, "A B C"]) -> Int[np.ndarray, "a b c"]:
+    """How many cells around each cell, and itself, are free of the inside: a ray may pass so many less one.
+
+    A spline lies within the range of its coefficients, so a cell whose 64 are all positive is empty.
+    """
+    from scipy.ndimage import distance_transform_cdt, minimum_filter1d
+
+    least = coefficients
+    for axis, count in enumerate(coefficients.shape):
+        least = minimum_filter1d(least, 4, axis, origin=-2).take(range(count - 3), axis)
+    if (least > 0).all():
+        return np.full(least.shape, max(least.shape), dtype=np.int32)
+    found: np.ndarray = distance_transform_cdt(least > 0, "chessboard").astype(np.int32)
+    return found
 
 
 def mirrored(
@@ -148,14 +178,35 @@ def without_means(
 
 
 def third_differences(
-    coefficients: Float[np.ndarray, "A B C"], active: Bool[np.ndarray, "A B C"], *, backend: ArrayBackend = "cpu"
+    coefficients: Float[np.ndarray, "A B C"],
+    active: Bool[np.ndarray, "A B C"],
+    *,
+    whole: Int[np.ndarray, "A B C"] | None = None,
+    backend: ArrayBackend = "cpu",
 ) -> Float[np.ndarray, "A B C"]:
     """DᵀD c with ‖D c‖² = Σ |D³c|² over all third differences whose coefficients are all active.
 
-    There are ten kinds, of which a mixed one counts as often as it is in |D³c|².
+    There are ten kinds, of which a mixed one counts as often as it is in |D³c|². `whole` are the `whole_differences` of
+    what is active, found anew where they are not given.
     """
     _check_coefficients(coefficients)
-    return array_kernels(backend, "level_set_products").third_differences(coefficients, active)
+    whole = whole_differences(active) if whole is None else whole
+    return array_kernels(backend, "level_set_products").third_differences(coefficients, active, whole)
+
+
+def whole_differences(active: Bool[np.ndarray, "A B C"]) -> Int[np.ndarray, "A B C"]:
+    """Which third differences at each coefficient have active ones only, a bit for each kind, in the order of
+    `DIFFERENCE_ORDERS`.
+    """
+    found, padded = np.zeros(active.shape, dtype=np.int16), np.pad(active, ((1, 2),) * 3)
+    for bit, orders in enumerate(DIFFERENCE_ORDERS):
+        taken = padded
+        for axis, (order, count) in enumerate(zip(orders, active.shape, strict=True)):
+            line = np.moveaxis(taken, axis, 0)
+            shifted = [line[1 + tap : 1 + tap + count] for tap in DIFFERENCE_TAPS[order]]
+            taken = np.moveaxis(reduce(np.logical_and, shifted), 0, axis)
+        found |= taken.astype(np.int16) << bit
+    return found
 
 
 def _check_coefficients(coefficients: np.ndarray) -> None:

@@ -38,8 +38,8 @@ def complete(state: FitState, views: Views, config: FitConfig) -> Views:
         config = replace(config, tint=state.reflectance.tint)
     softness = earned_softness(usable, state.geometry, config) if state.training is None else Softness()
     state.roughness, state.blur_px = softness.roughness, softness.blur_px
-    _solve(state, replace(usable, blur_px=state.blur_px or 0.0), config)
-    return replace(views, blur_px=state.blur_px or 0.0)
+    _solve(state, usable if state.blur_px is None else replace(usable, blur_px=state.blur_px), config)
+    return views if state.blur_px is None else replace(views, blur_px=state.blur_px)
 
 
 def _solve(state: FitState, views: Views, config: FitConfig) -> None:

@@ -79,7 +79,7 @@ class FreeFormMirror(ExactGeometry):
             self.options.least_map_cosine,
             occlusion_test=self.occlusion_test,
         )
-        return sights, sights.clear & (inner_distance_px(view).ravel()[index] > self.options.map_inner_px)
+        return sights, sights.clear & (inner_distance_px(view.mask)[index] > self.options.map_inner_px)
 
     def map_resolution(self, rays: list[Rays]) -> int:
         """As fine as held-out views want it."""

@@ -5,11 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
+from panoless.capture.masks import remembered
 from panoless.capture.poses import Poses
 from panoless.capture.rays import camera_rays, pose_of
 from panoless.capture.silhouettes import mask_contours
-from panoless.capture.views import TrainView, Views, concatenated, every_kth_pixel
+from panoless.capture.views import Views, concatenated, every_kth_pixel
 from panoless.capture.zoom import farther_rays
 from panoless.kernels.rasterize import RasterCamera
 from shinypartial.core.conventions import PIXEL_CENTER, SOLID_ALPHA
@@ -76,12 +78,13 @@ class Pixels:
     inner_px: Float[np.ndarray, "P"]
 
 
-def inner_distance_px(view: TrainView) -> Float[np.ndarray, "H W"]:
+@remembered
+def inner_distance_px(mask: Float[Tensor, "H W"]) -> Float[np.ndarray, "P"]:
     """How far each pixel lies from the nearest one that is not solid; the picture's border counts as such."""
     from scipy.ndimage import distance_transform_edt
 
-    solid = np.pad(view.mask.cpu().numpy() > SOLID_ALPHA, 1)
-    found: np.ndarray = distance_transform_edt(solid)[1:-1, 1:-1]
+    solid = np.pad(mask.cpu().numpy() > SOLID_ALPHA, 1)
+    found: np.ndarray = distance_transform_edt(solid)[1:-1, 1:-1].astype(np.float32).ravel()
     return found
 
 
@@ -92,7 +95,7 @@ def solid_pixels(views: Views, count: int) -> Pixels:
         index = pixels.cpu().numpy()
         rays.append(PixelRays.centers(view.camera, index, number))
         radiance.append(view.radiance_at(pixels).cpu().numpy().astype(np.float64))
-        inner.append(inner_distance_px(view).ravel()[index])
+        inner.append(inner_distance_px(view.mask)[index])
     return Pixels(concatenated(rays), np.concatenate(radiance), np.concatenate(inner))
 
 

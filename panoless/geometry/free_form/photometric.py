@@ -21,7 +21,14 @@ from panoless.geometry.free_form.observations import PixelRays, Pixels
 from panoless.geometry.free_form.options import FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.surface import Hits, LevelSet
 from panoless.geometry.free_form.trust import Trust
-from panoless.kernels.level_set import mirror_rows, mirrored, seen_with_slopes, third_differences, without_means
+from panoless.kernels.level_set import (
+    mirror_rows,
+    mirrored,
+    seen_with_slopes,
+    third_differences,
+    whole_differences,
+    without_means,
+)
 from panoless.kernels.reference.cubemap import padded_texels
 from panoless.numeric.robust import bounded_error, robust_weight
 
@@ -248,7 +255,11 @@ class Solution:
     @cached_property
     def bent(self) -> Float[np.ndarray, "A B C"]:
         """The gradient of half the prior."""
-        return self.smoothing * third_differences(self._rough, self.active)
+        return self.smoothing * third_differences(self._rough, self.active, whole=self._whole)
+
+    @cached_property
+    def _whole(self) -> Int[np.ndarray, "A B C"]:
+        return whole_differences(self.active)
 
     @property
     def _rough(self) -> Float[np.ndarray, "A B C"]:
@@ -353,7 +364,7 @@ class Solution:
         seen = self.beyond_map(seen)
         total = self.photographs.backward(seen, shape)
         total += self.constraints.backward(constrained, shape)
-        total += self.smoothing * third_differences(change, self.active)
+        total += self.smoothing * third_differences(change, self.active, whole=self._whole)
         pulled = zip(self.beside, beside, strict=True)
         return total * self.active, [each.backward(seen, constrained[:count], moved) for each, moved in pulled]
 

@@ -1,13 +1,14 @@
 """A closed surface as the zero level of a tricubic uniform B-spline φ, negative inside, over a box."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from panoless.environment.surroundings import FAR, Surroundings
 from panoless.first_surface.mesh import TriangleMesh
-from panoless.kernels.level_set import evaluate, first_hits, nearest_approach
+from panoless.kernels.level_set import empty_cells, evaluate, first_hits, nearest_approach
 from shinypartial.core.camera import Similarity
 
 NEAREST = 6
@@ -99,18 +100,25 @@ class LevelSet:
     ) -> Hits:
         """Where rays of unit direction meet the surface first; those `leaving` it start on it."""
         starts = self.places(origins)
-        return self._along(starts, directions, first_hits(self.coefficients, starts, directions, leaving=leaving))
+        distance = first_hits(self.coefficients, starts, directions, leaving=leaving, empty=self._empty)
+        return self._along(starts, directions, distance)
 
     def meets_again(
         self, places: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"]
     ) -> Bool[np.ndarray, "P"]:
         """Whether rays that leave the surface at places in cells meet it again."""
-        return np.isfinite(first_hits(self.coefficients, places, directions, leaving=True))
+        return np.isfinite(first_hits(self.coefficients, places, directions, leaving=True, empty=self._empty))
 
     def nearest(self, origins: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"]) -> Hits:
         """Where φ is least along rays of unit direction; an infinite distance for those that miss the box."""
         starts = self.places(origins)
-        return self._along(starts, directions, nearest_approach(self.coefficients, starts, directions))
+        return self._along(
+            starts, directions, nearest_approach(self.coefficients, starts, directions, empty=self._empty)
+        )
+
+    @cached_property
+    def _empty(self) -> Int[np.ndarray, "a b c"]:
+        return empty_cells(self.coefficients)
 
     def _along(
         self, starts: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"], distance: Float[np.ndarray, "P"]

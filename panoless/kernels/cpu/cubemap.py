@@ -46,7 +46,7 @@ class SampleCubemap(torch.autograd.Function):
         directions = directions.detach().contiguous()
         values = directions.new_empty(len(directions), channels)
         rays = _flat(directions), _flat(values)
-        run_shared(_sample, _flat(texture), resolution, *rays, (0,) * channels)
+        run_shared(_sample, _flat(texture), resolution, *rays, _samples(directions), (0,) * channels)
         ctx.save_for_backward(texture, directions)
         return values
 
@@ -61,26 +61,32 @@ class SampleCubemap(torch.autograd.Function):
         if ctx.needs_input_grad[1]:
             grad_directions = torch.empty_like(directions)
             _, padded, _, channels = texture.shape
-            rays = _flat(directions), _flat(grad_values), _flat(grad_directions)
+            each = (grad_values / _samples(directions)).repeat_interleave(_samples(directions), 0)
+            rays = _flat(directions), _flat(each), _flat(grad_directions)
             run_shared(_pull_to_directions, _flat(texture), padded - 2, *rays, (0,) * channels)
         return grad_cubemap, grad_directions
 
 
 def scatter_cubemap(
-    values: Float[Tensor, "P C"], directions: Float[Tensor, "P 3"], resolution: int
+    values: Float[Tensor, "P C"], directions: Float[Tensor, "P *K 3"], resolution: int
 ) -> Float[Tensor, "6 C L L"]:
     """The adjoint of `SampleCubemap` in its first argument."""
-    channels = values.shape[1]
+    channels, samples = values.shape[1], _samples(directions)
     padding = cubemap_padding(resolution, torch.device("cpu"))
     # Clearing and adding up one more buffer must cost less than the work it takes from the others.
-    useful = max(1, 4 * len(directions) // (6 * resolution**2))
+    useful = max(1, 4 * samples * len(directions) // (6 * resolution**2))
     buffers = _scatter_buffers(min(MOST_SHARES, useful), resolution, channels, get_ident())
     flat_buffers = buffers.reshape(len(buffers), -1)
-    run_shared(_scatter, _flat(values), _flat(directions), flat_buffers, resolution, (0,) * channels)
+    run_shared(_scatter, _flat(values), _flat(directions), flat_buffers, resolution, samples, (0,) * channels)
     cubemap = values.new_empty(6, channels, resolution, resolution)
     run_shared(_add_up, buffers, cubemap.numpy())
     _fold_rings(buffers, padding.sources.numpy(), padding.corners.numpy(), cubemap.numpy())
     return cubemap
+
+
+def _samples(directions: Float[Tensor, "P *K 3"]) -> int:
+    """How many directions belong to each value."""
+    return directions.shape[1] if directions.ndim == 3 else 1
 
 
 def _flat(tensor: Tensor) -> Float[np.ndarray, "N"]:
@@ -159,17 +165,22 @@ def _locate(directions, resolution, cells, rights, downs, present):
 
 
 @njit(**VECTORIZED_LOOPS)
-def _sample(counter, texture, resolution, directions, values, unrolled):
-    rays, channels = directions.size // 3, len(unrolled)
-    cells, places = np.empty(RAYS_PER_BLOCK, np.int32), np.empty((3, RAYS_PER_BLOCK), np.float32)
+def _sample(counter, texture, resolution, directions, values, samples, unrolled):
+    """Means over so many directions each."""
+    count, channels, block = directions.size // 3 // samples, len(unrolled), max(RAYS_PER_BLOCK // samples, 1)
+    cells, places = np.empty(block * samples, np.int32), np.empty((3, block * samples), np.float32)
     while True:
-        begin = fetch_add(counter, RAYS_PER_BLOCK)
-        if begin >= rays:
+        begin = fetch_add(counter, block)
+        if begin >= count:
             return
-        end = min(begin + RAYS_PER_BLOCK, rays)
-        _locate(directions[3 * begin : 3 * end], resolution, cells, places[0], places[1], places[2])
+        end = min(begin + block, count)
+        share = directions[3 * samples * begin : 3 * samples * end]
+        _locate(share, resolution, cells, places[0], places[1], places[2])
         out = values[channels * begin : channels * end]
-        _interpolate(texture, resolution + 2, cells, places, out, unrolled)
+        if samples == 1:
+            _interpolate(texture, resolution + 2, cells, places, out, unrolled)
+        else:
+            _interpolate_means(texture, resolution + 2, cells, places, out, samples, unrolled)
 
 
 @njit(**VECTORIZED_LOOPS)
@@ -188,39 +199,60 @@ def _interpolate(texture, stride, cells, places, values, unrolled):
 
 
 @njit(**VECTORIZED_LOOPS)
-def _scatter(counter, values, directions, buffers, resolution, unrolled):
-    """Clear each padded buffer and add its share of the rays to it: the same share whichever thread comes to it."""
-    rays, channels = directions.size // 3, len(unrolled)
-    count = len(buffers)
-    cells, places = np.empty(RAYS_PER_BLOCK, np.int32), np.empty((3, RAYS_PER_BLOCK), np.float32)
-    while True:
-        task = fetch_add(counter, 1)
-        if task >= count:
-            return
-        buffer = buffers[task]
-        buffer[:] = f32(0)
-        last = (task + 1) * rays // count
-        for begin in range(task * rays // count, last, RAYS_PER_BLOCK):
-            end = min(begin + RAYS_PER_BLOCK, last)
-            _locate(directions[3 * begin : 3 * end], resolution, cells, places[0], places[1], places[2])
-            _deposit(values[channels * begin : channels * end], resolution + 2, cells, places, buffer, unrolled)
+def _interpolate_means(texture, stride, cells, places, values, samples, unrolled):
+    channels, share = len(unrolled), f32(1) / f32(samples)
+    values[:] = f32(0)
+    for pixel in range(values.size // channels):
+        for i in range(samples * pixel, samples * (pixel + 1)):
+            right, down = places[0, i], places[1, i] * share
+            left, up = places[2, i] - right, share - down
+            a = np.int64(cells[i]) * channels
+            b, c = a + channels, a + stride * channels
+            d = c + channels
+            for k in range(channels):
+                upper = left * texture[a + k] + right * texture[b + k]
+                lower = left * texture[c + k] + right * texture[d + k]
+                values[channels * pixel + k] += up * upper + down * lower
 
 
 @njit(**VECTORIZED_LOOPS)
-def _deposit(values, stride, cells, places, buffer, unrolled):
-    channels = len(unrolled)
-    for i in range(values.size // channels):
-        right, down = places[0, i], places[1, i]
-        left, up = places[2, i] - right, f32(1) - down
-        a = np.int64(cells[i]) * channels
-        b, c = a + channels, a + stride * channels
-        d = c + channels
-        for k in range(channels):
-            value = values[channels * i + k]
-            buffer[a + k] += up * left * value
-            buffer[b + k] += up * right * value
-            buffer[c + k] += down * left * value
-            buffer[d + k] += down * right * value
+def _scatter(counter, values, directions, buffers, resolution, samples, unrolled):
+    """Clear each padded buffer and add its share of the rays to it: the same share whichever thread comes to it."""
+    count, channels, block = directions.size // 3 // samples, len(unrolled), max(RAYS_PER_BLOCK // samples, 1)
+    shares = len(buffers)
+    cells, places = np.empty(block * samples, np.int32), np.empty((3, block * samples), np.float32)
+    while True:
+        task = fetch_add(counter, 1)
+        if task >= shares:
+            return
+        buffer = buffers[task]
+        buffer[:] = f32(0)
+        last = (task + 1) * count // shares
+        for begin in range(task * count // shares, last, block):
+            end = min(begin + block, last)
+            share = directions[3 * samples * begin : 3 * samples * end]
+            _locate(share, resolution, cells, places[0], places[1], places[2])
+            _deposit(
+                values[channels * begin : channels * end], resolution + 2, cells, places, buffer, samples, unrolled
+            )
+
+
+@njit(**VECTORIZED_LOOPS)
+def _deposit(values, stride, cells, places, buffer, samples, unrolled):
+    channels, share = len(unrolled), f32(1) / f32(samples)
+    for pixel in range(values.size // channels):
+        for i in range(samples * pixel, samples * (pixel + 1)):
+            right, down = places[0, i], places[1, i] * share
+            left, up = places[2, i] - right, share - down
+            a = np.int64(cells[i]) * channels
+            b, c = a + channels, a + stride * channels
+            d = c + channels
+            for k in range(channels):
+                value = values[channels * pixel + k]
+                buffer[a + k] += up * left * value
+                buffer[b + k] += up * right * value
+                buffer[c + k] += down * left * value
+                buffer[d + k] += down * right * value
 
 
 @njit(**VECTORIZED_LOOPS)

@@ -14,10 +14,11 @@ from panoless.kernels.cpu.workers import run_shared
 
 PLACES_PER_CLAIM = 2048
 SAFE_SHARE, LONGEST_STEP = 0.8, 1.0
-SAMPLE_STEP, SAMPLE_SHARE = 0.25, 0.5
+SAMPLE_STEP, SAMPLE_SHARE, CLOSE_SHARE = 0.5, 0.5, 0.5
 LEAVING_STEP, LEAVING_TRIALS = 0.25, 8
-BISECTIONS = 26
+LEVEL_CONVERGED = 1e-7
 NEAR_CELLS = 3
+ZERO = (0.0, 0.0, 0.0, 0.0)
 
 
 def evaluate(coefficients: Float[np.ndarray, "A B C"], places: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 10"]:
@@ -32,37 +33,24 @@ def first_hits(
     origins: Float[np.ndarray, "P 3"],
     directions: Float[np.ndarray, "P 3"],
     leaving: bool,
+    empty: Int[np.ndarray, "a b c"],
 ) -> Float[np.ndarray, "P"]:
     """See `panoless.kernels.level_set`."""
-    distance, coefficients = np.empty(len(origins)), _array(coefficients)
-    empty = empty_cells(coefficients)
-    run_shared(_trace, coefficients, empty, _array(origins), _array(directions), leaving, distance)
+    distance = np.empty(len(origins))
+    run_shared(_trace, _array(coefficients), empty, _array(origins), _array(directions), leaving, distance)
     return distance
 
 
 def nearest_approach(
-    coefficients: Float[np.ndarray, "A B C"], origins: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"]
+    coefficients: Float[np.ndarray, "A B C"],
+    origins: Float[np.ndarray, "P 3"],
+    directions: Float[np.ndarray, "P 3"],
+    empty: Int[np.ndarray, "a b c"],
 ) -> Float[np.ndarray, "P"]:
     """See `panoless.kernels.level_set`."""
-    distance, coefficients = np.empty(len(origins)), _array(coefficients)
-    empty = empty_cells(coefficients)
-    run_shared(_approach, coefficients, empty, _array(origins), _array(directions), distance)
+    distance = np.empty(len(origins))
+    run_shared(_approach, _array(coefficients), empty, _array(origins), _array(directions), distance)
     return distance
-
-
-def empty_cells(coefficients: Float[np.ndarray, "A B C"]) -> Int[np.ndarray, "a b c"]:
-    """How many cells around each cell, and itself, are free of the inside: a ray may pass so many less one.
-
-    A spline lies within the range of its coefficients, so a cell whose 64 are all positive is empty.
-    """
-    from scipy.ndimage import distance_transform_cdt, minimum_filter1d
-
-    least = coefficients
-    for axis, count in enumerate(coefficients.shape):
-        least = minimum_filter1d(least, 4, axis, origin=-2).take(range(count - 3), axis)
-    if (least > 0).all():
-        return np.full(least.shape, max(least.shape), dtype=np.int32)
-    return distance_transform_cdt(least > 0, "chessboard").astype(np.int32)
 
 
 def _array(values: np.ndarray) -> np.ndarray:
@@ -108,6 +96,16 @@ def _more(sums, weight, row, first):
 
 
 @njit(**VECTORIZED_LOOPS)
+def _added(sums, weight, others):
+    return (
+        sums[0] + weight * others[0],
+        sums[1] + weight * others[1],
+        sums[2] + weight * others[2],
+        sums[3] + weight * others[3],
+    )
+
+
+@njit(**VECTORIZED_LOOPS)
 def _dot(weights, sums):
     return weights[0] * sums[0] + weights[1] * sums[1] + weights[2] * sums[2] + weights[3] * sums[3]
 
@@ -118,10 +116,12 @@ def value_at(coefficients, x, y, z):
     first, u = cell_of(x, coefficients.shape[0])
     second, v = cell_of(y, coefficients.shape[1])
     third, w = cell_of(z, coefficients.shape[2])
-    by_x, by_y, sums = weights_of(u), weights_of(v), (0.0, 0.0, 0.0, 0.0)
+    by_x, by_y, sums = weights_of(u), weights_of(v), ZERO
     for i in range(4):
+        plain = ZERO
         for j in range(4):
-            sums = _more(sums, by_x[i] * by_y[j], coefficients[first + i, second + j], third)
+            plain = _more(plain, by_y[j], coefficients[first + i, second + j], third)
+        sums = _added(sums, by_x[i], plain)
     return _dot(weights_of(w), sums)
 
 
@@ -132,20 +132,21 @@ def value_and_gradient(coefficients, x, y, z):
     second, v = cell_of(y, coefficients.shape[1])
     third, w = cell_of(z, coefficients.shape[2])
     by_x, by_y, along_x, along_y = weights_of(u), weights_of(v), slopes_of(u), slopes_of(v)
-    sums = sums_x = sums_y = (0.0, 0.0, 0.0, 0.0)
+    sums = sums_x = sums_y = ZERO
     for i in range(4):
+        plain = steep = ZERO
         for j in range(4):
             row = coefficients[first + i, second + j]
-            sums = _more(sums, by_x[i] * by_y[j], row, third)
-            sums_x = _more(sums_x, along_x[i] * by_y[j], row, third)
-            sums_y = _more(sums_y, by_x[i] * along_y[j], row, third)
+            plain = _more(plain, by_y[j], row, third)
+            steep = _more(steep, along_y[j], row, third)
+        sums, sums_y = _added(sums, by_x[i], plain), _added(sums_y, by_x[i], steep)
+        sums_x = _added(sums_x, along_x[i], plain)
     by_z = weights_of(w)
     return _dot(by_z, sums), _dot(by_z, sums_x), _dot(by_z, sums_y), _dot(slopes_of(w), sums)
 
 
 @njit(**VECTORIZED_LOOPS)
 def _evaluate(counter, coefficients, places, found):
-    zero = (0.0, 0.0, 0.0, 0.0)
     while True:
         begin = fetch_add(counter, PLACES_PER_CLAIM)
         if begin >= len(places):
@@ -156,16 +157,21 @@ def _evaluate(counter, coefficients, places, found):
             third, w = cell_of(places[place, 2], coefficients.shape[2])
             by_x, along_x, bend_x = weights_of(u), slopes_of(u), bends_of(u)
             by_y, along_y, bend_y = weights_of(v), slopes_of(v), bends_of(v)
-            sums = sums_x = sums_y = sums_xx = sums_xy = sums_yy = zero
+            sums = sums_x = sums_y = sums_xx = sums_xy = sums_yy = ZERO
             for i in range(4):
+                plain = steep = bent = ZERO
                 for j in range(4):
                     row = coefficients[first + i, second + j]
-                    sums = _more(sums, by_x[i] * by_y[j], row, third)
-                    sums_x = _more(sums_x, along_x[i] * by_y[j], row, third)
-                    sums_y = _more(sums_y, by_x[i] * along_y[j], row, third)
-                    sums_xx = _more(sums_xx, bend_x[i] * by_y[j], row, third)
-                    sums_xy = _more(sums_xy, along_x[i] * along_y[j], row, third)
-                    sums_yy = _more(sums_yy, by_x[i] * bend_y[j], row, third)
+                    plain = _more(plain, by_y[j], row, third)
+                    steep = _more(steep, along_y[j], row, third)
+                    bent = _more(bent, bend_y[j], row, third)
+                sums, sums_y, sums_yy = (
+                    _added(sums, by_x[i], plain),
+                    _added(sums_y, by_x[i], steep),
+                    _added(sums_yy, by_x[i], bent),
+                )
+                sums_x, sums_xy = _added(sums_x, along_x[i], plain), _added(sums_xy, along_x[i], steep)
+                sums_xx = _added(sums_xx, bend_x[i], plain)
             by_z, along_z = weights_of(w), slopes_of(w)
             found[place, 0] = _dot(by_z, sums)
             found[place, 1] = _dot(by_z, sums_x)
@@ -197,9 +203,8 @@ def _span(shape, ox, oy, oz, dx, dy, dz):
 
 
 @njit(**VECTORIZED_LOOPS)
-def _root(coefficients, ox, oy, oz, dx, dy, dz, outside, inside):
-    """Where φ = 0 between t `outside` and t `inside`: Newton's steps, or halves where these leave the bracket."""
-    t = 0.5 * (outside + inside)
+def _root(coefficients, ox, oy, oz, dx, dy, dz, outside, inside, t):
+    """Where φ = 0 between `outside` and `inside`: Newton's steps from t, or halves where these leave the bracket."""
     for _ in range(MAX_ROOT_STEPS):
         value, gx, gy, gz = value_and_gradient(coefficients, ox + t * dx, oy + t * dy, oz + t * dz)
         if value > 0:
@@ -238,7 +243,7 @@ def _march(coefficients, empty, ox, oy, oz, dx, dy, dz, start, end):
     if free == 0:
         value = value_at(coefficients, x, y, z)
     while True:
-        before = t
+        before, above = t, value
         if free > 0:
             t += max(free - 1.0, LEAST_STEP) / widest
         else:
@@ -246,11 +251,12 @@ def _march(coefficients, empty, ox, oy, oz, dx, dy, dz, start, end):
         if t >= end:
             return np.inf
         x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-        free = _free(empty, x, y, z)
+        free, value = _free(empty, x, y, z), 0.0
         if free == 0:
             value = value_at(coefficients, x, y, z)
             if value <= 0:
-                return _root(coefficients, ox, oy, oz, dx, dy, dz, before, t)
+                between = before + (t - before) * (above / (above - value) if above > 0 else 0.5)
+                return _root(coefficients, ox, oy, oz, dx, dy, dz, before, t, between)
 
 
 @njit(**VECTORIZED_LOOPS)
@@ -278,8 +284,13 @@ def _trace(counter, coefficients, empty, origins, directions, leaving, distance)
 
 @njit(**VECTORIZED_LOOPS)
 def _least_sample(coefficients, empty, near, ox, oy, oz, dx, dy, dz, start, end):
-    """The least of samples of φ along a ray, where the inside is at most `near` cells away, and its t."""
-    least, best, t = np.inf, start, start
+    """Where the least of samples of φ along a ray lies, and the samples before and after it; infinite where there are
+    none, because the inside is never at most `near` cells away.
+
+    Samples lie closely where φ is small. The farther a ray is from the surface, or from where it was nearest so far,
+    the farther they lie apart.
+    """
+    least, best, low, high, before, t = np.inf, np.inf, start, end, start, start
     widest = max(abs(dx), abs(dy), abs(dz))
     while t < end:
         x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
@@ -288,10 +299,11 @@ def _least_sample(coefficients, empty, near, ox, oy, oz, dx, dy, dz, start, end)
             t += max(free - near, SAMPLE_STEP) / widest
             continue
         value = value_at(coefficients, x, y, z)
+        following = t + max(SAMPLE_STEP, SAMPLE_SHARE * max(value - max(least, 0.0), CLOSE_SHARE * value))
         if value < least:
-            least, best = value, t
-        t += max(SAMPLE_STEP, SAMPLE_SHARE * (value - max(least, 0.0)))
-    return least, best
+            least, best, low, high = value, t, max(before, t - LONGEST_STEP), following
+        before, t = t, following
+    return best, low, min(high, end)
 
 
 @njit(**VECTORIZED_LOOPS)
@@ -307,15 +319,44 @@ def _approach(counter, coefficients, empty, origins, directions, distance):
             if start >= end:
                 distance[ray] = np.inf
                 continue
-            least, best = _least_sample(coefficients, empty, NEAR_CELLS, ox, oy, oz, dx, dy, dz, start, end)
-            if least == np.inf:
-                least, best = _least_sample(coefficients, empty, empty.size, ox, oy, oz, dx, dy, dz, start, end)
-            low, high = max(best - SAMPLE_STEP, start), min(best + SAMPLE_STEP, end)
-            for _ in range(BISECTIONS):
-                middle = 0.5 * (low + high)
-                _, gx, gy, gz = value_and_gradient(coefficients, ox + middle * dx, oy + middle * dy, oz + middle * dz)
-                if gx * dx + gy * dy + gz * dz > 0:
-                    high = middle
-                else:
-                    low = middle
-            distance[ray] = 0.5 * (low + high)
+            best, low, high = _least_sample(coefficients, empty, NEAR_CELLS, ox, oy, oz, dx, dy, dz, start, end)
+            if best == np.inf:
+                best, low, high = _least_sample(coefficients, empty, empty.size, ox, oy, oz, dx, dy, dz, start, end)
+            distance[ray] = _level(coefficients, ox, oy, oz, dx, dy, dz, low, high)
+
+
+@njit(**VECTORIZED_LOOPS)
+def _level(coefficients, ox, oy, oz, dx, dy, dz, low, high):
+    """Where φ ceases to fall between two t: the end beyond which it falls on, or the root of its slope along the ray,
+    by regula falsi with Illinois weights (Dowell and Jarratt 1971), the slope being nearly linear there.
+    """
+    falling, rising = (
+        _slope(coefficients, ox, oy, oz, dx, dy, dz, low),
+        _slope(coefficients, ox, oy, oz, dx, dy, dz, high),
+    )
+    if falling >= 0:
+        return low
+    if rising <= 0:
+        return high
+    side, t = 0, low
+    for _ in range(MAX_ROOT_STEPS):
+        before, t = t, (low * rising - high * falling) / (rising - falling)
+        if abs(t - before) < LEVEL_CONVERGED:
+            break
+        slope = _slope(coefficients, ox, oy, oz, dx, dy, dz, t)
+        if slope > 0:
+            high, rising = t, slope
+            falling *= 0.5 if side > 0 else 1.0
+            side = 1
+        else:
+            low, falling = t, slope
+            rising *= 0.5 if side < 0 else 1.0
+            side = -1
+    return t
+
+
+@njit(**VECTORIZED_LOOPS)
+def _slope(coefficients, ox, oy, oz, dx, dy, dz, t):
+    """Of φ along a ray."""
+    _, gx, gy, gz = value_and_gradient(coefficients, ox + t * dx, oy + t * dy, oz + t * dz)
+    return gx * dx + gy * dy + gz * dz

@@ -13,7 +13,7 @@ from panoless.kernels.cpu.level_set import cell_of, slopes_of, value_and_gradien
 from panoless.kernels.cpu.simd_memory import fetch_add
 from panoless.kernels.cpu.workers import run_shared
 
-PARTS = 4
+PARTS, SLAB = 4, 4
 
 
 def apply_rows(
@@ -66,42 +66,16 @@ def without_means(
 
 
 def third_differences(
-    coefficients: Float[np.ndarray, "A B C"], active: Bool[np.ndarray, "A B C"]
+    coefficients: Float[np.ndarray, "A B C"], active: Bool[np.ndarray, "A B C"], whole: Int[np.ndarray, "A B C"]
 ) -> Float[np.ndarray, "A B C"]:
     """See `panoless.kernels.level_set`."""
-    sums = np.zeros((PARTS, *coefficients.shape))
-    stencils = _OFFSETS, _FACTORS, _LENGTHS
-    run_shared(_third_differences, np.ascontiguousarray(coefficients), active, *stencils, sums)
-    return sums.sum(0)
-
-
-def third_difference_stencils() -> list[tuple[Int[np.ndarray, "T 3"], Float[np.ndarray, "T"]]]:
-    """Offsets and factors of the ten third differences, each times the root of how often it is in |D³φ|²."""
-    single = {
-        0: ((0, 1.0),),
-        1: ((0, -1.0), (1, 1.0)),
-        2: ((-1, 1.0), (0, -2.0), (1, 1.0)),
-        3: ((-1, -1.0), (0, 3.0), (1, -3.0), (2, 1.0)),
-    }
-    found = []
-    for orders in [(i, j, 3 - i - j) for i in range(4) for j in range(4 - i)]:
-        often = 6 / np.prod([(1, 1, 2, 6)[order] for order in orders])
-        taps = [
-            ((i, j, k), a * b * c * often**0.5)
-            for i, a in single[orders[0]]
-            for j, b in single[orders[1]]
-            for k, c in single[orders[2]]
-        ]
-        found.append((np.array([place for place, _ in taps]), np.array([factor for _, factor in taps])))
-    return found
-
-
-_STENCILS = third_difference_stencils()
-_LENGTHS = np.array([len(factors) for _, factors in _STENCILS])
-_OFFSETS = np.zeros((len(_STENCILS), max(_LENGTHS), 3), dtype=np.int64)
-_FACTORS = np.zeros((len(_STENCILS), max(_LENGTHS)))
-for _index, (_places, _values) in enumerate(_STENCILS):
-    _OFFSETS[_index, : len(_values)], _FACTORS[_index, : len(_values)] = _places, _values
+    result = np.zeros(coefficients.shape)
+    flat, (_, rows, columns) = np.ascontiguousarray(coefficients).ravel(), coefficients.shape
+    for parity in range(2):
+        run_shared(
+            _third_differences, parity, flat, whole.reshape(len(whole), -1), rows * columns, columns, result.ravel()
+        )
+    return result
 
 
 @njit(**VECTORIZED_LOOPS)
@@ -218,36 +192,76 @@ def _subtract(counter, parts, values, means, groups, result):
 
 
 @njit(**VECTORIZED_LOOPS)
-def _third_differences(counter, coefficients, active, offsets, factors, lengths, sums):
+def _third_differences(counter, parity, coefficients, whole, by_row, by_column, result):
+    """Slabs of every other four rows at once: none adds to what another adds to."""
+    x, y, z = by_row, by_column, 1
     while True:
-        slot = fetch_add(counter, 1)
-        if slot >= len(sums):
+        slab = 2 * fetch_add(counter, 1) + parity
+        if SLAB * slab >= len(whole):
             return
-        begin, end = _part(slot, len(sums), coefficients.shape[0])
-        for i in range(begin, end):
-            for j in range(coefficients.shape[1]):
-                for k in range(coefficients.shape[2]):
-                    if active[i, j, k]:
-                        _add_differences(coefficients, active, offsets, factors, lengths, sums[slot], i, j, k)
+        for row in range(SLAB * slab, min(SLAB * (slab + 1), len(whole))):
+            for column in range(by_row):
+                kinds, place = np.int64(whole[row, column]), row * by_row + column
+                if kinds == 0:
+                    continue
+                if kinds & 1:
+                    _add_three(coefficients, result, place, z)
+                if kinds & 2:
+                    _add_two_and_one(coefficients, result, place, z, y)
+                if kinds & 4:
+                    _add_two_and_one(coefficients, result, place, y, z)
+                if kinds & 8:
+                    _add_three(coefficients, result, place, y)
+                if kinds & 16:
+                    _add_two_and_one(coefficients, result, place, z, x)
+                if kinds & 32:
+                    _add_one_each(coefficients, result, place, x, y, z)
+                if kinds & 64:
+                    _add_two_and_one(coefficients, result, place, y, x)
+                if kinds & 128:
+                    _add_two_and_one(coefficients, result, place, x, z)
+                if kinds & 256:
+                    _add_two_and_one(coefficients, result, place, x, y)
+                if kinds & 512:
+                    _add_three(coefficients, result, place, x)
 
 
 @njit(**VECTORIZED_LOOPS)
-def _add_differences(coefficients, active, offsets, factors, lengths, result, i, j, k):
-    """What the differences that begin at one coefficient add."""
-    rows, columns, layers = coefficients.shape
-    inner = 1 <= i < rows - 2 and 1 <= j < columns - 2 and 1 <= k < layers - 2
-    for kind in range(len(lengths)):
-        value, whole = 0.0, True
-        for tap in range(lengths[kind]):
-            a, b, c = i + offsets[kind, tap, 0], j + offsets[kind, tap, 1], k + offsets[kind, tap, 2]
-            if not inner and (min(a, b, c) < 0 or a >= rows or b >= columns or c >= layers):
-                whole = False
-                break
-            if not active[a, b, c]:
-                whole = False
-                break
-            value += factors[kind, tap] * coefficients[a, b, c]
-        if whole:
-            for tap in range(lengths[kind]):
-                a, b, c = i + offsets[kind, tap, 0], j + offsets[kind, tap, 1], k + offsets[kind, tap, 2]
-                result[a, b, c] += factors[kind, tap] * value
+def _add_three(values, result, place, step):
+    """Of the third difference along an axis, which is once in |D³c|²."""
+    a, b, c, d = place - step, place, place + step, place + 2 * step
+    value = values[d] - values[a] + 3 * (values[b] - values[c])
+    result[a] -= value
+    result[b] += 3 * value
+    result[c] -= 3 * value
+    result[d] += value
+
+
+@njit(**VECTORIZED_LOOPS)
+def _add_two_and_one(values, result, place, twice, once):
+    """Of the second difference along one axis and the first along another, three times in |D³c|²."""
+    a, b, c = place - twice, place, place + twice
+    d, e, f = a + once, b + once, c + once
+    value = 3 * (values[d] + values[f] - values[a] - values[c] + 2 * (values[b] - values[e]))
+    result[a] -= value
+    result[b] += 2 * value
+    result[c] -= value
+    result[d] += value
+    result[e] -= 2 * value
+    result[f] += value
+
+
+@njit(**VECTORIZED_LOOPS)
+def _add_one_each(values, result, place, x, y, z):
+    """Of the first differences along all three axes, six times in |D³c|²."""
+    a, b, c, d = place, place + z, place + y, place + y + z
+    e, f, g, h = a + x, b + x, c + x, d + x
+    value = 6 * (values[b] - values[a] + values[c] - values[d] + values[e] - values[f] + values[h] - values[g])
+    result[a] -= value
+    result[b] += value
+    result[c] += value
+    result[d] -= value
+    result[e] += value
+    result[f] -= value
+    result[g] -= value
+    result[h] += value

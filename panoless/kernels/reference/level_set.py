@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from panoless.kernels.constants import LEAST_STEP, MAX_ROOT_STEPS
 
@@ -37,8 +37,9 @@ def first_hits(
     origins: Float[np.ndarray, "P 3"],
     directions: Float[np.ndarray, "P 3"],
     leaving: bool,
+    empty: Int[np.ndarray, "a b c"],
 ) -> Float[np.ndarray, "P"]:
-    """See `panoless.kernels.level_set`: dense samples, then bisection."""
+    """See `panoless.kernels.level_set`: dense samples everywhere, then bisection."""
     from scipy.optimize import elementwise
 
     spline = spline_of(coefficients)
@@ -62,7 +63,10 @@ def first_hits(
 
 
 def nearest_approach(
-    coefficients: Float[np.ndarray, "A B C"], origins: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"]
+    coefficients: Float[np.ndarray, "A B C"],
+    origins: Float[np.ndarray, "P 3"],
+    directions: Float[np.ndarray, "P 3"],
+    empty: Int[np.ndarray, "a b c"],
 ) -> Float[np.ndarray, "P"]:
     """See `panoless.kernels.level_set`: the least of dense samples, refined by a parabola."""
     spline = spline_of(coefficients)

@@ -54,7 +54,7 @@ def without_means(
 
 
 def third_differences(
-    coefficients: Float[np.ndarray, "A B C"], active: Bool[np.ndarray, "A B C"]
+    coefficients: Float[np.ndarray, "A B C"], active: Bool[np.ndarray, "A B C"], whole: Int[np.ndarray, "A B C"]
 ) -> Float[np.ndarray, "A B C"]:
     """See `panoless.kernels.level_set`: every path of three forward differences along axes is one term of |D³c|²."""
     result = np.zeros_like(coefficients)

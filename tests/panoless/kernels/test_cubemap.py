@@ -60,6 +60,25 @@ def test_scatter_is_the_adjoint_of_the_lookup(backend, dtype, tolerance, resolut
 
 
 @every_implementation
+@pytest.mark.parametrize("samples", [1, 4, 700])
+def test_several_directions_give_their_mean_and_its_adjoint_and_gradients(backend, dtype, tolerance, samples):
+    """Against one lookup a direction, in float64; 700 are more than a block of the kernel holds."""
+    directions = torch.randn(2100, 3, generator=torch.Generator().manual_seed(4)).to(dtype).reshape(-1, samples, 3)
+    weights = torch.randn(len(directions), 3, generator=torch.Generator().manual_seed(3)).to(dtype)
+    each, exact = directions.double().reshape(-1, 3).requires_grad_(), random_cubemap(5).requires_grad_()
+    expected = sample_cubemap(exact, each, backend="reference").reshape(-1, samples, 3).mean(1)
+    cubemap, joined = random_cubemap(5, dtype).requires_grad_(), directions.clone().requires_grad_()
+    found = sample_cubemap(cubemap, joined, backend=backend)
+    torch.testing.assert_close(found.double(), expected, atol=10 * tolerance, rtol=0)
+    (expected * weights.double()).sum().backward()
+    (found * weights).sum().backward()
+    scattered = scatter_cubemap(weights, directions, 5, backend=backend)
+    for pulled in (cubemap.grad, scattered):
+        torch.testing.assert_close(pulled.double(), exact.grad, atol=100 * tolerance, rtol=0)
+    torch.testing.assert_close(joined.grad.double().reshape(-1, 3), each.grad, atol=200 * tolerance, rtol=1e-4)
+
+
+@every_implementation
 @pytest.mark.parametrize("resolution", RESOLUTIONS)
 def test_a_texel_center_returns_its_texel(backend, dtype, tolerance, resolution):
     cubemap = random_cubemap(resolution, dtype)
