@@ -1,12 +1,15 @@
 """The free-form surface as a kind of geometry."""
 
+from collections.abc import MutableMapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.utils.weak import WeakIdKeyDictionary
 
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import TrainView, Views, at_most_pixels
@@ -29,6 +32,28 @@ from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.geometry.surfels.placement import surfels_on_mesh
 from panoless.kernels.rasterize import RasterCamera
 from shinypartial.io.records import read_record, write_record
+
+
+@dataclass(frozen=True)
+class _Traces:
+    """Where the rays of a view's pixels meet the surface, not a number where none was traced, and whether they see the
+    surroundings by way of it.
+    """
+
+    camera: RasterCamera
+    distance: Float[np.ndarray, "P"]
+    clear: Bool[np.ndarray, "P"]
+
+    @classmethod
+    def none(cls, camera: RasterCamera) -> "_Traces":
+        """Of no pixel."""
+        count = camera.width * camera.height
+        return cls(camera, np.full(count, np.nan), np.zeros(count, dtype=bool))
+
+    def are_of(self, camera: RasterCamera) -> bool:
+        """Whether they are of that camera."""
+        pose, other = self.camera.world_to_camera, camera.world_to_camera
+        return torch.equal(pose, other) and replace(self.camera, world_to_camera=other) == camera
 
 
 @dataclass(frozen=True)
@@ -71,15 +96,27 @@ class FreeFormMirror(ExactGeometry):
         return Rays(outgoing.to(radiance.device), radiance, trusted.to(radiance.device), incoming)
 
     def _sights(self, view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Sights, Bool[np.ndarray, "P"]]:
-        index = pixels.cpu().numpy()
-        sights = Sights.of(
-            self.surface,
-            PixelRays.centers(view.camera, index),
-            1,
-            self.options.least_map_cosine,
-            occlusion_test=self.occlusion_test,
-        )
-        return sights, sights.clear & (inner_distance_px(view.mask)[index] > self.options.map_inner_px)
+        sights, inner = self._traced(view, pixels, 1), inner_distance_px(view.mask)[pixels.cpu().numpy()]
+        return sights, sights.clear & (inner > self.options.map_inner_px)
+
+    def _traced(self, view: TrainView, pixels: Int[Tensor, "P"], samples: int) -> Sights:
+        """What pixels of a view see. Each is traced once, because selection, map and verdict ask for the same."""
+        index, surface, known = pixels.cpu().numpy(), self.surface, self._traces.get(view.mask)
+        if known is None or not known.are_of(view.camera):
+            self._traces[view.mask] = known = _Traces.none(view.camera)
+        rays, new = PixelRays.centers(view.camera, index), np.isnan(known.distance[index])
+        if new.any():
+            found = Sights.of(
+                surface, rays.chosen(new), 1, self.options.least_map_cosine, occlusion_test=self.occlusion_test
+            )
+            known.distance[index[new]], known.clear[index[new]] = found.hits.distance, found.clear
+        hits = surface.hits_at(rays.origins, rays.directions, known.distance[index])
+        return Sights.along(surface, rays, samples, hits, known.clear[index])
+
+    @cached_property
+    def _traces(self) -> MutableMapping[Tensor, "_Traces"]:
+        """Of the pixels of each view, by its mask."""
+        return WeakIdKeyDictionary()
 
     def map_resolution(self, rays: list[Rays]) -> int:
         """As fine as held-out views want it."""
@@ -89,8 +126,7 @@ class FreeFormMirror(ExactGeometry):
         """Four directions over each of at most `footprints` pixels that are trusted and turn little."""
         found = []
         for view, pixels in at_most_pixels(views, min(max_pixels, self.options.footprints)):
-            rays = PixelRays.centers(view.camera, pixels.cpu().numpy())
-            sights = Sights.of(self.surface, rays, 4, self.options.least_map_cosine, occlusion_test=self.occlusion_test)
+            sights = self._traced(view, pixels, 4)
             trusted = self.trust.at(self.surface.points(sights.hits.places)) > self.options.least_footprint_trust
             kept = sights.clear & trusted & (sights.turn < self.options.widest_footprint_rad)
             directions = torch.from_numpy(sights.outgoing[kept]).float().to(view.radiance.device)

@@ -52,13 +52,21 @@ class Sights:
     ) -> "Sights":
         """By tracing the rays, and, but without an occlusion test, their mirrored rays against the surface itself."""
         hits = surface.hits(rays.origins, rays.directions)
-        distance = np.where(hits.met, hits.distance, 0.0) / surface.spacing
-        normals, outgoing, turn = mirrored(hits.derivatives, rays.directions, distance, rays.steps, samples)
+        normals = hits.normals
         facing = -(normals * rays.directions).sum(1)
         clear = hits.met & (facing > least_cosine)
         chosen = np.flatnonzero(clear & occlusion_test)
         middle = rays.directions[chosen] + 2 * facing[chosen, None] * normals[chosen]
         clear[chosen[surface.meets_again(hits.places[chosen], middle)]] = False
+        return cls.along(surface, rays, samples, hits, clear)
+
+    @classmethod
+    def along(
+        cls, surface: LevelSet, rays: PixelRays, samples: int, hits: Hits, clear: Bool[np.ndarray, "P"]
+    ) -> "Sights":
+        """Of rays that were traced already."""
+        distance = np.where(hits.met, hits.distance, 0.0) / surface.spacing
+        _, outgoing, turn = mirrored(hits.derivatives, rays.directions, distance, rays.steps, samples)
         points = np.broadcast_to(surface.points(hits.places)[:, None], outgoing.shape)
         looked_up = surface.surroundings.looked_up(points, outgoing)
         return cls(hits, outgoing.mean(1), looked_up, turn, clear)

@@ -103,6 +103,12 @@ class LevelSet:
         distance = first_hits(self.coefficients, starts, directions, leaving=leaving, empty=self._empty)
         return self._along(starts, directions, distance)
 
+    def hits_at(
+        self, origins: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"], distance: Float[np.ndarray, "P"]
+    ) -> Hits:
+        """The same where the distance is known already, infinite for a miss."""
+        return self._along(self.places(origins), directions, distance / self.spacing)
+
     def meets_again(
         self, places: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"]
     ) -> Bool[np.ndarray, "P"]:
