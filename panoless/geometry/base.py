@@ -1,7 +1,7 @@
 """What any mirror can do, and how a kind of mirror is proposed from silhouettes and fitted."""
 
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, MutableMapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from typing import Any, ClassVar, Protocol, TypeVar, get_args, runtime_checkable
 
@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
+from torch.utils.weak import WeakIdKeyDictionary
 
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.poses import Poses
@@ -24,8 +25,8 @@ from panoless.kernels.rasterize import RasterCamera
 Numbers = TypeVar("Numbers")
 SOLID_SURFACE_ALPHA = 0.9
 """A pixel with more alpha than this shows the surface."""
-LAST_USABLE = "_last_usable"
-"""Where a geometry keeps the views that it was asked for last, and the answer."""
+_last_usable: MutableMapping["Geometry", tuple[Callable[[], Views | None], Views]] = WeakIdKeyDictionary()
+"""The views that were asked for last, and the answer."""
 
 
 @dataclass(frozen=True)
@@ -324,15 +325,15 @@ def poses_from_plain(content: dict[str, Any]) -> Poses | None:
 def usable_views(views: Views, geometry: Geometry) -> Views:
     """The views with their cameras as a geometry has them, and its usable pixels as their solid ones.
 
-    A geometry keeps the last answer, because pixels of the same views are asked for by selection, map and verdict.
+    The last answer for each geometry is kept, because selection, map and verdict ask for pixels of the same views.
     """
-    last: tuple[Callable[[], Views | None], Views] | None = geometry.__dict__.get(LAST_USABLE)
+    last = _last_usable.get(geometry)
     if last is not None and last[0]() is views:
         return last[1]
     posed = geometry.corrected(views)
     clear = tuple(replace(view, solid=geometry.usable_pixels(view)) for view in posed.train)
     found = replace(posed, train=clear)
-    geometry.__dict__[LAST_USABLE] = weakref.ref(views), found
+    _last_usable[geometry] = weakref.ref(views), found
     return found
 
 
