@@ -48,7 +48,7 @@ def coverage(
     row, column = np.divmod(pixels, camera.width)
     share = np.zeros(len(pixels))
     for rays in _grid_of_rays(camera, column, row, samples):
-        share += surface.hits(rays.origins, rays.directions).met
+        share += surface.meets(rays.origins, rays.directions)
     return share / samples**2
 
 
@@ -77,8 +77,7 @@ def free_form_light(
     sights = Sights.of(surface, PixelRays.centers(camera, index), options.render_directions, 0.0)
     light = shade_centers(environment, camera, pixels, normals_camera)
     narrow = sights.clear & (sights.turn < options.widest_render_turn_rad)
-    directions = torch.from_numpy(sights.outgoing[narrow].reshape(-1, 3)).to(environment)
-    mean = sample_cubemap(environment, directions).view(-1, options.render_directions, 3).mean(1)
+    mean = sample_cubemap(environment, torch.from_numpy(sights.outgoing[narrow]).to(environment))
     light[torch.from_numpy(np.flatnonzero(narrow)).to(light.device)] = mean
     row, column = np.divmod(index[~narrow], camera.width)
     total, count = torch.zeros(len(row), 3).to(light), torch.zeros(len(row)).to(light)

@@ -109,6 +109,10 @@ class LevelSet:
         """The same where the distance is known already, infinite for a miss."""
         return self._along(self.places(origins), directions, distance / self.spacing)
 
+    def meets(self, origins: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, "P"]:
+        """Whether rays of unit direction meet the surface."""
+        return np.isfinite(first_hits(self.coefficients, self.places(origins), directions, empty=self._empty))
+
     def meets_again(
         self, places: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"]
     ) -> Bool[np.ndarray, "P"]:
