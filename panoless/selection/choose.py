@@ -235,14 +235,17 @@ def _examine(
     geometry, start = fitted.geometry, fitted.start
     options, evidence = config.selection, (start.proposal.silhouette_px, start.proposal.overlap)
     views = fitted.corrections.applied(views, config)
-    own, free = held_out_errors(usable_views(views, geometry), config, geometry, trial)
+    asked_from = 0.0 if is_refined(family.kind) else options.explained_error
+    own, free = held_out_errors(usable_views(views, geometry), config, geometry, trial, asked_from)
     unexplained = is_refined(family.kind) and float(own.mean()) > options.largest_error
-    better = is_clearly_lower(free, own, options)
+    better = free is not None and is_clearly_lower(free, own, options)
     verdict = Verdict.REFUSED_BY_HELD_OUT_VIEWS if unexplained or better else Verdict.CHOSEN
     reason = "surfels are clearly better" if better else "surfels are no better"
+    if free is None:
+        reason = "leaves next to nothing unexplained"
     if unexplained and not better:
         reason = "leaves too much unexplained"
-    errors = float(own.mean()), float(free.mean())
+    errors = float(own.mean()), None if free is None else float(free.mean())
     cameras = _found_cameras(geometry, views, config)
     figures = (*evidence, *errors)
     return Candidate(family.kind, verdict, reason, *figures, corrections=fitted.corrections, **cameras), geometry

@@ -40,21 +40,25 @@ def train_briefly(views: Views, config: FitConfig, start: Geometry) -> Geometry:
 
 
 def held_out_errors(
-    views: Views, config: FitConfig, candidate: Geometry, trial: Trial
-) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:
-    """Mean ‖e‖²/(‖e‖² + s²) of each held-out view, for a candidate and for surfels that started on it.
+    views: Views, config: FitConfig, candidate: Geometry, trial: Trial, least: float = 0.0
+) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"] | None]:
+    """Mean ‖e‖²/(‖e‖² + s²) of each held-out view, for a candidate and for surfels that started on it; None of these
+    where the candidate leaves less than `least`.
 
     Every fifth view is held out from the map and from the surfels. Both arrays are [0] where there are too few views.
     """
     parts = held_out_parts(views)
     if parts is None:
         return np.zeros(1), np.zeros(1)
-    start = candidate.to_surfels(config).to(views.train[0].mask.device)
-    geometries, options = (candidate, trial(parts[0], config, start)), config.selection
-    own, free = (
-        unexplained(*parts, geometry, options.compared_rays, options.trial_resolution) for geometry in geometries
-    )
-    return own, free
+    options = config.selection
+
+    def errors(geometry: Geometry) -> Float[np.ndarray, "V"]:
+        return unexplained(*parts, geometry, options.compared_rays, options.trial_resolution)
+
+    own = errors(candidate)
+    if own.mean() < least:
+        return own, None
+    return own, errors(trial(parts[0], config, candidate.to_surfels(config).to(views.train[0].mask.device)))
 
 
 def held_out_parts(views: Views) -> tuple[Views, Views] | None:

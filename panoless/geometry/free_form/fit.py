@@ -104,16 +104,22 @@ def fit_free_form(
 
 def follow_views(views: Views, fitted: FitStage, options: FreeFormOptions = DEFAULTS) -> FitStage:
     """What an earlier fit led to after its last round was taken again, with views that changed a little, or with the
-    focal length among the unknowns.
+    focal length among the unknowns. A few steps by fewer pixels tell whether that asks for more of them.
     """
     rounds = [*options.rounds, *options.finer]
     last = next((each for each in reversed(rounds) if each.cells == fitted.surface.cells), rounds[-1])
     stage = replace(fitted, settings=last)
     settings = last if stage.poses is None else _freed(stage)
-    if stage.focal is not None:
-        settings = replace(settings, steps=options.focal_steps)
-        options = replace(options, least_gain=options.least_focal_gain)
     with torch.no_grad():
+        if stage.focal is not None:
+            glance = replace(
+                settings, steps=options.focal_glance_steps, rays=min(options.focal_glance_rays, settings.rays)
+            )
+            seen = take_round(views, stage, glance, options)
+            if seen.focal is not None and abs(seen.focal) < options.least_focal_change:
+                return seen
+            settings = replace(settings, steps=options.focal_steps)
+            options = replace(options, least_gain=options.least_focal_gain)
         return take_round(views, stage, settings, options, Progress("fitting on", settings.steps))
 
 

@@ -170,14 +170,17 @@ def test_surfels_that_cover_nothing_do_not_beat_the_plane() -> None:
 
 
 def test_a_box_is_refused_by_its_silhouettes() -> None:
-    """Before anything is fitted, as plane and as surface of revolution; the table says how far away they are."""
-    geometry, selection = choose_geometry(pillar_views(around(10, SIZE_PX)), CONFIG, as_started)
+    """Before anything is fitted, as plane and as surface of revolution; the table says how far away they are. A free
+    form explains all of it, so surfels are not asked.
+    """
+    geometry, selection = choose_geometry(pillar_views(around(10, SIZE_PX)), CONFIG, no_trial)
     assert geometry.kind == "free_form"
     refused = Verdict.REFUSED_BY_SILHOUETTES, Verdict.NOT_PROPOSED
     assert all(verdicts(selection)[kind] in refused for kind in ("sphere", "plane", "height_field", "revolution"))
     plane = selection.candidates[1]
     assert plane.verdict == Verdict.NOT_PROPOSED or plane.silhouette_px > 0.5 or plane.overlap < 0.98
-    assert selection.sentence.startswith("free_form (surfels are no better;")
+    assert selection.sentence.startswith("free_form (leaves next to nothing unexplained;")
+    assert selection.candidates[-1].surfels_error is None
 
 
 def test_a_fit_remembers_why_it_took_its_kind() -> None:
