@@ -10,16 +10,20 @@ other options.
 
 import argparse
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from main_scenes import figures, make_folders
 
+from shinypartial.blender.runtime import studio_light
 from shinypartial.io.files import write_json, write_text
+from shinypartial.io.images import read_exr_rgb, write_exr_rgb
 
 FOLDER = Path("build/other-shapes")
 NUMBERS = Path("docs/results/other-shapes.json")
+WORLD = "world.exr"
 
 
 @dataclass(frozen=True)
@@ -35,9 +39,19 @@ class Trial:
     azimuth_deg: float
     elevation_deg: tuple[float, float]
     stretch: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    more: tuple[str, ...] = ()
+    """Further parts: shape and offset of each."""
+    ground: float = 1.0
+    """Factor of the light from below the horizon."""
+    strength: float = 1.0
+    """Factor of all light."""
 
     def recipe(self, name: str) -> str:
         """As scene.toml."""
+        parts = "".join(f"\n[[object.parts]]\n{part}\n" for part in self.more)
+        kind = f'kind = "studiolight"\nname = "{self.world}"'
+        if self.ground != 1:
+            kind = f'kind = "file"\npath = "{WORLD}"\nlicense = "CC0-1.0"\nsource = "{self.world} of Blender"'
         return f"""format = 1
 name = "{name}"
 title = "Trial shape {name}"
@@ -52,10 +66,10 @@ kind = "assembly"
 stretch = {list(self.stretch)}
 turn_deg = {list(self.turn_deg)}
 shape = {{ {self.shape} }}
-
+{parts}
 [world]
-kind = "studiolight"
-name = "{self.world}"
+{kind}
+strength = {self.strength}
 
 [camera]
 path = "{self.path}"
@@ -65,9 +79,31 @@ azimuth_deg = [{-self.azimuth_deg}, {self.azimuth_deg}]
 elevation_deg = {list(self.elevation_deg)}
 """
 
+    def write(self, path: Path, name: str) -> None:
+        """The recipe, and beside it the world that it names where Blender brings along none such."""
+        write_text(path, self.recipe(name))
+        if self.ground != 1:
+            radiance = read_exr_rgb(studio_light(self.world))
+            radiance[len(radiance) // 2 :] *= self.ground
+            write_exr_rgb(path.parent / WORLD, radiance)
+
 
 BENT = "[[-0.8, 0.0, 0.25, 0.5, 2.0], [-0.45, 0.0, -0.05, 0.55, 2.0], [0.0, 0.0, -0.18, 0.6, 2.0], \
 [0.45, 0.0, -0.05, 0.55, 2.0], [0.8, 0.0, 0.25, 0.5, 2.0]]"
+HANDLE = """shape = { kind = "tube", path = [[0.45, 0.0, 0.45], [0.85, 0.0, 0.5], [1.05, 0.0, 0.15], \
+[0.9, 0.0, -0.25], [0.5, 0.0, -0.45]], radii = [0.1, 0.1, 0.1, 0.1, 0.1] }"""
+SPOUT = """shape = { kind = "tube", path = [[-0.5, 0.0, -0.3], [-0.8, 0.0, -0.05], [-0.95, 0.0, 0.3], \
+[-1.08, 0.0, 0.5]], radii = [0.22, 0.16, 0.11, 0.1] }"""
+SPOUT_END = """shape = { kind = "sphere", radius = 0.1 }
+offset = [-1.08, 0.0, 0.5]"""
+BUST = "[[0.0, 0.1, 0.4, 0.55, 1.4], [0.02, -0.08, 0.0, 0.42, 1.0], [0.0, -0.52, 0.14, 0.2, 0.7], \
+[0.0, 0.1, -0.5, 0.4, 1.1], [0.5, 0.12, -0.8, 0.4, 1.0], [-0.5, 0.08, -0.8, 0.4, 1.0], [0.0, 0.1, -0.85, 0.4, 0.6], \
+[0.23, -0.55, 0.33, 0.2, -1.6], [-0.21, -0.55, 0.34, 0.2, -1.6], [0.0, -0.6, -0.18, 0.17, -1.2], \
+[0.6, 0.1, 0.3, 0.2, 0.9], [-0.6, 0.12, 0.3, 0.2, 0.9]]"
+EIGHT = [
+    [round(f, 3) for f in (0.85 * math.sin(t), 0.3 * math.cos(t), 0.62 * math.sin(2 * t))]
+    for t in (2 * math.pi * k / 24 for k in range(24))
+]
 TRIALS = {
     "brick": Trial(
         'kind = "superquadric", size = [1.3, 0.7, 1.0], exponents = [6.0, 5.0]',
@@ -130,6 +166,61 @@ TRIALS = {
         50.0,
         (-20.0, 50.0),
     ),
+    "jug": Trial(
+        'kind = "surface_of_revolution", profile = [[0.0, -0.85], [0.5, -0.8], [0.72, -0.35], [0.6, 0.2], [0.4, 0.5], \
+[0.38, 0.66], [0.22, 0.78], [0.0, 0.82]]',
+        (0.0, 0.0, 0.0),
+        "city",
+        "plus",
+        3.8,
+        -70.0,
+        50.0,
+        (-15.0, 50.0),
+        more=(HANDLE, SPOUT, SPOUT_END),
+    ),
+    "bust": Trial(
+        f'kind = "soft_balls", radius = 1.2, resolution = 160, balls = {BUST}',
+        (0.0, 0.0, 0.0),
+        "courtyard",
+        "plus",
+        3.8,
+        -90.0,
+        55.0,
+        (-20.0, 50.0),
+    ),
+    "eight": Trial(
+        f'kind = "tube", closed = true, path = {EIGHT}, radii = {[0.2] * len(EIGHT)}',
+        (10.0, 0.0, 30.0),
+        "interior",
+        "plus",
+        3.7,
+        -60.0,
+        50.0,
+        (-20.0, 50.0),
+    ),
+    "ingot": Trial(
+        'kind = "superquadric", size = [1.5, 1.0, 1.1], exponents = [8.0, 6.0]',
+        (8.0, -12.0, 35.0),
+        "courtyard",
+        "plus",
+        3.7,
+        -40.0,
+        45.0,
+        (-15.0, 50.0),
+        ground=0.1,
+        strength=0.5,
+    ),
+    "drum": Trial(
+        'kind = "superquadric", size = [1.6, 1.1, 1.0], exponents = [2.0, 8.0]',
+        (35.0, 15.0, 20.0),
+        "sunrise",
+        "plus",
+        3.7,
+        -80.0,
+        50.0,
+        (-15.0, 50.0),
+        ground=0.3,
+    ),
 }
 
 
@@ -139,7 +230,7 @@ def make(name: str, options: Sequence[str]) -> Path:
     fitted = FOLDER / "predictions" / "-".join([name, *options]).replace("/", "_")
     oracle = FOLDER / "predictions" / f"{name}-oracle"
     scene.parent.mkdir(parents=True, exist_ok=True)
-    write_text(scene, TRIALS[name].recipe(name))
+    TRIALS[name].write(scene, name)
     generated = ("--scene", scene, "--resolution", 160, "--train", 50, "--test", 6)
     settings = [word for option in options for word in ("--set", option)]
     make_folders(dataset, fitted, oracle, generated, ("--preset", "fast", *settings))
