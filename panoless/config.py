@@ -14,7 +14,7 @@ import tyro
 from msgspec import Meta
 
 from panoless.alignment.options import PoseOptions
-from panoless.capture.options import MaskRepairOptions
+from panoless.capture.options import ContrastOptions, MaskRepairOptions
 from panoless.environment.options import ConfidenceOptions, FootprintMapOptions, MaterialOptions, SurroundingsOptions
 from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.geometry.free_form.options import FreeFormOptions
@@ -213,6 +213,7 @@ class FitConfig:
     density: DensityConfig = field(default_factory=DensityConfig)
     rates: RateConfig = field(default_factory=RateConfig)
     mask_repair: Tuned[MaskRepairOptions] = field(default_factory=MaskRepairOptions)
+    contrast: Tuned[ContrastOptions] = field(default_factory=ContrastOptions)
     first_surface: Tuned[FirstSurfaceOptions] = field(default_factory=FirstSurfaceOptions)
     sphere: Tuned[SphereOptions] = field(default_factory=SphereOptions)
     plane: Tuned[PlaneOptions] = field(default_factory=PlaneOptions)

@@ -1,4 +1,4 @@
-"""The tuned numbers of how masks are read."""
+"""The tuned numbers of how photographs are read."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -41,3 +41,17 @@ class MaskRepairOptions:
     and stray pieces, 0.01 to 0.3 with wrong poses and masks that are too small."""
     rounds: Count = 4
     """Most rounds: masks that were mended tell more about others."""
+
+
+@dataclass(frozen=True)
+class ContrastOptions:
+    """When photographs are compared as logarithms: where most of what the object shows is dark."""
+
+    dark_share: NonNegative = 0.25
+    """Share of the mean brightness below which a median one is dark; with 0 none is. The median is 0.6 to 0.9 of the
+    mean on the development scenes, and 0.17 and 0.11 on the trial shapes ingot and ellipsoid."""
+    medians: Positive = 6.0
+    """Radiance counts as it is up to the median brightness over this, and as its logarithm above. On ingot knees of
+    0.17 and 0.9 of the median take the normals after the first rounds from 7.5° to 0.7° and to 1.7°."""
+    least_knee: Positive = 0.002
+    """But up to this at least (linear radiance), below which photographs show noise. Not tuned."""

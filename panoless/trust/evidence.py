@@ -2,7 +2,8 @@
 
 Every fifth view is held out from a map that is solved anew for the final geometry, of pixels as areas where the kind
 knows them: what a pixel blurs is no error of the shape. What the map leaves unexplained is compared with what two
-models leave that know no mirror: one color a view, and one color a place on the surface, as a matte object has.
+models leave that know no mirror: one color a view, and one color a place on the surface, as a matte object has. Where
+most of what the object shows is dark, errors are those of the logarithms of radiance.
 """
 
 import math
@@ -14,6 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from panoless.capture.contrast import Contrast, contrasted
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
 from panoless.capture.encoding import encoding_of
 from panoless.capture.masks import MASK_LEVEL
@@ -45,7 +47,7 @@ class Evidence:
     unexplained_part: float | None
     """Share of the light in held-out views that comes from places on the surface of which most is unexplained."""
     noise: float | None
-    """Standard deviation of the pixels' noise (linear radiance), from their second differences."""
+    """Standard deviation of the pixels' noise, from their second differences: of radiance, or of its contrast."""
     error_in_noise: float | None
     """Median error of a held-out ray's channel in standard deviations of the noise."""
     silhouette_px: float
@@ -158,21 +160,23 @@ def _light(
     solved = replace(views, train=tuple(split_held_out(views.train)[0]))
     tested = replace(views, train=tuple(view for view, _ in held_out))
     environment = _predicting_map(_seen_areas(solved, geometry, config), config)
-    device = views.train[0].mask.device
+    contrast, device = Contrast.of(views, config.contrast), views.train[0].mask.device
     places, parts = _Cells.empty(options.cells, 3, device), _Cells.empty(options.part_cells, 1, device)
     for view, surface in kept:
-        places.add(view, surface, view.solid, view.radiance_at(view.solid))
+        places.add(view, surface, view.solid, contrast.shown(view.radiance_at(view.solid)))
     errors, confidence, explained, plain = [], [], _Mean(), {"one_color": _Mean(), "matte": _Mean()}
     saturation = encoding_of(config).saturation.to(environment)
     for areas in _seen_areas(tested, geometry, config):
-        rays, error = areas.rays(), areas.seen(environment).minimum(saturation) - areas.radiance
+        rays, seen = areas.rays(), areas.seen(environment).minimum(saturation)
+        error = contrast.shown(seen) - contrast.shown(areas.radiance)
         explained.add(bounded_error(error, options.scale), rays.initial_weight())
         errors.append(error)
         confidence.append(sample_cubemap(visibility[:, None], rays.directions)[:, 0])
     for (view, surface), (_, pixels) in zip(held_out, at_most_pixels(tested, options.rays), strict=True):
-        radiance = view.radiance_at(pixels)
+        radiance = contrast.shown(view.radiance_at(pixels))
         normals = surface.normals_camera.flatten(1)[:, pixels]
-        shown = geometry.shade(environment, view.camera, pixels, normals).minimum(saturation) - radiance
+        shaded = geometry.shade(environment, view.camera, pixels, normals).minimum(saturation)
+        shown = contrast.shown(shaded) - radiance
         parts.add(view, surface, pixels, bounded_error(shown, options.scale)[:, None])
         guesses = {"one_color": radiance.mean(0), "matte": places.means(view, surface, pixels)}
         for name, guess in guesses.items():
@@ -180,7 +184,7 @@ def _light(
     if explained.weight <= 0:
         return nothing
     every, sure = torch.cat(errors), torch.cat(confidence)
-    noise = float(np.median([_noise(view) for view in views.train]))
+    noise = float(np.median([_noise(view) for view in contrasted(views, config.contrast).train]))
     return {
         "unexplained": explained.value,
         "one_color": plain["one_color"].value,

@@ -20,6 +20,7 @@ from shinypartial.prediction.format import read_info
 
 TUNED = (
     "mask_repair",
+    "contrast",
     "first_surface",
     "sphere",
     "plane",

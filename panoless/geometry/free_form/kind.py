@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
+from panoless.capture.contrast import contrasted
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
@@ -192,7 +193,7 @@ class FreeFormFamily(ExactFamily):
         """
         if len(views.train) < config.free_form.least_views and not asked:
             return None
-        return Proposal(first_surfaces(views, config), 0.0, 1.0)
+        return Proposal(first_surfaces(contrasted(views, config.contrast), config), 0.0, 1.0)
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The first surface, trusted everywhere."""
@@ -203,7 +204,7 @@ class FreeFormFamily(ExactFamily):
     def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
         """On from a fit, in rounds with that logarithm among the unknowns."""
         options = config.free_form
-        stage = _followed(views, fitted, options, focal=0.0)
+        stage = _followed(contrasted(views, config.contrast), fitted, options, focal=0.0)
         assert stage.focal is not None, "the focal length was unknown"
         factor = float(np.exp(-stage.focal))
         surface, trust = stage.surface.scaled(factor), stage.trust.scaled(factor)
@@ -211,11 +212,12 @@ class FreeFormFamily(ExactFamily):
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """All coefficients by outlines and photographs together."""
+        shown = contrasted(views, config.contrast)
         if proposal.fitted is None:
-            start = started(views, proposal.shape, config.free_form)
-            surface, trust, poses = fit_free_form(views, start, config.free_form)
+            start = started(shown, proposal.shape, config.free_form)
+            surface, trust, poses = fit_free_form(shown, start, config.free_form)
         else:
-            found = _followed(views, proposal.fitted, config.free_form)
+            found = _followed(shown, proposal.fitted, config.free_form)
             surface, trust, poses = found.surface, found.trust, found.poses
         return FreeFormMirror(surface, trust, config.environment.trace, config.free_form, poses=poses)
 

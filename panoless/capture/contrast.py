@@ -1,0 +1,49 @@
+"""Contrast: how much a difference of radiance counts, in photographs most of which are dark."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from panoless.capture.options import ContrastOptions
+from panoless.capture.views import Views
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """Radiance c as ln(1 + c/k)/ln(1 + 1/k), which takes [0, 1] to itself; as it is where no knee k is given.
+
+    Under a bright sky a dark ground has no say in residuals of radiance, and what mirrors it gets no shape. As a
+    logarithm it has the say that its contrast gives it.
+    """
+
+    knee: float | None = None
+
+    @classmethod
+    def of(cls, views: Views, options: ContrastOptions) -> "Contrast":
+        """What views ask for: logarithms where the median brightness of the object's pixels is far below the mean.
+
+        The share of the two does not depend on the exposure, but for what that saturates.
+        """
+        brightness = torch.cat([view.radiance_at(view.solid).mean(1) for view in views.train])
+        median = float(brightness.median()) if len(brightness) else 0.0
+        if not len(brightness) or median >= options.dark_share * float(brightness.mean()):
+            return cls()
+        return cls(max(median / options.medians, options.least_knee))
+
+    def shown(self, radiance: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:
+        """What stands for radiance; below 0 there is none."""
+        if self.knee is None:
+            return radiance
+        return torch.log1p(radiance.clamp(min=0) / self.knee) / math.log1p(1 / self.knee)
+
+
+def contrasted(views: Views, options: ContrastOptions) -> Views:
+    """The views with the contrast that they ask for."""
+    contrast = Contrast.of(views, options)
+    if contrast.knee is None:
+        return views
+    shown = (replace(view, radiance=contrast.shown(view.radiance)) for view in views.train)
+    return replace(views, train=tuple(shown))
