@@ -204,22 +204,23 @@ class FreeFormFamily(ExactFamily):
     def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
         """On from a fit, in rounds with that logarithm among the unknowns."""
         options = config.free_form
-        stage = _followed(contrasted(views, config.contrast), fitted, options, focal=0.0)
+        stage = _followed(views, fitted, options, focal=0.0)
         assert stage.focal is not None, "the focal length was unknown"
         factor = float(np.exp(-stage.focal))
         surface, trust = stage.surface.scaled(factor), stage.trust.scaled(factor)
         return FreeFormMirror(surface, trust, config.environment.trace, options, poses=stage.poses), stage.focal
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
-        """All coefficients by outlines and photographs together."""
-        shown = contrasted(views, config.contrast)
-        if proposal.fitted is None:
-            start = started(shown, proposal.shape, config.free_form)
-            surface, trust, poses = fit_free_form(shown, start, config.free_form)
-        else:
-            found = _followed(shown, proposal.fitted, config.free_form)
-            surface, trust, poses = found.surface, found.trust, found.poses
-        return FreeFormMirror(surface, trust, config.environment.trace, config.free_form, poses=poses)
+        """All coefficients by outlines and photographs together; after a fit to logarithms by radiance once more."""
+        options, fitted = config.free_form, proposal.fitted
+        if fitted is None:
+            shown = contrasted(views, config.contrast)
+            surface, trust, poses = fit_free_form(shown, started(shown, proposal.shape, options), options)
+            fitted = FreeFormMirror(surface, trust, config.environment.trace, options, poses=poses)
+            if shown is views:
+                return fitted
+        found = _followed(views, fitted, options)
+        return FreeFormMirror(found.surface, found.trust, config.environment.trace, options, poses=found.poses)
 
 
 def _followed(
