@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from panoless.capture.corrections import with_focal_factor
+from panoless.capture.options import ContrastOptions
 from panoless.capture.poses import Poses, StatedCameras
 from panoless.capture.views import Views, views_of
 from panoless.config import FitConfig, SurfelConfig
@@ -315,6 +316,21 @@ def test_flat_faces_that_no_outline_shows_are_found_by_a_descent() -> None:
         return float(np.median(normal_errors_deg(fitted(views, options), block(), views, cameras_around(7, 60)[1::2])))
 
     assert error_deg(replace(OPTIONS, descent=DescentOptions())) < 1.0 < 3.0 < error_deg(OPTIONS)
+
+
+@pytest.mark.slow
+def test_flat_faces_that_mirror_a_dark_ground_are_found_by_contrast() -> None:
+    """The median brightness is a tenth of the mean. As logarithms 1.6° are measured, and 41° without."""
+    views = body_views(block(), VIEWS, SIZE_PX)
+    dark = replace(views, train=tuple(replace(view, radiance=5 * view.radiance**16) for view in views.train))
+    config = replace(CONFIG, free_form=replace(OPTIONS, descent=DescentOptions()))
+
+    def error_deg(config: FitConfig) -> float:
+        family = FreeFormFamily()
+        surface = family.fit(dark, family.propose(dark, config, asked=True), config).surface
+        return float(np.median(normal_errors_deg(surface, block(), dark, cameras_around(7, 60)[1::2])))
+
+    assert error_deg(config) < 3.0 < 10.0 < error_deg(replace(config, contrast=ContrastOptions(dark_share=0.0)))
 
 
 def test_what_all_cameras_share_is_taken_back() -> None:
