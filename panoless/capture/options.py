@@ -55,3 +55,6 @@ class ContrastOptions:
     least_knee: Positive = 0.002
     """But up to this at least (linear radiance), below which photographs show noise. On ingot, whose median is 0.007,
     knees of 0.001, 0.002 and 0.005 take the normals after the first rounds from 7.5° to 0.6°, 0.7° and 1.7°."""
+    explained: NonNegative = 0.15
+    """Error of held-out views, in logarithms, below which a shape that was fitted to radiance stays. On
+    ingot it is 0.27 of the surface fitted to radiance and 0.09 of the one fitted to logarithms, on ellipsoid 0.04."""

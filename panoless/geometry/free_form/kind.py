@@ -13,7 +13,8 @@ from torch.utils.weak import WeakIdKeyDictionary
 
 from panoless.capture.contrast import contrasted
 from panoless.capture.object_frame import ObjectFrame
-from panoless.capture.views import TrainView, Views, at_most_pixels
+from panoless.capture.poses import Poses
+from panoless.capture.views import TrainView, Views, at_most_pixels, split_held_out
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays
@@ -21,12 +22,12 @@ from panoless.environment.resolution import finest_resolution
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, poses_from_plain, to_plain
 from panoless.geometry.exact import ExactFamily, ExactGeometry
-from panoless.geometry.free_form.fit import FitStage, fit_free_form, follow_views
+from panoless.geometry.free_form.fit import FitStage, fit_free_form, follow_views, held_out_error
 from panoless.geometry.free_form.observations import PixelRays, inner_distance_px
 from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions
 from panoless.geometry.free_form.photometric import Sights
 from panoless.geometry.free_form.rendering import free_form_buffers, free_form_light
-from panoless.geometry.free_form.start import first_surfaces, started
+from panoless.geometry.free_form.start import FirstSurfaces, first_surfaces, started
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import Trust, full_trust
 from panoless.geometry.surfels.mirror import SurfelMirror
@@ -193,7 +194,7 @@ class FreeFormFamily(ExactFamily):
         """
         if len(views.train) < config.free_form.least_views and not asked:
             return None
-        return Proposal(first_surfaces(contrasted(views, config.contrast), config), 0.0, 1.0)
+        return Proposal(first_surfaces(views, config), 0.0, 1.0)
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The first surface, trusted everywhere."""
@@ -211,21 +212,45 @@ class FreeFormFamily(ExactFamily):
         return FreeFormMirror(surface, trust, config.environment.trace, options, poses=stage.poses), stage.focal
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
-        """All coefficients by outlines and photographs together; after a fit to logarithms by radiance once more."""
-        options, fitted = config.free_form, proposal.fitted
-        if fitted is None:
-            shown = contrasted(views, config.contrast)
-            surface, trust, poses = fit_free_form(shown, started(shown, proposal.shape, options), options)
-            fitted = FreeFormMirror(surface, trust, config.environment.trace, options, poses=poses)
-            if shown is views:
-                return fitted
-        found = _followed(views, fitted, options)
-        return FreeFormMirror(found.surface, found.trust, config.environment.trace, options, poses=found.poses)
+        """All coefficients by outlines and photographs together; by logarithms of radiance where this leaves what is
+        dark unexplained and they explain more of it in held-out views.
+        """
+        if proposal.fitted is not None:
+            found = _followed(views, proposal.fitted, config.free_form)
+            return _mirror(found.surface, found.trust, found.poses, config)
+        fitted, shown = _fitted(views, proposal.shape, config), contrasted(views, config.contrast)
+        if shown is views or _unexplained(shown, fitted, config) < config.contrast.explained:
+            return fitted
+        first = replace(first_surfaces(shown, config), surroundings=proposal.shape.surroundings)
+        tried = (fitted, _fitted(shown, first, config))
+        return min(tried, key=lambda each: _unexplained(shown, each, config))
+
+
+def _mirror(surface: LevelSet, trust: Trust, poses: Poses | None, config: FitConfig) -> FreeFormMirror:
+    return FreeFormMirror(surface, trust, config.environment.trace, config.free_form, poses=poses)
+
+
+def _fitted(views: Views, first: FirstSurfaces, config: FitConfig) -> FreeFormMirror:
+    """From first surfaces on."""
+    return _mirror(*fit_free_form(views, started(views, first, config.free_form), config.free_form), config)
+
+
+def _unexplained(views: Views, fitted: FreeFormMirror, config: FitConfig) -> float:
+    """How badly a map of four fifths of the views predicts the others; nothing where there are too few."""
+    known, unknown = split_held_out((views if fitted.poses is None else fitted.poses.moved(views)).train)
+    if not known or not unknown:
+        return 0.0
+    stage, (solved, tested) = _stage(fitted), (replace(views, train=tuple(each)) for each in (known, unknown))
+    return held_out_error(solved, tested, replace(stage, poses=None), config.free_form)
 
 
 def _followed(
     views: Views, fitted: FreeFormMirror, options: FreeFormOptions, *, focal: float | None = None
 ) -> FitStage:
     """What a fit leads to from where it ended (see `follow_views`)."""
-    start = FitStage(fitted.surface, fitted.trust, None, options.damping, poses=fitted.poses, focal=focal)
-    return follow_views(views, start, options)
+    return follow_views(views, replace(_stage(fitted), focal=focal), options)
+
+
+def _stage(fitted: FreeFormMirror) -> FitStage:
+    """What a fit ended with."""
+    return FitStage(fitted.surface, fitted.trust, None, fitted.options.damping, poses=fitted.poses)
