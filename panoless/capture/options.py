@@ -47,9 +47,9 @@ class MaskRepairOptions:
 class ContrastOptions:
     """When photographs are compared as logarithms: where most of what the object shows is dark."""
 
-    dark_share: NonNegative = 0.25
+    dark_share: NonNegative = 0.5
     """Share of the mean brightness below which a median one is dark; with 0 none is. The median is 0.6 to 0.9 of the
-    mean on development scenes, 0.17 and 0.11 on the trial shapes ingot and ellipsoid, and 0.37 or more on the rest."""
+    mean on development scenes, and 0.17, 0.11, 0.37 and 0.37 on the trial shapes ingot, ellipsoid, bust and twist."""
     medians: Positive = 6.0
     """Radiance counts as it is up to the median brightness over this, and as its logarithm above."""
     least_knee: Positive = 0.002
@@ -57,4 +57,5 @@ class ContrastOptions:
     knees of 0.001, 0.002 and 0.005 take the normals after the first rounds from 7.5° to 0.6°, 0.7° and 1.7°."""
     explained: NonNegative = 0.15
     """Error of held-out views, in logarithms, below which a shape that was fitted to radiance stays. On
-    ingot it is 0.27 of the surface fitted to radiance and 0.09 of the one fitted to logarithms, on ellipsoid 0.04."""
+    ingot it is 0.27 of the surface fitted to radiance and 0.09 of the one fitted to logarithms, on bust 0.39 and 0.35,
+    on twist 0.12 and on ellipsoid 0.04."""
