@@ -26,8 +26,11 @@ class MaskRepairOptions:
     object shows in all of them. Not tuned."""
     cells: Count = 48
     """Points along a side of the grid that views vote on, which holds the object."""
+    fine_cells: Count = 96
+    """The same of a finer grid on which mended masks vote on the masks as they were. Of holes of 3 % of vase, 0.23 %
+    are left by the coarse grid and 0.05 % by this one; of sculpture 0.31 % and 0.13 %."""
     margin: NonNegative = 0.8
-    """What stands out lies farther than this beside the masks of the others, in spacings of the grid: 2.8 px in
+    """What stands out lies farther than this beside the masks of the others, in spacings of the first grid: 2.8 px in
     pictures of 160 px. With 0.6, vase loses parts of its lip to masks that are 4 px too small."""
     least_radius: NonNegative = 1.0
     """Parts in which no larger disk fits are left alone, in spacings: gaps of sculpture as narrow are seen by one view
@@ -40,7 +43,7 @@ class MaskRepairOptions:
     """Share that parts which are not long have of all that is as wide and contradicts, at least. It is 1.0 with holes
     and stray pieces, 0.01 to 0.3 with wrong poses and masks that are too small."""
     rounds: Count = 4
-    """Most rounds: masks that were mended tell more about others."""
+    """Most rounds on each grid: masks that were mended tell more about others."""
 
 
 @dataclass(frozen=True)

@@ -35,26 +35,33 @@ def with_repaired_masks(views: Views, options: MaskRepairOptions) -> Views:
 
     What is filled is on the object, but no photograph shows it whole, so it tells no color. Crescents along an outline
     stay: wrong poses make them, and masks that are too small. Where these are most of what contradicts, nothing is
-    mended. What is missing is filled first: holes in other masks look as if a view showed too much.
+    mended. What is missing is filled first: holes in other masks look as if a view showed too much. In each round the
+    mended masks vote on the masks as they were, in the last rounds on a finer grid.
     """
     if options.mode == "off" or len(views.train) < options.least_views:
         return views
-    holes, pieces, grid = 0, 0, _Grid.of(views, options)
-    changed: set[int] = set()
-    for _ in range(options.rounds):
-        votes = _Votes.of(views, grid, options)
-        radii = [max(options.least_radius * grid.spacing_px(view), options.least_radius_px) for view in views.train]
-        inside = [view.mask.cpu().numpy() >= MASK_LEVEL for view in views.train]
-        lacking = _Contradicted.of([~each & votes.shown(index) for index, each in enumerate(inside)], radii, options)
-        excess = _Contradicted.of([each & ~votes.allowed(index) for index, each in enumerate(inside)], radii, options)
-        blobs = lacking.count + excess.count
-        if not blobs or lacking.area + excess.area < options.least_share * (lacking.wide + excess.wide):
+    said, inside = views, [view.mask.cpu().numpy() >= MASK_LEVEL for view in views.train]
+    margin = options.margin * _Grid.of(views, options.cells).spacing
+    for cells in (options.cells, options.fine_cells):
+        grid, lacked, stood_out = _Grid.of(said, cells), 0, 0
+        radii = [max(options.least_radius * grid.spacing_px(view), options.least_radius_px) for view in said.train]
+        for _ in range(options.rounds):
+            votes = _Votes.of(views, grid, margin, options)
+            gaps = [~each & votes.shown(index) for index, each in enumerate(inside)]
+            beyond = [each & ~votes.allowed(index) for index, each in enumerate(inside)]
+            lacking, excess = (_Contradicted.of(regions, radii, options) for regions in (gaps, beyond))
+            is_settled = lacking.area <= lacked and excess.area <= stood_out
+            if is_settled or lacking.area + excess.area < options.least_share * (lacking.wide + excess.wide):
+                break
+            if lacking.area > lacked:
+                excess = excess.without_any()
+            lacked, stood_out = lacking.area, excess.area
+            parts = zip(said.train, lacking.blobs, excess.blobs, radii, strict=True)
+            train = tuple(_without(_filled(view, part, size), extra, size) for view, part, extra, size in parts)
+            changed = sum(bool((one | other).any()) for one, other in zip(lacking.blobs, excess.blobs, strict=True))
+            views = replace(said, train=train, repairs=MaskRepairs(lacking.count, excess.count, changed))
+        if views is said:
             break
-        chosen, mended = (lacking, _filled) if lacking.count else (excess, _without)
-        train = (mended(*each) for each in zip(views.train, chosen.blobs, radii, strict=True))
-        changed |= {index for index, part in enumerate(chosen.blobs) if part.any()}
-        holes, pieces = holes + lacking.count, pieces + (0 if lacking.count else excess.count)
-        views = replace(views, train=tuple(train), repairs=MaskRepairs(holes, pieces, len(changed)))
     return views
 
 
@@ -66,12 +73,12 @@ class _Grid:
     spacing: float
 
     @classmethod
-    def of(cls, views: Views, options: MaskRepairOptions) -> "_Grid":
+    def of(cls, views: Views, cells: int) -> "_Grid":
         reach = SPARE * max(1.0, views.object_frame.reach)
-        side = torch.linspace(-reach, reach, options.cells)
+        side = torch.linspace(-reach, reach, cells)
         points = torch.stack(torch.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3)
         inside = points[points.norm(dim=1) <= reach].to(views.train[0].mask.device)
-        return cls(inside, 2 * reach / (options.cells - 1))
+        return cls(inside, 2 * reach / (cells - 1))
 
     def spacing_px(self, view: TrainView) -> float:
         """In pixels of a view, at the object's center."""
@@ -80,7 +87,8 @@ class _Grid:
 
 @dataclass(frozen=True)
 class _Votes:
-    """Which views see each point of the grid beside their masks, and which see it farther off than a margin."""
+    """Which views see each point of the grid beside their masks, and which see it farther off than a margin (normalized
+    frame)."""
 
     views: Views
     grid: _Grid
@@ -91,14 +99,12 @@ class _Votes:
     options: MaskRepairOptions
 
     @classmethod
-    def of(cls, views: Views, grid: _Grid, options: MaskRepairOptions) -> "_Votes":
+    def of(cls, views: Views, grid: _Grid, margin: float, options: MaskRepairOptions) -> "_Votes":
         away = [mask_distance(view).distances(grid.points).cpu().numpy() for view in views.train]
         centers = np.array([view.position for view in views.train])
         sights = centers / np.linalg.norm(centers, axis=1, keepdims=True)
         order = np.argsort(-(sights @ sights.T) - 2 * np.eye(len(sights)), axis=1)[:, 1 : 1 + options.near_views]
-        outside, beyond = (
-            np.array([each > margin * grid.spacing for each in away]) for margin in (0.0, options.margin)
-        )
+        outside, beyond = (np.array([each > farther for each in away]) for farther in (0.0, margin))
         return cls(views, grid, outside, beyond, order, options)
 
     def shown(self, index: int) -> Image:
@@ -154,6 +160,10 @@ class _Contradicted:
     """Of these parts, in pixels…"""
     wide: int
     """…and of all that is as wide."""
+
+    def without_any(self) -> "_Contradicted":
+        """The same with none of these parts."""
+        return _Contradicted([np.zeros_like(blob) for blob in self.blobs], 0, 0, self.wide)
 
     @classmethod
     def of(cls, regions: Sequence[Image], radii: Sequence[float], options: MaskRepairOptions) -> "_Contradicted":

@@ -98,3 +98,16 @@ def test_off_means_off(ring: Views) -> None:
     row, column = solid_middle(ring.train[5])
     wrong = painted(ring, 5, row, column, 4, 0.0)
     assert with_repaired_masks(wrong, replace(OPTIONS, mode="off")) is wrong
+
+
+def test_a_finer_grid_fills_a_dent_up_to_the_outline(ring: Views) -> None:
+    """A coarse one with 4 px between its points leaves a third of it."""
+    before = ring.train[5].mask >= MASK_LEVEL
+    rows, columns = np.nonzero(before.numpy())
+    dented = painted(ring, 5, int(rows[columns.argmin()]), int(columns.min()), 9, 0.0)
+
+    def lacking(views: Views) -> int:
+        return int((before & (views.train[5].mask < MASK_LEVEL)).sum())
+
+    coarse, fine = (with_repaired_masks(dented, replace(OPTIONS, cells=20, fine_cells=cells)) for cells in (20, 40))
+    assert lacking(fine) < 0.05 * lacking(dented) < 0.2 * lacking(dented) < lacking(coarse)
