@@ -13,7 +13,7 @@ from torch import Tensor
 from panoless.alignment.adjustment import adjusting_step
 from panoless.alignment.equations import PoseRows, light_rows, outline_rows
 from panoless.alignment.options import PoseOptions
-from panoless.capture.poses import Poses, StatedCameras, moved_view
+from panoless.capture.poses import Poses, StatedCameras, common_and_lens, moved_view
 from panoless.capture.silhouettes import mask_distance_px
 from panoless.capture.views import TrainView, Views
 from panoless.environment.solve import solve_environment
@@ -100,14 +100,17 @@ class Alignment:
         """Turns less what looks like a motion of the object, which outlines don't tell from one: by least squares.
 
         With v the line of sight, a shift t of the object across it looks like the turn v × t, and a turn θ of the
-        object about it like the turn (v·θ) v.
+        object about it like the turn (v·θ) v. What a wrong principal point turns looks much like these: where it is
+        most of what they leave, it stays as a whole.
         """
-        centers = np.array([view.position for view in self.views.train])
-        sights = centers / np.linalg.norm(centers, axis=1, keepdims=True)
-        shifted = np.cross(sights[:, None], np.eye(3))
-        rolled = sights[:, :, None] * sights[:, None]
-        basis = np.concatenate([shifted, rolled], 1).transpose(0, 2, 1).reshape(-1, 6)
-        alike = basis @ np.linalg.lstsq(basis, turns.turns.ravel(), rcond=None)[0]
+        cameras = StatedCameras.of(self.views)
+        sights = cameras.centers / np.linalg.norm(cameras.centers, axis=1, keepdims=True)
+        shifted, rolled = np.cross(sights[:, None], np.eye(3)), sights[:, :, None] * sights[:, None]
+        motions, lens = (
+            each.transpose(0, 2, 1).reshape(-1, each.shape[1])
+            for each in (np.concatenate([shifted, rolled], 1), cameras.rotations[:, :2])
+        )
+        alike = motions @ common_and_lens(motions, lens, turns.turns.ravel())[0]
         return Poses(turns.turns - alike.reshape(-1, 3), turns.shifts)
 
     def without_common(self, poses: Poses) -> Poses:

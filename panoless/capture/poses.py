@@ -103,11 +103,7 @@ class Poses:
         own = np.concatenate([cameras.rotations[:, :2], np.zeros((count, 2, 3))], 2)
         basis = (np.concatenate([turned, shifted, scaled, own], 1) * np.sqrt(prior)).transpose(0, 2, 1).reshape(-1, 9)
         stacked = (self.stacked * np.sqrt(prior)).ravel()
-        fits = [np.linalg.lstsq(basis[:, :columns], stacked, rcond=None)[0] for columns in (7, 9)]
-        left = [float(((stacked - basis[:, : len(fit)] @ fit) ** 2).sum()) for fit in fits]
-        if left[1] < LENS_SHARE * left[0]:
-            return fits[1][:7], fits[1][7:]
-        return fits[0], None
+        return common_and_lens(basis[:, :7], basis[:, 7:], stacked)
 
     def moved(self, views: Views) -> Views:
         """The views with their cameras there."""
@@ -116,6 +112,20 @@ class Poses:
             moved_view(view, turn, shift) for view, turn, shift in zip(views.train, turns, self.shifts, strict=True)
         ]
         return replace(views, train=tuple(moved))
+
+
+def common_and_lens(
+    common: Float[np.ndarray, "P C"], lens: Float[np.ndarray, "P L"], stacked: Float[np.ndarray, "P"]
+) -> tuple[Float[np.ndarray, "C"], Float[np.ndarray, "L"] | None]:
+    """Coefficients of common motions in stacked poses, by least squares, and of a wrong principal point beside them if
+    both together leave less than `LENS_SHARE` of the squares.
+    """
+    bases = common, np.concatenate([common, lens], 1)
+    fits = [np.linalg.lstsq(basis, stacked, rcond=None)[0] for basis in bases]
+    left = [float(((stacked - basis @ fit) ** 2).sum()) for basis, fit in zip(bases, fits, strict=True)]
+    if left[1] < LENS_SHARE * left[0]:
+        return fits[1][: common.shape[1]], fits[1][common.shape[1] :]
+    return fits[0], None
 
 
 def moved_view(view: TrainView, turn: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> TrainView:

@@ -144,3 +144,24 @@ def test_a_wrong_principal_point_is_told_from_a_motion_that_all_cameras_share() 
     camera = views.train[0].camera
     assert right == pytest.approx(-camera.fx * np.tan(0.016), rel=0.1)
     assert down == pytest.approx(-camera.fy * np.tan(0.012), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("family", "views"),
+    [(PlaneFamily(), flat_views()), (RevolutionFamily(), revolution_views(goblet(), around(12)))],
+)
+def test_outlines_tell_a_principal_point_that_is_wrong_in_all_views(family: Family, views: Views) -> None:
+    """To a tenth of it: all but a little looks like a motion of the object, and stays in the cameras nevertheless."""
+    train = (
+        replace(each, camera=replace(each.camera, cx=each.camera.cx + 2, cy=each.camera.cy + 1.5))
+        for each in views.train
+    )
+    wrong = replace(views, train=tuple(train))
+    proposal = family.propose(wrong, CONFIG, asked=True)
+    assert proposal is not None
+    start = align_proposal(family, wrong, proposal, CONFIG)
+    assert start is not None
+    assert start.poses is not None
+    found = start.poses.principal_point_px(wrong, pose_prior(CONFIG.poses))
+    assert found == pytest.approx((-2.0, -1.5), abs=0.25)
+    assert start.proposal.silhouette_px < 0.5 * proposal.silhouette_px
