@@ -99,10 +99,11 @@ def earned_softness(views: Views, geometry: Geometry, config: FitConfig) -> Soft
 
     Four fifths of the views make the maps by which the others are judged: one that is shown as it is, one that a lobe
     blurs, and one under wider pixels, after the same steps from the same start, and on areas of pixels, because a map
-    that knows of none is better blurred for that. A first value of each tells whether to search on, and for which
-    (Brent 1973). A lobe blurs all directions alike, a wider pixel those that a curved part spreads. Nobody asks where
-    the roughness is known, or in a high dynamic range, in which a mean of encoded values is not the encoding of the
-    mean.
+    that knows of none is better blurred for that. A lobe averages noise, too, as that of compression. So a map that is
+    shown as it is has to explain less even where the lobe smooths it afterwards, which averages as much. A first value
+    of each tells whether to search on, and for which (Brent 1973). A lobe blurs all directions alike, a wider pixel
+    those that a curved part spreads. Nobody asks where the roughness is known, or in a high dynamic range, in which a
+    mean of encoded values is not the encoding of the mean.
     """
     options, encoding = config.material, encoding_of(config)
     if encoding.high_dynamic_range or options.roughness == options.blur == "off":
@@ -114,14 +115,17 @@ def earned_softness(views: Views, geometry: Geometry, config: FitConfig) -> Soft
         if trial is None:
             return Softness()
         rounds, clearly = options.judged_rounds, replace(config.selection, least_gain=options.least_roughness_gain)
-        sharp, asked = trial.errors(Softness(), rounds), []
+        smoothing = Softness(roughness=options.first_roughness)
+        sharp, smoothed = (trial.errors(Softness(), rounds, each) for each in (Softness(), smoothing))
+        asked = []
         if options.roughness == "auto":
-            asked.append(Softness(roughness=options.first_roughness))
+            asked.append(smoothing)
         if options.blur == "auto":
             asked.append(Softness(blur_px=options.first_blur_px))
         errors = [trial.errors(each, rounds) for each in asked]
         best = int(np.argmin([each.mean() for each in errors]))
-        if not is_clearly_lower(errors[best], sharp, clearly):
+        is_more_than_smooth = errors[best].mean() < (1 - options.least_roughness_gain) * smoothed.mean()
+        if not is_more_than_smooth or not is_clearly_lower(errors[best], sharp, clearly):
             return Softness()
         if asked[best].roughness is None:
             return Softness(blur_px=trial.searched(lambda value: Softness(blur_px=value), options.blurs_px))
@@ -153,16 +157,15 @@ class _SoftnessTrial:
         start = solve_environment([each.rays() for each in known], options.judged_resolution)
         return cls(known, held_out, start, encoding_of(config).saturation, options)
 
-    def errors(self, softness: Softness, rounds: int) -> Float[np.ndarray, "V"]:
-        """Mean of ‖e‖²/(‖e‖² + s²) of each held-out view with that softness, after so many rounds."""
-        lobe, blur_px, options = (
-            Lobe.of(softness.roughness, self.start.shape[-1]),
-            softness.blur_px or 0.0,
-            self.options,
-        )
+    def errors(self, softness: Softness, rounds: int, smoothing: Softness = Softness()) -> Float[np.ndarray, "V"]:
+        """Mean of ‖e‖²/(‖e‖² + s²) of each held-out view with that softness, after so many rounds, under the map that
+        the lobe of another one then smooths.
+        """
+        lobe, smoother = (Lobe.of(each.roughness, self.start.shape[-1]) for each in (softness, smoothing))
+        blur_px, options = softness.blur_px or 0.0, self.options
         known = [each.widened(blur_px) for each in self.known]
         found = sharpened_map(self.start, known, lobe, self.saturation, options, rounds)
-        shown, found_errors = lobe.blurred(found), []
+        shown, found_errors = smoother.blurred(lobe.blurred(found)), []
         for view in self.held_out:
             wider = [each.widened(blur_px) for each in view]
             error = [each.seen(shown).minimum(self.saturation.to(shown)) - each.radiance for each in wider]
