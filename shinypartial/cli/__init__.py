@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import tyro
 
 from shinypartial.cli.converting import Convert, Import, Relight
-from shinypartial.cli.datasets import Align, ExportCameras, Perturb, Release, Subset, Validate
+from shinypartial.cli.datasets import Align, ExportCameras, ImportDataset, Perturb, Release, Subset, Validate
 from shinypartial.cli.presenting import Chart, Leaderboard, Report
 from shinypartial.cli.scenes import Film, Generate
 from shinypartial.cli.scoring import Compare, Evaluate, Oracle, Postprocess, Weights
@@ -16,6 +16,7 @@ Command = (
     Generate
     | Film
     | Subset
+    | ImportDataset
     | Perturb
     | Align
     | ExportCameras

@@ -7,6 +7,7 @@ from typing import Literal
 import tyro
 
 from shinypartial.cli.newest import announce_newest
+from shinypartial.conversion.layouts import AxisName, CaptureLayout
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.perturb.options import CameraErrors, MaskErrors, Perturbation, SensorErrors, ViewChoice, World
 
@@ -42,6 +43,37 @@ class Subset:
         for split in made.without_normals:
             print(f"No normals in {split}: only some of its views had any, and scores need all or none.")
         print(f"Next: panoless fit {made.root}")
+
+
+@dataclass(frozen=True)
+class ImportDataset:
+    """Make a dataset folder of a capture of a public set of real objects, with its light and its normals.
+
+    Run again to continue where an earlier run stopped.
+    """
+
+    layout: tyro.conf.Positional[CaptureLayout]
+    """Whose layout the folder has; see docs/how-to/real-objects.md."""
+    folder: tyro.conf.Positional[Path]
+    """One capture; it is only read."""
+    output: Path
+    """Folder to write."""
+    map_axes: tuple[AxisName, AxisName, AxisName] | None = None
+    """What the stored map shows in its middle, right of it and on top, in place of the layout's own: +X -Y +Z. In axes
+    of the world, or of the camera where each view has a map."""
+    link: bool = False
+    """Make hard links in place of copies of files that stay the same."""
+
+    def run(self) -> None:
+        """Write the folder and say what is missing."""
+        from shinypartial.conversion.captures.make import import_capture, named_axes
+
+        axes = None if self.map_axes is None else named_axes(self.map_axes)
+        made = import_capture(self.layout, self.folder, self.output, axes, link=self.link)
+        print(f"{self.output}: {made.train} training and {made.test} test views")
+        for reason in made.left_out:
+            print(f"Left out {reason}")
+        print(f"Next: panoless fit {self.output}")
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,11 @@ Every entry says which file of which commit told it; docs/how-to/compare-methods
 from dataclasses import dataclass, replace
 from typing import Literal
 
-Axis = tuple[int, int, int]
+Axis = tuple[float, float, float]
 LayoutName = Literal["3dgs-dr", "ref-gaussian", "materialrefgs", "gaussianshader", "panoless-paper"]
+#: Public sets of photographs, which `conversion.captures` reads.
+CaptureLayout = Literal["stanford-orb", "objects-with-lighting"]
+AxisName = Literal["+X", "-X", "+Y", "-Y", "+Z", "-Z"]
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ def open_source(source: Path, root: Path) -> Dataset:
 
 def write_derived(
     root: Path,
-    source: Dataset,
+    licenses: list[dict[str, str]],
     recipe: dict[str, Any],
     jobs: Iterable[Job],
     title: str,
@@ -69,11 +69,12 @@ def write_derived(
         for job in missing:
             job.make()
             progress.advance()
-        complete_dataset(root, _licenses(source), finish())
+        complete_dataset(root, licenses, finish())
     return sum(len(job.files) for job in missing)
 
 
-def _licenses(source: Dataset) -> list[dict[str, str]]:
+def licenses_of(source: Dataset) -> list[dict[str, str]]:
+    """A row for each asset of a dataset, also of one that states none."""
     if (source.root / LICENSES).exists():
         return read_json(source.root / LICENSES, "the licenses")  # type: ignore[no-any-return]
     return [{"asset": "images", "license": "that of the source", "source": f"dataset {source.name}"}]

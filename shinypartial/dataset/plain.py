@@ -29,24 +29,34 @@ UNIT_TOLERANCE = 0.05
 FACING_TOLERANCE = 0.1
 #: Creases and outlines are a small share; normals in another frame or encoding are wrong nearly everywhere.
 TOLERATED_SHARE = 0.1
+#: What the recipe of a folder names that was made of another one.
+DERIVED = ("subset_of", "perturbation_of", "import_of")
 
 
 def is_plain(root: Path, manifest: dict[str, Any]) -> bool:
     """Whether a folder promises no more than the plain layout does.
 
-    By its manifest a subset or a perturbed copy; else a folder without any file of a rendered set.
+    By its manifest a subset, a perturbed copy or an imported capture; else a folder without any file of a rendered set.
     """
     if (root / MANIFEST).exists():
-        recipe = manifest.get("recipe")
-        return isinstance(recipe, dict) and ("subset_of" in recipe or is_perturbed(manifest))
+        return any(_has_recipe(manifest, word) for word in DERIVED)
     rendered = (CHECKSUMS, LICENSES, ENVIRONMENT_LATLONG.parent)
     return (root / "transforms_train.json").exists() and not any((root / name).exists() for name in rendered)
 
 
 def is_perturbed(manifest: dict[str, Any]) -> bool:
     """Whether a folder is a worse copy of another: its training views contradict each other on purpose."""
+    return _has_recipe(manifest, "perturbation_of")
+
+
+def is_imported(manifest: dict[str, Any]) -> bool:
+    """Whether a folder holds photographs of a public set, which have masks in files of their own."""
+    return _has_recipe(manifest, "import_of")
+
+
+def _has_recipe(manifest: dict[str, Any], word: str) -> bool:
     recipe = manifest.get("recipe")
-    return isinstance(recipe, dict) and "perturbation_of" in recipe
+    return isinstance(recipe, dict) and word in recipe
 
 
 def read_plain_frames(root: Path, split: str) -> tuple[list[Frame], int, list[Violation]]:
@@ -155,7 +165,7 @@ def check_normals_of_split(split: str, frames: Sequence[Frame]) -> Iterator[Viol
 
 
 def _has_normals(frame: Frame) -> bool:
-    return frame.normal_png.exists() or frame.exr.exists()
+    return frame.normal_png.exists() or (frame.exr.exists() and frame.mask is None)
 
 
 def what_is_absent(root: Path, train: Sequence[Frame], test: Sequence[Frame]) -> str | None:

@@ -151,7 +151,11 @@ def _view_of(frame: Frame, photograph: _Photograph) -> View:
         view = View(radiance, alpha, _companion_normals(frame, alpha), None, photograph.premultiplied)
     else:
         has_normals = all(name in channels for name in NORMAL_CHANNELS)
-        normals = stack_channels(channels, NORMAL_CHANNELS, frame.photograph) if has_normals else None
+        normals = (
+            stack_channels(channels, NORMAL_CHANNELS, frame.photograph)
+            if has_normals
+            else _companion_normals(frame, alpha)
+        )
         depth = channels[DEPTH_CHANNEL].astype(np.float32) if DEPTH_CHANNEL in channels else None
         self_reflection = channels.get(SELF_REFLECTION_CHANNEL)
         mask = None if self_reflection is None else self_reflection.astype(np.float32)

@@ -16,7 +16,7 @@ from shinypartial.core.errors import InputError
 from shinypartial.core.trajectory import Trajectory, unit_vectors
 from shinypartial.dataset.camera_plot import CAMERA_PLOT, plot_cameras
 from shinypartial.dataset.crossing import angles_rad, find_crossings, look_at_point
-from shinypartial.dataset.derived import Job, open_source, write_derived
+from shinypartial.dataset.derived import Job, licenses_of, open_source, write_derived
 from shinypartial.dataset.schema import SPLITS, Dataset, Frame
 from shinypartial.io.files import read_json, sha256_of, write_json
 
@@ -173,7 +173,8 @@ def make_subset(source: Path, root: Path, options: SubsetOptions, *, link: bool 
 
     jobs = [Job.copy(old, new, link) for old, new in files]
     title, recipe = "Linking" if link else "Copying", _recipe(dataset, selection, options)
-    return Subset(root, selection, write_derived(root, dataset, recipe, jobs, title, finish), without_normals)
+    num_files = write_derived(root, licenses_of(dataset), recipe, jobs, title, finish)
+    return Subset(root, selection, num_files, without_normals)
 
 
 def _recipe(dataset: Dataset, selection: Selection, options: SubsetOptions) -> dict[str, Any]:

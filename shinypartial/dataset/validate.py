@@ -17,6 +17,7 @@ from shinypartial.dataset.plain import (
     check_normals_of_split,
     check_perturbed_frame,
     check_plain_frame,
+    is_imported,
     is_perturbed,
     is_plain,
     read_plain_frames,
@@ -48,6 +49,7 @@ RESTORE = "Restore the file from the released dataset, or generate the dataset a
 CONTINUE = "Run the `shinypartial generate` that began the folder again: it continues where it stopped."
 SUBSET = "`shinypartial subset`"
 PERTURB = "`shinypartial perturb`"
+IMPORT = "`shinypartial import-dataset`"
 ANGLE_TOLERANCE_RAD = 1e-6
 #: The lat-long and the cube are each rounded to half precision (relative 5e-4).
 RADIANCE_TOLERANCE = 2e-3
@@ -74,7 +76,7 @@ def validate(root: Path, progress: bool = False) -> list[Violation]:
     for frame in frames:
         if is_perturbed(manifest) and frame.name.startswith("train/"):
             violations += check_perturbed_frame(root, frame)
-        elif plain and not frame.exr.exists():
+        elif plain and (is_imported(manifest) or not frame.exr.exists()):
             violations += check_plain_frame(root, frame)
         else:
             violations += check_frame(root, frame, self_reflection=complete)
@@ -85,7 +87,7 @@ def validate(root: Path, progress: bool = False) -> list[Violation]:
     if not original:
         violations += [*_check_licenses(root), *_check_checksums(root)]
     if plain:  # What made it, and so what makes it again.
-        maker = PERTURB if is_perturbed(manifest) else SUBSET
+        maker = PERTURB if is_perturbed(manifest) else IMPORT if is_imported(manifest) else SUBSET
         violations = [
             replace(each, remedy=each.remedy.replace("`shinypartial generate`", maker)) for each in violations
         ]
@@ -101,7 +103,9 @@ def unscored(root: Path) -> str | None:
 def _check_plain_split(root: Path, split: str, manifest: dict[str, Any]) -> tuple[list[Frame], list[Violation]]:
     frames, listed, violations = read_plain_frames(root, split)
     problems = [*_set_problems(frames, listed, split, manifest)]
-    if manifest and not is_perturbed(manifest):  # An original folder is photographed from all around.
+    if manifest and not (
+        is_perturbed(manifest) or is_imported(manifest)
+    ):  # Originals are photographed from all around.
         problems += _hemisphere_problems(frames, manifest)
     file = f"transforms_{split}.json"
     return frames, [

@@ -1,6 +1,7 @@
 """Write a dataset folder frame by frame; what is there already is kept, so a killed run continues."""
 
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -136,16 +137,19 @@ def encode_normals(normals: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H 
 def write_transforms(root: Path, split: str, frames: Sequence[Frame]) -> None:
     """Write `transforms_SPLIT.json` with OpenGL poses, as NeRF-synthetic and nerfstudio readers expect.
 
-    Intrinsics of the first frame stand for all; frames that differ from it have their own.
+    Intrinsics of the first frame stand for all; frames that differ from it have their own. Masks that are files of
+    their own are named.
     """
     shared = intrinsics_of(frames[0].camera)
     entries = []
     for frame in frames:
         own = intrinsics_of(frame.camera)
-        entry = {
+        entry: dict[str, Any] = {
             "file_path": f"./{split}/{frame.stem.name}",
             "transform_matrix": opencv_to_opengl(frame.camera.camera_to_world).tolist(),
         }
+        if frame.mask is not None:
+            entry["mask_path"] = Path(os.path.relpath(frame.mask, root)).as_posix()
         entries.append(entry if own == shared else {**entry, **own})
     write_json(root / f"transforms_{split}.json", {**shared, "frames": entries})
 
@@ -161,6 +165,12 @@ def intrinsics_of(camera: Camera) -> dict[str, float]:
         "w": camera.width,
         "h": camera.height,
     }
+
+
+def environment_files(root: Path) -> tuple[Path, ...]:
+    """What `write_environment` writes, in this order."""
+    cube = (root / ENVIRONMENT_CUBE / f"{name}.exr" for name in FACES)
+    return (root / ENVIRONMENT_LATLONG, *cube, root / ENVIRONMENT_LATLONG_Y_UP)
 
 
 def write_environment(root: Path, latlong: Float[np.ndarray, "H W 3"], cube_resolution: int = 256) -> None:

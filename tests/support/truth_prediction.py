@@ -1,5 +1,6 @@
 """The ground truth written as a prediction: the folder that must score perfectly, and a base for damaged ones."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,8 @@ def write_truth_prediction(root: Path, dataset: Dataset) -> Path:
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(frame.png.read_bytes())
         else:
-            write_test_view(root, frame, view)
+            depth = np.zeros_like(view.alpha) if view.depth is None else view.depth
+            write_test_view(root, frame, replace(view, depth=depth))
     if (dataset.root / ENVIRONMENT_LATLONG).exists():
         radiance = read_environment(dataset)
         write_environment_map(root, radiance)

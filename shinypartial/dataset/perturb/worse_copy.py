@@ -15,18 +15,15 @@ from jaxtyping import UInt8
 
 from shinypartial.core.camera import opencv_to_opengl
 from shinypartial.core.color import to_display
-from shinypartial.core.conventions import FACES
 from shinypartial.core.errors import InputError
-from shinypartial.dataset.derived import Job, open_source, write_derived
+from shinypartial.dataset.derived import Job, licenses_of, open_source, write_derived
 from shinypartial.dataset.perturb import picture as pictures
 from shinypartial.dataset.perturb.options import Perturbation, changed_options
 from shinypartial.dataset.perturb.plan import Plan, PlannedView, generator, make_plan
 from shinypartial.dataset.perturb.turned import write_turned_environment, write_turned_normals, write_turned_transforms
 from shinypartial.dataset.schema import (
     CHECKSUMS,
-    ENVIRONMENT_CUBE,
     ENVIRONMENT_LATLONG,
-    ENVIRONMENT_LATLONG_Y_UP,
     Dataset,
     Frame,
     View,
@@ -36,6 +33,7 @@ from shinypartial.dataset.write import (
     display_rgba,
     encode_normals,
     encode_unit,
+    environment_files,
     exr_channels,
     intrinsics_of,
 )
@@ -72,7 +70,7 @@ def perturb(source: Path, root: Path, options: Perturbation, *, link: bool = Fal
         return _statistics(plan, dataset)
 
     jobs, recipe = _jobs(_Copy(dataset, root, plan, link)), _recipe(dataset, options)
-    return PerturbedCopy(root, plan, write_derived(root, dataset, recipe, jobs, "Perturbing", finish))
+    return PerturbedCopy(root, plan, write_derived(root, licenses_of(dataset), recipe, jobs, "Perturbing", finish))
 
 
 @dataclass(frozen=True)
@@ -123,9 +121,7 @@ def _jobs(copy: _Copy) -> Iterator[Job]:
     if copy.dataset.test:
         yield Job((copy.root / TEST,), partial(write_turned_transforms, source / TEST, copy.root / TEST, plan.turn))
     if (source / ENVIRONMENT_LATLONG).exists():
-        files = (ENVIRONMENT_LATLONG, *(ENVIRONMENT_CUBE / f"{name}.exr" for name in FACES), ENVIRONMENT_LATLONG_Y_UP)
-        made = tuple(copy.root / file for file in files)
-        yield Job(made, partial(write_turned_environment, source, copy.root, plan.turn))
+        yield Job(environment_files(copy.root), partial(write_turned_environment, source, copy.root, plan.turn))
 
 
 def _suffix(frame: Frame, options: Perturbation) -> str:
