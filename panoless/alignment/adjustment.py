@@ -24,7 +24,7 @@ def adjusting_step(
     found: Sequence[Sequence[PoseRows]],
     noise: Sequence[float],
     poses: Float[np.ndarray, "V 6"],
-    prior: Float[np.ndarray, "6"],
+    prior: Float[np.ndarray, "V 6 6"],
     resolution: int,
     options: PoseOptions,
 ) -> Float[np.ndarray, "V 6"]:
@@ -36,8 +36,8 @@ def adjusting_step(
     gradient, matrix = np.zeros((views, 6)), np.zeros((views, 6, views, 6))
     for index, rows in enumerate(found):
         parts = [each.equations(options.noise_multiple * sigma, sigma) for each, sigma in zip(rows, noise, strict=True)]
-        gradient[index] = sum((part[0] for part in parts), prior * poses[index])
-        matrix[index, :, index] = sum((part[1] for part in parts), np.diag(prior))
+        gradient[index] = sum((part[0] for part in parts), prior[index] @ poses[index])
+        matrix[index, :, index] = sum((part[1] for part in parts), prior[index])
     flat, full = gradient.reshape(-1), matrix.reshape(6 * views, 6 * views)
     for means, residuals in _texel_means([rows[-1] for rows in found], noise[-1], resolution, options):
         flat -= means.T @ residuals

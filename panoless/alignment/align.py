@@ -1,5 +1,6 @@
 """Poses of all views under one geometry: six unknowns a view, robust Gauss–Newton steps with a prior."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -35,9 +36,9 @@ class Scene:
         return 3 if self.environment is None else 6
 
 
-def pose_prior(options: PoseOptions) -> Float[np.ndarray, "6"]:
-    """1/σ² of turns (rad) and shifts."""
-    return np.repeat([np.radians(options.turn_deg) ** -2, options.shift**-2], 3)
+def pose_prior(views: Views, options: PoseOptions) -> Float[np.ndarray, "V 6 6"]:
+    """Inverse covariances of turns (rad) and shifts."""
+    return StatedCameras.of(views).prior(math.radians(options.turn_deg), options.shift)
 
 
 @dataclass(frozen=True)
@@ -47,10 +48,10 @@ class Alignment:
     views: Views
     options: PoseOptions
 
-    @property
-    def prior(self) -> Float[np.ndarray, "6"]:
+    @cached_property
+    def prior(self) -> Float[np.ndarray, "V 6 6"]:
         """Weights of squared turns and shifts."""
-        return pose_prior(self.options)
+        return pose_prior(self.views, self.options)
 
     @cached_property
     def _seen(self) -> "list[_SeenView]":
@@ -80,7 +81,7 @@ class Alignment:
         found = start.stacked
         noise = self._noise([self._seen[index].rows(scene, found[index]) for index in indices])
         for index in indices:
-            found[index] = self._seen[index].solved(scene, found[index], noise, self.prior)
+            found[index] = self._seen[index].solved(scene, found[index], noise, self.prior[index])
         return Poses(found[:, :3], found[:, 3:])
 
     def adjusted(self, geometry: Geometry, poses: Poses, environment: Float[Tensor, "6 3 L L"]) -> Poses:
@@ -147,7 +148,7 @@ class _SeenView:
         return rows
 
     def solved(
-        self, scene: Scene, start: Float[np.ndarray, "6"], noise: Sequence[float], prior: Float[np.ndarray, "6"]
+        self, scene: Scene, start: Float[np.ndarray, "6"], noise: Sequence[float], prior: Float[np.ndarray, "6 6"]
     ) -> Float[np.ndarray, "6"]:
         """The pose of least cost that was met on Gauss–Newton steps, shortened where the cost rises."""
         rows, free = self.rows(scene, start), slice(scene.unknowns)
@@ -158,10 +159,10 @@ class _SeenView:
         pose = best
         for _ in range(self.options.steps):
             parts = [each.equations(*numbers) for each, *numbers in zip(rows, scales, noise, strict=True)]
-            cost = sum(part[2] for part in parts) + float(prior @ pose.stacked[0] ** 2) / 2
+            cost = sum(part[2] for part in parts) + float(pose.stacked[0] @ prior @ pose.stacked[0]) / 2
             if cost < least:
-                gradient = sum((part[0] for part in parts), prior * pose.stacked[0])
-                matrix = sum((part[1] for part in parts), np.diag(prior))
+                gradient = sum((part[0] for part in parts), prior @ pose.stacked[0])
+                matrix = sum((part[1] for part in parts), prior)
                 best, least = pose, cost
                 step[0, free] = -np.linalg.solve(matrix[free, free], gradient[free])
             else:

@@ -26,12 +26,19 @@ class StatedCameras:
 
     centers: Float[np.ndarray, "V 3"]
     rotations: Float[np.ndarray, "V 3 3"]
+    covariances: tuple[Float[np.ndarray, "6 6"] | None, ...]
+    """Of turns and shifts, as far as the dataset states them."""
 
     @classmethod
     def of(cls, views: Views) -> "StatedCameras":
         """Those of the views."""
         rotations, centers = zip(*(pose_of(view.camera) for view in views.train), strict=True)
-        return cls(np.array(centers), np.array(rotations))
+        return cls(np.array(centers), np.array(rotations), tuple(view.pose_covariance for view in views.train))
+
+    def prior(self, turn_rad: float, shift: float) -> Float[np.ndarray, "V 6 6"]:
+        """Inverse covariance of each camera's turn and shift: as stated, else of these standard deviations."""
+        usual = np.diag(np.repeat([turn_rad, shift], 3) ** -2.0)
+        return np.array([usual if each is None else np.linalg.inv(each) for each in self.covariances])
 
 
 @dataclass(frozen=True)
@@ -61,7 +68,7 @@ class Poses:
         turns = Rotation.from_rotvec(change[:, :3]) * Rotation.from_rotvec(self.turns)
         return Poses(turns.as_rotvec(), self.shifts + change[:, 3:])
 
-    def without_common(self, cameras: "StatedCameras", prior: Float[np.ndarray, "6"]) -> tuple[Similarity, "Poses"]:
+    def without_common(self, cameras: "StatedCameras", prior: Float[np.ndarray, "V 6 6"]) -> tuple[Similarity, "Poses"]:
         """What turns, shifts and scales all cameras alike, by least squares under the weights of the prior, and the
         poses in a world from which that was taken back.
 
@@ -75,14 +82,14 @@ class Poses:
         turns = Rotation.from_matrix(common.rotation.T) * Rotation.from_rotvec(self.turns)
         return common, Poses(turns.as_rotvec(), common.undone(cameras.centers + self.shifts) - cameras.centers)
 
-    def lens_turn(self, cameras: "StatedCameras", prior: Float[np.ndarray, "6"]) -> Float[np.ndarray, "2"] | None:
+    def lens_turn(self, cameras: "StatedCameras", prior: Float[np.ndarray, "V 6 6"]) -> Float[np.ndarray, "2"] | None:
         """By how much every camera is turned about its own x and y axis (rad), as by a wrong principal point.
 
         None where that explains little.
         """
         return self._alike(cameras, prior)[1]
 
-    def principal_point_px(self, views: Views, prior: Float[np.ndarray, "6"]) -> tuple[float, float] | None:
+    def principal_point_px(self, views: Views, prior: Float[np.ndarray, "V 6 6"]) -> tuple[float, float] | None:
         """By how much the principal point lies to the right and below of where it is said to be, in all views alike;
         None where that is not told.
         """
@@ -93,7 +100,7 @@ class Poses:
         return -fx * math.tan(turn[1]), fy * math.tan(turn[0])
 
     def _alike(
-        self, cameras: "StatedCameras", prior: Float[np.ndarray, "6"]
+        self, cameras: "StatedCameras", prior: Float[np.ndarray, "V 6 6"]
     ) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "2"] | None]:
         """θ, t and σ, and the turns about own axes if these leave less than `LENS_SHARE` of the squares."""
         axes, centers, count = np.eye(3), cameras.centers, len(cameras.centers)
@@ -101,8 +108,9 @@ class Poses:
         shifted = np.concatenate([np.zeros((count, 3, 3)), np.tile(axes, (count, 1, 1))], 2)
         scaled = np.concatenate([np.zeros((count, 1, 3)), centers[:, None]], 2)
         own = np.concatenate([cameras.rotations[:, :2], np.zeros((count, 2, 3))], 2)
-        basis = (np.concatenate([turned, shifted, scaled, own], 1) * np.sqrt(prior)).transpose(0, 2, 1).reshape(-1, 9)
-        stacked = (self.stacked * np.sqrt(prior)).ravel()
+        roots = np.linalg.cholesky(prior)
+        basis = (np.concatenate([turned, shifted, scaled, own], 1) @ roots).transpose(0, 2, 1).reshape(-1, 9)
+        stacked = np.matmul(self.stacked[:, None], roots).ravel()
         return common_and_lens(basis[:, :7], basis[:, 7:], stacked)
 
     def moved(self, views: Views) -> Views:

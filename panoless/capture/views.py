@@ -39,6 +39,7 @@ class Photograph:
     camera: Camera
     radiance: Float[Tensor, "3 H W"]
     mask: Float[Tensor, "H W"]
+    pose_covariance: Float[np.ndarray, "6 6"] | None = None
 
 
 @dataclass(frozen=True)
@@ -53,10 +54,13 @@ class TrainView:
     mask: Float[Tensor, "H W"]
     solid: Int[Tensor, "P"]
     """Flat indices of the pixels that lie wholly on the object."""
+    pose_covariance: Float[np.ndarray, "6 6"] | None = None
+    """Of the camera's turn (rad, world axes) and shift (normalized frame), where the dataset states it."""
 
     def to(self, device: torch.device) -> "TrainView":
         """The same view on a device."""
-        return TrainView(
+        return replace(
+            self,
             camera=replace(self.camera, world_to_camera=self.camera.world_to_camera.to(device)),
             radiance=self.radiance.to(device),
             mask=self.mask.to(device),
@@ -165,7 +169,8 @@ def load_views(
         alpha = _block_means(np.clip(view.alpha, 0, 1), downscale)
         if (alpha >= MASK_LEVEL).any():
             radiance = encoding.encoded(_block_means(encoding.clipped(frame, view), downscale), alpha)
-            photographs.append(cropped(frame.camera.downscaled(downscale), radiance, alpha, crop_margin_px))
+            photograph = cropped(frame.camera.downscaled(downscale), radiance, alpha, crop_margin_px)
+            photographs.append(replace(photograph, pose_covariance=frame.pose_covariance))
         else:
             empty.append(frame.name)
         progress.advance()
@@ -199,6 +204,7 @@ def views_of(photographs: Sequence[Photograph], known_radius: float = 0.0) -> Vi
             radiance=photograph.radiance,
             mask=photograph.mask,
             solid=torch.nonzero(photograph.mask.flatten() > SOLID_ALPHA)[:, 0],
+            pose_covariance=object_frame.pose_covariance(photograph.pose_covariance),
         )
         for photograph in photographs
     )

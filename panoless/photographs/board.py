@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from panoless.photographs.certainty import SeenPoints
 from panoless.photographs.corners import Sighting, corners_of, locate_corners
 from panoless.photographs.frames import Frames
 from panoless.photographs.lens import Lens, opencv
 from panoless.photographs.options import CaptureOptions
-from panoless.photographs.posed import PosedView, Poses, as_rows
+from panoless.photographs.posed import PosedView, Poses, as_rows, with_covariances
 from panoless.photographs.video import luminance
 from shinypartial.core.board import CELLS_OF_MARKER, CELLS_OF_SQUARE, MM, Board
 from shinypartial.core.errors import InputError
@@ -158,11 +159,15 @@ def poses_from_board(board: Board, frames: Frames, folder: Path, options: Captur
             found=f"an uncertainty of {adjusted.focal_error:.1%}",
             remedy="Add frames that see the board at a slant, from different sides.",
         )
-    views = []
+    views, seen_points, corners = [], [], corners_of(board) @ BOARD_TO_WORLD[:3, :3]
     for sighting, pose, residuals in zip(sightings, adjusted.poses, adjusted.residuals_px, strict=True):
+        in_world = BOARD_TO_WORLD @ pose
         error = float(np.sqrt((residuals**2).mean()))
-        views.append(PosedView(sighting.name, adjusted.lens, as_rows(BOARD_TO_WORLD @ pose), error))
-    return Poses(origin, "m", tuple(views), focal_error=adjusted.focal_error)
+        views.append(PosedView(sighting.name, adjusted.lens, as_rows(in_world), error))
+        points = corners[sighting.corners]
+        seen_points.append(SeenPoints(adjusted.lens, in_world, sighting.corners, points, sighting.places_px))
+    poses = Poses(origin, "m", tuple(views), focal_error=adjusted.focal_error)
+    return with_covariances(poses, seen_points, known_points=True)
 
 
 @dataclass(frozen=True)

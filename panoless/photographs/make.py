@@ -65,6 +65,9 @@ class Captured:
         errors = [view.error_px for view in views if view.error_px is not None]
         left_out = f", none for {', '.join(self.poses.left_out)}" if self.poses.left_out else ""
         within = f", {np.median(errors):.2f} px off in the median view" if errors else ""
+        stated = [each for view in views if (each := view.pose_covariance) is not None]
+        turns = [np.degrees(np.sqrt(np.trace(each[:3, :3]))) for each in stated]
+        within += f", sure to {np.median(turns):.2g}° there" if turns else ""
         sure = f" ± {self.poses.focal_error:.2%}" if self.poses.focal_error is not None else ""
         return [
             f"Frames: {len(blurs)}, blur {np.median(blurs):.2f} in the median frame",
@@ -88,7 +91,10 @@ def capture(request: Request) -> Captured:
         poses, masks_of_frames = _poses(request, frames, pictures, work)
         masks = _masks(request, frames, poses, masks_of_frames, work)
         train = request.output / "train"
-        listed = [Frame(f"train/{view.name}", view.camera, train / view.name, ".png") for view in poses.views]
+        listed = [
+            Frame(f"train/{view.name}", view.camera, train / view.name, ".png", pose_covariance=view.pose_covariance)
+            for view in poses.views
+        ]
         write_transforms(request.output, "train", listed)
     return Captured(frames, poses, masks)
 

@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from panoless.photographs.certainty import SeenPoints
 from panoless.photographs.frames import Frames, Photograph
 from panoless.photographs.lens import INSTALL, Lens, lens_of_model
-from panoless.photographs.posed import PosedView, Poses, as_rows, lens_for
+from panoless.photographs.posed import PosedView, Poses, as_rows, lens_for, with_covariances
+from shinypartial.core.conventions import PIXEL_CENTER
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.transforms import DISTORTION_FIELDS, frames_of
 from shinypartial.io.files import read_json
@@ -73,7 +75,9 @@ def read_colmap(folder: Path, frames: Frames) -> Poses:
 def poses_of(model: Any, frames: Frames, origin: str) -> Poses:
     """Poses of a pycolmap reconstruction."""
     images = {image.name: image for image in model.images.values() if image.has_pose}
-    views = []
+    views, seen = [], []
+    numbers = {key: index for index, key in enumerate(model.points3D)}
+    places = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
     for photograph in frames.photographs:
         name = listed_name(photograph, images)
         if name is None:
@@ -86,7 +90,13 @@ def poses_of(model: Any, frames: Frames, origin: str) -> Poses:
         pose = np.eye(4)
         pose[:3] = image.cam_from_world().inverse().matrix()
         views.append(PosedView(photograph.name, lens_for(photograph, lens), as_rows(pose)))
-    return Poses(origin, "unknown", tuple(views))
+        shown = [point for point in image.points2D if point.has_point3D()]
+        which = np.array([numbers[point.point3D_id] for point in shown], dtype=np.int64)
+        # COLMAP's pixel (0, 0) spans [0, 1]².
+        found = np.array([point.xy for point in shown]).reshape(-1, 2) - PIXEL_CENTER
+        seen.append(SeenPoints(lens, pose, which, places[which], found))
+    poses = Poses(origin, "unknown", tuple(views))
+    return with_covariances(poses, seen, known_points=False) if all(len(each.numbers) for each in seen) else poses
 
 
 def listed_name(photograph: Photograph, names: Iterable[str]) -> str | None:

@@ -1,17 +1,19 @@
 """What the stage of poses finds, whatever found it."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
+from panoless.photographs.certainty import SeenPoints, pose_covariances
 from panoless.photographs.frames import Frames, Photograph
 from panoless.photographs.lens import Lens
 from panoless.photographs.options import CaptureOptions
 from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
 
-Rows = tuple[tuple[float, float, float, float], ...]
+Rows = tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,14 @@ class PosedView:
     camera_to_world: Rows
     error_px: float | None = None
     """Root mean square of what the pose leaves of the points that it was found from; None where it was given."""
+    covariance: Rows | None = None
+    """Of the camera's turn (rad, world axes) and shift (units of the world), by the points that it was found from; None
+    where these are not known."""
+
+    @property
+    def pose_covariance(self) -> Float[np.ndarray, "6 6"] | None:
+        """The same as an array."""
+        return None if self.covariance is None else np.array(self.covariance)
 
     @property
     def camera(self) -> Camera:
@@ -45,9 +55,18 @@ class Poses:
     """Standard deviation of the focal length as a share of it, where it was estimated here."""
 
 
-def as_rows(pose: Float[np.ndarray, "4 4"]) -> Rows:
-    """A pose as the records have it."""
-    return tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in pose)
+def as_rows(matrix: Float[np.ndarray, "N N"]) -> Rows:
+    """A pose or a covariance as the records have it."""
+    return tuple(tuple(map(float, row)) for row in matrix)
+
+
+def with_covariances(poses: Poses, seen: Sequence[SeenPoints], *, known_points: bool) -> Poses:
+    """The same with how sure each pose is, by the points that its view shows; one entry a view."""
+    found = pose_covariances(seen, known_points=known_points)
+    if found is None:
+        return poses
+    views = [replace(view, covariance=as_rows(each)) for view, each in zip(poses.views, found, strict=True)]
+    return replace(poses, views=tuple(views))
 
 
 def without_the_rest(poses: Poses, frames: Frames, options: CaptureOptions, remedy: str) -> Poses:

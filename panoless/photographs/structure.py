@@ -10,7 +10,8 @@ from jaxtyping import Float
 from panoless.photographs.frames import Frames, Photograph
 from panoless.photographs.models import poses_of, pycolmap_module
 from panoless.photographs.options import CaptureOptions
-from panoless.photographs.posed import PosedView, Poses, as_rows
+from panoless.photographs.posed import Poses, as_rows
+from shinypartial.core.camera import Similarity
 from shinypartial.core.errors import InputError
 from shinypartial.io.images import read_png, write_png
 
@@ -76,15 +77,15 @@ def _write_outsides(masks: dict[str, Path], frames: Frames, folder: Path) -> Non
 
 def upright_world(poses: Poses) -> Poses:
     """The same cameras in a world that is turned so that their mean upward direction is +z."""
-    matrices = [np.array(view.camera_to_world) for view in poses.views]
-    up = -np.mean([pose[:3, 1] for pose in matrices], axis=0)
-    turn = np.eye(4)
-    turn[:3, :3] = turned_up(up / np.linalg.norm(up))
-    views = tuple(
-        PosedView(view.name, view.lens, as_rows(turn @ pose), view.error_px)
-        for view, pose in zip(poses.views, matrices, strict=True)
-    )
-    return Poses(poses.origin, poses.unit, views, poses.left_out, poses.focal_error)
+    up = -np.mean([np.array(view.camera_to_world)[:3, 1] for view in poses.views], axis=0)
+    turn = Similarity(1.0, turned_up(up / np.linalg.norm(up)), np.zeros(3))
+    views = []
+    for view in poses.views:
+        covariance = view.pose_covariance
+        turned = None if covariance is None else as_rows(turn.pose_covariance(covariance))
+        pose = as_rows(turn.pose(np.array(view.camera_to_world)))
+        views.append(replace(view, camera_to_world=pose, covariance=turned))
+    return replace(poses, views=tuple(views))
 
 
 def turned_up(up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

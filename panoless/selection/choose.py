@@ -256,5 +256,5 @@ def _found_cameras(geometry: Geometry, views: Views, config: FitConfig) -> dict[
     poses = geometry.poses
     if poses is None:
         return {}
-    principal = poses.principal_point_px(views, pose_prior(config.poses))
+    principal = poses.principal_point_px(views, pose_prior(views, config.poses))
     return {"camera_turn_deg": poses.turn_deg, "principal_point_px": principal}

@@ -111,6 +111,13 @@ class Similarity:
         moved[:3, 3] = self(camera_to_world[None, :3, 3])[0]
         return moved
 
+    def pose_covariance(self, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
+        """That of a pose, of its turn (rad, world axes) and its shift, in the other world."""
+        carried = np.zeros((6, 6))
+        carried[:3, :3], carried[3:, 3:] = self.rotation, self.scale * self.rotation
+        moved: np.ndarray = carried @ covariance @ carried.T
+        return moved
+
 
 def look_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
     """OpenCV camera-to-world pose at `position` that looks at `target` with world +Z up in the image."""

@@ -135,7 +135,9 @@ def _moved(frame: Frame, output: Path, gauge: Similarity) -> Frame:
     camera = frame.camera
     pose = gauge.pose(camera.camera_to_world)
     there = Camera(pose, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-    return Frame(f"{SPLITS[0]}/{stem.name}", there, stem)
+    stated = frame.pose_covariance
+    moved = None if stated is None else gauge.pose_covariance(stated)
+    return Frame(f"{SPLITS[0]}/{stem.name}", there, stem, pose_covariance=moved)
 
 
 def _compare(kind: GaugeKind, scale: float, pairs: Sequence[tuple[Frame, Frame]]) -> Alignment:

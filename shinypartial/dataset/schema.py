@@ -64,7 +64,8 @@ class Frame:
     """A named camera of a split; `stem` is the image path without extension or suffix.
 
     `suffix` is the extension of the photograph where the transforms name it, `mask` the file that holds its mask where
-    they name one.
+    they name one. `pose_covariance` is that of the camera's turn (rad, world axes) and of its center's shift (scene
+    units), where they state it.
     """
 
     name: str
@@ -72,6 +73,7 @@ class Frame:
     stem: Path
     suffix: str = ""
     mask: Path | None = None
+    pose_covariance: Float[np.ndarray, "6 6"] | None = None
 
     @property
     def photograph(self) -> Path:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from jaxtyping import Float
 from msgspec import Meta
 
 from shinypartial.core.camera import Camera, check_pose, opengl_to_opencv
@@ -44,6 +45,7 @@ class _Entry:
     file_path: Text
     transform_matrix: Any
     mask_path: Text | None = None
+    pose_covariance: Any = None
 
 
 def read_frames(root: Path, split: str) -> tuple[list[Frame], int, list[InputError]]:
@@ -151,7 +153,27 @@ def _read_frame(
     cx = next((value for value in (own.cx, pixels.cx) if value is not None), width / 2)
     cy = next((value for value in (own.cy, pixels.cy) if value is not None), height / 2)
     camera = Camera(opengl_to_opencv(pose), fx, fy, cx, cy, int(width), int(height))
-    return Frame(name, camera, stem, suffix, None if read.mask_path is None else root / read.mask_path)
+    mask = None if read.mask_path is None else root / read.mask_path
+    return Frame(name, camera, stem, suffix, mask, _read_covariance(read.pose_covariance, name, path))
+
+
+def _read_covariance(stored: Any, name: str, path: Path) -> Float[np.ndarray, "6 6"] | None:
+    if stored is None:
+        return None
+    try:
+        covariance = np.array(stored, dtype=np.float64)
+    except (TypeError, ValueError):
+        covariance = np.zeros(0)
+    finite = covariance.shape == (6, 6) and np.isfinite(covariance).all()
+    scales = np.sqrt(np.maximum(np.diag(covariance), 0)) if finite else np.zeros(6)
+    # Radians and scene units differ by decades: definite is said of the correlations.
+    if not scales.all() or np.linalg.eigvalsh((covariance + covariance.T) / np.outer(scales, scales))[0] <= 0:
+        raise InputError(
+            expected=f"pose_covariance of {name} in {path} to be a positive definite 6×6 matrix",
+            found=f"shape {covariance.shape}" if covariance.shape != (6, 6) else "another matrix",
+            remedy="Correct it, or leave it out: turn (rad, world axes), then shift (scene units).",
+        )
+    return (covariance + covariance.T) / 2
 
 
 def _focal_lengths(

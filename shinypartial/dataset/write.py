@@ -138,7 +138,7 @@ def write_transforms(root: Path, split: str, frames: Sequence[Frame]) -> None:
     """Write `transforms_SPLIT.json` with OpenGL poses, as NeRF-synthetic and nerfstudio readers expect.
 
     Intrinsics of the first frame stand for all; frames that differ from it have their own. Masks that are files of
-    their own are named.
+    their own are named, and covariances of poses stated, where frames have them.
     """
     shared = intrinsics_of(frames[0].camera)
     entries = []
@@ -148,6 +148,8 @@ def write_transforms(root: Path, split: str, frames: Sequence[Frame]) -> None:
             "file_path": f"./{split}/{frame.stem.name}",
             "transform_matrix": opencv_to_opengl(frame.camera.camera_to_world).tolist(),
         }
+        if frame.pose_covariance is not None:
+            entry["pose_covariance"] = frame.pose_covariance.tolist()
         if frame.mask is not None:
             entry["mask_path"] = Path(os.path.relpath(frame.mask, root)).as_posix()
         entries.append(entry if own == shared else {**entry, **own})

@@ -50,8 +50,8 @@ class Beside:
     silhouettes: BlockRows
     value: Float[np.ndarray, "B M"]
     """By how much they are off what the prior expects."""
-    precision: Float[np.ndarray, "M"]
-    """1/σ² of the prior."""
+    precision: Float[np.ndarray, "B M M"]
+    """Inverse covariances of the prior."""
     blocks: Float[np.ndarray, "B M M"]
     """Of the Gauss–Newton matrix, with the prior: what preconditions."""
 
@@ -61,7 +61,7 @@ class Beside:
         """Jᵀ W e of both, and the prior's part of a value."""
         count = len(value)
         pulled = self.photographs.backward(seen, count) + self.silhouettes.backward(outlined, count)
-        return pulled + self.precision * value
+        return pulled + np.matmul(self.precision, value[..., None])[..., 0]
 
 
 def pixel_pose_rows(

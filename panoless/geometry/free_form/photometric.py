@@ -1,5 +1,6 @@
 """What pixels see by way of a level set under a map that follows it, and what it costs."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -286,16 +287,16 @@ class Solution:
         photographs = scale**2 * float((before.weights * bounded_error(residual, scale)).sum()) / 2
         prior = float((self.bent * self._rough).sum()) / 2
         if self.poses is not None:
-            prior += float((self.pose_prior * self.poses.stacked**2).sum()) / 2
+            prior += float(np.einsum("vi,vij,vj", self.poses.stacked, self.pose_prior, self.poses.stacked)) / 2
         if self.focal is not None:
             prior += (self.focal / self.task.options.focal_prior) ** 2 / 2
         return photographs + self.constraints.cost + prior
 
     @property
-    def pose_prior(self) -> Float[np.ndarray, "6"]:
+    def pose_prior(self) -> Float[np.ndarray, "V 6 6"]:
         """Weights of squared turns and shifts."""
         options = self.task.options
-        return np.repeat([np.radians(options.pose_turn_deg), options.pose_shift], 3) ** -2.0
+        return self.task.cameras.prior(math.radians(options.pose_turn_deg), options.pose_shift)
 
     @cached_property
     def _texel_total(self) -> Float[np.ndarray, "T"]:
@@ -321,7 +322,7 @@ class Solution:
 
     def _beside_poses(self, poses: Poses) -> Beside:
         count = len(poses.turns)
-        blocks = sum(rows.blocks(count) for rows in self.pose_rows) + np.diag(self.pose_prior)
+        blocks = sum(rows.blocks(count) for rows in self.pose_rows) + self.pose_prior
         return Beside(*self.pose_rows, poses.stacked, self.pose_prior, blocks)
 
     def _beside_shared(self) -> Beside:
@@ -345,10 +346,10 @@ class Solution:
         matrix = np.einsum("pck,p,pcl->kl", rows, photographs.weights, beyond) + of_silhouettes.blocks(1)[0]
         least = options.least_surroundings_share * max(float(np.trace(matrix)), 1e-30)
         known = [] if self.focal is None else [self.focal]
-        precision = np.array([least] * len(around) + [options.focal_prior**-2.0] * len(known))
+        precision = np.diag([least] * len(around) + [options.focal_prior**-2.0] * len(known))[None]
         value = np.array([0.0] * len(around) + known)
         of_photographs = BlockRows(np.zeros(len(photographs.weights), int), rows, photographs.weights)
-        return Beside(of_photographs, of_silhouettes, value[None], precision, (matrix + np.diag(precision))[None])
+        return Beside(of_photographs, of_silhouettes, value[None], precision, matrix + precision)
 
     def gradient(self) -> tuple[Float[np.ndarray, "A B C"], list[Float[np.ndarray, "_ _"]]]:
         """Of the cost, over active coefficients and over what is unknown beside them."""

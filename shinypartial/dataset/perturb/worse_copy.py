@@ -195,6 +195,7 @@ def _transforms(plan: Plan, dataset: Dataset) -> dict[str, Any]:
         frame, entry = view.source, dict(content["frames"][view.index])
         if not np.array_equal(view.camera.camera_to_world, frame.camera.camera_to_world):
             entry["transform_matrix"] = opencv_to_opengl(view.camera.camera_to_world).tolist()
+            entry.pop("pose_covariance", None)  # What the source states of a camera says nothing of another one.
         if not as_before:
             entry = {key: value for key, value in entry.items() if key not in own} | ({} if alike else own)
         if plan.options.changes_pictures:

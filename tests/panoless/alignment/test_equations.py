@@ -114,7 +114,7 @@ def test_a_texel_of_one_pixel_tells_nothing() -> None:
         [outline, PoseRows(np.ones((2, 3)), rng.normal(size=(2, 3, 6)), part)]
         for part in (directions[:2], directions[2:])
     ]
-    arguments = [0.1, 1.0], np.zeros((2, 6)), np.ones(6), 64, OPTIONS
+    arguments = [0.1, 1.0], np.zeros((2, 6)), np.tile(np.eye(6), (2, 1, 1)), 64, OPTIONS
     np.testing.assert_allclose(adjusting_step(apart, *arguments), 0, atol=1e-12)
     shared = [[outline, replace(rows, directions=directions[:2])] for _, rows in apart]
     shared[1][1] = replace(shared[1][1], residual=-shared[1][1].residual)

@@ -137,7 +137,7 @@ def test_a_wrong_principal_point_is_told_from_a_motion_that_all_cameras_share() 
     common = Similarity(1.002, turn.as_matrix(), np.array([0.01, 0.0, -0.01]))
     shifted = common(stated.centers + single.shifts) - stated.centers
     seen = Poses((turn * Rotation.from_rotvec(single.turns)).as_rotvec(), shifted)
-    prior = pose_prior(CONFIG.poses)
+    prior = pose_prior(views, CONFIG.poses)
     found = seen.without_common(stated, prior)[1]
     np.testing.assert_allclose(found.stacked, single.stacked, atol=1.5e-3)
     right, down = found.principal_point_px(views, prior) or (0.0, 0.0)
@@ -162,6 +162,24 @@ def test_outlines_tell_a_principal_point_that_is_wrong_in_all_views(family: Fami
     start = align_proposal(family, wrong, proposal, CONFIG)
     assert start is not None
     assert start.poses is not None
-    found = start.poses.principal_point_px(wrong, pose_prior(CONFIG.poses))
+    found = start.poses.principal_point_px(wrong, pose_prior(wrong, CONFIG.poses))
     assert found == pytest.approx((-2.0, -1.5), abs=0.25)
     assert start.proposal.silhouette_px < 0.5 * proposal.silhouette_px
+
+
+def test_cameras_that_are_surer_stay_where_they_are_said_to_be() -> None:
+    """Half of the cameras are turned alike: of equal priors the world takes half of that, of stated ones nothing."""
+    views, turn = flat_views(), np.array([0.004, -0.008, 0.005])
+    count = len(views.train)
+    sure = np.diag(np.repeat([1e-5, 1e-4], 3) ** 2)
+    stated = [replace(view, pose_covariance=None if i % 2 else sure) for i, view in enumerate(views.train)]
+    turned = Poses(np.outer(np.arange(count) % 2, turn), np.zeros((count, 3)))
+    left = [
+        Alignment(each, CONFIG.poses).without_common(turned).turns
+        for each in (views, replace(views, train=tuple(stated)))
+    ]
+    sizes = [np.linalg.norm(each[::2], axis=1).max() / np.linalg.norm(turn) for each in left]
+    assert sizes[0] > 0.2  # Shifts take over a part of what half of the turn would be.
+    # Weights of 1/σ² differ by 3e6 for turns.
+    assert sizes[1] < 1e-3
+    np.testing.assert_allclose(left[1][1::2], np.tile(turn, (count // 2, 1)), atol=1e-5)

@@ -1,6 +1,7 @@
 """Writing a dataset: the Y-up export, checksums, resuming, and folders that belong to something else."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,8 @@ from shinypartial.dataset.schema import (
     ENVIRONMENT_LATLONG_Y_UP,
     Dataset,
 )
-from shinypartial.dataset.write import claim_folder, is_written, write_environment
+from shinypartial.dataset.transforms import read_frames
+from shinypartial.dataset.write import claim_folder, is_written, write_environment, write_transforms
 from shinypartial.io.files import sha256_of
 from shinypartial.io.images import read_exr_rgb
 
@@ -117,3 +119,20 @@ def test_foreign_files_are_not_written_over(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="files that are not a dataset"):
         claim_folder(tmp_path / "thesis.tex", RECIPE, {})
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_covariances_of_poses_are_stored_as_they_are(tmp_path: Path, sphere_dataset: Dataset) -> None:
+    random = np.random.default_rng(0)
+    root = random.normal(size=(6, 6)) * np.repeat([1e-5, 1.0], 3)[:, None]
+    covariance = root @ root.T
+    frames = [replace(frame, pose_covariance=covariance) for frame in sphere_dataset.train[:1]]
+    write_transforms(tmp_path, "train", [*frames, *sphere_dataset.train[1:]])
+    first, second, *_ = read_frames(tmp_path, "train")[0]
+    np.testing.assert_allclose(first.pose_covariance, covariance, rtol=1e-12)
+    assert second.pose_covariance is None
+    path = tmp_path / "transforms_train.json"
+    content = json.loads(path.read_text())
+    for broken in (covariance[:3].tolist(), (-covariance).tolist(), np.zeros((6, 6)).tolist(), "sure"):
+        content["frames"][0]["pose_covariance"] = broken
+        path.write_text(json.dumps(content))
+        assert "positive definite" in read_frames(tmp_path, "train")[2][0].expected

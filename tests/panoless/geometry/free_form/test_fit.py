@@ -337,7 +337,7 @@ def test_what_all_cameras_share_is_taken_back() -> None:
     """A turn of 0.6°, a shift and a scale of cameras leave the poses that they had apart from it."""
     cameras = body_views(ellipsoid(), 8, 24)
     stated = StatedCameras.of(cameras)
-    rng, prior = np.random.default_rng(2), np.full(6, 1e4)
+    rng, prior = np.random.default_rng(2), np.tile(1e4 * np.eye(6), (8, 1, 1))
     own = Poses(1e-3 * rng.normal(size=(8, 3)), 1e-3 * rng.normal(size=(8, 3)))
     own = own.without_common(stated, prior)[1]
     turn = Rotation.from_rotvec([0.004, -0.008, 0.005])
