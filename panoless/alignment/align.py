@@ -38,7 +38,7 @@ class Scene:
 
 def pose_prior(views: Views, options: PoseOptions) -> Float[np.ndarray, "V 6 6"]:
     """Inverse covariances of turns (rad) and shifts."""
-    return StatedCameras.of(views).prior(math.radians(options.turn_deg), options.shift)
+    return StatedCameras.of(views).prior(math.radians(options.turn_deg), options.shift, options.stated_floor)
 
 
 @dataclass(frozen=True)

@@ -35,10 +35,13 @@ class StatedCameras:
         rotations, centers = zip(*(pose_of(view.camera) for view in views.train), strict=True)
         return cls(np.array(centers), np.array(rotations), tuple(view.pose_covariance for view in views.train))
 
-    def prior(self, turn_rad: float, shift: float) -> Float[np.ndarray, "V 6 6"]:
-        """Inverse covariance of each camera's turn and shift: as stated, else of these standard deviations."""
-        usual = np.diag(np.repeat([turn_rad, shift], 3) ** -2.0)
-        return np.array([usual if each is None else np.linalg.inv(each) for each in self.covariances])
+    def prior(self, turn_rad: float, shift: float, floor: float) -> Float[np.ndarray, "V 6 6"]:
+        """Inverse covariance of each camera's turn and shift: of these standard deviations; where a covariance is
+        stated, of that and of `floor` times these together.
+        """
+        usual = np.diag(np.repeat([turn_rad, shift], 3) ** 2.0)
+        known = [usual if each is None else each + floor**2 * usual for each in self.covariances]
+        return np.linalg.inv(np.array(known))
 
 
 @dataclass(frozen=True)

@@ -269,6 +269,8 @@ class FreeFormOptions:
     """Expected error of a camera's rotation."""
     pose_shift: float = 0.02
     """Expected error of its position, in radii of the object."""
+    pose_stated_floor: float = 0.1
+    """The share of both that is added, in squares, to a stated covariance; see `poses.stated_floor`."""
     focal_prior: float = 0.02
     """Expected error of the logarithm of the focal length, where it is unknown."""
     focal_steps: int = 8

@@ -296,7 +296,9 @@ class Solution:
     def pose_prior(self) -> Float[np.ndarray, "V 6 6"]:
         """Weights of squared turns and shifts."""
         options = self.task.options
-        return self.task.cameras.prior(math.radians(options.pose_turn_deg), options.pose_shift)
+        return self.task.cameras.prior(
+            math.radians(options.pose_turn_deg), options.pose_shift, options.pose_stated_floor
+        )
 
     @cached_property
     def _texel_total(self) -> Float[np.ndarray, "T"]:

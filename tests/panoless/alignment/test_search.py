@@ -180,6 +180,6 @@ def test_cameras_that_are_surer_stay_where_they_are_said_to_be() -> None:
     ]
     sizes = [np.linalg.norm(each[::2], axis=1).max() / np.linalg.norm(turn) for each in left]
     assert sizes[0] > 0.2  # Shifts take over a part of what half of the turn would be.
-    # Weights of 1/σ² differ by 3e6 for turns.
-    assert sizes[1] < 1e-3
-    np.testing.assert_allclose(left[1][1::2], np.tile(turn, (count // 2, 1)), atol=1e-5)
+    # To what is stated a tenth of the usual deviation is added: weights differ by 100.
+    assert sizes[1] < 0.02
+    np.testing.assert_allclose(left[1][1::2], np.tile(turn, (count // 2, 1)), atol=0.02 * np.linalg.norm(turn))
