@@ -15,6 +15,7 @@ from shinypartial.core.errors import InputError, parse_and_run
 from shinypartial.io.records import check_record
 
 if TYPE_CHECKING:
+    from panoless.photographs.masks import Hint
     from panoless.viewer.server import Viewer
 
 
@@ -192,10 +193,16 @@ class Capture:
     """Side of a square of the board as measured on the print, in millimeters."""
     masks: Path | None = None
     """Folder of masks by the names of the photographs, white on the object."""
+    segmenter: Path | None = None
+    """Without masks: an ONNX model that tells the object from its surroundings; docs/how-to/capture.md says what it is
+    given and has to return."""
     box: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="X0,Y0,X1,Y1")] = ()
     """Without masks: a rectangle about the object, in pixels of the photograph that --box-in names. May be repeated."""
     box_in: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME")] = ()
     """Name of the photograph of each rectangle, without its suffix."""
+    clicks: Path | None = None
+    """Without masks: a JSON file of points on the object and beside it, {"NAME": {"on": [[x, y], ...], "off": [[x, y],
+    ...]}}, in pixels of the photographs. Without a rectangle the object lies between those beside it."""
     upright: bool = True
     """Turn pictures as their EXIF tag says; poses of other programs may be for pixels as they are stored."""
     options: CaptureOptions = CaptureOptions()
@@ -212,12 +219,22 @@ class Capture:
             board=self.board,
             square_mm=self.square_mm,
             masks=self.masks,
-            boxes=self._boxes(),
+            segmenter=self.segmenter,
+            hints=self._hints(),
             upright=self.upright,
             options=self.options,
         )
         print("\n".join(capture(request).summary()))
         print(f"Look at {self.output}/capture/masks.jpg. Next: panoless fit {self.output}")
+
+    def _hints(self) -> "dict[str, Hint]":
+        from panoless.photographs.masks import Hint, read_clicks
+
+        hints = {} if self.clicks is None else read_clicks(self.clicks)
+        return hints | {
+            name: Hint(box, hints.get(name, Hint()).on, hints.get(name, Hint()).off)
+            for name, box in self._boxes().items()
+        }
 
     def _boxes(self) -> dict[str, tuple[float, float, float, float]]:
         try:

@@ -10,10 +10,11 @@ import numpy as np
 from panoless.photographs.board import poses_from_board
 from panoless.photographs.frames import Frames, block_means, make_frames, source_files
 from panoless.photographs.hull import nearest_point
-from panoless.photographs.masks import Box, Masks, find_masks, given_mask, overlaps_of
+from panoless.photographs.masks import Hint, Masks, find_masks, given_mask, overlaps_of
 from panoless.photographs.models import find_model, find_transforms, read_colmap, read_transforms
 from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import PosedView, Poses, without_the_rest
+from panoless.photographs.segmenter import Segmented, segment
 from panoless.photographs.stage import stage
 from panoless.photographs.structure import REMEDY, poses_from_structure
 from shinypartial.core.board import BOARDS, Board, Paper
@@ -44,8 +45,10 @@ class Request:
     square_mm: float | None = None
     """As measured on the print; None for what was meant to be printed."""
     masks: Path | None = None
-    boxes: Mapping[str, Box] = field(default_factory=dict)
-    """Rectangles about the object by name of the photograph: left, top, right, bottom in its pixels."""
+    segmenter: Path | None = None
+    """An ONNX model; see `panoless.photographs.segmenter`."""
+    hints: Mapping[str, Hint] = field(default_factory=dict)
+    """Rectangles and clicks by name of the photograph."""
     upright: bool = True
     options: CaptureOptions = CaptureOptions()
 
@@ -141,13 +144,16 @@ def _poses(request: Request, frames: Frames, pictures: Path, work: Path) -> tupl
         named = {one.name: given_mask(request.masks, one.name) for one in frames.photographs}
     elif transforms:
         read, named = read_transforms(transforms, frames)
-    masks = _masks_of_frames(request, frames, named, work / "given")
+    if request.segmenter:
+        masks = _segmented(request.segmenter, request, frames, pictures, work)
+    else:
+        masks = _masks_of_frames(request, frames, named, work / "given")
     given = {
         "frames": sha256_of(work / "frames.json"),
         "board": write_record(board) if board else None,
         "model": [[str(path), path.stat().st_mtime_ns] for path in _model_files(model)] if model else None,
         "transforms": sha256_of(transforms) if transforms else None,
-        "masks": sorted(named),
+        "masks": sorted(masks),
     }
 
     def work_on() -> Poses:
@@ -175,6 +181,20 @@ def _model_files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.glob("*") if path.suffix in (".txt", ".bin"))
 
 
+def _segmented(model: Path, request: Request, frames: Frames, pictures: Path, work: Path) -> dict[str, Path]:
+    """Masks by a model; like given ones they leave the object out of structure from motion."""
+    given = {
+        "frames": sha256_of(work / "frames.json"),
+        "model": sha256_of(model) if model.is_file() else None,
+        "options": write_record(request.options),
+    }
+    folder = work / "segmented"
+    found = stage(
+        work, "segmented", given, Segmented, lambda: segment(model, frames, pictures, folder, request.options)
+    )
+    return {name: folder / f"{name}.png" for name in found.names}
+
+
 def _masks_of_frames(request: Request, frames: Frames, named: Mapping[str, Path], folder: Path) -> dict[str, Path]:
     """Given masks, turned and averaged as their photographs were; InputError for other sizes."""
     written = {}
@@ -198,7 +218,7 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
     train = request.output / "train"
     given = {
         "poses": sha256_of(work / "poses.json"),
-        "boxes": {name: list(box) for name, box in request.boxes.items()},
+        "hints": {name: write_record(hint) for name, hint in request.hints.items()},
         "masks": {name: sha256_of(path) for name, path in given_masks.items()},
     }
 
@@ -208,20 +228,20 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
         for view in poses.views:
             picture = view.lens.undistorted(read_png(work / "frames" / f"{view.name}.png"))
             # A mask of its own replaces an alpha channel.
-            own = not (given_masks or request.boxes)
+            own = not (given_masks or request.hints)
             write_png(train / f"{view.name}.png", picture if own else np.ascontiguousarray(picture[..., :3]))
         if given_masks:
-            origin = "files"
+            origin = f"the model {request.segmenter.name}" if request.segmenter else "files"
             for view in poses.views:
                 if view.name not in given_masks:
                     raise _no_mask(view)
                 mask = view.lens.undistorted(read_png(given_masks[view.name])[..., 0])
                 write_png(train / f"{view.name}_alpha.png", mask)
-        elif request.boxes:
-            origin = f"rectangles in {', '.join(request.boxes)}"
+        elif request.hints:
+            origin = f"hints in {', '.join(request.hints)}"
             sides = {one.name: one.side for one in frames.photographs}
-            boxes = {name: _scaled(box, sides.get(name, 1)) for name, box in request.boxes.items()}
-            for name, mask in find_masks(cameras, train, boxes, request.options).items():
+            hints = {name: hint.scaled(sides.get(name, 1)) for name, hint in request.hints.items()}
+            for name, mask in find_masks(cameras, train, hints, request.options).items():
                 write_png(train / f"{name}_alpha.png", mask)
         else:
             origin = "alpha channels"
@@ -233,17 +253,12 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
     return stage(work, "masks", given, Masks, work_on)
 
 
-def _scaled(box: Box, side: int) -> Box:
-    left, top, right, bottom = box
-    return left / side, top / side, right / side, bottom / side
-
-
 def _no_mask(view: PosedView) -> InputError:
     return InputError(
         expected=f"a mask of the object in {view.name}",
         found="none",
-        remedy="Give a folder of them (--masks), or a rectangle about the object in a frame or two "
-        "(--box X0,Y0,X1,Y1 --box-in NAME).",
+        remedy="Give a folder of them (--masks), a model (--segmenter), a rectangle about the object in a frame or two "
+        "(--box X0,Y0,X1,Y1 --box-in NAME), or clicks (--clicks).",
     )
 
 

@@ -1,8 +1,9 @@
-"""Masks of the object: those that are given, or found from a rectangle in one frame or a few.
+"""Masks of the object: those that are given, or found from hints in one frame or a few: rectangles and clicks.
 
-Within a rectangle GrabCut (Rother et al. 2004) parts the object from what lies around. A mask moves to the nearest
-view without one, as if painted on a plane, and GrabCut finds its edge there. Then each view and its neighbors vote, and
-edges are found anew. The visual hull of all masks judges them: it is as large as each of them only where they agree.
+GrabCut (Rother et al. 2004) parts the object from what lies around: within a rectangle, or that of clicks around it. A
+mask moves to the nearest view without one, as if painted on a plane, and GrabCut finds its edge there. Then each view
+and its neighbors vote, and edges are found anew. The visual hull of all masks judges them: it is as large as each of
+them only where they agree.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,13 +20,51 @@ from panoless.photographs.lens import opencv
 from panoless.photographs.options import CaptureOptions
 from shinypartial.core.camera import Camera, project
 from shinypartial.core.errors import InputError
+from shinypartial.io.files import read_json
 from shinypartial.io.images import read_png
 from shinypartial.io.progress import Progress
+from shinypartial.io.records import read_record
 
 Box = tuple[float, float, float, float]
+Points = tuple[tuple[float, float], ...]
+#: Codes of GrabCut's trimaps.
+AROUND, OBJECT, _, PERHAPS_OBJECT = range(4)
 #: Blur of an edge that GrabCut leaves as a staircase, in pixels: the line at one half stays where it was.
 EDGE_PX = 0.7
 SEED_ITERATIONS, ITERATIONS = 5, 2
+
+
+@dataclass(frozen=True)
+class Hint:
+    """What is told of the object in one photograph, in its pixels: a rectangle, or points around it, or both."""
+
+    box: Box | None = None
+    """A rectangle about the object: left, top, right, bottom."""
+    on: Points = ()
+    """Points (x, y) on the object."""
+    off: Points = ()
+    """Points beside it, and in its holes."""
+
+    @property
+    def bounds(self) -> Box:
+        """The rectangle; without one, that of the points beside the object; InputError where they have no extent."""
+        if self.box is not None:
+            return self.box
+        columns, rows = zip(*self.off, strict=True) if self.off else ((0.0,), (0.0,))
+        bounds = min(columns), min(rows), max(columns), max(rows)
+        if not (bounds[0] < bounds[2] and bounds[1] < bounds[3]):
+            raise InputError(
+                expected="clicks beside the object on all of its sides, in each photograph without a rectangle",
+                found=f"{len(self.off)} beside it",
+                remedy='Add some to the file of --clicks: {"NAME": {"off": [[x, y], [x, y], [x, y], [x, y]]}}.',
+            )
+        return bounds
+
+    def scaled(self, side: int) -> "Hint":
+        """The same in a picture whose pixels are blocks of `side` × `side`."""
+        box = None if self.box is None else tuple(value / side for value in self.box)
+        on, off = (tuple((x / side, y / side) for x, y in points) for points in (self.on, self.off))
+        return Hint(box, on, off)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -96,14 +135,27 @@ def given_mask(folder: Path, name: str) -> Path:
     return found
 
 
-def find_masks(
-    whole: Mapping[str, Camera], folder: Path, boxes: Mapping[str, Box], options: CaptureOptions
-) -> dict[str, UInt8[np.ndarray, "_ _"]]:
-    """Masks of all views from rectangles in some. Raises InputError for names of no view and for empty rectangles."""
-    unknown = [name for name in boxes if name not in whole]
-    if unknown or not boxes:
+def read_clicks(path: Path) -> dict[str, Hint]:
+    """Hints of a JSON file: {"NAME": {"on": [[x, y], …], "off": [[x, y], …]}}; InputError for other content."""
+    content = read_json(path, "the clicks")
+    if not isinstance(content, dict):
         raise InputError(
-            expected="the names of posed frames for --box-in, such as " + next(iter(whole)),
+            expected=f"a table of photographs in {path}", found="something else", remedy="See --help of --clicks."
+        )
+    return {
+        name: read_record(Hint, entry, f"{path}, {name}", remedy='Write "on" and "off", points as [x, y] each.')
+        for name, entry in content.items()
+    }
+
+
+def find_masks(
+    whole: Mapping[str, Camera], folder: Path, hints: Mapping[str, Hint], options: CaptureOptions
+) -> dict[str, UInt8[np.ndarray, "_ _"]]:
+    """Masks of all views from hints in some. Raises InputError for names of no view and for hints that tell nothing."""
+    unknown = [name for name in hints if name not in whole]
+    if unknown or not hints:
+        raise InputError(
+            expected="the names of posed frames for --box-in and --clicks, such as " + next(iter(whole)),
             found=", ".join(unknown) or "none",
             remedy="Take names of photographs without their suffix.",
         )
@@ -114,28 +166,42 @@ def find_masks(
     pictures = {name: block_means(read_png(folder / f"{name}.png")[..., :3], side) for name in names}
     progress = Progress("masks", len(names) * (2 + options.rounds))
     masks: dict[str, Bool[np.ndarray, "_ _"]] = {}
-    for name, box in boxes.items():
-        trimap = np.full((cameras[name].height, cameras[name].width), 0, np.uint8)
-        left, top, right, bottom = (round(value / side) for value in box)
-        trimap[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)] = 3
-        masks[name] = _cut(pictures[name], trimap, SEED_ITERATIONS)
+    known = {name: hint.scaled(side) for name, hint in hints.items()}
+    for name, hint in known.items():
+        trimap = np.full(pictures[name].shape[:2], PERHAPS_OBJECT, np.uint8)
+        masks[name] = _cut(pictures[name], _hinted(trimap, hint, options), SEED_ITERATIONS)
         if not masks[name].any():
             raise InputError(
-                expected=f"the object within --box in {name}",
+                expected=f"the object by --box or --clicks in {name}",
                 found="nothing that differs from what lies around",
-                remedy="Draw the rectangle some pixels larger than the object, or give --masks.",
+                remedy="Draw the rectangle some pixels larger than the object, add clicks, or give --masks.",
             )
         progress.advance()
     _spread(names, cameras, pictures, masks, options, progress)
     for _ in range(options.rounds):
         ball = _ball(cameras, masks)
         voted = {name: _voted(name, cameras, masks, ball, options) for name in names}
-        masks = {name: _cut(pictures[name], _band(voted[name], options.band), ITERATIONS) for name in names}
+        bands = {name: _band(voted[name], options.band) for name in names}
+        bands |= {name: _hinted(bands[name], hint, options) for name, hint in known.items()}
+        masks = {name: _cut(pictures[name], bands[name], ITERATIONS) for name in names}
         progress.advance(steps=len(names))
     found = {}
     for name, camera in whole.items():
         found[name] = smooth_edge(_enlarged(masks[name], camera, side, folder / f"{name}.png"))
         progress.advance()
+    return found
+
+
+def _hinted(trimap: UInt8[np.ndarray, "H W"], hint: Hint, options: CaptureOptions) -> UInt8[np.ndarray, "H W"]:
+    """The trimap with what is told surely: nothing beyond the rectangle, and disks about clicks."""
+    found = trimap.copy()
+    left, top, right, bottom = (max(round(value), 0) for value in hint.bounds)
+    within = np.zeros(trimap.shape, bool)
+    within[top:bottom, left:right] = True
+    found[~within] = AROUND
+    for points, code in ((hint.on, OBJECT), (hint.off, AROUND)):
+        for x, y in points:
+            opencv().circle(found, (round(x - 0.5), round(y - 0.5)), options.click_px, code, -1)
     return found
 
 
@@ -219,13 +285,13 @@ def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
 
 
 def _band(shape: Bool[np.ndarray, "H W"], share: float, least_px: float = 2.0) -> UInt8[np.ndarray, "H W"]:
-    """GrabCut's trimap: 0 surely around, 1 surely the object, 3 perhaps, within a band about an outline."""
+    """GrabCut's trimap, which is open within a band about an outline."""
     cv2 = opencv()
     width = max(least_px, share * float(np.sqrt(np.count_nonzero(shape))))
     inside = cv2.distanceTransform(np.pad(shape, 1, mode="edge").astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
     outside = cv2.distanceTransform((~shape).astype(np.uint8), cv2.DIST_L2, 3)
-    trimap = np.full(shape.shape, 3, np.uint8)
-    trimap[inside > width], trimap[outside > width] = 1, 0
+    trimap = np.full(shape.shape, PERHAPS_OBJECT, np.uint8)
+    trimap[inside > width], trimap[outside > width] = OBJECT, AROUND
     return trimap
 
 
@@ -234,7 +300,7 @@ def _cut(
 ) -> Bool[np.ndarray, "H W"]:
     """GrabCut from a trimap, in the part of the picture around it; the trimap itself where it leaves no choice."""
     cv2 = opencv()
-    perhaps = trimap > 0
+    perhaps = trimap != AROUND
     rows, columns = np.nonzero(perhaps.any(1))[0], np.nonzero(perhaps.any(0))[0]
     if not len(rows):
         return perhaps
@@ -244,13 +310,13 @@ def _cut(
         slice(max(columns[0] - margin, 0), columns[-1] + margin),
     )
     part = trimap[window].copy()
-    if not (part == 0).any() or not (part == 3).any():
+    if not (part == AROUND).any() or not (part == PERHAPS_OBJECT).any():
         return perhaps
     image = np.ascontiguousarray(picture[window])
     cv2.setRNGSeed(0)
     cv2.grabCut(image, part, None, np.zeros((1, 65)), np.zeros((1, 65)), iterations, cv2.GC_INIT_WITH_MASK)
     cut = np.zeros(trimap.shape, bool)
-    cut[window] = (part == 1) | (part == 3)
+    cut[window] = (part == OBJECT) | (part == PERHAPS_OBJECT)
     return largest_pieces(cut, MAIN_SHARE) if cut.any() else cut
 
 

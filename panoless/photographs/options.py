@@ -67,6 +67,15 @@ class CaptureOptions:
     seconds for a picture of 800 pixels."""
     rounds: Count = 3
     """Rounds of votes and edges."""
+    click_px: Count = 2
+    """Radius of what a click marks, in pixels of those pictures. Not tuned."""
+    segmenter_side_px: Count = 1024
+    """Side of the square picture that a segmentation model is given. This and the two below are those of IS-Net (Qin et
+    al. 2022)."""
+    segmenter_mean: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    """What is subtracted from red, green and blue in [0, 1] before…"""
+    segmenter_deviation: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
+    """…they are divided by this."""
     least_overlap: Share = 0.7
     """Overlap (intersection over union) of a view's mask and the hull's outline, in the median, below which poses and
     masks contradict each other: 0.99 with true masks of *vase*, 0.9 where those found of *mirror* are right to 0.98,

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from panoless.photographs.hull import carve, nearest_point, outline, overlap
-from panoless.photographs.masks import find_masks, moved_mask, overlaps_of
+from panoless.photographs.masks import Hint, find_masks, moved_mask, overlaps_of, read_clicks
 from panoless.photographs.options import CaptureOptions
 from shinypartial.core.camera import Camera, ray_directions_world
 from shinypartial.core.errors import InputError
-from shinypartial.io.images import write_png
+from shinypartial.io.files import write_json
+from shinypartial.io.images import read_png, write_png
 from tests.support.photographed_planes import arc
 
 CENTER, RADIUS = np.array([0.1, -0.05, 0.2]), 0.4
@@ -94,15 +95,15 @@ def write_pictures(folder: Path) -> None:
 
 def box_of(mask: np.ndarray, margin: int = 3) -> tuple[float, float, float, float]:
     rows, columns = np.nonzero(mask)
-    return columns.min() - margin, rows.min() - margin, columns.max() + 1 + margin, rows.max() + 1 + margin
+    low, high = (columns.min() - margin, rows.min() - margin), (columns.max() + 1 + margin, rows.max() + 1 + margin)
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
 def test_one_rectangle_gives_all_masks(tmp_path: Path) -> None:
     """Where the object stands out. An overlap of 0.98 is a quarter of a pixel along the edge."""
     write_pictures(tmp_path)
     cameras = {f"p_{index}": camera for index, camera in enumerate(CAMERAS)}
-    box = tuple(float(value) for value in box_of(TRUTH[4]))
-    masks = find_masks(cameras, tmp_path, {"p_4": box}, OPTIONS)
+    masks = find_masks(cameras, tmp_path, {"p_4": Hint(box_of(TRUTH[4]))}, OPTIONS)
     assert list(masks) == list(cameras)
     for mask, truth in zip(masks.values(), TRUTH, strict=True):
         assert overlap(mask > 127, truth) > 0.98
@@ -110,13 +111,59 @@ def test_one_rectangle_gives_all_masks(tmp_path: Path) -> None:
 
 def test_rectangles_without_a_view_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--box-in"):
-        find_masks({"p_0": CAMERAS[0]}, tmp_path, {"other": (0.0, 0.0, 9.0, 9.0)}, OPTIONS)
+        find_masks({"p_0": CAMERAS[0]}, tmp_path, {"other": Hint((0.0, 0.0, 9.0, 9.0))}, OPTIONS)
 
 
 def test_masks_of_large_pictures_are_found_in_small_ones(tmp_path: Path) -> None:
     write_pictures(tmp_path)
     cameras = {f"p_{index}": camera for index, camera in enumerate(CAMERAS)}
-    box = tuple(float(value) for value in box_of(TRUTH[4]))
-    masks = find_masks(cameras, tmp_path, {"p_4": box}, CaptureOptions(mask_side_px=40, rounds=1))
+    masks = find_masks(cameras, tmp_path, {"p_4": Hint(box_of(TRUTH[4]))}, CaptureOptions(mask_side_px=40, rounds=1))
     for mask, truth in zip(masks.values(), TRUTH, strict=True):
         assert overlap(mask > 127, truth) > 0.97
+
+
+def test_five_clicks_give_all_masks(tmp_path: Path) -> None:
+    """One on the object and four around it, in one picture: overlaps as from a rectangle."""
+    write_pictures(tmp_path)
+    cameras = {f"p_{index}": camera for index, camera in enumerate(CAMERAS)}
+    rows, columns = np.nonzero(TRUTH[4])
+    x, y, (left, top, right, bottom) = float(columns.mean()), float(rows.mean()), box_of(TRUTH[4], 6)
+    clicks = {"p_4": {"on": [[x, y]], "off": [[left, y], [right, y], [x, top], [x, bottom]]}}
+    write_json(tmp_path / "clicks.json", clicks)
+    masks = find_masks(cameras, tmp_path, read_clicks(tmp_path / "clicks.json"), OPTIONS)
+    for mask, truth in zip(masks.values(), TRUTH, strict=True):
+        assert overlap(mask > 127, truth) > 0.98
+
+
+def test_clicks_are_believed(tmp_path: Path) -> None:
+    """A patch of the ground's colors in the middle of the ball: what is clicked stays as it was clicked."""
+    write_pictures(tmp_path)
+    rows, columns = np.nonzero(TRUTH[4])
+    x, y = round(columns.mean()), round(rows.mean())
+    image = read_png(tmp_path / "p_4.png").copy()
+    image[y - 6 : y + 6, x - 6 : x + 6] = image[:12, :12]
+    write_png(tmp_path / "p_4.png", image)
+    cameras = {f"p_{index}": CAMERAS[index] for index in (3, 4, 5)}
+    middle, once = ((float(x), float(y)),), CaptureOptions(hull_voxels=48, rounds=1)
+    for hint, covered in ((Hint(box_of(TRUTH[4]), on=middle), True), (Hint(box_of(TRUTH[4]), off=middle), False)):
+        mask = find_masks(cameras, tmp_path, {"p_4": hint}, once)["p_4"] > 127
+        assert mask[y - 1 : y + 1, x - 1 : x + 1].all() == covered
+        assert mask[y - 1 : y + 1, x - 1 : x + 1].any() == covered
+        assert mask[y, x - 12]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"p_0": {"on": [[9, 9]]}}, "all of its sides"),
+        ({"p_0": {"off": [[9, 9], [80, 9]]}}, "all of its sides"),
+        ({"p_0": {"on": [[9]]}}, "p_0"),
+        ({"p_0": {"inside": [[9, 9]]}}, "inside"),
+        ([1], "table of photographs"),
+    ],
+)
+def test_clicks_that_tell_nothing_are_refused(tmp_path: Path, content: object, message: str) -> None:
+    write_pictures(tmp_path)
+    write_json(tmp_path / "clicks.json", content)
+    with pytest.raises(InputError, match=message):
+        find_masks({"p_0": CAMERAS[0]}, tmp_path, read_clicks(tmp_path / "clicks.json"), OPTIONS)
