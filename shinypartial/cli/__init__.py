@@ -10,6 +10,7 @@ from shinypartial.cli.presenting import Chart, Leaderboard, Report
 from shinypartial.cli.scenes import Film, Generate
 from shinypartial.cli.scoring import Compare, Evaluate, Oracle, Postprocess, Weights
 from shinypartial.cli.stability import Stability
+from shinypartial.cli.tables import Tables
 from shinypartial.core.errors import parse_and_run
 
 Command = (
@@ -34,6 +35,7 @@ Command = (
     | Leaderboard
     | Chart
     | Stability
+    | Tables
 )
 
 

@@ -47,7 +47,7 @@ class Stability:
         from shinypartial.stability.collect import collect
         from shinypartial.stability.page import write_stability_page
         from shinypartial.stability.plan import make_plan, parse_methods
-        from shinypartial.stability.suite import run_suite
+        from shinypartial.workflow.suite import run_suite
 
         methods = parse_methods(self.methods, self.method)
         plan = make_plan(self.plan, methods, self.seeds, scenes=self.scenes, axes=self.axes, size=self.size)

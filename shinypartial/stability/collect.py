@@ -11,9 +11,9 @@ from shinypartial.evaluation.scores import read_scores
 from shinypartial.io.files import write_text
 from shinypartial.metrics.calibration import auroc
 from shinypartial.prediction.format import read_info
-from shinypartial.stability.attempt import read_record
 from shinypartial.stability.axes import BY_NAME, Axis
 from shinypartial.stability.plan import Cell, Plan, Size
+from shinypartial.workflow.attempt import read_record
 
 FORMAT, FORMAT_VERSION = "shinypartial-stability", 1
 #: A fit is lost where its environment is this much worse than that of the clean fit, or its normals this many times.

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from shinypartial.core.errors import InputError
-from shinypartial.io.files import read_json, write_json
 from shinypartial.stability.axes import ANCHORS, AXES, BY_NAME, Axis
+from shinypartial.workflow.jobs import Job, read_jobs
 
-PLAN = "plan.json"
 FAST, DEFAULT, PAPER = (
     f"panoless fit {{dataset}} --preset {preset} --config.seed {{seed}} --output {{prediction}}"
     for preset in ("fast", "default", "paper")
@@ -65,21 +64,17 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Job:
-    """A command, and the jobs that have to end before it; `name` is KIND/NAME."""
-
-    name: str
-    command: str
-    after: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
 class Plan:
     """All cells and the jobs that make them, in the order in which they are written down."""
 
     size: Size
     cells: tuple[Cell, ...]
     jobs: tuple[Job, ...]
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What is stored beside the jobs."""
+        return {"size": asdict(self.size), "cells": list(map(asdict, self.cells))}
 
 
 def conditions(plan: Plans, axes: Sequence[str] = ()) -> Iterator[tuple[str | None, float | None]]:
@@ -186,25 +181,7 @@ def _fit_jobs(cell: Cell, template: str, data: Sequence[Job]) -> Iterator[Job]:
     yield Job(f"score/{cell.name}", score, (f"fit/{cell.name}", *dict.fromkeys((data[0].name, data[-1].name))))
 
 
-def write_plan(folder: Path, plan: Plan) -> None:
-    """Write FOLDER/plan.json; InputError where a job of the same name that is there means another command."""
-    begun = {job.name: job.command for job in read_plan(folder).jobs} if (folder / PLAN).exists() else {}
-    for job in plan.jobs:
-        if begun.get(job.name, job.command) != job.command:
-            raise InputError(
-                expected=f"{job.name} to be `{begun[job.name]}`, as in {folder / PLAN}",
-                found=f"`{job.command}`",
-                remedy="Choose another --output, another name for the method, or the options of the earlier run.",
-            )
-    write_json(folder / PLAN, {"size": asdict(plan.size), "cells": list(map(asdict, plan.cells)), "jobs": _table(plan)})
-
-
-def _table(plan: Plan) -> dict[str, dict[str, Any]]:
-    return {job.name: {"command": job.command, "after": list(job.after)} for job in plan.jobs}
-
-
 def read_plan(folder: Path) -> Plan:
     """The plan that a folder was made by."""
-    content = read_json(folder / PLAN, "the plan of a stability suite")
-    jobs = (Job(name, job["command"], tuple(job["after"])) for name, job in content["jobs"].items())
-    return Plan(Size(**content["size"]), tuple(Cell(**cell) for cell in content["cells"]), tuple(jobs))
+    jobs, facts = read_jobs(folder)
+    return Plan(Size(**facts["size"]), tuple(Cell(**cell) for cell in facts["cells"]), jobs)

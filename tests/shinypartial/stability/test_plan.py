@@ -9,7 +9,8 @@ from shinypartial.cli.datasets import Perturb
 from shinypartial.cli.scenes import Generate
 from shinypartial.core.errors import InputError
 from shinypartial.stability.axes import AXES, BY_NAME, Axis
-from shinypartial.stability.plan import METHODS, Plan, conditions, make_plan, parse_methods, read_plan, write_plan
+from shinypartial.stability.plan import METHODS, Plan, conditions, make_plan, parse_methods, read_plan
+from shinypartial.workflow.jobs import write_jobs
 
 COPY = {"copy": "cp -r {dataset} {prediction} # {seed}"}
 
@@ -108,9 +109,9 @@ def test_unknown_names_are_refused() -> None:
 
 
 def test_a_folder_takes_more_cells_but_no_other_command(tmp_path: Path) -> None:
-    write_plan(tmp_path, make_plan("tiny", COPY, [0]))
+    write_jobs(tmp_path, make_plan("tiny", COPY, [0]))
     more = make_plan("tiny", COPY, [0, 1])
-    write_plan(tmp_path, more)
+    write_jobs(tmp_path, more)
     assert read_plan(tmp_path) == more
     with pytest.raises(InputError, match="another name for the method"):
-        write_plan(tmp_path, make_plan("tiny", {"copy": "false {dataset}"}, [0]))
+        write_jobs(tmp_path, make_plan("tiny", {"copy": "false {dataset}"}, [0]))

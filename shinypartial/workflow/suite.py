@@ -8,8 +8,8 @@ from pathlib import Path
 from shinypartial.core.errors import InputError
 from shinypartial.io.files import folder_lock, write_text
 from shinypartial.io.progress import Progress
-from shinypartial.stability.attempt import RECORDS, read_record
-from shinypartial.stability.plan import Plan, write_plan
+from shinypartial.workflow.attempt import RECORDS, read_record
+from shinypartial.workflow.jobs import Plan, write_jobs
 
 SNAKEFILE = Path(__file__).parent / "Snakefile"
 DONE = Path("done")
@@ -28,7 +28,7 @@ def run_suite(folder: Path, plan: Plan, cores: int, arguments: Sequence[str] = (
     words = snakemake_arguments(folder, cores, arguments)
     dry_run = not DRY_RUN.isdisjoint(arguments)
     with folder_lock(folder):
-        write_plan(folder, plan)
+        write_jobs(folder, plan)
         write_text(folder / ".gitignore", "*\n")
         if retry and not dry_run:
             forget_failures(folder, plan)
@@ -94,9 +94,9 @@ def _call(snakemake, words: list[str]) -> int:  # type: ignore[no-untyped-def]
 
 
 def _watch(folder: Path, plan: Plan, ended: threading.Event) -> None:
-    """Report the cells that are done; those of earlier runs don't count in the speed."""
-    marks = [folder / RECORDS / "score" / f"{cell.name}.json" for cell in plan.cells]
-    progress = Progress("Cells", len(marks), sum(mark.exists() for mark in marks))
+    """Report the scores that are done; those of earlier runs don't count in the speed."""
+    marks = [folder / RECORDS / f"{job.name}.json" for job in plan.jobs if job.name.startswith("score/")]
+    progress = Progress("Scores", len(marks), sum(mark.exists() for mark in marks))
     while not ended.wait(WATCH_INTERVAL_S):
         _report(progress, marks)
     _report(progress, marks)

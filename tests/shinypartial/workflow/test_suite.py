@@ -12,10 +12,11 @@ from pathlib import Path
 import pytest
 
 from shinypartial.core.errors import InputError
-from shinypartial.stability.attempt import attempt, read_record
 from shinypartial.stability.collect import collect
-from shinypartial.stability.plan import Cell, Job, Plan, Size, make_plan, write_plan
-from shinypartial.stability.suite import forget_failures, run_suite, snakemake_arguments
+from shinypartial.stability.plan import Cell, Plan, Size, make_plan
+from shinypartial.workflow.attempt import attempt, read_record
+from shinypartial.workflow.jobs import Job, write_jobs
+from shinypartial.workflow.suite import forget_failures, run_suite, snakemake_arguments
 
 ROOT = Path(__file__).resolve().parents[3]
 CELL = Cell("tiny-vase", "development", "broken", None, None, 0)
@@ -39,7 +40,7 @@ def start(folder: Path, *words: str) -> subprocess.Popen[str]:
 def test_a_failed_method_is_recorded_and_stops_nothing(tmp_path: Path) -> None:
     fit = Job(f"fit/{CELL.name}", "echo begun; echo 'error: no light'; echo bye; exit 3")
     plan = plan_of(fit, Job(f"score/{CELL.name}", "touch scored", (fit.name,)), cells=(CELL,))
-    write_plan(tmp_path, plan)
+    write_jobs(tmp_path, plan)
     assert [attempt(job.name, 1, tmp_path) for job in plan.jobs] == [0, 0]
     record = read_record(tmp_path, fit.name)
     assert record is not None
@@ -53,13 +54,13 @@ def test_a_failed_method_is_recorded_and_stops_nothing(tmp_path: Path) -> None:
 
 
 def test_a_finished_job_is_not_run_again_and_threads_are_capped(tmp_path: Path) -> None:
-    write_plan(tmp_path, plan_of(Job("fit/a", "echo $OMP_NUM_THREADS $NUMBA_NUM_THREADS >> threads")))
+    write_jobs(tmp_path, plan_of(Job("fit/a", "echo $OMP_NUM_THREADS $NUMBA_NUM_THREADS >> threads")))
     assert [attempt("fit/a", 1, tmp_path), attempt("fit/a", 1, tmp_path)] == [0, 0]
     assert (tmp_path / "threads").read_text() == "1 1\n"
 
 
 def test_a_job_that_was_stopped_has_not_failed(tmp_path: Path) -> None:
-    write_plan(tmp_path, plan_of(Job("fit/a", "kill -TERM $$")))
+    write_jobs(tmp_path, plan_of(Job("fit/a", "kill -TERM $$")))
     assert attempt("fit/a", 1, tmp_path) == 128 + signal.SIGTERM
     assert read_record(tmp_path, "fit/a") is None
 

@@ -1,6 +1,6 @@
 """One job of the suite: run its command, and record how it ended in place of stopping the suite.
 
-    python -m shinypartial.stability.attempt fit/vase.0.fast --threads 1 --folder stability
+    python -m shinypartial.workflow.attempt fit/vase.0.fast --threads 1 --folder stability
 
 The log is locked while the command or anything that it started lives. So after a kill the next attempt waits for what
 is still at work, and does not begin it a second time.
@@ -18,7 +18,7 @@ from pathlib import Path
 
 from shinypartial.core.errors import EXIT_INTERRUPTED
 from shinypartial.io.files import read_json, write_json
-from shinypartial.stability.plan import PLAN
+from shinypartial.workflow.jobs import PLAN
 
 RECORDS, LOGS = Path("records"), Path("logs")
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -36,6 +36,8 @@ class Record:
     code: int | None
     seconds: float
     reason: str = ""
+    cpu_seconds: float | None = None
+    """Processor time in the programs themselves, of all that the command waited for."""
 
 
 def read_record(folder: Path, job: str) -> Record | None:
@@ -62,14 +64,21 @@ def attempt(job: str, threads: int, folder: Path = Path()) -> int:
             record = Record(planned["command"], None, 0.0, f"{failed[0]}: {failed[1].reason}"[:REASON_CHARACTERS])
         else:
             begun = stream.tell()
-            started = time.monotonic()
+            started, worked = time.monotonic(), _worked()
             code = _run(planned["command"], threads, folder, stream.fileno())
             if code in STOP_CODES:
                 return code if code > 0 else 128 - code
             reason = _reason(log.read_bytes()[begun:].decode(errors="replace"), code) if code else ""
-            record = Record(planned["command"], code, round(time.monotonic() - started, 3), reason)
+            seconds = round(time.monotonic() - started, 3)
+            record = Record(planned["command"], code, seconds, reason, round(_worked() - worked, 3))
         write_json(folder / RECORDS / f"{job}.json", asdict(record))
     return 0
+
+
+def _worked() -> float:
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
 
 
 def _run(command: str, threads: int, folder: Path, log: int) -> int:
@@ -89,7 +98,7 @@ def _reason(log: str, code: int) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Attempt the job that is named."""
-    parser = argparse.ArgumentParser(description="Run one job of a stability suite.")
+    parser = argparse.ArgumentParser(description="Run one job of a suite.")
     parser.add_argument("job", help="KIND/NAME")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--folder", type=Path, default=Path(), help="of the suite; the working directory by default")

@@ -1,0 +1,1 @@
+"""Plans of commands that Snakemake runs, and that continue after any stop; imports io."""

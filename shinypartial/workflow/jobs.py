@@ -1,0 +1,57 @@
+"""Jobs as data: commands and what has to end before each of them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+from shinypartial.core.errors import InputError
+from shinypartial.io.files import read_json, write_json
+
+PLAN = "plan.json"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A command, and the jobs that have to end before it; `name` is KIND/NAME."""
+
+    name: str
+    command: str
+    after: tuple[str, ...] = ()
+
+
+@runtime_checkable
+class Plan(Protocol):
+    """Jobs in the order in which they are written down, and what is stored beside them."""
+
+    @property
+    def jobs(self) -> tuple[Job, ...]:
+        """All of them."""
+
+    @property
+    def facts(self) -> Mapping[str, Any]:
+        """What tells what the jobs are for, as JSON has it."""
+
+
+def write_jobs(folder: Path, plan: Plan) -> None:
+    """Write FOLDER/plan.json; InputError where a job of the same name that is there means another command."""
+    begun = {job.name: job.command for job in read_jobs(folder)[0]} if (folder / PLAN).exists() else {}
+    for job in plan.jobs:
+        if begun.get(job.name, job.command) != job.command:
+            raise InputError(
+                expected=f"{job.name} to be `{begun[job.name]}`, as in {folder / PLAN}",
+                found=f"`{job.command}`",
+                remedy="Choose another --output, another name for the method, or the options of the earlier run.",
+            )
+    write_json(folder / PLAN, {**plan.facts, "jobs": _table(plan.jobs)})
+
+
+def _table(jobs: Sequence[Job]) -> dict[str, dict[str, Any]]:
+    return {job.name: {"command": job.command, "after": list(job.after)} for job in jobs}
+
+
+def read_jobs(folder: Path) -> tuple[tuple[Job, ...], dict[str, Any]]:
+    """The jobs that a folder was made by, and what is stored beside them."""
+    content = read_json(folder / PLAN, "the plan of a suite")
+    table = content.pop("jobs")
+    return tuple(Job(name, job["command"], tuple(job["after"])) for name, job in table.items()), content
