@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from panoless.capture.masks import SPARE
+from panoless.capture.poses import StatedCameras
 from panoless.capture.views import TrainView, Views, load_views
 from shinypartial.core.camera import project, ray_directions_world
 from shinypartial.core.errors import InputError
@@ -151,3 +152,16 @@ def test_views_along_one_line_leave_the_depth_open(sphere_dataset: Dataset) -> N
 def test_cameras_that_look_away_are_refused(sphere_dataset: Dataset) -> None:
     with pytest.raises(InputError, match="behind one of the cameras"):
         load_views(moved(sphere_dataset, lambda pose: pose @ np.diag([-1.0, 1.0, -1.0, 1.0])), 2)
+
+
+def test_stated_covariances_come_in_units_of_the_frame(sphere_dataset: Dataset) -> None:
+    """Turns keep their radians; shifts are in radii of the object. Where none is stated, the usual prior stands."""
+    root = np.random.default_rng(0).normal(size=(6, 6))
+    first = replace(sphere_dataset.train[0], pose_covariance=root @ root.T)
+    views = load_views(replace(sphere_dataset, train=(first, *sphere_dataset.train[1:])), WHOLE)
+    scaled = root / np.repeat([1.0, views.object_frame.radius], 3)[:, None]
+    np.testing.assert_allclose(views.train[0].pose_covariance, scaled @ scaled.T)
+    prior = StatedCameras.of(views).prior(0.5, 0.25, 0.1)
+    np.testing.assert_allclose(prior[1], np.diag([4.0] * 3 + [16.0] * 3))
+    floor = np.diag([0.05**2] * 3 + [0.025**2] * 3)
+    np.testing.assert_allclose(np.linalg.inv(prior[0]), scaled @ scaled.T + floor, rtol=1e-6, atol=1e-9)
