@@ -10,9 +10,9 @@ from shinypartial.dataset.schema import Dataset
 from shinypartial.evaluation.evaluate import evaluate
 from shinypartial.io.files import write_json
 from shinypartial.tables.collect import Outcome, Results, collect, read_results
-from shinypartial.tables.page import Line, marked, write_tables_page
+from shinypartial.tables.page import Line, marked, published_lines, write_tables_page
 from shinypartial.tables.plan import ORACLE, OURS, TABLES, Column, Size, make_plan
-from shinypartial.tables.published import PAPER
+from shinypartial.tables.published import DR, MATERIAL, PAPER, REF, SHADER
 from tests.support.truth_prediction import write_truth_prediction
 
 PSNR = Column("paper.environment.psnr_reinhard", "PSNR")
@@ -80,3 +80,16 @@ def test_figures_are_those_of_the_scores(tmp_path: Path, sphere_dataset: Dataset
     assert found.figures["parameters"] == 14000
     assert found.figures[ERROR.path] < 0.3  # 8 bits in the paper's protocol.
     assert found.figures["environment.as_predicted.observed.psnr_linear"] > 60
+
+
+def test_published_figures_have_the_marks_that_the_paper_prints() -> None:
+    """Of *Vase* in its main table."""
+    lines = [each for each in published_lines(TABLES["main"]) if each.scene == "vase"]
+    cells = marked(TABLES["main"].columns, lines)
+    bold = {name: [i for i, text in enumerate(row) if text.startswith("**")] for name, row in cells.items()}
+    italic = {
+        name: [i for i, text in enumerate(row) if text.startswith("*") and i not in bold[name]]
+        for name, row in cells.items()
+    }
+    assert bold == {DR: [], SHADER: [], REF: [], MATERIAL: [2], PAPER: [0, 1, 3, 4, 5, 6, 7, 8, 9]}
+    assert italic == {DR: [5, 7], SHADER: [], REF: [3], MATERIAL: [0, 1, 4, 6, 8, 9], PAPER: [2]}
