@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import block_diag, csr_matrix
+from scipy.sparse import bsr_matrix, csr_matrix
 
 from panoless.photographs.lens import Lens, opencv
 
@@ -121,7 +121,8 @@ def _explained_by_points(cameras: csr_matrix, points: csr_matrix, total: int) ->
     blocks = np.zeros((total, 3, 3))
     row = np.repeat(np.arange(total), np.diff(own.indptr))
     blocks[row[row == own.indices]] = own.data[row == own.indices]
-    inverse = block_diag(list(np.linalg.pinv(blocks, hermitian=True)), "csr")
+    inverses = np.linalg.pinv(blocks, hermitian=True)
+    inverse = bsr_matrix((inverses, np.arange(total), np.arange(total + 1)), (3 * total, 3 * total))
     shared = cameras.T @ points
     explained: np.ndarray = (shared @ inverse @ shared.T).toarray()
     return explained
