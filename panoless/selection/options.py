@@ -19,8 +19,7 @@ class SelectionOptions:
     even if surfels do no better. Right ones leave a twentieth."""
     explained_error: Share = 0.03
     """A candidate that no other kind takes on, and that leaves less of the held-out views unexplained, is chosen
-    without asking surfels, whose trial is a third of the time of a free form. On sculpture and on other shapes of trial
-    these leave 0.04 and more."""
+    without asking surfels. On sculpture and on other shapes of trial these leave 0.04 and more."""
     least_gain: Share = 0.05
     """Surfels have to lower the held-out error by this share to be preferred."""
     standard_errors: NonNegative = 2.0
