@@ -1,7 +1,7 @@
 """The `panoless` command: make a dataset of photographs, fit it, export or view a finished fit."""
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -231,10 +231,7 @@ class Capture:
         from panoless.photographs.masks import Hint, read_clicks
 
         hints = {} if self.clicks is None else read_clicks(self.clicks)
-        return hints | {
-            name: Hint(box, hints.get(name, Hint()).on, hints.get(name, Hint()).off)
-            for name, box in self._boxes().items()
-        }
+        return hints | {name: replace(hints.get(name, Hint()), box=box) for name, box in self._boxes().items()}
 
     def _boxes(self) -> dict[str, tuple[float, float, float, float]]:
         try:

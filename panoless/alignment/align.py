@@ -15,7 +15,7 @@ from panoless.alignment.adjustment import adjusting_step
 from panoless.alignment.equations import PoseRows, light_rows, outline_rows
 from panoless.alignment.options import PoseOptions
 from panoless.capture.poses import Poses, StatedCameras, common_and_lens, moved_view
-from panoless.capture.silhouettes import mask_distance_px
+from panoless.capture.silhouettes import silhouette_distance_px
 from panoless.capture.views import TrainView, Views
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, observe_views, usable_views
@@ -129,7 +129,7 @@ class _SeenView:
     @cached_property
     def distance_px(self) -> Float[np.ndarray, "H W"]:
         """How far each pixel lies outside of the mask's contour."""
-        return mask_distance_px(self.view.mask.cpu().numpy()).astype(np.float64)
+        return silhouette_distance_px(self.view.mask).cpu().numpy().astype(np.float64)
 
     @cached_property
     def pixels(self) -> Int[np.ndarray, "P"]:

@@ -39,11 +39,14 @@ class Contrast:
             return radiance
         return torch.log1p(radiance.clamp(min=0) / self.knee) / math.log1p(1 / self.knee)
 
+    def applied(self, views: Views) -> Views:
+        """The views with that contrast; themselves where it is that of radiance."""
+        if self.knee is None:
+            return views
+        shown = (replace(view, radiance=self.shown(view.radiance)) for view in views.train)
+        return replace(views, train=tuple(shown))
+
 
 def contrasted(views: Views, options: ContrastOptions) -> Views:
     """The views with the contrast that they ask for."""
-    contrast = Contrast.of(views, options)
-    if contrast.knee is None:
-        return views
-    shown = (replace(view, radiance=contrast.shown(view.radiance)) for view in views.train)
-    return replace(views, train=tuple(shown))
+    return Contrast.of(views, options).applied(views)

@@ -71,11 +71,12 @@ class MaskDistance:
 
 def mask_distance(view: TrainView) -> MaskDistance:
     """The silhouette of a view as a signed distance."""
-    return MaskDistance(view.camera, _distance_px(view.mask), cut_sides(view.mask.cpu().numpy()))
+    return MaskDistance(view.camera, silhouette_distance_px(view.mask), cut_sides(view.mask.cpu().numpy()))
 
 
 @remembered
-def _distance_px(mask: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+def silhouette_distance_px(mask: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+    """`mask_distance_px` of a view's mask."""
     return torch.from_numpy(mask_distance_px(mask.cpu().numpy())).to(mask.device)
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from panoless.alignment.equations import PoseRows, outline_rows
 from panoless.alignment.search import PosedProposal
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
-from panoless.capture.silhouettes import mask_distance_px
+from panoless.capture.silhouettes import silhouette_distance_px
 from panoless.capture.views import Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.geometry.base import Geometry, usable_views
@@ -58,7 +58,7 @@ def _outlines(views: Views, geometry: Geometry) -> Iterator[PoseRows]:
     """Of a geometry against the masks of a few views that see it."""
     train = geometry.corrected(views).train
     for view in train[:: -(-len(train) // PULLED_VIEWS)]:
-        distance = mask_distance_px(view.mask.cpu().numpy()).astype(np.float64)
+        distance = silhouette_distance_px(view.mask).cpu().numpy().astype(np.float64)
         rows = outline_rows(view, distance, geometry.buffers(view.camera))
         if len(rows.residual):
             yield rows

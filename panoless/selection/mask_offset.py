@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.corrections import Corrections
-from panoless.capture.silhouettes import mask_distance_px
+from panoless.capture.silhouettes import silhouette_distance_px
 from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.geometry.base import Family, Geometry
@@ -65,7 +65,7 @@ def find_mask_offset(source: Family, views: Views, fitted: Fitted, config: FitCo
     """
     options, poses = config.corrections, fitted.geometry.poses
     inner = [_pixels_inside(view.mask, options.largest_px) for view in views.train]
-    depth = float(np.median([-mask_distance_px(view.mask.cpu().numpy()).min() for view in views.train]))
+    depth = float(np.median([-float(silhouette_distance_px(view.mask).min()) for view in views.train]))
 
     def disagreement(offset: float) -> float:
         if -offset > depth / 4:
@@ -91,8 +91,7 @@ def find_mask_offset(source: Family, views: Views, fitted: Fitted, config: FitCo
 
 def _pixels_inside(mask: Float[Tensor, "H W"], depth_px: float) -> Int[Tensor, "P"]:
     """Flat indices of the pixels that lie deeper inside a mask."""
-    distance = torch.from_numpy(mask_distance_px(mask.cpu().numpy())).to(mask.device)
-    return torch.nonzero(distance.flatten() < -depth_px)[:, 0]
+    return torch.nonzero(silhouette_distance_px(mask).flatten() < -depth_px)[:, 0]
 
 
 def _offset_is_earned(views: Views, before: Fitted, after: Fitted, config: FitConfig) -> bool:

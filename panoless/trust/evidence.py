@@ -15,11 +15,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from panoless.capture.contrast import Contrast, contrasted
+from panoless.capture.contrast import Contrast
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
 from panoless.capture.encoding import encoding_of
 from panoless.capture.masks import MASK_LEVEL
-from panoless.capture.silhouettes import mask_distance_px
+from panoless.capture.silhouettes import mask_distance_px, silhouette_distance_px
 from panoless.capture.views import TrainView, Views, at_most_pixels, split_held_out
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints, deblur_map, thinned
@@ -184,7 +184,7 @@ def _light(
     if explained.weight <= 0:
         return nothing
     every, sure = torch.cat(errors), torch.cat(confidence)
-    noise = float(np.median([_noise(view) for view in contrasted(views, config.contrast).train]))
+    noise = float(np.median([_noise(view) for view in contrast.applied(views).train]))
     return {
         "unexplained": explained.value,
         "one_color": plain["one_color"].value,
@@ -280,7 +280,7 @@ def _silhouette(view: TrainView, surface: SurfaceBuffers, options: TrustOptions)
     mask, alpha, shared = view.mask.cpu().numpy(), surface.alpha.cpu().numpy(), overlap(surface.alpha, view.mask)
     if min(mask.max(), alpha.max()) < MASK_LEVEL or max(mask.min(), alpha.min()) > MASK_LEVEL:
         return float(max(mask.shape)), float(max(mask.shape)), shared
-    of_mask, of_fit = mask_distance_px(mask), mask_distance_px(alpha)
+    of_mask, of_fit = silhouette_distance_px(view.mask).cpu().numpy(), mask_distance_px(alpha)
     rows, columns = np.gradient(of_fit)
     near = np.abs(of_fit) < 1
     near[[0, -1]], near[:, [0, -1]] = False, False

@@ -5,18 +5,17 @@ from pathlib import Path
 
 import tyro
 
+from shinypartial.cli.suite import Suite
 from shinypartial.stability.plan import Plans, Size
 
 
 @dataclass(frozen=True)
-class Stability:
+class Stability(Suite):
     """Fit methods on data that get worse step by step: axes × levels × scenes × seeds, run by Snakemake.
 
     Run again to continue where an earlier run stopped. Words after -- go to Snakemake, such as its --executor.
     """
 
-    snakemake: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Arguments of Snakemake, after --."""
     plan: Plans = "core"
     """The core axes; all axes; clean data alone, for the spread over many --seeds; or a tiny plan without rendering."""
     methods: tuple[str, ...] = ("fast",)
@@ -30,39 +29,22 @@ class Stability:
     seeds: tuple[int, ...] = (0, 1)
     """Seeds of what is drawn by chance, in the copies and in the methods."""
     size: tyro.conf.OmitArgPrefixes[Size] = Size()
-    cores: int = 2
-    """Jobs that run at once on this machine, each with one thread; rendering takes two cores."""
     output: Path = Path("stability")
     """Folder of datasets, predictions and logs."""
     page: Path | None = None
     """Page to write, such as docs/stability.md, with numbers and pictures beside it; OUTPUT/stability.md by default."""
-    retry: bool = False
-    """Run jobs again that failed."""
-    collect_only: bool = False
-    """Run nothing; write the page of what is there."""
 
     def run(self) -> None:
         """Run the plan, collect it and write the page."""
-        from shinypartial.core.errors import InputError
         from shinypartial.stability.collect import collect
         from shinypartial.stability.page import write_stability_page
         from shinypartial.stability.plan import make_plan, parse_methods
-        from shinypartial.workflow.suite import run_suite
 
         methods = parse_methods(self.methods, self.method)
         plan = make_plan(self.plan, methods, self.seeds, scenes=self.scenes, axes=self.axes, size=self.size)
-        print(f"{len(plan.cells)} cells, {len(plan.jobs)} jobs in {self.output}")
-        if not self.collect_only and not run_suite(self.output, plan, self.cores, self.snakemake, retry=self.retry):
+        results = self._collected(self.output, plan, collect)
+        if results is None:
             return
-        results = collect(self.output, plan)
-        if not results.outcomes:
-            raise InputError(
-                expected=f"a finished cell in {self.output}",
-                found="none",
-                remedy="Run the same command without --collect-only.",
-            )
         page = self.page or self.output / "stability.md"
         write_stability_page(page, self.output, results)
-        failed = sum(bool(each.failure) for each in results.outcomes)
-        print(f"{len(results.outcomes)} of {len(plan.cells)} cells have ended, {failed} of them failed")
         print(f"Page: {page}")

@@ -6,18 +6,17 @@ from typing import get_args
 
 import tyro
 
+from shinypartial.cli.suite import Suite
 from shinypartial.tables.plan import Size, TableName
 
 
 @dataclass(frozen=True)
-class Tables:
+class Tables(Suite):
     """Make the paper's tables with our figures beside its own: render, fit, score and write a page, run by Snakemake.
 
     Run again to continue where an earlier run stopped. Words after -- go to Snakemake, such as its --executor.
     """
 
-    snakemake: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Arguments of Snakemake, after --."""
     tables: tuple[TableName, ...] = get_args(TableName)
     """Which of them."""
     scenes: tuple[str, ...] = ()
@@ -30,41 +29,24 @@ class Tables:
     schedule: str = ""
     """Options of `panoless fit` for the paper's method and those that it compares with, which else take their whole
     schedules: --schedule="--config.iterations 3000 --config.surfels.count 3000". The page states them."""
-    cores: int = 2
-    """Jobs that run at once on this machine, each with one thread; rendering takes two cores."""
     output: Path = Path("tables")
     """Folder of datasets, predictions and logs."""
     page: Path | None = None
     """Page to write, such as docs/results/tables.md, with numbers beside it, which keep what an earlier run left there;
     OUTPUT/tables.md by default."""
-    retry: bool = False
-    """Run jobs again that failed."""
-    collect_only: bool = False
-    """Run nothing; write the page of what is there."""
 
     def run(self) -> None:
         """Run the plan, collect it and write the page."""
-        from shinypartial.core.errors import InputError
         from shinypartial.tables.collect import collect
         from shinypartial.tables.page import write_tables_page
         from shinypartial.tables.plan import make_plan
-        from shinypartial.workflow.suite import run_suite
 
         plan = make_plan(
             self.tables, self.seeds, self.size, scenes=self.scenes, methods=self.methods, schedule=self.schedule
         )
-        print(f"{len(plan.cells)} cells, {len(plan.jobs)} jobs in {self.output}")
-        if not self.collect_only and not run_suite(self.output, plan, self.cores, self.snakemake, retry=self.retry):
+        results = self._collected(self.output, plan, collect)
+        if results is None:
             return
-        results = collect(self.output, plan)
-        if not results.outcomes:
-            raise InputError(
-                expected=f"a finished cell in {self.output}",
-                found="none",
-                remedy="Run the same command without --collect-only.",
-            )
         page = self.page or self.output / "tables.md"
         write_tables_page(page, results)
-        failed = sum(bool(each.failure) for each in results.outcomes)
-        print(f"{len(results.outcomes)} of {len(plan.cells)} cells have ended, {failed} of them failed")
         print(f"Page: {page}")

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from shinypartial.core.errors import InputError
 from shinypartial.stability.axes import ANCHORS, AXES, BY_NAME, Axis
-from shinypartial.workflow.jobs import Job, read_jobs
+from shinypartial.workflow.jobs import Job, read_jobs, require_known
 
 FAST, DEFAULT, PAPER = (
     f"panoless fit {{dataset}} --preset {preset} --config.seed {{seed}} --output {{prediction}}"
@@ -80,10 +80,7 @@ class Plan:
 def conditions(plan: Plans, axes: Sequence[str] = ()) -> Iterator[tuple[str | None, float | None]]:
     """Axis and level of every cell of a scene: clean, the chosen axes, and the anchors."""
     yield None, None
-    for name in axes:
-        if name not in BY_NAME:
-            known = ", ".join(BY_NAME)
-            raise InputError(expected=f"axes: {known}", found=repr(name), remedy="Choose some of them.")
+    require_known("axes", axes, BY_NAME)
     if plan in ("clean", "tiny"):
         yield from (("rotation", 0.5), ("rotation", 2.0)) if plan == "tiny" else ()
         return
@@ -107,9 +104,7 @@ def make_plan(
 ) -> Plan:
     """Every cell and job. Raises InputError for scenes, axes or methods that can't be used."""
     splits = {TINY: "development"} if plan == "tiny" else SCENES
-    for scene in scenes:
-        if scene not in splits:
-            raise InputError(expected=f"scenes: {', '.join(splits)}", found=repr(scene), remedy="Choose some of them.")
+    require_known("scenes", scenes, splits)
     _check_methods(methods)
     cells: list[Cell] = []
     jobs: dict[str, Job] = {}

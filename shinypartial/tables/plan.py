@@ -5,11 +5,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from shinypartial.core.errors import InputError
 from shinypartial.metrics.registry import Direction, metric
 from shinypartial.tables import published
 from shinypartial.tables.published import DR, MATERIAL, NO_NORMAL, NO_SILHOUETTE, PAPER, REF, RHO, SHADER, SILHOUETTE
-from shinypartial.workflow.jobs import Job
+from shinypartial.workflow.jobs import Job, require_known
 
 TableName = Literal["main", "fairness", "ablation", "roughness", "self-reflection", "pose-jitter"]
 OURS, ORACLE = "ours", "oracle baseline"
@@ -253,8 +252,8 @@ def make_plan(
 
     Raises InputError for scenes and methods of no table.
     """
-    _check("scenes", scenes, {scene for table in TABLES.values() for scene in table.scenes})
-    _check("methods", methods, {method.slug for table in TABLES.values() for method in table.methods})
+    require_known("scenes", scenes, sorted({scene for table in TABLES.values() for scene in table.scenes}))
+    require_known("methods", methods, sorted({method.slug for table in TABLES.values() for method in table.methods}))
     cells: dict[str, Cell] = {}
     jobs: dict[str, Job] = {}
     for name in tables:
@@ -263,14 +262,6 @@ def make_plan(
                 cells[cell.name] = cell
                 jobs |= {job.name: job for job in _jobs(cell, size, schedule)}
     return TablePlan(size, schedule, tuple(cells.values()), tuple(jobs.values()))
-
-
-def _check(what: str, found: Sequence[str], known: set[str]) -> None:
-    for name in found:
-        if name not in known:
-            raise InputError(
-                expected=f"{what}: {', '.join(sorted(known))}", found=repr(name), remedy="Choose some of them."
-            )
 
 
 def _cells(table: Table, seeds: Sequence[int]) -> Iterator[Cell]:

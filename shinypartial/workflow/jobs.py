@@ -1,6 +1,6 @@
 """Jobs as data: commands and what has to end before each of them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -31,6 +31,13 @@ class Plan(Protocol):
     @property
     def facts(self) -> Mapping[str, Any]:
         """What tells what the jobs are for, as JSON has it."""
+
+
+def require_known(what: str, names: Sequence[str], known: Collection[str]) -> None:
+    """Raise InputError for a name that is none of the known ones."""
+    for name in names:
+        if name not in known:
+            raise InputError(expected=f"{what}: {', '.join(known)}", found=repr(name), remedy="Choose some of them.")
 
 
 def write_jobs(folder: Path, plan: Plan) -> None:

@@ -224,7 +224,7 @@ def take_round(
     if solution.poses is None:
         return found
     # The map follows with the next round, which starts it anew.
-    common, poses = solution.poses.without_common(task.cameras, solution.pose_prior)
+    common, poses = solution.poses.without_common(task.cameras, task.pose_prior)
     return replace(found, surface=solution.surface.taken_back(common), poses=poses, environment=None)
 
 

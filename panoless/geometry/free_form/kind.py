@@ -200,7 +200,7 @@ class FreeFormFamily(ExactFamily):
         """The first surface, trusted everywhere."""
         surface = proposal.shape.surface
         trust = full_trust(surface, config.free_form.trust_cells)
-        return FreeFormMirror(surface, trust, config.environment.trace, config.free_form)
+        return _mirror(surface, trust, None, config)
 
     def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
         """On from a fit, in rounds with that logarithm among the unknowns."""
@@ -209,7 +209,7 @@ class FreeFormFamily(ExactFamily):
         assert stage.focal is not None, "the focal length was unknown"
         factor = float(np.exp(-stage.focal))
         surface, trust = stage.surface.scaled(factor), stage.trust.scaled(factor)
-        return FreeFormMirror(surface, trust, config.environment.trace, options, poses=stage.poses), stage.focal
+        return _mirror(surface, trust, stage.poses, config), stage.focal
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """All coefficients by outlines and photographs together; by logarithms of radiance where this leaves what is
@@ -219,11 +219,11 @@ class FreeFormFamily(ExactFamily):
             found = _followed(views, proposal.fitted, config.free_form)
             return _mirror(found.surface, found.trust, found.poses, config)
         fitted, shown = _fitted(views, proposal.shape, config), contrasted(views, config.contrast)
-        if shown is views or _unexplained(shown, fitted, config) < config.contrast.explained:
+        if shown is views or (left := _unexplained(shown, fitted, config)) < config.contrast.explained:
             return fitted
         first = replace(first_surfaces(shown, config), surroundings=proposal.shape.surroundings)
-        tried = (fitted, _fitted(shown, first, config))
-        return min(tried, key=lambda each: _unexplained(shown, each, config))
+        again = _fitted(shown, first, config)
+        return again if _unexplained(shown, again, config) < left else fitted
 
 
 def _mirror(surface: LevelSet, trust: Trust, poses: Poses | None, config: FitConfig) -> FreeFormMirror:

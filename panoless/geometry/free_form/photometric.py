@@ -92,6 +92,12 @@ class Task:
     anchor: Float[np.ndarray, "A B C"] | None = None
     """Coefficients the change from which is to be smooth; None: the surface is."""
 
+    @cached_property
+    def pose_prior(self) -> Float[np.ndarray, "V 6 6"]:
+        """Weights of squared turns and shifts."""
+        options = self.options
+        return self.cameras.prior(math.radians(options.pose_turn_deg), options.pose_shift, options.pose_stated_floor)
+
     def seen_from(self, rays: PixelRays, poses: Poses | None, focal: float | None) -> PixelRays:
         """Rays where their cameras are, through the lens that they have."""
         rays = rays if focal is None else rays.zoomed(focal, self.cameras.rotations[rays.view, 2])
@@ -287,18 +293,10 @@ class Solution:
         photographs = scale**2 * float((before.weights * bounded_error(residual, scale)).sum()) / 2
         prior = float((self.bent * self._rough).sum()) / 2
         if self.poses is not None:
-            prior += float(np.einsum("vi,vij,vj", self.poses.stacked, self.pose_prior, self.poses.stacked)) / 2
+            prior += float(np.einsum("vi,vij,vj", self.poses.stacked, self.task.pose_prior, self.poses.stacked)) / 2
         if self.focal is not None:
             prior += (self.focal / self.task.options.focal_prior) ** 2 / 2
         return photographs + self.constraints.cost + prior
-
-    @property
-    def pose_prior(self) -> Float[np.ndarray, "V 6 6"]:
-        """Weights of squared turns and shifts."""
-        options = self.task.options
-        return self.task.cameras.prior(
-            math.radians(options.pose_turn_deg), options.pose_shift, options.pose_stated_floor
-        )
 
     @cached_property
     def _texel_total(self) -> Float[np.ndarray, "T"]:
@@ -324,8 +322,8 @@ class Solution:
 
     def _beside_poses(self, poses: Poses) -> Beside:
         count = len(poses.turns)
-        blocks = sum(rows.blocks(count) for rows in self.pose_rows) + self.pose_prior
-        return Beside(*self.pose_rows, poses.stacked, self.pose_prior, blocks)
+        blocks = sum(rows.blocks(count) for rows in self.pose_rows) + self.task.pose_prior
+        return Beside(*self.pose_rows, poses.stacked, self.task.pose_prior, blocks)
 
     def _beside_shared(self) -> Beside:
         """Coefficients of the surroundings, and then the logarithm of the focal length. The prior of the former only

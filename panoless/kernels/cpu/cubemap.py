@@ -61,7 +61,8 @@ class SampleCubemap(torch.autograd.Function):
         if ctx.needs_input_grad[1]:
             grad_directions = torch.empty_like(directions)
             _, padded, _, channels = texture.shape
-            each = (grad_values / _samples(directions)).repeat_interleave(_samples(directions), 0)
+            samples = _samples(directions)
+            each = grad_values if samples == 1 else (grad_values / samples).repeat_interleave(samples, 0)
             rays = _flat(directions), _flat(each), _flat(grad_directions)
             run_shared(_pull_to_directions, _flat(texture), padded - 2, *rays, (0,) * channels)
         return grad_cubemap, grad_directions
