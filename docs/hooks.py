@@ -20,16 +20,14 @@ ROOMS = re.compile(r"<!-- rooms of (?P<package>\w+) -->")
 ORDER = (
     *("api", "capture", "first_surface", "environment", "geometry", "alignment", "selection"),
     *("trust", "reconstruct", "export"),
-    *("core", "io", "scene", "blender", "generate", "film", "dataset", "release", "prediction", "oracle"),
+    *("core", "io", "scene", "blender", "generate", "dataset", "release", "prediction", "oracle"),
     *(
         "metrics",
         "evaluation",
         "comparison",
         "conversion",
         "report",
-        "workflow",
-        "stability",
-        "tables",
+        "suites",
         "numeric",
         "kernels",
         "config",

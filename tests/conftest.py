@@ -42,7 +42,7 @@ settings.register_profile("ci", deadline=None, max_examples=20, derandomize=True
 settings.load_profile("ci" if os.environ.get("CI") else "local")
 
 #: Folders and files whose few tests render or fit for long: with workers, who takes them last lets the others wait.
-FIRST = ("tests/integration/", "tests/shinypartial/test_generate.py")
+FIRST = ("tests/integration/", "tests/shinypartial/generate/test_dataset.py")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -97,7 +97,7 @@ class Generate:
     def run(self) -> None:
         """Make the dataset and say what to do next."""
         from shinypartial.dataset.read import DEFAULT_FOLDER
-        from shinypartial.generate import generate
+        from shinypartial.generate.dataset import generate
         from shinypartial.scene import find_scene, override, variant_name
 
         original = find_scene(self.scene, self.object)
@@ -136,7 +136,7 @@ class Film:
 
     def run(self) -> None:
         """Make the film, or all of them, and say how to capture it."""
-        from shinypartial.film.film import DEFAULT_FOLDER
+        from shinypartial.generate.film import DEFAULT_FOLDER
         from shinypartial.scene import film_names
 
         if self.scene:
@@ -148,7 +148,7 @@ class Film:
     def _film(self, name: str, output: Path | None) -> None:
         from dataclasses import replace
 
-        from shinypartial.film.film import DEFAULT_FOLDER, MASKS, TRUTH, VIDEO, film
+        from shinypartial.generate.film import DEFAULT_FOLDER, MASKS, TRUTH, VIDEO, film
         from shinypartial.scene import load_film, override
 
         spec = load_film(name)

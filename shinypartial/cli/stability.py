@@ -6,7 +6,7 @@ from pathlib import Path
 import tyro
 
 from shinypartial.cli.suite import Suite
-from shinypartial.stability.plan import Plans, Size
+from shinypartial.suites.stability.plan import Plans, Size
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class Stability(Suite):
 
     def run(self) -> None:
         """Run the plan, collect it and write the page."""
-        from shinypartial.stability.collect import collect
-        from shinypartial.stability.page import write_stability_page
-        from shinypartial.stability.plan import make_plan, parse_methods
+        from shinypartial.suites.stability.collect import collect
+        from shinypartial.suites.stability.page import write_stability_page
+        from shinypartial.suites.stability.plan import make_plan, parse_methods
 
         methods = parse_methods(self.methods, self.method)
         plan = make_plan(self.plan, methods, self.seeds, scenes=self.scenes, axes=self.axes, size=self.size)

@@ -27,7 +27,7 @@ class Suite:
         Raises InputError where none has ended.
         """
         from shinypartial.core.errors import InputError
-        from shinypartial.workflow.suite import run_suite
+        from shinypartial.suites.run import run_suite
 
         print(f"{len(plan.cells)} cells, {len(plan.jobs)} jobs in {output}")
         if not self.collect_only and not run_suite(output, plan, self.cores, self.snakemake, retry=self.retry):

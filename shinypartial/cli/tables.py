@@ -7,7 +7,7 @@ from typing import get_args
 import tyro
 
 from shinypartial.cli.suite import Suite
-from shinypartial.tables.plan import Size, TableName
+from shinypartial.suites.tables.plan import Size, TableName
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class Tables(Suite):
 
     def run(self) -> None:
         """Run the plan, collect it and write the page."""
-        from shinypartial.tables.collect import collect
-        from shinypartial.tables.page import write_tables_page
-        from shinypartial.tables.plan import make_plan
+        from shinypartial.suites.tables.collect import collect
+        from shinypartial.suites.tables.page import write_tables_page
+        from shinypartial.suites.tables.plan import make_plan
 
         plan = make_plan(
             self.tables, self.seeds, self.size, scenes=self.scenes, methods=self.methods, schedule=self.schedule

@@ -8,7 +8,7 @@ import pytest
 from panoless.photographs.make import Request, capture
 from panoless.photographs.options import CaptureOptions
 from shinypartial.dataset.same_world import align
-from shinypartial.film.film import MASKS, TRUTH, VIDEO, film
+from shinypartial.generate.film import MASKS, TRUTH, VIDEO, film
 from shinypartial.scene import load_film, override
 
 pytest.importorskip("bpy")

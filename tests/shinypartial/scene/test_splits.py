@@ -102,7 +102,7 @@ def test_a_recipe_without_split_learns_what_to_write() -> None:
 
 def test_a_dataset_tells_the_split_of_its_scene_and_an_older_one_continues(tmp_path: Path) -> None:
     pytest.importorskip("bpy")
-    from shinypartial.generate import generate
+    from shinypartial.generate.dataset import generate
 
     spec = tiny_scene(tmp_path / "recipe")
     root = generate(spec, tmp_path / "made").root

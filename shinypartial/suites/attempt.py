@@ -1,0 +1,113 @@
+"""One job of the suite: run its command, and record how it ended in place of stopping the suite.
+
+    python -m shinypartial.suites.attempt fit/vase.0.fast --threads 1 --folder stability
+
+The log is locked while the command or anything that it started lives. So after a kill the next attempt waits for what
+is still at work, and does not begin it a second time.
+"""
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from shinypartial.core.errors import EXIT_INTERRUPTED
+from shinypartial.io.files import read_json, write_json
+from shinypartial.suites.jobs import PLAN
+
+RECORDS, LOGS = Path("records"), Path("logs")
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+STOPPED = (signal.SIGINT, signal.SIGTERM)
+#: Codes of a command that was stopped from outside, which says nothing about it.
+STOP_CODES = tuple(code for number in STOPPED for code in (-number, 128 + number))
+REASON_CHARACTERS = 300
+
+
+@dataclass(frozen=True)
+class Record:
+    """How a command ended; `reason` is empty unless it failed, `code` None where it was not begun."""
+
+    command: str
+    code: int | None
+    seconds: float
+    reason: str = ""
+    cpu_seconds: float | None = None
+    """Processor time in the programs themselves, of all that the command waited for."""
+
+
+def read_record(folder: Path, job: str) -> Record | None:
+    """The record of a job, or None."""
+    path = folder / RECORDS / f"{job}.json"
+    return Record(**read_json(path, "the record of a job")) if path.exists() else None
+
+
+def attempt(job: str, threads: int, folder: Path = Path()) -> int:
+    """Run a job of the folder's plan unless its record is there; 0 unless it was stopped."""
+    import fcntl
+
+    planned = read_json(folder / PLAN, "the plan")["jobs"][job]
+    log = folder / LOGS / f"{job}.log"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("ab") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        earlier = read_record(folder, job)
+        if earlier is not None and earlier.command == planned["command"]:
+            return 0
+        befores = ((name, read_record(folder, name)) for name in planned["after"])
+        failed = next(((name, record) for name, record in befores if record and record.reason), None)
+        if failed is not None:
+            record = Record(planned["command"], None, 0.0, f"{failed[0]}: {failed[1].reason}"[:REASON_CHARACTERS])
+        else:
+            begun = stream.tell()
+            started, worked = time.monotonic(), _worked()
+            code = _run(planned["command"], threads, folder, stream.fileno())
+            if code in STOP_CODES:
+                return code if code > 0 else 128 - code
+            reason = _reason(log.read_bytes()[begun:].decode(errors="replace"), code) if code else ""
+            seconds = round(time.monotonic() - started, 3)
+            record = Record(planned["command"], code, seconds, reason, round(_worked() - worked, 3))
+        write_json(folder / RECORDS / f"{job}.json", asdict(record))
+    return 0
+
+
+def _worked() -> float:
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+
+
+def _run(command: str, threads: int, folder: Path, log: int) -> int:
+    """In a shell that finds the programs of this environment first, with capped threads."""
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
+    caps = {name: str(threads) for name in THREAD_VARIABLES}
+    environment = {**os.environ, **caps, "PATH": path, "OMP_WAIT_POLICY": "PASSIVE"}
+    return subprocess.run(command, shell=True, cwd=folder, env=environment, stdout=log, stderr=log).returncode
+
+
+def _reason(log: str, code: int) -> str:
+    """The last line that speaks of an error, else the last line, else the code."""
+    lines = [line.strip() for line in log.splitlines() if line.strip()]
+    errors = [line for line in lines if "error" in line.lower()]
+    return ([f"ended with code {code}", *lines[-1:], *errors[-1:]])[-1][:REASON_CHARACTERS]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Attempt the job that is named."""
+    parser = argparse.ArgumentParser(description="Run one job of a suite.")
+    parser.add_argument("job", help="KIND/NAME")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--folder", type=Path, default=Path(), help="of the suite; the working directory by default")
+    options = parser.parse_args(arguments)
+    try:
+        return attempt(options.job, options.threads, options.folder)
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

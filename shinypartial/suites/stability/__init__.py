@@ -1,0 +1,1 @@
+"""How far methods bear worse data: axes and their levels, the plan, and the page."""

@@ -1,0 +1,163 @@
+"""The page: curves, levels at which methods break, how well verdicts knew it, and the paper's figures beside ours."""
+
+import math
+import statistics
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from shinypartial.io.files import write_text
+from shinypartial.suites.stability.axes import BY_NAME, Axis
+from shinypartial.suites.stability.collect import (
+    LOST_DB,
+    LOST_FACTOR,
+    REFUSED,
+    Judged,
+    Results,
+    judged,
+    limits,
+    mean,
+    verdict_auroc,
+    write_results,
+)
+from shinypartial.suites.stability.figures import write_curves, write_pictures
+from shinypartial.suites.stability.plan import TINY
+
+RESULTS, ASSETS = Path("results/stability.json"), Path("assets")
+SPLITS = ("development", "held-out")
+VERDICTS = ("trust", "partly", "do not trust")
+#: Pose jitter on the paper's own Vase (its supplement): degrees, and PSNR of the environment map, from one seed.
+PAPER_JITTER = {0.0: 18.41, 0.5: 12.04, 1.0: 11.71}
+
+
+def write_stability_page(page: Path, suite: Path, results: Results) -> None:
+    """Write the page with its numbers and pictures beside it; the same results give the same files."""
+    write_results(page.parent / RESULTS, results)
+    assets = page.parent / ASSETS
+    for axis in results.axes:
+        write_curves(assets / f"stability-{axis.name}.svg", results, axis)
+    pictures = write_pictures(assets, suite, results, results.methods[0])
+    write_text(page, "\n".join(page_lines(results, pictures)) + "\n")
+
+
+def page_lines(results: Results, pictures: Sequence[tuple[str, str]]) -> Iterator[str]:
+    """The page as Markdown."""
+    size = results.size
+    seeds = len({each.cell.seed for each in results.outcomes})
+    yield from ("# Stability", "")
+    counts = (_count(len(results.scenes), "scene"), _count(len(results.methods), "method"), _count(seeds, "seed"))
+    yield f"{_count(len(results.outcomes), 'fit')} on data that get worse step by step: {', '.join(counts)}."
+    if TINY not in results.scenes:
+        yield f"Datasets have {size.train} training views of {size.resolution} × {size.resolution} pixels."
+    yield from ("", f"- Scenes: {', '.join(results.scenes)}", f"- Methods: {', '.join(results.methods)}")
+    yield f"- Numbers: [{RESULTS.name}]({RESULTS.as_posix()}), made with this page by `shinypartial stability --page`"
+    yield from ("", "Environment: PSNR of linear light over the directions that the true training views observe.")
+    yield "Normals: pooled over pixels of test views that see the environment."
+    if results.axes:
+        yield from ("", "## Where methods break", "", *_limit_table(results))
+        text = "Means over scenes; the band is the range over seeds. Failed fits are left out."
+        yield from ("", "## Curves", "", text)
+    for axis in results.axes:
+        yield from ("", f"![Curves: {axis.title}]({ASSETS.as_posix()}/stability-{axis.name}.svg)")
+    if seeds > 1:
+        yield from ("", "## Spread over seeds", "", *_spread_lines(results))
+    yield from ("", "## How well the verdicts knew", "", *_verdict_lines(results))
+    yield from ("", "## Pose jitter, beside the paper", "", *_jitter_lines(results))
+    if pictures:
+        yield from ("", "## What breaking looks like")
+        for name, caption in pictures:
+            yield from ("", f"![Environment maps: {caption}]({ASSETS.as_posix()}/{name})", "", f"{caption}.")
+    failed = [each for each in results.outcomes if each.failure]
+    if failed:
+        yield from ("", "## Failed fits", "", "| Fit | Last line |", "| --- | --- |")
+        yield from (f"| {each.cell.name} | {_escaped(each.failure)} |" for each in failed)
+
+
+def _limit_table(results: Results) -> Iterator[str]:
+    yield f"The level at which the environment has lost {LOST_DB:g} dB, and at which the mean error of the normals is"
+    yield f"{LOST_FACTOR:g} times that of the clean fit, linear between levels: median over scenes, and its range. A"
+    yield "level at which no seed gave a result counts as lost. A dash: not within the range of levels."
+    yield ""
+    headings = [f"{method}: {what}" for method in results.methods for what in ("environment", "normals")]
+    yield "| Axis | " + " | ".join(headings) + " |"
+    yield "| --- " * (1 + len(headings)) + "|"
+    for axis in results.axes:
+        found = [limits(results, axis, method) for method in results.methods]
+        cells = [_limit_text(axis, each) for one in found for each in (one.environment, one.normals)]
+        yield f"| {axis.title} | " + " | ".join(cells) + " |"
+
+
+def _limit_text(axis: Axis, positions: Sequence[float | None]) -> str:
+    if not positions:
+        return "not run"
+    ordered = sorted(math.inf if each is None else each for each in positions)
+    texts = ["–" if math.isinf(each) else axis.text(each) for each in (ordered[0], ordered[-1])]
+    middle = statistics.median_low(ordered)
+    median = "–" if math.isinf(middle) else axis.text(middle)
+    return median if texts[0] == texts[1] else f"{median} ({texts[0]} to {texts[1]})"
+
+
+def _spread_lines(results: Results) -> Iterator[str]:
+    yield "Standard deviation over seeds on clean data, of the environment and of the normals' mean error."
+    yield ""
+    yield "| Scene | Method | Seeds | Environment | Normals |\n| --- | --- | --- | --- | --- |"
+    for scene in results.scenes:
+        for method in results.methods:
+            clean = [each for each in results.outcomes if each.cell.axis is None and not each.failure]
+            fits = [each for each in clean if (each.cell.scene, each.cell.method) == (scene, method)]
+            decibels = [each.environment_db for each in fits if each.environment_db is not None]
+            degrees = [each.normals_mean_deg for each in fits if each.normals_mean_deg is not None]
+            texts = [
+                f"{statistics.stdev(values):.3f}{unit}" if len(values) > 1 else "–"
+                for values, unit in ((decibels, " dB"), (degrees, "°"))
+            ]
+            yield f"| {scene} | {method} | {len(fits)} | {' | '.join(texts)} |"
+
+
+def _verdict_lines(results: Results) -> Iterator[str]:
+    clean = [each for each in results.outcomes if each.cell.axis is None and each.verdict == REFUSED]
+    refused = dict.fromkeys(f"{each.cell.scene} with {each.cell.method}" for each in clean)
+    yield f"A fit is *lost* where its environment is {LOST_DB:g} dB or more worse than that of the clean fit of the"
+    yield "same scene, method and seed. AUROC: the chance that a lost fit states a higher risk than one that is"
+    yield "not lost. Fits that state no risk are left out, and those of a scene and method whose clean fit is"
+    yield f"refused by its own verdict: {', '.join(refused) or 'none'}."
+    yield ""
+    yield "| Scenes | Fits | Lost | AUROC of the risk |\n| --- | --- | --- | --- |"
+    groups = {split: list(judged(results, split)) for split in SPLITS}
+    for split, fits in groups.items():
+        area = verdict_auroc(fits)
+        text = "–" if area is None else f"{area:.3f}"
+        yield f"| {split} | {len(fits)} | {sum(each.lost for each in fits)} | {text} |"
+    yield ""
+    headings = [f"{split}: {word}" for split in SPLITS for word in ("kept", "lost")]
+    yield "| Verdict | " + " | ".join(headings) + " |"
+    yield "| --- " * (1 + len(headings)) + "|"
+    for verdict in VERDICTS:
+        counts = (_counted(groups[split], verdict, lost) for split in SPLITS for lost in (False, True))
+        yield f"| {verdict} | " + " | ".join(map(str, counts)) + " |"
+
+
+def _counted(fits: Sequence[Judged], verdict: str, lost: bool) -> int:
+    return sum(each.lost == lost and each.outcome.verdict == verdict for each in fits)
+
+
+def _jitter_lines(results: Results) -> Iterator[str]:
+    yield "PSNR of the whole map by the paper's protocol, each camera turned by a fixed angle. The paper's vase"
+    yield "is its own, so that falls compare and levels do not."
+    yield ""
+    scene = next((each for each in ("vase", "tiny-vase") if each in results.scenes), results.scenes[0])
+    axis = BY_NAME["rotation"]
+    columns = [results.along(axis, method, scene) for method in results.methods]
+    yield f"| Rotation | Paper | {' | '.join(f'{method} on {scene}' for method in results.methods)} |"
+    yield "| --- " * (2 + len(columns)) + "|"
+    for position in sorted({each for column in columns for each in column} | set(PAPER_JITTER)):
+        values = [mean(each.environment_paper_db for each in column.get(position, [])) for column in columns]
+        texts = ["–" if value is None else f"{value:.2f} dB" for value in (PAPER_JITTER.get(position), *values)]
+        yield f"| {position:g}° | " + " | ".join(texts) + " |"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _escaped(text: str) -> str:
+    return text.replace("|", "\\|").replace("<", "&lt;")

@@ -1,0 +1,1 @@
+"""The paper's tables with our figures beside its own: the published ones, the plan, and the page."""

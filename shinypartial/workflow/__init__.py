@@ -1,1 +1,0 @@
-"""Plans of commands that Snakemake runs, and that continue after any stop; imports io."""

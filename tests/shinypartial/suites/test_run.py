@@ -1,0 +1,121 @@
+"""The suite continues after a kill, outlives methods that fail, and hands arguments to Snakemake."""
+
+import importlib
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from shinypartial.core.errors import InputError
+from shinypartial.suites.attempt import attempt, read_record
+from shinypartial.suites.jobs import Job, write_jobs
+from shinypartial.suites.run import forget_failures, run_suite, snakemake_arguments
+from shinypartial.suites.stability.collect import collect
+from shinypartial.suites.stability.plan import Cell, Plan, Size, make_plan
+
+ROOT = Path(__file__).resolve().parents[3]
+CELL = Cell("tiny-vase", "development", "broken", None, None, 0)
+needs_snakemake = pytest.mark.skipif(importlib.util.find_spec("snakemake") is None, reason="Snakemake is not installed")
+
+
+def plan_of(*jobs: Job, cells: tuple[Cell, ...] = ()) -> Plan:
+    return Plan(Size(), cells, jobs)
+
+
+def start(folder: Path, *words: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "shinypartial.cli", "stability", "--plan", "tiny", "--output", str(folder), *words],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def test_a_failed_method_is_recorded_and_stops_nothing(tmp_path: Path) -> None:
+    fit = Job(f"fit/{CELL.name}", "echo begun; echo 'error: no light'; echo bye; exit 3")
+    plan = plan_of(fit, Job(f"score/{CELL.name}", "touch scored", (fit.name,)), cells=(CELL,))
+    write_jobs(tmp_path, plan)
+    assert [attempt(job.name, 1, tmp_path) for job in plan.jobs] == [0, 0]
+    record = read_record(tmp_path, fit.name)
+    assert record is not None
+    assert (record.code, record.reason) == (3, "error: no light")
+    assert not (tmp_path / "scored").exists()
+    (outcome,) = collect(tmp_path, plan).outcomes
+    assert outcome.failure == "error: no light"
+    assert outcome.environment_db is None
+    forget_failures(tmp_path, plan)
+    assert collect(tmp_path, plan).outcomes == ()
+
+
+def test_a_finished_job_is_not_run_again_and_threads_are_capped(tmp_path: Path) -> None:
+    write_jobs(tmp_path, plan_of(Job("fit/a", "echo $OMP_NUM_THREADS $NUMBA_NUM_THREADS >> threads")))
+    assert [attempt("fit/a", 1, tmp_path), attempt("fit/a", 1, tmp_path)] == [0, 0]
+    assert (tmp_path / "threads").read_text() == "1 1\n"
+
+
+def test_a_job_that_was_stopped_has_not_failed(tmp_path: Path) -> None:
+    write_jobs(tmp_path, plan_of(Job("fit/a", "kill -TERM $$")))
+    assert attempt("fit/a", 1, tmp_path) == 128 + signal.SIGTERM
+    assert read_record(tmp_path, "fit/a") is None
+
+
+def test_arguments_of_snakemake(tmp_path: Path) -> None:
+    assert snakemake_arguments(tmp_path, 2, [])[-4:] == ["--cores", "2", "--quiet", "all"]
+    words = snakemake_arguments(tmp_path, 2, ["--executor", "slurm", "--jobs", "50"])
+    assert "--cores" not in words
+    assert words[-4:] == ["--executor", "slurm", "--jobs", "50"]
+
+
+def test_without_snakemake_the_message_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "snakemake.cli", None)
+    with pytest.raises(InputError, match=r"pip install 'panoless\[stability\]'"):
+        run_suite(tmp_path, plan_of(), 1)
+
+
+@needs_snakemake
+def test_a_killed_suite_continues_and_does_nothing_twice(tmp_path: Path) -> None:
+    method = "echo {prediction} >> begun; sleep 1; echo {prediction} >> ended; exit 1 # {dataset}"
+    words = ["--methods", "--method", f"slow={method}", "--seeds", "0"]
+    killed = start(tmp_path, *words)
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "begun").exists():
+        assert killed.poll() is None, killed.communicate()[0]
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    killed.kill()
+    killed.wait()
+    assert killed.stdout is not None
+    killed.stdout.close()
+    assert not (tmp_path / "stability.md").exists()
+    again = start(tmp_path, *words)
+    output = again.communicate(timeout=120)[0]
+    assert again.returncode == 0, output
+    assert "3 of 3 cells have ended, 3 of them failed" in output
+    expected = sorted(f"predictions/{cell.name}" for cell in make_plan("tiny", {"slow": method}, [0]).cells)
+    for name in ("begun", "ended"):
+        assert sorted((tmp_path / name).read_text().split()) == expected
+
+
+@needs_snakemake
+@pytest.mark.parametrize("executor", ["slurm", "kubernetes"])
+def test_a_dry_run_on_a_cluster(tmp_path: Path, executor: str) -> None:
+    """Pods see no common folder by themselves: Snakemake's marks need a storage for them."""
+    words = ["--executor", executor, "--jobs", "4"]
+    needed = [f"snakemake_executor_plugin_{executor}"]
+    if executor == "kubernetes":
+        words += ["--default-storage-provider", "fs", "--default-storage-prefix", str(tmp_path)]
+        needed.append("snakemake_storage_plugin_fs")
+    missing = [name for name in needed if importlib.util.find_spec(name) is None]
+    if missing:
+        pytest.skip(f"not installed: {', '.join(missing)}")
+    dry = start(tmp_path, "--seeds", "0", "--", "--dry-run", *words)
+    output = dry.communicate(timeout=120)[0]
+    assert dry.returncode == 0, output
+    assert "rule fit" in output
+    assert not (tmp_path / "records").exists()
