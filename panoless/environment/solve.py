@@ -8,7 +8,7 @@ from torch import Tensor
 
 from panoless.environment.cubemap import resample
 from panoless.environment.fill import fill_unobserved
-from panoless.environment.rays import Rays, joined_rays
+from panoless.environment.rays import Rays, joined_rays, normalize_confidence
 from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap
 from panoless.numeric.conjugate_gradients import conjugate_gradients
 from panoless.numeric.robust import robust_weight
@@ -26,13 +26,13 @@ def solve_environment(
 ) -> Float[Tensor, "6 3 L L"]:
     """Robust least squares of the map for fixed geometry: min_E Σ t w ‖E(ω) − c‖², gaps filled smoothly.
 
-    Rounds of iteratively re-weighted least squares with the rays' trust t and Geman–McClure weights
-    w = 1/(1 + ‖e‖²/s²)², so that pixels which see the object itself or a wrong normal lose their vote. Each round
-    starts from the weighted splat Eᵀ(t w c)/Eᵀ(t w) and sharpens it by conjugate gradients on the normal equations.
-    From a `start`, a map of the same rays at any resolution, only the last scales are needed. The map lies between 0
-    and the brightest ray, or 1 where that is more.
+    Rounds of iteratively re-weighted least squares with the rays' trust t, in units of its mean, and Geman–McClure
+    weights w = 1/(1 + ‖e‖²/s²)², so that pixels which see the object itself or a wrong normal lose their vote. Each
+    round starts from the weighted splat Eᵀ(t w c)/Eᵀ(t w) and sharpens it by conjugate gradients on the normal
+    equations. From a `start`, a map of the same rays at any resolution, only the last scales are needed. The map lies
+    between 0 and the brightest ray, or 1 where that is more.
     """
-    rays = _merge(rays)
+    rays = _merge(normalize_confidence(rays))
     weights = [batch.initial_weight() for batch in rays]
     device = rays[0].directions.device if rays else None
     environment = torch.zeros(6, 3, resolution, resolution, device=device)
