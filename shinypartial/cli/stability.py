@@ -6,7 +6,8 @@ from pathlib import Path
 import tyro
 
 from shinypartial.cli.suite import Suite
-from shinypartial.suites.stability.plan import Plans, Size
+from shinypartial.suites.jobs import Size
+from shinypartial.suites.stability.plan import SIZE, Plans
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Stability(Suite):
     """Names of axes; those of the plan when not given."""
     seeds: tuple[int, ...] = (0, 1)
     """Seeds of what is drawn by chance, in the copies and in the methods."""
-    size: tyro.conf.OmitArgPrefixes[Size] = Size()
+    size: tyro.conf.OmitArgPrefixes[Size] = SIZE
     output: Path = Path("stability")
     """Folder of datasets, predictions and logs."""
     page: Path | None = None

@@ -7,7 +7,8 @@ from typing import get_args
 import tyro
 
 from shinypartial.cli.suite import Suite
-from shinypartial.suites.tables.plan import Size, TableName
+from shinypartial.suites.jobs import Size
+from shinypartial.suites.tables.plan import SIZE, TableName
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Tables(Suite):
     """Rows, such as ours, oracle-baseline and 3dgs-dr; all when not given."""
     seeds: tuple[int, ...] = (0,)
     """Seeds of the methods, and of what is drawn by chance in copies."""
-    size: tyro.conf.OmitArgPrefixes[Size] = Size()
+    size: tyro.conf.OmitArgPrefixes[Size] = SIZE
     schedule: str = ""
     """Options of `panoless fit` for the paper's method and those that it compares with, which else take their whole
     schedules: --schedule="--config.iterations 3000 --config.surfels.count 3000". The page states them."""

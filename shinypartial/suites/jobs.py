@@ -33,6 +33,23 @@ class Plan(Protocol):
         """What tells what the jobs are for, as JSON has it."""
 
 
+@dataclass(frozen=True)
+class Size:
+    """How large rendered datasets are."""
+
+    resolution: int
+    """Pixels per side."""
+    train: int
+    """Training views."""
+    test: int
+    """Test views."""
+
+    def rendering(self, scene: str) -> str:
+        """The command that renders a scene, but for where to."""
+        views = f"--train {self.train} --test {self.test}"
+        return f"shinypartial generate --scene {scene} --resolution {self.resolution} {views}"
+
+
 def require_known(what: str, names: Sequence[str], known: Collection[str]) -> None:
     """Raise InputError for a name that is none of the known ones."""
     for name in names:

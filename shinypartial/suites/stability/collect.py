@@ -12,8 +12,9 @@ from shinypartial.io.files import write_text
 from shinypartial.metrics.calibration import auroc
 from shinypartial.prediction.format import read_info
 from shinypartial.suites.attempt import read_record
+from shinypartial.suites.jobs import Size
 from shinypartial.suites.stability.axes import BY_NAME, Axis
-from shinypartial.suites.stability.plan import Cell, Plan, Size
+from shinypartial.suites.stability.plan import Cell, Plan
 
 FORMAT, FORMAT_VERSION = "shinypartial-stability", 1
 #: A fit is lost where its environment is this much worse than that of the clean fit, or its normals this many times.

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from shinypartial.core.errors import InputError
-from shinypartial.suites.jobs import Job, read_jobs, require_known
+from shinypartial.suites.jobs import Job, Size, read_jobs, require_known
 from shinypartial.suites.stability.axes import ANCHORS, AXES, BY_NAME, Axis
 
 FAST, DEFAULT, PAPER = (
@@ -26,19 +26,9 @@ SCENES = {
 #: The small plan takes what comes with the package, so that it needs no Blender.
 TINY = "tiny-vase"
 SIMPLE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+SIZE = Size(160, 50, 8)
+"""Of its datasets unless another is asked for."""
 Plans = Literal["core", "all", "clean", "tiny"]
-
-
-@dataclass(frozen=True)
-class Size:
-    """How large the rendered datasets are."""
-
-    resolution: int = 160
-    """Pixels per side."""
-    train: int = 50
-    """Training views."""
-    test: int = 8
-    """Test views."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +90,7 @@ def make_plan(
     *,
     scenes: Sequence[str] = (),
     axes: Sequence[str] = (),
-    size: Size = Size(),
+    size: Size = SIZE,
 ) -> Plan:
     """Every cell and job. Raises InputError for scenes, axes or methods that can't be used."""
     splits = {TINY: "development"} if plan == "tiny" else SCENES
@@ -148,9 +138,7 @@ def _check_methods(methods: dict[str, str]) -> None:
 
 def _dataset_jobs(scene: str, axis: Axis | None, level: float | None, seed: int, size: Size) -> list[Job]:
     """The jobs that make a dataset, its own last; the first one's name is that of the clean dataset."""
-    render = (
-        f"shinypartial generate --scene {scene} --resolution {size.resolution} --train {size.train} --test {size.test}"
-    )
+    render = size.rendering(scene)
     if scene == TINY:
         clean = Job(f"perturb/{scene}", f"shinypartial perturb {scene} --output datasets/{scene}")
     else:

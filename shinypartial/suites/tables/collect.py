@@ -10,7 +10,8 @@ from shinypartial.io.files import read_json, write_json
 from shinypartial.io.records import read_record as read_table
 from shinypartial.prediction.format import read_info
 from shinypartial.suites.attempt import read_record
-from shinypartial.suites.tables.plan import OF_COST, TABLES, Cell, Size, TablePlan
+from shinypartial.suites.jobs import Size
+from shinypartial.suites.tables.plan import OF_COST, TABLES, Cell, TablePlan
 
 FORMAT, FORMAT_VERSION = "shinypartial-tables", 1
 DIGITS = 6

@@ -17,7 +17,7 @@ from shinypartial.suites.stability.collect import (
     write_results,
 )
 from shinypartial.suites.stability.page import page_lines, write_stability_page
-from shinypartial.suites.stability.plan import Cell, Size
+from shinypartial.suites.stability.plan import SIZE, Cell
 
 ROTATION = BY_NAME["rotation"]
 
@@ -32,7 +32,7 @@ def outcome(level: float | None, decibels: float | None, risk: float | None = No
 
 #: Falls of 0, 1, 5 and 10 dB.
 VASE = [outcome(None, 20, 0.2), outcome(0.5, 19, 0.6), outcome(1.0, 15, 0.5), outcome(2.0, 10, 2.0)]
-RESULTS = Results(Size(), tuple(VASE))
+RESULTS = Results(SIZE, tuple(VASE))
 
 
 @pytest.mark.parametrize(
@@ -53,9 +53,9 @@ def test_limits_of_scenes() -> None:
     found = limits(RESULTS, ROTATION, "fast")
     assert found.environment == (0.75,)
     assert found.normals == (None,)
-    failed = limits(Results(Size(), (*VASE[:2], outcome(1.0, None))), ROTATION, "fast")
+    failed = limits(Results(SIZE, (*VASE[:2], outcome(1.0, None))), ROTATION, "fast")
     assert failed.environment == failed.normals == (1.0,)
-    assert limits(Results(Size(), tuple(VASE[1:])), ROTATION, "fast").environment == ()
+    assert limits(Results(SIZE, tuple(VASE[1:])), ROTATION, "fast").environment == ()
 
 
 def test_auroc_of_verdicts() -> None:
@@ -64,20 +64,20 @@ def test_auroc_of_verdicts() -> None:
     assert [each.lost for each in fits] == [False, False, True, True]
     assert verdict_auroc(fits) == 0.75
     assert verdict_auroc(list(judged(RESULTS, "held-out"))) is None
-    unknown = Results(Size(), (*VASE, outcome(0.1, None), outcome(0.25, 10)))
+    unknown = Results(SIZE, (*VASE, outcome(0.1, None), outcome(0.25, 10)))
     assert len(list(judged(unknown, "development"))) == 4
 
 
 def test_results_are_written_whole(tmp_path: Path) -> None:
     outcomes = (*VASE, outcome(0.1, None))
-    write_results(tmp_path / "results.json", Results(Size(), outcomes))
+    write_results(tmp_path / "results.json", Results(SIZE, outcomes))
     cells = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["cells"]
     found = [Outcome(Cell(**{key: each.pop(key) for key in Cell.__dataclass_fields__}), **each) for each in cells]
     assert tuple(found) == outcomes
 
 
 def test_the_page_is_the_same_for_the_same_results(tmp_path: Path) -> None:
-    results = Results(Size(), (*VASE, outcome(0.1, None), outcome(None, 21, 0.1, "mirror")))
+    results = Results(SIZE, (*VASE, outcome(0.1, None), outcome(None, 21, 0.1, "mirror")))
     for name in ("a", "b"):
         write_stability_page(tmp_path / name / "stability.md", tmp_path, results)
     files = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file())
@@ -94,5 +94,5 @@ def test_the_spread_over_seeds_is_stated() -> None:
     fits = [(None, 20.0), (None, 21.0), (None, 22.0), (0.5, 5.0), (None, None)]
     outcomes = [outcome(level, decibels) for level, decibels in fits]
     seeded = [replace(each, cell=replace(each.cell, seed=seed)) for seed, each in enumerate(outcomes)]
-    page = "\n".join(page_lines(Results(Size(), tuple(seeded)), []))
+    page = "\n".join(page_lines(Results(SIZE, tuple(seeded)), []))
     assert "| vase | fast | 3 | 1.000 dB |" in page

@@ -9,9 +9,10 @@ from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
 from shinypartial.evaluation.evaluate import evaluate
 from shinypartial.io.files import write_json
+from shinypartial.suites.jobs import Size
 from shinypartial.suites.tables.collect import Outcome, Results, collect, read_results
 from shinypartial.suites.tables.page import Line, marked, published_lines, write_tables_page
-from shinypartial.suites.tables.plan import ORACLE, OURS, TABLES, Column, Size, make_plan
+from shinypartial.suites.tables.plan import ORACLE, OURS, SIZE, TABLES, Column, make_plan
 from shinypartial.suites.tables.published import DR, MATERIAL, PAPER, REF, SHADER
 from tests.support.truth_prediction import write_truth_prediction
 
@@ -62,7 +63,7 @@ def test_the_page_has_published_and_measured_rows_and_keeps_earlier_ones(tmp_pat
     assert "| cola | PanoLess (paper) | 0 | no\\| |" in text
     assert len(read_results(page.with_suffix(".json")).outcomes) == 5
     with pytest.raises(InputError, match="Choose another --page"):
-        write_tables_page(page, replace(first, size=Size()))
+        write_tables_page(page, replace(first, size=SIZE))
 
 
 def test_figures_are_those_of_the_scores(tmp_path: Path, sphere_dataset: Dataset) -> None:

@@ -12,8 +12,9 @@ from panoless.presets import PRESETS
 from shinypartial.cli import Command
 from shinypartial.core.errors import InputError
 from shinypartial.metrics.registry import metric
+from shinypartial.suites.jobs import Size
 from shinypartial.suites.tables.page import averages, published_lines
-from shinypartial.suites.tables.plan import OF_COST, TABLES, Size, TableName, make_plan
+from shinypartial.suites.tables.plan import OF_COST, TABLES, TableName, make_plan
 from shinypartial.suites.tables.published import DR, MATERIAL, PAPER, REF, SHADER
 
 NAMES: tuple[TableName, ...] = get_args(TableName)
