@@ -269,8 +269,17 @@ class Solution:
 
     @cached_property
     def bent(self) -> Float[np.ndarray, "A B C"]:
-        """The gradient of half the prior."""
+        """The gradient of the prior."""
         return self.smoothing * third_differences(self._rough, self.active, whole=self._whole)
+
+    def prior(self, before: "Solution") -> float:
+        """λ/2 ∫ |D³φ|² over the unknowns of a solution `before`: coefficients that come near the surface by a step have
+        never been smoothed, and would count against it.
+        """
+        bent = self.bent
+        if before is not self:
+            bent = self.smoothing * third_differences(self._rough, before.active, whole=before._whole)
+        return float((bent * self._rough).sum()) / 2
 
     @cached_property
     def _whole(self) -> Int[np.ndarray, "A B C"]:
@@ -283,7 +292,7 @@ class Solution:
         return coefficients if anchor is None else coefficients - anchor
 
     def cost(self, before: "Solution") -> float:
-        """Half the sum of all robust squares, pixels weighed as in a solution `before`, and with its gain.
+        """Half the sum of all robust squares, pixels weighed as in a solution `before`, and with its gain and unknowns.
 
         A pixel that no longer sees the surroundings costs what it did before, so it is not lost for gain.
         """
@@ -291,7 +300,7 @@ class Solution:
         residual = self.residual * (before.gain / self.gain)[:, None]
         residual = np.where(self.sights.clear[:, None], residual, before.residual)
         photographs = scale**2 * float((before.weights * bounded_error(residual, scale)).sum()) / 2
-        prior = float((self.bent * self._rough).sum()) / 2
+        prior = self.prior(before)
         if self.poses is not None:
             prior += float(np.einsum("vi,vij,vj", self.poses.stacked, self.task.pose_prior, self.poses.stacked)) / 2
         if self.focal is not None:

@@ -177,6 +177,15 @@ def test_smoothness_of_an_anchored_round_is_asked_of_the_change_alone(solution: 
     assert anchored.cost(anchored) < solution.cost(solution) == free.cost(free)
 
 
+@pytest.mark.parametrize("cells", [-1.0, 1.0])
+def test_a_step_that_moves_all_of_the_surface_alike_costs_no_smoothness(solution: Solution, cells: float) -> None:
+    """Third differences of a constant are zero; coefficients that come near the surface have not been smoothed yet."""
+    moved = replace(solution, surface=replace(solution.surface, coefficients=solution.surface.coefficients + cells))
+    assert (moved.active & ~solution.active).any()
+    assert moved.prior(solution) == pytest.approx(solution.prior(solution), rel=1e-9)
+    assert moved.prior(moved) != pytest.approx(solution.prior(solution), rel=0.1)
+
+
 @pytest.mark.slow
 def test_a_start_that_descended_is_taken_where_pixels_agree_better() -> None:
     """Not a hull with waves but what the hull leads to; and the hull itself where no gain is enough."""
