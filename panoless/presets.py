@@ -158,9 +158,9 @@ PRESETS: dict[str, FitConfig] = {
         environment=EnvironmentConfig(resolution=64, rays=2_000_000),
         free_form=FreeFormOptions(
             rounds=(
-                FreeFormRound(20, 16, 0.30, 1, 20_000, 100.0, 4),
-                FreeFormRound(20, 32, 0.20, 1, 30_000, 100.0, 3),
-                FreeFormRound(28, 64, 0.15, 4, 40_000, 30.0, 3),
+                FreeFormRound(20, 16, 0.30, 1, 20_000, 100.0, 5),
+                FreeFormRound(20, 32, 0.20, 1, 30_000, 100.0, 4),
+                FreeFormRound(28, 64, 0.15, 4, 40_000, 30.0, 4),
             ),
             finer=(),
         ),

@@ -373,13 +373,15 @@ class Solution:
     def product(
         self, change: Float[np.ndarray, "A B C"], beside: Sequence[Float[np.ndarray, "_ _"]] = ()
     ) -> tuple[Float[np.ndarray, "A B C"], list[Float[np.ndarray, "_ _"]]]:
-        """The Gauss–Newton matrix times a change of active coefficients and of what is unknown beside them."""
+        """The Gauss–Newton matrix, bent as photographs are, times a change of active coefficients and of what is
+        unknown beside them.
+        """
         shape, count = self.surface.shape, len(self.silhouettes.weights)
         seen, constrained = self.photographs.forward(change), self.constraints.forward(change)
         for each, moved in zip(self.beside, beside, strict=True):
             seen += each.photographs.forward(moved)
             constrained[:count] += each.silhouettes.forward(moved)
-        seen = self.beyond_map(seen)
+        seen = self.task.options.photograph_curvature * self.beyond_map(seen)
         total = self.photographs.backward(seen, shape)
         total += self.constraints.backward(constrained, shape)
         total += self.smoothing * third_differences(change, self.active, whole=self._whole)
@@ -402,6 +404,7 @@ class Solution:
     def diagonal(self, smoothing_diagonal: float) -> Float[np.ndarray, "A B C"]:
         """The matrix's diagonal, but for what the map takes over; at least a millionth of its largest."""
         shape = self.surface.shape
-        total = self.photographs.squares(shape) + self.constraints.squares(shape)
+        total = self.task.options.photograph_curvature * self.photographs.squares(shape)
+        total += self.constraints.squares(shape)
         total += self.smoothing * smoothing_diagonal
         return np.maximum(total, 1e-6 * total[self.active].max(initial=1e-30))
