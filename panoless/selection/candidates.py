@@ -45,7 +45,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Selection:
-    """The kind that was chosen, and all candidates in the order in which they were examined."""
+    """The kind that was chosen, and all candidates in the order in which they were examined, the chosen one last."""
 
     chosen: str
     candidates: tuple[Candidate, ...]

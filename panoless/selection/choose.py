@@ -10,7 +10,7 @@ from typing import Any
 
 from panoless.alignment.align import pose_prior
 from panoless.alignment.search import PosedProposal, align_proposal, fit_at, fit_with_poses
-from panoless.capture.corrections import NO_CORRECTIONS, Corrections
+from panoless.capture.corrections import NO_CORRECTIONS
 from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.environment.surroundings import FAR, Surroundings
@@ -24,6 +24,8 @@ from panoless.selection.surroundings import explains_clearly_more, proposed_surr
 from shinypartial.core.errors import InputError
 
 ANY = "auto"
+UNEXPLAINED = "leaves too much unexplained"
+LEAST = "leaves much unexplained, and nothing explains more"
 BENT = "a bend explains more than near surroundings do"
 
 
@@ -31,8 +33,9 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
     """The geometry of the scene and the evidence for it; of surfels it is the start.
 
     Candidates are examined from the simplest on. One is refused when it misses the silhouettes, or when surfels that
-    start on it explain held-out views clearly better. Surfels explain what is left; of the candidates that explained
-    the silhouettes they start on the one from which they explained held-out views best. `config.model` overrides.
+    start on it explain held-out views clearly better. One that leaves too much unexplained waits until those after it
+    are refused, too. Surfels explain what is left; of the candidates that explained the silhouettes they start on the
+    one from which they explained held-out views best. `config.model` overrides.
     Raises InputError when a kind is asked for and can't be proposed, and when views along one line show no kind that
     these tell.
     """
@@ -42,7 +45,7 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
     if views.object_frame.depth_is_open:
         families = [family for family in families if not family.needs_depth]
     table, refused = list[Candidate](), dict[str, list[PosedProposal]]()
-    starts = list[tuple[float, Geometry, Corrections]]()
+    fitted = list[tuple[Candidate, Geometry]]()
     for family in families:
         source = _source(family)
         proposals = refused.get(source.kind, []) if family.refines else _proposals(source, views, config, asked=False)
@@ -55,15 +58,41 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
                     return geometry, Selection(family.kind, tuple(table))
                 table[-1] = replace(candidate, verdict=Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason=BENT)
                 continue
-            starts.append((candidate.surfels_error or 0.0, geometry, candidate.corrections))
+            fitted.append((candidate, geometry))
+    waiting = least_unexplained(fitted, config)
+    if waiting is not None:
+        candidate, geometry = waiting
+        others = (each for each in table if each.kind != candidate.kind)
+        return geometry, Selection(candidate.kind, (*others, replace(candidate, verdict=Verdict.CHOSEN, reason=LEAST)))
     if views.object_frame.depth_is_open:
         raise _along_one_line()
-    nothing: tuple[float, Geometry | None, Corrections] = (0.0, None, NO_CORRECTIONS)
-    _, start, corrections = min(reversed(starts), key=lambda each: each[0]) if starts else nothing
+    start, corrections = None, NO_CORRECTIONS
+    if fitted:
+        candidate, start = min(reversed(fitted), key=lambda each: each[0].surfels_error or 0.0)
+        corrections = candidate.corrections
     geometry = last.fit(corrections.applied(views, config), Proposal(start, 0.0, 1.0), config)
     reason = "no simpler kind explains the views"
     table.append(Candidate(last.kind, Verdict.CHOSEN, reason, corrections=corrections))
     return geometry, Selection(last.kind, tuple(table))
+
+
+def least_unexplained(
+    fitted: Sequence[tuple[Candidate, Geometry]], config: FitConfig
+) -> tuple[Candidate, Geometry] | None:
+    """Of what was refused only because it leaves too much unexplained, the simplest that nothing else explains clearly
+    more than, surfels included; None where they do.
+    """
+
+    def error(each: tuple[Candidate, Geometry]) -> float:
+        return each[0].held_out_error or 0.0
+
+    waiting = [each for each in fitted if each[0].reason == UNEXPLAINED and not is_refined(each[0].kind)]
+    if not waiting:
+        return None
+    enough = min(map(error, waiting)) / (1 - config.selection.least_gain)
+    surfels = min(candidate.surfels_error for candidate, _ in fitted if candidate.surfels_error is not None)
+    simplest = next(each for each in waiting if error(each) <= enough)
+    return None if surfels < (1 - config.selection.least_gain) * error(simplest) else simplest
 
 
 def _source(family: Family) -> Family:
@@ -237,14 +266,14 @@ def _examine(
     views = fitted.corrections.applied(views, config)
     asked_from = 0.0 if is_refined(family.kind) else options.explained_error
     own, free = held_out_errors(usable_views(views, geometry), config, geometry, trial, asked_from)
-    unexplained = is_refined(family.kind) and float(own.mean()) > options.largest_error
+    unexplained = float(own.mean()) > options.largest_error
     better = free is not None and is_clearly_lower(free, own, options)
     verdict = Verdict.REFUSED_BY_HELD_OUT_VIEWS if unexplained or better else Verdict.CHOSEN
     reason = "surfels are clearly better" if better else "surfels are no better"
     if free is None:
         reason = "leaves next to nothing unexplained"
     if unexplained and not better:
-        reason = "leaves too much unexplained"
+        reason = UNEXPLAINED
     errors = float(own.mean()), None if free is None else float(free.mean())
     cameras = _found_cameras(geometry, views, config)
     figures = (*evidence, *errors)

@@ -15,8 +15,8 @@ class SelectionOptions:
     least_overlap: Share = 0.98
     """Its silhouette and the masks share at least this part of their union: median over views."""
     largest_error: NonNegative = 0.3
-    """A candidate that another kind takes on (a plane) is refused if it leaves more of the held-out views unexplained,
-    even if surfels do no better. Right ones leave a twentieth."""
+    """A candidate that leaves more of the held-out views unexplained is refused even if surfels do no better, unless no
+    later kind explains more. Right ones leave a twentieth."""
     explained_error: Share = 0.03
     """A candidate that no other kind takes on, and that leaves less of the held-out views unexplained, is chosen
     without asking surfels. On sculpture and on other shapes of trial these leave 0.04 and more."""

@@ -16,8 +16,8 @@ from panoless.geometry.plane.model import Plane, unoccluded_share
 from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.reconstruct.fit import begin, fit
 from panoless.reconstruct.snapshots import SnapshotSchedule
-from panoless.selection.candidates import Selection, Verdict
-from panoless.selection.choose import choose_geometry
+from panoless.selection.candidates import Candidate, Selection, Verdict
+from panoless.selection.choose import UNEXPLAINED, choose_geometry, least_unexplained
 from panoless.selection.options import CorrectionOptions
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
@@ -151,11 +151,35 @@ def test_surfels_that_explain_as_much_do_not_beat_the_plane() -> None:
     assert f"held-out error {row.held_out_error:.4f}" in selection.sentence
 
 
-def test_a_plane_that_explains_nothing_goes_even_if_the_trial_does_no_better() -> None:
-    """A bent mirror in a flat boundary, and surfels that did not learn to bend: the plane goes, and heights come."""
-    geometry, selection = choose_geometry(framed(0.0, 0.3), CONFIG, as_started)
-    assert geometry.kind == "height_field"
+@pytest.mark.parametrize(("bend", "kind"), [(0.2, "height_field"), (0.3, "free_form")])
+def test_a_plane_that_explains_nothing_goes_even_if_the_trial_does_no_better(bend: float, kind: str) -> None:
+    """A bent mirror in a flat boundary, and surfels that did not learn to bend: the plane goes, and heights come; and
+    where so few of them leave too much as well, what explains more.
+    """
+    geometry, selection = choose_geometry(framed(0.0, bend), CONFIG, as_started)
+    assert geometry.kind == kind
+    errors = {each.kind: each.held_out_error for each in selection.candidates if each.held_out_error is not None}
+    assert min(errors, key=lambda each: errors[each]) == kind
     assert "plane: leaves too much unexplained" in selection.sentence
+
+
+def test_what_leaves_too_much_waits_for_kinds_that_explain_more() -> None:
+    """The simplest of those that explain most stays, unless surfels explain clearly more."""
+
+    def left(kind: str, error: float, surfels: float, reason: str = UNEXPLAINED) -> tuple[Candidate, Geometry]:
+        geometry = PlaneMirror(plane_of(RECTANGLE))
+        return Candidate(kind, Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason, None, None, error, surfels), geometry
+
+    def kept(*fitted: tuple[Candidate, Geometry]) -> str | None:
+        found = least_unexplained(fitted, CONFIG)
+        return None if found is None else found[0].kind
+
+    plane, bend = left("plane", 0.31, 0.5), left("height_field", 0.4, 0.5)
+    assert kept(plane, bend) == "height_field"
+    assert kept(plane, bend, left("free_form", 0.39, 0.5)) == "height_field"
+    assert kept(plane, bend, left("free_form", 0.32, 0.5)) == "free_form"
+    assert kept(plane, bend, left("free_form", 0.32, 0.2)) is None
+    assert kept(plane, left("free_form", 0.2, 0.1, "surfels are clearly better")) is None
 
 
 def test_surfels_that_cover_nothing_do_not_beat_the_plane() -> None:
