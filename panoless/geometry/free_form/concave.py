@@ -61,13 +61,15 @@ def concave_start(views: Views, surface: LevelSet, settled: LevelSet, options: C
     """
     pixels = solid_pixels(views, options.rays)
     settled = settled.resampled(options.cells)
-    if not any(
-        any(unexplained_patches(chart, settled, pixels, options)) for chart in charts(settled, pixels.rays, options)
-    ):
+
+    def unexplained(chart: Chart, surface: LevelSet) -> Iterator[Patch]:
+        return unexplained_patches(chart, surface, settled, pixels, options)
+
+    if not any(any(unexplained(chart, settled)) for chart in charts(settled, pixels.rays, options)):
         return None
     coarse, found = surface.resampled(options.cells), False
     for chart in charts(coarse, pixels.rays, options):
-        for patch in unexplained_patches(chart, coarse, pixels, options):
+        for patch in unexplained(chart, coarse):
             hollow = searched(patch, options)
             carved = coarse if hollow is None else patch.relief.carved(hollow)
             if hollow is not None and explains_better(carved, coarse, patch.scored, options):
@@ -119,8 +121,12 @@ def _far_apart(points: Float[np.ndarray, "P 3"], count: int) -> list[int]:
     return chosen
 
 
-def unexplained_patches(chart: Chart, surface: LevelSet, pixels: Pixels, options: ConcaveOptions) -> Iterator[Patch]:
-    """The part of a surface that faces a chart where pixels disagree on most of it; else each part where they do."""
+def unexplained_patches(
+    chart: Chart, surface: LevelSet, settled: LevelSet, pixels: Pixels, options: ConcaveOptions
+) -> Iterator[Patch]:
+    """The part of a surface that faces a chart where pixels disagree on most of it; else each part where they do. Where
+    they do nowhere, the whole again if they still disagree in the mean under a surface that is `settled`.
+    """
     relief = Relief(surface, chart, options)
     size, waves = outline_of(relief, options.lid_angle_deg)
     whole = patch_inside(relief, size, waves, pixels, options)
@@ -128,7 +134,8 @@ def unexplained_patches(chart: Chart, surface: LevelSet, pixels: Pixels, options
         return
     final = FinalRays.of(surface, whole.scored.rays, 0)
     parts = unexplained_parts(final.points, whole.scored.by_pixel(surface, options.resolutions[-1]), options)
-    if sum(map(len, parts)) > options.whole_share * len(final.points):
+    disagreed = not parts and whole.scored(settled, options.resolutions[-1]) > options.settled_disagreement
+    if disagreed or sum(map(len, parts)) > options.whole_share * len(final.points):
         yield whole
         return
     for part in parts:
@@ -226,7 +233,7 @@ def searched(patch: Patch, options: ConcaveOptions) -> Hollow | None:
 
     scales = first_steps(options)
     costs = np.array([cost(guess, first) for guess in guesses])
-    if costs.min() >= before:
+    if costs.min() >= options.farthest_guess * before:
         return ended(None)
     best, least = min(
         (

@@ -65,18 +65,25 @@ class ConcaveOptions:
     least_disagreement: float = 0.95
     """…and from which they count as unexplained, in what pixels of any direction have: convex parts of a visual hull
     have 0.7, beside a socket 0.83, and a lid 1.0."""
+    settled_disagreement: float = 0.35
+    """Mean disagreement of a patch, after the first rounds, from which it may be a lid though no part of it is
+    unexplained: under a bright sky, pixels of a shallow dish agree with most others. On the trial shape tray it is 0.43
+    under a lid; on flat faces of twist, brick and drum 0.2 to 0.4, on sculpture there is no such patch."""
     least_part: int = 60
     """Parts of fewer unexplained pixels are left alone. Not tuned."""
     whole_share: float = 0.6
     """A patch of which at least this share is unexplained is the lid of one hollow; else each part of it may be."""
     lid_angle_deg: float = 40.0
     """A patch is what lies within so much of its mean normal."""
-    insets: NonEmpty[float] = (1.0, 0.93, 0.86, 0.79)
-    """Sizes of the first guesses, in those of the patch."""
+    insets: NonEmpty[float] = (1.1, 1.0, 0.93, 0.86, 0.79)
+    """Sizes of the first guesses, in those of the patch. The lip of tray lies beyond the patch."""
     depths: NonEmpty[float] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.3)
     """Depths of the first guesses, in mean radii of the patch: right ones are told from wrong ones within a tenth."""
     exponents: NonEmpty[float] = (1.3, 1.7, 2.0, 2.5, 4.0)
     """Exponents p of their profiles ρᵖ + δᵖ = 1: from nearly a cone to nearly a box."""
+    farthest_guess: float = 1.2
+    """First guesses that disagree by more than so many times what the patch does are not followed: on tray, the best
+    one disagrees as much as the lid does, and what it leads to by half of that."""
     rounding_cells: float = 0.7
     """Width over which hollow and surface melt together at the rim."""
     rim_share: float = 0.08
