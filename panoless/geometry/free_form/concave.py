@@ -5,7 +5,7 @@ is the spread of colors among the rays that leave in the same direction, so no m
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -51,13 +51,16 @@ class Patch:
     size: float
     waves: Float[np.ndarray, "4"]
     scored: Scored
+    in_the_mean: bool = False
+    """Whether pixels disagree under it only in the mean, on no part of it by themselves."""
 
 
 def concave_start(views: Views, surface: LevelSet, settled: LevelSet, options: ConcaveOptions) -> LevelSet | None:
     """The surface with the hollows that make pixels agree better; None where there is none, or where the same surface
     explains all pixels once it is `settled` by steps.
 
-    Hollows are looked for under one patch after the other, each on the surface that those before it left.
+    Hollows are looked for under one patch after the other, each on the surface that those before it left. Where pixels
+    disagree under the settled surface only in the mean, hollows have to explain more than that one, too.
     """
     pixels = solid_pixels(views, options.rays)
     settled = settled.resampled(options.cells)
@@ -65,14 +68,17 @@ def concave_start(views: Views, surface: LevelSet, settled: LevelSet, options: C
     def unexplained(chart: Chart, surface: LevelSet) -> Iterator[Patch]:
         return unexplained_patches(chart, surface, settled, pixels, options)
 
-    if not any(any(unexplained(chart, settled)) for chart in charts(settled, pixels.rays, options)):
+    asked = [patch for chart in charts(settled, pixels.rays, options) for patch in unexplained(chart, settled)]
+    if not asked:
         return None
+    in_the_mean = all(patch.in_the_mean for patch in asked)
     coarse, found = surface.resampled(options.cells), False
     for chart in charts(coarse, pixels.rays, options):
         for patch in unexplained(chart, coarse):
             hollow = searched(patch, options)
             carved = coarse if hollow is None else patch.relief.carved(hollow)
-            if hollow is not None and explains_better(carved, coarse, patch.scored, options):
+            rivals = [settled, coarse] if in_the_mean else [coarse]
+            if hollow is not None and all(explains_better(carved, each, patch.scored, options) for each in rivals):
                 coarse, found = carved, True
     return coarse if found else None
 
@@ -136,7 +142,7 @@ def unexplained_patches(
     parts = unexplained_parts(final.points, whole.scored.by_pixel(surface, options.resolutions[-1]), options)
     disagreed = not parts and whole.scored(settled, options.resolutions[-1]) > options.settled_disagreement
     if disagreed or sum(map(len, parts)) > options.whole_share * len(final.points):
-        yield whole
+        yield replace(whole, in_the_mean=disagreed)
         return
     for part in parts:
         about, ratio = chart_about(final.points[part], final.normals[part])

@@ -186,7 +186,8 @@ class FreeFormOptions:
     """The photographs weigh as much as so many pixels, however many take part."""
     photograph_curvature: Positive = 0.5
     """Factor of the photographs' part of the Gauss–Newton matrix. Along steps on the trial shape twist, their cost has
-    0.6 times the curvature that the matrix says where the map stays, and less where it follows. 0.3 is no better."""
+    0.6 times the curvature that the matrix says where the map stays, and less where it follows. 0.3 is no better.
+    It is 1 where cameras or surroundings are unknown, too: there it was not measured."""
     radiance_sigma: float = 0.02
     """Standard deviation of a pixel of mean brightness (linear radiance)."""
     outline_sigma_px: float = 0.15

@@ -329,6 +329,11 @@ class Solution:
         of_all = () if self.focal is None and self.surface.surroundings.is_far else (self._beside_shared(),)
         return of_poses + of_all
 
+    @property
+    def _curvature(self) -> float:
+        """Factor of the photographs' part of the matrix: one where cameras or surroundings are unknown, too."""
+        return 1.0 if self.beside else self.task.options.photograph_curvature
+
     def _beside_poses(self, poses: Poses) -> Beside:
         count = len(poses.turns)
         blocks = sum(rows.blocks(count) for rows in self.pose_rows) + self.task.pose_prior
@@ -381,7 +386,7 @@ class Solution:
         for each, moved in zip(self.beside, beside, strict=True):
             seen += each.photographs.forward(moved)
             constrained[:count] += each.silhouettes.forward(moved)
-        seen = self.task.options.photograph_curvature * self.beyond_map(seen)
+        seen = self._curvature * self.beyond_map(seen)
         total = self.photographs.backward(seen, shape)
         total += self.constraints.backward(constrained, shape)
         total += self.smoothing * third_differences(change, self.active, whole=self._whole)
@@ -404,7 +409,7 @@ class Solution:
     def diagonal(self, smoothing_diagonal: float) -> Float[np.ndarray, "A B C"]:
         """The matrix's diagonal, but for what the map takes over; at least a millionth of its largest."""
         shape = self.surface.shape
-        total = self.task.options.photograph_curvature * self.photographs.squares(shape)
+        total = self._curvature * self.photographs.squares(shape)
         total += self.constraints.squares(shape)
         total += self.smoothing * smoothing_diagonal
         return np.maximum(total, 1e-6 * total[self.active].max(initial=1e-30))

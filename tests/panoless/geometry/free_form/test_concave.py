@@ -7,7 +7,7 @@ import pytest
 
 from panoless.capture.views import Views
 from panoless.config import FitConfig
-from panoless.geometry.free_form.concave import concave_start, unexplained_parts
+from panoless.geometry.free_form.concave import concave_start, unexplained_parts, unexplained_patches
 from panoless.geometry.free_form.fit import fit_free_form
 from panoless.geometry.free_form.hollows import Chart, Hollow, Relief, smooth_maximum
 from panoless.geometry.free_form.kind import FreeFormFamily
@@ -196,6 +196,20 @@ def test_what_steps_explain_is_not_searched(dish: tuple[Body, Views]) -> None:
     body, views = dish
     lidded = Body(lambda x: np.maximum(ellipsoid(OUTER).value(x), x[:, 0] - RIM))
     assert concave_start(views, level_set_of(lidded, views), level_set_of(body, views), OPTIONS) is None
+
+
+def test_a_patch_that_settled_steps_leave_unexplained_is_searched_as_a_whole(dish: tuple[Body, Views]) -> None:
+    """Though no part of it is unexplained by itself; not where steps explain it."""
+    body, views = dish
+    lid = level_set_of(Body(lambda x: np.maximum(ellipsoid(OUTER).value(x), x[:, 0] - RIM)), views)
+    lenient = replace(OPTIONS, least_disagreement=10.0, settled_disagreement=0.7)
+    pixels, chart = solid_pixels(views, lenient.rays), Chart.about(np.array([0.5, 0.0, 0.0]), np.eye(3)[0], 0.5)
+    under_lid, under_body = (
+        list(unexplained_patches(chart, lid, settled, pixels, lenient))
+        for settled in (lid, level_set_of(body, views, 60))
+    )
+    assert len(under_lid) == 1
+    assert not under_body
 
 
 def test_photographs_of_one_color_tell_no_hollow(dish: tuple[Body, Views]) -> None:
