@@ -104,6 +104,11 @@ EIGHT = [
     [round(f, 3) for f in (0.85 * math.sin(t), 0.3 * math.cos(t), 0.62 * math.sin(2 * t))]
     for t in (2 * math.pi * k / 24 for k in range(24))
 ]
+BALL = """shape = { kind = "superquadric", size = [1.0, 0.95, 1.05], exponents = [2.0, 2.0] }
+offset = [0.1, 0.05, 0.62]"""
+BACK = """shape = { kind = "superquadric", size = [1.3, 0.42, 1.3], exponents = [4.0, 4.0] }
+turn_deg = [-8.0, 0.0, 20.0]
+offset = [-0.14, 0.4, 0.55]"""
 TRIALS = {
     "brick": Trial(
         'kind = "superquadric", size = [1.3, 0.7, 1.0], exponents = [6.0, 5.0]',
@@ -220,6 +225,50 @@ TRIALS = {
         50.0,
         (-15.0, 50.0),
         ground=0.3,
+    ),
+    "tray": Trial(
+        'kind = "surface_of_revolution", profile = [[0.0, -0.3], [0.45, -0.28], [0.85, -0.1], [1.02, 0.14], \
+[0.98, 0.24], [0.86, 0.18], [0.7, 0.04], [0.4, -0.06], [0.0, -0.09]]',
+        (60.0, 0.0, 35.0),
+        "city",
+        "plus",
+        3.7,
+        -70.0,
+        45.0,
+        (-15.0, 50.0),
+        (1.05, 0.75, 1.0),
+    ),
+    "crown": Trial(
+        'kind = "ring", radius = 0.78, thickness = 0.26, waves = 5, bend = 0.1, swell = 0.12, phase_deg = 60.0',
+        (55.0, -15.0, 0.0),
+        "forest",
+        "plus",
+        3.7,
+        -80.0,
+        50.0,
+        (-15.0, 50.0),
+    ),
+    "pawn": Trial(
+        'kind = "superquadric", size = [1.6, 1.3, 0.4], exponents = [3.0, 3.0]',
+        (5.0, -5.0, 25.0),
+        "sunrise",
+        "plus",
+        3.7,
+        -50.0,
+        50.0,
+        (-10.0, 55.0),
+        more=(BALL,),
+    ),
+    "chair": Trial(
+        'kind = "superquadric", size = [1.3, 1.2, 0.42], exponents = [4.0, 4.0]',
+        (0.0, 0.0, 20.0),
+        "interior",
+        "plus",
+        3.8,
+        -70.0,
+        50.0,
+        (-10.0, 50.0),
+        more=(BACK,),
     ),
 }
 
