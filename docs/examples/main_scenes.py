@@ -52,17 +52,27 @@ def make(scene: str, resolution: int) -> None:
 
 
 def make_folders(
-    dataset: Path, prediction: Path, oracle: Path, scene: Sequence[object], settings: Sequence[object] = ()
+    dataset: Path,
+    prediction: Path,
+    oracle: Path,
+    scene: Sequence[object],
+    settings: Sequence[object] = (),
+    worse: tuple[Path, Sequence[object]] | None = None,
 ) -> None:
-    """The same of any scene, by arguments of `shinypartial generate`, and of `panoless fit`."""
+    """The same of any scene, by arguments of `shinypartial generate` and of `panoless fit`; by photographs of a worse
+    copy, where its folder and arguments of `shinypartial perturb` are given.
+    """
     if not (dataset / CHECKSUMS).exists():
         run("shinypartial", "generate", *scene, "--output", dataset)
     if not is_scored(oracle):
         run("shinypartial", "oracle", dataset, "--output", oracle)
+    photographs, options = (dataset, ()) if worse is None else worse
+    if not (photographs / CHECKSUMS).exists():
+        run("shinypartial", "perturb", dataset, *options, "--link", "--output", photographs)
     if not (prediction / DESCRIPTION).exists():
-        run("panoless", "fit", dataset, *settings, "--output", prediction)
+        run("panoless", "fit", photographs, *settings, "--output", prediction)
     if not is_scored(prediction):
-        run("shinypartial", "evaluate", prediction, "--oracle", oracle)
+        run("shinypartial", "evaluate", prediction, "--dataset", dataset, "--oracle", oracle)
 
 
 def is_scored(folder: Path) -> bool:

@@ -2,10 +2,12 @@
 
     python docs/examples/other_shapes.py                      # every shape: about an hour on one core
     python docs/examples/other_shapes.py --shapes brick torus --set free_form.descent.rounds='[]'
+    python docs/examples/other_shapes.py --shapes torus --worse rotation=0.5 room=10
 
-Each shape is rendered, fitted with the preset `fast` and scored by commands in processes of their own. Finished ones
-are skipped, so the same line continues. Figures, but no times, go to docs/results/other-shapes.json, unless the fit has
-other options.
+Each shape is rendered, fitted with the preset `fast` and scored by commands in processes of their own. With --worse,
+all named axes of `shinypartial stability` make its photographs worse; the truth is that of the clean dataset, or of
+the one that is rendered so. Finished ones are skipped, so the same line continues. Figures, but no times, go to
+docs/results/other-shapes.json, unless the fit has other options; keys are such as torus.rotation-0.5.
 """
 
 import argparse
@@ -20,6 +22,8 @@ from main_scenes import figures, make_folders
 from shinypartial.blender.runtime import studio_light
 from shinypartial.io.files import write_json, write_text
 from shinypartial.io.images import read_exr_rgb, write_exr_rgb
+from shinypartial.prediction.format import read_info
+from shinypartial.stability.axes import BY_NAME, Axis
 
 FOLDER = Path("build/other-shapes")
 NUMBERS = Path("docs/results/other-shapes.json")
@@ -273,17 +277,46 @@ TRIALS = {
 }
 
 
-def make(name: str, options: Sequence[str]) -> Path:
+Level = tuple[Axis, float]
+
+
+def level(text: str) -> Level:
+    """An axis and its level of AXIS=LEVEL."""
+    name, _, value = text.partition("=")
+    axis = BY_NAME.get(name)
+    if axis is None or axis.own_truth:
+        known = ", ".join(name for name, axis in BY_NAME.items() if not axis.own_truth)
+        raise argparse.ArgumentTypeError(f"expected AXIS=LEVEL with one of {known}, found {text!r}")
+    return axis, float(value)
+
+
+def named(name: str, worse: Sequence[Level]) -> str:
+    """A shape and what is worse, in a word."""
+    return ".".join([name, *(f"{axis.name}-{at:g}" for axis, at in worse)])
+
+
+def make(name: str, options: Sequence[str], worse: Sequence[Level]) -> Path:
     """Render, fit and score a shape, as far as that is not done; the prediction's folder."""
-    scene, dataset = FOLDER / "scenes" / name / "scene.toml", FOLDER / "datasets" / name
-    fitted = FOLDER / "predictions" / "-".join([name, *options]).replace("/", "_")
-    oracle = FOLDER / "predictions" / f"{name}-oracle"
+    scene = FOLDER / "scenes" / name / "scene.toml"
     scene.parent.mkdir(parents=True, exist_ok=True)
     TRIALS[name].write(scene, name)
-    generated = ("--scene", scene, "--resolution", 160, "--train", 50, "--test", 6)
-    settings = [word for option in options for word in ("--set", option)]
-    make_folders(dataset, fitted, oracle, generated, ("--preset", "fast", *settings))
+    rendered = [each for each in worse if each[0].rendered]
+    truth, photographs = named(name, rendered), FOLDER / "datasets" / named(name, worse)
+    fitted = FOLDER / "predictions" / "-".join([photographs.name, *options]).replace("/", "_")
+    make_folders(
+        FOLDER / "datasets" / truth,
+        fitted,
+        FOLDER / "predictions" / f"{truth}-oracle",
+        ("--scene", scene, "--resolution", 160, "--train", 50, "--test", 6, *words(rendered)),
+        ("--preset", "fast", *(word for option in options for word in ("--set", option))),
+        (photographs, words([each for each in worse if not each[0].rendered])),
+    )
     return fitted
+
+
+def words(worse: Sequence[Level]) -> list[str]:
+    """As options of `shinypartial generate` or `perturb`."""
+    return [word for axis, at in worse for word in axis.arguments(at)]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -291,10 +324,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shapes", nargs="*", choices=TRIALS, default=list(TRIALS))
     parser.add_argument("--set", action="append", default=[], help="SECTION.OPTION=VALUE of `panoless fit`")
+    parser.add_argument("--worse", nargs="*", type=level, default=[], metavar="AXIS=LEVEL", help="of the photographs")
     options = parser.parse_args(arguments)
     for name in options.shapes:
-        found = figures(make(name, options.set)) or {}
+        folder = make(name, options.set, options.worse)
+        found, verdict = figures(folder) or {}, read_info(folder).verdict
         found = {key: value for key, value in found.items() if not key.startswith("seconds")}
+        found["verdict"] = verdict and str(verdict.verdict)
+        name = named(name, options.worse)
         print(json.dumps({name: found}, indent=1))
         if not options.set:
             numbers = json.loads(NUMBERS.read_text(encoding="utf-8")) if NUMBERS.exists() else {}
