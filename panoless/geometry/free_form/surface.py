@@ -195,8 +195,11 @@ def level_set_of(surface: TriangleMesh, cells: int, margin: float) -> LevelSet:
     The box is wider by the `margin` at each side, as a share of that one.
 
     Near the mesh it is the mean distance from the tangent planes of the six nearest vertices, weighted by exp(−d/a), a
-    their usual spacing; from two to four of these on the distance from the nearest vertex takes over.
+    their usual spacing; from two to four of these on the distance from the nearest vertex takes over. The sign of that
+    is wrong over a wide region where the nearest vertex lies in a fold, so what can be reached from the border of the
+    box without coming near to the mesh is outside.
     """
+    from scipy.ndimage import label
     from scipy.spatial import cKDTree
 
     vertices, normals = surface.vertices, surface.vertex_normals()
@@ -210,6 +213,11 @@ def level_set_of(surface: TriangleMesh, cells: int, margin: float) -> LevelSet:
     distance, index = tree.query(points)
     usual = float(np.median(tree.query(vertices[:: max(len(vertices) // 1000, 1)], k=2)[0][:, 1]))
     values = np.copysign(distance, ((points - vertices[index]) * normals[index]).sum(1))
+    parts = label((distance > max(spacing, 2 * usual)).reshape(empty.shape))[0]
+    inner = np.zeros(empty.shape, dtype=bool)
+    inner[1:-1, 1:-1, 1:-1] = True
+    reached = np.isin(parts, np.setdiff1d(parts[~inner], 0)).ravel()
+    values[reached] = distance[reached]
     near = distance < 4 * usual
     distance, index = tree.query(points[near], k=NEAREST)
     planes = ((points[near, None] - vertices[index]) * normals[index]).sum(2)
