@@ -248,11 +248,12 @@ def take_steps(
         if not still:
             solution = replace(solution, trust=measured_trust(solution))
         before = solution
-        solution, length = _accepted(solution, gauss_newton_step(solution, damping, still=still))
-        factor = options.damping_less if length == 1 else options.damping_more
+        solution, shortened = _accepted(solution, gauss_newton_step(solution, damping, still=still))
+        stiffest = damping >= options.damping_range[1]
+        factor = options.damping_more**shortened if shortened else options.damping_less
         damping = float(np.clip(damping * factor, *options.damping_range))
         gain = 1 - solution.cost(before) / before.cost(before)
-        last = gain < options.least_gain
+        last = gain < options.least_gain and (shortened < options.trials or stiffest)
         if progress is not None:
             progress.advance(steps=settings.steps - index if last else 1)
         if last:
@@ -260,17 +261,17 @@ def take_steps(
     return solution, damping
 
 
-def _accepted(solution: Solution, step: Change) -> tuple[Solution, float]:
-    """The solution after the longest of the tried lengths of a step that lowers the cost, and that length; the same
-    solution after none.
+def _accepted(solution: Solution, step: Change) -> tuple[Solution, int]:
+    """The solution after the longest of the tried lengths of a step that lowers the cost, and how many times it was
+    shortened; the same solution after none, and the number of trials.
     """
-    options, length, before = solution.task.options, 1.0, solution.cost(solution)
-    for _ in range(options.trials):
+    options, before = solution.task.options, solution.cost(solution)
+    for shortened in range(options.trials):
+        length = options.shortening**shortened
         moved = solution.after(length * step.coefficients, [length * each for each in step.beside])
         if moved.cost(solution) < before:
-            return moved, length
-        length *= options.shortening
-    return solution, 0.0
+            return moved, shortened
+    return solution, options.trials
 
 
 def gauss_newton_step(solution: Solution, damping: float, *, still: bool = False) -> Change:

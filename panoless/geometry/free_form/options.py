@@ -259,7 +259,7 @@ class FreeFormOptions:
     damping_less: float = 0.3
     """Factor of μ after a whole step."""
     damping_more: float = 4.0
-    """Factor of μ after a shortened one."""
+    """Factor of μ for each time that one was shortened."""
     damping_range: tuple[float, float] = (1e-5, 1.0)
     """Bounds of μ."""
     shortening: float = 0.35

@@ -12,7 +12,8 @@ from panoless.capture.poses import Poses, StatedCameras
 from panoless.capture.views import Views, views_of
 from panoless.config import FitConfig, SurfelConfig
 from panoless.environment.surroundings import Surroundings
-from panoless.geometry.free_form.fit import fit_free_form, gauss_newton_step, make_task
+from panoless.geometry.free_form import fit
+from panoless.geometry.free_form.fit import Change, fit_free_form, gauss_newton_step, make_task
 from panoless.geometry.free_form.kind import FreeFormFamily, FreeFormMirror
 from panoless.geometry.free_form.options import DEFAULTS, ConcaveOptions, DescentOptions, FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.photometric import Sights, Solution
@@ -299,6 +300,23 @@ def test_the_matrix_with_all_unknowns_is_symmetric(solution: Solution) -> None:
 
     assert dot(one, other) == pytest.approx(dot(other, one), rel=1e-6)
     assert dot(one, one) > 0
+
+
+def test_a_refused_step_is_tried_again_with_more_damping(solution: Solution, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever is refused below a damping of 0.06, a round goes on until that is reached, and then moves."""
+    tried: list[float] = []
+
+    def step(solution: Solution, damping: float, **_: bool) -> Change:
+        tried.append(damping)
+        found = gauss_newton_step(solution, damping)
+        return found if damping > 0.06 else replace(found, coefficients=-100 * found.coefficients)
+
+    monkeypatch.setattr(fit, "gauss_newton_step", step)
+    settings = replace(solution.task.settings, steps=3)
+    moved, _ = fit.take_steps(replace(solution, task=replace(solution.task, settings=settings)), 1e-3)
+    assert tried[0] == 1e-3
+    assert tried[1] > 0.06
+    assert moved.cost(solution) < solution.cost(solution)
 
 
 @pytest.mark.slow
