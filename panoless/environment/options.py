@@ -79,6 +79,9 @@ class SurroundingsOptions:
     least_pull: float = 0.0003
     """Share of the cost that this step has to promise. It is 0.024 and 0.017 in rooms of vase at 5 and 10 radii, 0.063
     and 0.028 in those of sculpture, 0.0005 in one of mirror at 20 radii, and up to 0.0001 in their far worlds."""
+    first_inverse_distance: Positive = 0.1
+    """1/D, in inverse radii of the object, in which a fit is tried first that a far world leaves pulled like that. The
+    fit of a brick in a room at 5 radii, no scene of the benchmark, is pulled by 0.002; in a far world by 0.00005."""
     resolutions: NonEmpty[int] = (8, 8, 16, 16, 16, 32, 32, 32, 64, 64, 64)
     """Texels along a face side of the maps of all steps."""
     stretch: float = 1.7

@@ -20,7 +20,7 @@ from panoless.selection.candidates import Candidate, Selection, Verdict
 from panoless.selection.corrections import with_corrections
 from panoless.selection.fitted import Fitted, is_refined
 from panoless.selection.held_out import Trial, held_out_errors, is_clearly_lower, train_briefly
-from panoless.selection.surroundings import explains_clearly_more, proposed_surroundings
+from panoless.selection.surroundings import brought_near, explains_clearly_more, proposed_surroundings
 from shinypartial.core.errors import InputError
 
 ANY = "auto"
@@ -193,7 +193,14 @@ def _fit_around(
     around = proposed_surroundings(source, posed, start.proposal, config)
     if around.is_far:
         start = start if known.is_far else start.in_surroundings(FAR)
-        return fit_with_poses(family, source, views, start, config)
+        far = fit_with_poses(family, source, views, start, config)
+        if far is None or not family.finds_poses:
+            return far
+
+        def follow(fitted: Geometry, surroundings: Surroundings) -> Geometry | None:
+            return fit_at(family, views, start.after(fitted).in_surroundings(surroundings), config)
+
+        return brought_near(views, far, follow, config)
     around = around if known.is_far else known
     near = fit_with_poses(family, source, views, start.in_surroundings(around), config)
     if near is None or config.surroundings.mode == "on" or not known.is_far:

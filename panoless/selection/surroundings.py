@@ -4,6 +4,7 @@ A shape that believes in a far world bends until it agrees with a near one as we
 that is. A shape from silhouettes alone knows of no light, so it tells the distance at once.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from panoless.environment.nearness import LeavingRays, Linearized, found_surroun
 from panoless.environment.options import SurroundingsOptions
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
-from panoless.environment.surroundings import FAR, Surroundings
+from panoless.environment.surroundings import FAR, SHARPEST, Surroundings
 from panoless.geometry.base import Family, Geometry, Proposal, usable_views
 from panoless.selection.held_out import is_clearly_lower
 
@@ -33,11 +34,9 @@ def proposed_surroundings(family: Family, views: Views, proposal: Proposal, conf
     options, geometry = config.surroundings, family.as_proposed(proposal, config)
     if options.mode == "off" or geometry is None or not np.isfinite(proposal.silhouette_px):
         return FAR
+    start = FAR.with_degree(0)
     with torch.no_grad():
-        start, checked = FAR.with_degree(0), views.train[:: -(-len(views.train) // options.checked_views)]
-        some = leaving_rays(replace(views, train=checked), geometry, options.checked_rays)
-        first = Linearized.at(joined(some), start, options.checked_resolution, options)
-        if options.mode == "auto" and first.pull(options.least_share) < options.least_pull:
+        if options.mode == "auto" and not _is_pulled(views, geometry, options):
             return FAR
         kept, held_out = split_held_out(leaving_rays(views, geometry, options.rays))
         if not kept or not held_out:
@@ -51,6 +50,38 @@ def proposed_surroundings(family: Family, views: Views, proposal: Proposal, conf
     return (
         found if options.degree == 0 else found_surroundings(joined(kept), found.with_degree(options.degree), options)
     )
+
+
+def brought_near(
+    views: Views, far: Geometry, follow: Callable[[Geometry, Surroundings], Geometry | None], config: FitConfig
+) -> Geometry:
+    """The fit of a kind in a far world, or in near surroundings that a shape from silhouettes did not tell.
+
+    A shape that bent until it agreed with a far world hides most of how near it is, but not all. Where rays ask for
+    near surroundings, `follow` takes the fit on in a wide sphere and then in one half as wide, as long as held-out
+    views are explained clearly better.
+    """
+    options, best = config.surroundings, far
+    inverse = options.first_inverse_distance
+    if options.mode == "off":
+        return far
+    with torch.no_grad():
+        if not _is_pulled(views if far.poses is None else far.poses.moved(views), far, options):
+            return far
+    while inverse < SHARPEST:
+        near = follow(best, Surroundings(np.array([inverse])))
+        if near is None or near.surroundings.is_far or not explains_clearly_more(views, near, best, config):
+            break
+        best, inverse = near, 2 * inverse
+    return best
+
+
+def _is_pulled(views: Views, geometry: Geometry, options: SurroundingsOptions) -> bool:
+    """Whether a step toward near surroundings, under a coarse map and from some of the views, promises enough."""
+    some = replace(views, train=views.train[:: -(-len(views.train) // options.checked_views)])
+    rays = joined(leaving_rays(some, geometry, options.checked_rays))
+    step = Linearized.at(rays, FAR.with_degree(0), options.checked_resolution, options)
+    return step.pull(options.least_share) >= options.least_pull
 
 
 def explains_clearly_more(views: Views, near: Geometry, far: Geometry, config: FitConfig) -> bool:

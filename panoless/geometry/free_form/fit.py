@@ -118,8 +118,9 @@ def follow_views(views: Views, fitted: FitStage, options: FreeFormOptions = DEFA
             seen = take_round(views, stage, glance, options)
             if seen.focal is not None and abs(seen.focal) < options.least_focal_change:
                 return seen
-            settings = replace(settings, steps=options.focal_steps)
-            options = replace(options, least_gain=options.least_focal_gain)
+        if stage.focal is not None or not stage.surface.surroundings.is_far:
+            settings = replace(settings, steps=options.shared_steps)
+            options = replace(options, least_gain=options.least_shared_gain)
         return take_round(views, stage, settings, options, Progress("fitting on", settings.steps))
 
 

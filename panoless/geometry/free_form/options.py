@@ -284,8 +284,8 @@ class FreeFormOptions:
     """The share of both that is added, in squares, to a stated covariance; see `poses.stated_floor`."""
     focal_prior: float = 0.02
     """Expected error of the logarithm of the focal length, where it is unknown."""
-    focal_steps: int = 8
-    """Most steps in which it is found."""
+    shared_steps: int = 8
+    """Most steps in which it, or how near the surroundings are, is found on from a fit."""
     focal_glance_steps: int = 2
     """Steps by which is told whether it is looked for at all…"""
     focal_glance_rays: int = 60_000
@@ -293,8 +293,8 @@ class FreeFormOptions:
     least_focal_change: float = 0.002
     """…which have to change its logarithm by this. On sculpture, by 40,000 pixels, one step changes it by 0.0003 where
     it is right, and by 0.0055 and more where it is off by 0.5 % or 2 %."""
-    least_focal_gain: float = 3e-4
-    """They end when one lowers the cost by less than this share."""
+    least_shared_gain: float = 3e-4
+    """Steps end, where that is unknown, when one lowers the cost by less than this share."""
     pose_steps: int = 6
     """Most steps of the round in which poses are set free, and of finding those of other views."""
     least_pose_pull: float = 0.03

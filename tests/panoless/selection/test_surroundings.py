@@ -17,7 +17,7 @@ from panoless.geometry.base import Geometry, Proposal
 from panoless.geometry.plane.kind import PlaneFamily
 from panoless.geometry.plane.model import Plane
 from panoless.selection.choose import _first_fit
-from panoless.selection.surroundings import explains_clearly_more, proposed_surroundings
+from panoless.selection.surroundings import brought_near, explains_clearly_more, proposed_surroundings
 from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
 from tests.support.synthetic_dataset import environment_radiance
 
@@ -85,3 +85,21 @@ def test_surroundings_that_a_fit_before_found_are_not_compared_with_a_far_world(
     assert again is not None
     assert again.geometry.surroundings is known
     assert family.fits == 3
+
+
+def test_a_fit_in_a_far_world_is_brought_into_ever_nearer_walls() -> None:
+    """Spheres of 10, 5 and 2.5 radii about a mirror in one of 4: the second is the last that explains more. A far
+    world stays far.
+    """
+    plane = plane_of(RECTANGLE)
+    views = replace(FAR_VIEWS, train=tuple(in_room(view, plane, 4.0) for view in FAR_VIEWS.train))
+    far, tried = PlaneFamily().as_proposed(Proposal(plane, 0.1, 1.0), CONFIG), list[float]()
+    assert far is not None
+
+    def follow(before: Geometry, surroundings: Surroundings) -> Geometry:
+        tried.extend(surroundings.coefficients)
+        return before.in_surroundings(surroundings)
+
+    assert brought_near(views, far, follow, CONFIG).surroundings.coefficients == pytest.approx([0.2])
+    assert tried == pytest.approx([0.1, 0.2, 0.4])
+    assert brought_near(FAR_VIEWS, far, follow, CONFIG).surroundings.is_far
