@@ -263,6 +263,10 @@ class Family(Protocol):
         """
         ...
 
+    def after_as_many_steps(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:
+        """A fitted geometry after the steps of `with_focal_length` without that unknown, for comparison."""
+        ...
+
     def begin(self, views: Views, geometry: Geometry, config: FitConfig) -> Training | None:
         """What an iterative fit starts from; None where `fit` has done everything."""
         ...

@@ -111,6 +111,10 @@ class ExactFamily:
         """None: it is told by how far photographs pull (see `panoless.alignment.lens`)."""
         return None
 
+    def after_as_many_steps(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:
+        """The same: none are taken."""
+        return cast(Geometry, fitted)
+
     def begin(self, views: Views, geometry: Geometry, config: FitConfig) -> Training | None:
         """None: no steps are left to take."""
         return None

@@ -38,16 +38,19 @@ class _FocalTrial:
 def with_focal_length(views: Views, fitted: Fitted, config: FitConfig, refit: Refit) -> Fitted:
     """Fitted anew to other focal lengths until photographs pull no more, which is found by secants. Of the trials the
     one nearest to the zero of a line through all pulls is kept, if held-out views are clearly better explained by it
-    and the factor is told better than it is known.
+    and the factor is told better than it is known. A kind that finds it beside its shape takes more steps for that, so
+    it is compared with a fit after as many without.
     """
     options = config.corrections
-    jointly = FAMILIES[fitted.geometry.kind].with_focal_length(
-        fitted.corrections.applied(views, config), fitted.geometry, config
-    )
+    family, corrected = FAMILIES[fitted.geometry.kind], fitted.corrections.applied(views, config)
+    jointly = family.with_focal_length(corrected, fitted.geometry, config)
     if jointly is not None:
         geometry, change = jointly
         told = replace(fitted, geometry=geometry, corrections=_corrected(fitted, change, options.focal_error))
-        return told if _is_believed(views, fitted, told, change, config) else fitted
+        if options.lens != "on" and not _is_likely(told, change, options):
+            return fitted
+        settled = replace(fitted, geometry=family.after_as_many_steps(corrected, fitted.geometry, config))
+        return told if _is_believed(views, settled, told, change, config) else settled
     trials = [_FocalTrial.of(views, 0.0, fitted, config)]
     pull = trials[0].pull
     least = options.least_focal_pull if fitted.geometry.poses is None else options.least_posed_focal_pull
@@ -85,16 +88,17 @@ def _corrected(fitted: Fitted, change: float, uncertainty: float) -> Corrections
 
 
 def _is_believed(views: Views, before: Fitted, after: Fitted, change: float, config: FitConfig) -> bool:
-    options, told = config.corrections, after.corrections
+    options = config.corrections
     if options.lens == "on":
         return True
-    uncertainty = (told.focal_uncertainty or 0.0) / told.focal_factor
-    is_likely = uncertainty < options.focal_prior and abs(change) < options.farthest_focal * options.focal_prior
-    return (
-        is_likely
-        and abs(change) > options.nearest_focal * uncertainty
-        and _focal_length_is_earned(views, before, after, config)
-    )
+    return _is_likely(after, change, options) and _focal_length_is_earned(views, before, after, config)
+
+
+def _is_likely(told: Fitted, change: float, options: CorrectionOptions) -> bool:
+    """Whether a change is told better than it is expected, larger than its uncertainty, and not too large."""
+    uncertainty = (told.corrections.focal_uncertainty or 0.0) / told.corrections.focal_factor
+    nearest, farthest = options.nearest_focal * uncertainty, options.farthest_focal * options.focal_prior
+    return uncertainty < options.focal_prior and nearest < abs(change) < farthest
 
 
 def _looks_like_a_focal_length(views: Views, geometry: Geometry, options: CorrectionOptions) -> bool:

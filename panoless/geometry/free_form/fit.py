@@ -102,9 +102,12 @@ def fit_free_form(
     return stage.surface, stage.trust, stage.poses
 
 
-def follow_views(views: Views, fitted: FitStage, options: FreeFormOptions = DEFAULTS) -> FitStage:
+def follow_views(
+    views: Views, fitted: FitStage, options: FreeFormOptions = DEFAULTS, *, longer: bool = False
+) -> FitStage:
     """What an earlier fit led to after its last round was taken again, with views that changed a little, or with the
-    focal length among the unknowns. A few steps by fewer pixels tell whether that asks for more of them.
+    focal length among the unknowns. A few steps by fewer pixels tell whether that asks for more of them, or for as many
+    without where `longer`.
     """
     rounds = [*options.rounds, *options.finer]
     last = next((each for each in reversed(rounds) if each.cells == fitted.surface.cells), rounds[-1])
@@ -118,7 +121,7 @@ def follow_views(views: Views, fitted: FitStage, options: FreeFormOptions = DEFA
             seen = take_round(views, stage, glance, options)
             if seen.focal is not None and abs(seen.focal) < options.least_focal_change:
                 return seen
-        if stage.focal is not None or not stage.surface.surroundings.is_far:
+        if longer or stage.focal is not None or not stage.surface.surroundings.is_far:
             settings = replace(settings, steps=options.shared_steps)
             options = replace(options, least_gain=options.least_shared_gain)
         return take_round(views, stage, settings, options, Progress("fitting on", settings.steps))

@@ -211,6 +211,11 @@ class FreeFormFamily(ExactFamily):
         surface, trust = stage.surface.scaled(factor), stage.trust.scaled(factor)
         return _mirror(surface, trust, stage.poses, config), stage.focal
 
+    def after_as_many_steps(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:
+        """On from a fit, in a round as long as with that unknown."""
+        stage = follow_views(views, _stage(fitted), config.free_form, longer=True)
+        return _mirror(stage.surface, stage.trust, stage.poses, config)
+
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """All coefficients by outlines and photographs together; by logarithms of radiance where this leaves what is
         dark unexplained and they explain more of it in held-out views.

@@ -9,14 +9,16 @@ import torch
 from panoless.alignment.search import PosedProposal
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections, with_focal_factor
 from panoless.capture.views import Views
-from panoless.geometry.base import Proposal
-from panoless.geometry.plane.kind import PlaneMirror
+from panoless.config import FitConfig
+from panoless.geometry.base import Geometry, Proposal
+from panoless.geometry.plane.kind import PlaneFamily, PlaneMirror
 from panoless.geometry.registry import FAMILIES
 from panoless.presets import PRESETS
 from panoless.selection.candidates import Candidate, Selection, Verdict, selection_from_plain, selection_to_plain
 from panoless.selection.choose import choose_geometry
 from panoless.selection.corrections import with_corrections
 from panoless.selection.fitted import Fitted, outline_pull_px
+from panoless.selection.focal_length import with_focal_length
 from panoless.selection.options import CorrectionOptions
 from shinypartial.core.conventions import SOLID_ALPHA
 from shinypartial.dataset.perturb.masks import dilated, eroded
@@ -100,6 +102,30 @@ def test_a_wrong_focal_length_is_found_and_a_true_one_believed(factor: float) ->
     else:
         assert found.focal_uncertainty is not None
         assert 0 < found.focal_uncertainty < 0.003
+
+
+class Slow(PlaneFamily):
+    """A kind whose fit, a tilted mirror, ends before it is right; it finds focal lengths beside its shape."""
+
+    def with_focal_length(self, views: Views, fitted: Geometry, config: FitConfig) -> tuple[Geometry, float]:
+        """Steps that make the shape right, and with it a focal length that is wrong."""
+        return MIRROR, 0.02
+
+    def after_as_many_steps(self, views: Views, fitted: Geometry, config: FitConfig) -> Geometry:
+        """Which the same steps do without it."""
+        return MIRROR
+
+
+def test_a_focal_length_is_not_believed_for_what_more_steps_explain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Held-out views are explained better by the fit with it than by the first one, and as well by one without."""
+    monkeypatch.setitem(FAMILIES, "plane", Slow())
+    views = unsaturated()
+    turned = np.linalg.qr(np.eye(3) + 0.05 * np.random.default_rng(1).normal(size=(3, 3)))[0]
+    tilted = replace(MIRROR, plane=replace(MIRROR.plane, normal=turned @ MIRROR.plane.normal))
+    before = Fitted(tilted, PosedProposal(Proposal(MIRROR.plane, 0.0, 1.0)))
+    found = with_focal_length(views, before, replace(CONFIG, corrections=FOCAL), silhouettes_plane)
+    assert found.geometry is MIRROR
+    assert found.corrections == NO_CORRECTIONS
 
 
 def with_masks(views: Views, offset_px: float) -> Views:
