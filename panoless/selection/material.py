@@ -101,7 +101,8 @@ def earned_softness(views: Views, geometry: Geometry, config: FitConfig) -> Soft
     blurs, and one under wider pixels, after the same steps from the same start, and on areas of pixels, because a map
     that knows of none is better blurred for that. A lobe averages noise, too, as that of compression. So a map that is
     shown as it is has to explain less even where the lobe smooths it afterwards, which averages as much. A first value
-    of each tells whether to search on, and for which (Brent 1973). A lobe blurs all directions alike, a wider pixel
+    of each tells whether to search on, and for which (Brent 1973). Where the sharp map leaves next to nothing
+    unexplained, nothing softer is needed. A lobe blurs all directions alike, a wider pixel
     those that a curved part spreads. Nobody asks where the roughness is known, or in a high dynamic range, in which a
     mean of encoded values is not the encoding of the mean.
     """
@@ -115,8 +116,11 @@ def earned_softness(views: Views, geometry: Geometry, config: FitConfig) -> Soft
         if trial is None:
             return Softness()
         rounds, clearly = options.judged_rounds, replace(config.selection, least_gain=options.least_roughness_gain)
+        sharp = trial.errors(Softness(), rounds)
+        if sharp.mean() < options.least_unexplained:
+            return Softness()
         smoothing = Softness(roughness=options.first_roughness)
-        sharp, smoothed = (trial.errors(Softness(), rounds, each) for each in (Softness(), smoothing))
+        smoothed = trial.errors(Softness(), rounds, smoothing)
         asked = []
         if options.roughness == "auto":
             asked.append(smoothing)

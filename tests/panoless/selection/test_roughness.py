@@ -1,5 +1,6 @@
 """A rough mirror is told from a smooth one by held-out views, made by facets that are drawn at random."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.options import MaterialOptions
 from panoless.geometry.revolution.kind import RevolutionMirror
-from panoless.selection.material import Softness, earned_softness
+from panoless.selection.material import Softness, _SoftnessTrial, earned_softness
 from tests.support.mirror_revolution import around, goblet, rays_of, revolution_views
 
 ROUGHNESS = 0.3
@@ -91,3 +92,24 @@ def _blurred(view: TrainView, sigma_px: float) -> torch.Tensor:
 def test_nobody_asks_where_roughness_is_off_or_known(options: MaterialOptions, expected: float | None) -> None:
     views = revolution_views(MIRROR.surface, around(5, size=16))
     assert earned_softness(views, MIRROR, FitConfig(material=options)) == Softness(roughness=expected)
+
+
+@pytest.mark.parametrize(("sharp", "asked"), [(0.004, 1), (0.04, 4)])
+def test_nothing_softer_is_asked_for_where_a_sharp_map_explains_all(
+    monkeypatch: pytest.MonkeyPatch, sharp: float, asked: int
+) -> None:
+    """Though a rough mirror would explain half of what little is left."""
+    found: list[Softness] = []
+
+    class Trial:
+        def errors(self, softness: Softness, *_: object) -> np.ndarray:
+            found.append(softness)
+            return np.full(5, sharp if softness.roughness is None else sharp / 2) + np.linspace(0, 1e-6, 5)
+
+        def searched(self, softness: Callable[[float], Softness], bounds: tuple[float, float]) -> float:
+            return 0.1
+
+    monkeypatch.setattr(_SoftnessTrial, "of", lambda *_: Trial())
+    taken = earned_softness(views_of(0.0), MIRROR, FitConfig())
+    assert taken == (Softness() if asked == 1 else Softness(roughness=0.1))
+    assert len(found) == asked
