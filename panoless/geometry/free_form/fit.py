@@ -83,7 +83,10 @@ def fit_free_form(
             deeper = coarse_stage(solved, hollowed, options.concave.rounds, options)
             stage = better(stage, deeper, options.concave.least_held_out_gain) if held_out else deeper
         pull = pose_pull(solved, stage, options) if held_out and options.poses == "auto" else 0.0
-        if pull > options.least_pose_pull:
+        least = options.least_pose_pull
+        if options.least_doubted_pull < pull <= least and error(stage) > options.doubted_error:
+            least = options.least_doubted_pull
+        if pull > least:
             settled, free = _settled(solved, stage, options.pose_steps, options), _with_poses(solved, start, options)
             settled_error = error(settled)
             untold = pull > options.outline_pull and settled_error > options.unexplained_error

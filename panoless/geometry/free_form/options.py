@@ -301,6 +301,11 @@ class FreeFormOptions:
     """Share of the cost that a step of the poses alone has to promise for them to be tried. On sculpture at 160 px it
     is 0.003 with true cameras, and 0.26 and 0.14 with cameras turned by 0.25° and 2°; 0.016 with masks 2 px too large,
     0.018 in a room at 10 radii; on chrome-block over a dark ground 0.02 with true ones."""
+    least_doubted_pull: float = 0.01
+    """The same, where the fit…"""
+    doubted_error: float = 0.2
+    """…leaves a larger held-out error than this: on the trial shape torus it is 0.41 with cameras turned by 0.5°, which
+    pull by 0.026, and 0.06 with true ones."""
     pull_scale_px: float = 10.0
     """Distance of outlines beyond which these have no say in that: they are this far off where cameras are by 2°."""
     outline_pull: float = 0.1
