@@ -67,7 +67,7 @@ def make_folders(
     if not is_scored(oracle):
         run("shinypartial", "oracle", dataset, "--output", oracle)
     photographs, options = (dataset, ()) if worse is None else worse
-    if not (photographs / CHECKSUMS).exists():
+    if worse is not None and not (photographs / CHECKSUMS).exists():
         run("shinypartial", "perturb", dataset, *options, "--link", "--output", photographs)
     if not (prediction / DESCRIPTION).exists():
         run("panoless", "fit", photographs, *settings, "--output", prediction)

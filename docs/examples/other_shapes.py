@@ -23,7 +23,7 @@ from shinypartial.blender.runtime import studio_light
 from shinypartial.io.files import write_json, write_text
 from shinypartial.io.images import read_exr_rgb, write_exr_rgb
 from shinypartial.prediction.format import read_info
-from shinypartial.stability.axes import BY_NAME, Axis
+from shinypartial.suites.stability.axes import BY_NAME, Axis
 
 FOLDER = Path("build/other-shapes")
 NUMBERS = Path("docs/results/other-shapes.json")

@@ -54,15 +54,15 @@ class RevolutionProposal:
 def propose_revolution(views: Views, options: RevolutionOptions = DEFAULTS) -> RevolutionProposal | None:
     """Axis and outer profile that explain the masks best; None when none comes near.
 
-    Where the body between the ends that silhouettes tell misses the masks, one that begins a little longer is tried:
-    outlines push back what is too long, while one that is too short leans to reach them. After it, one with what may be
-    a stem below the body, or a cone that silhouettes leave beyond its lip.
+    What may be a stem below the body, or a cone that silhouettes leave beyond its lip, is believed only where the body
+    without it misses the masks. Where both do, one that begins a little longer is tried: outlines push back what is too
+    long, while a body that is too short leans to reach them.
     """
     rays = contour_rays(views, options.silhouette)
     if len(np.unique(rays.view)) < options.silhouette.least_views:
         return None
     best, starts = None, axis_starts(views, options.silhouette)
-    for ends in (Ends(), Ends(beyond=options.silhouette.beyond_cells), Ends(stem=True)):
+    for ends in (Ends(), Ends(stem=True), Ends(beyond=options.silhouette.beyond_cells)):
         found = _propose(views, rays, starts, options, ends)
         if found is not None and (best is None or np.median(found.iou) > np.median(best.iou)):
             best = found

@@ -151,15 +151,15 @@ def test_surfels_that_explain_as_much_do_not_beat_the_plane() -> None:
     assert f"held-out error {row.held_out_error:.4f}" in selection.sentence
 
 
-@pytest.mark.parametrize(("bend", "kind"), [(0.2, "height_field"), (0.3, "free_form")])
-def test_a_plane_that_explains_nothing_goes_even_if_the_trial_does_no_better(bend: float, kind: str) -> None:
-    """A bent mirror in a flat boundary, and surfels that did not learn to bend: the plane goes, and heights come; and
-    where so few of them leave too much as well, what explains more.
+@pytest.mark.parametrize("bend", [0.2, 0.3])
+def test_a_plane_that_explains_nothing_goes_even_if_the_trial_does_no_better(bend: float) -> None:
+    """A bent mirror in a flat boundary, and surfels that did not learn to bend: the plane goes, and heights come, also
+    where so few of them leave too much as well, because nothing explains more.
     """
     geometry, selection = choose_geometry(framed(0.0, bend), CONFIG, as_started)
-    assert geometry.kind == kind
+    assert geometry.kind == "height_field"
     errors = {each.kind: each.held_out_error for each in selection.candidates if each.held_out_error is not None}
-    assert min(errors, key=lambda each: errors[each]) == kind
+    assert min(errors, key=lambda each: errors[each]) == "height_field"
     assert "plane: leaves too much unexplained" in selection.sentence
 
 

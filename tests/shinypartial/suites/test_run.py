@@ -16,7 +16,7 @@ from shinypartial.suites.attempt import attempt, read_record
 from shinypartial.suites.jobs import Job, write_jobs
 from shinypartial.suites.run import forget_failures, run_suite, snakemake_arguments
 from shinypartial.suites.stability.collect import collect
-from shinypartial.suites.stability.plan import Cell, Plan, Size, make_plan
+from shinypartial.suites.stability.plan import SIZE, Cell, Plan, make_plan
 
 ROOT = Path(__file__).resolve().parents[3]
 CELL = Cell("tiny-vase", "development", "broken", None, None, 0)
@@ -24,7 +24,7 @@ needs_snakemake = pytest.mark.skipif(importlib.util.find_spec("snakemake") is No
 
 
 def plan_of(*jobs: Job, cells: tuple[Cell, ...] = ()) -> Plan:
-    return Plan(Size(), cells, jobs)
+    return Plan(SIZE, cells, jobs)
 
 
 def start(folder: Path, *words: str) -> subprocess.Popen[str]:
