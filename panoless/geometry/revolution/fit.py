@@ -25,7 +25,6 @@ from panoless.geometry.revolution.pixels import CENTER, PixelBundles, evenly
 from panoless.geometry.revolution.profile import resample_profile
 from panoless.geometry.revolution.silhouette import (
     ContourRays,
-    Ends,
     axis_starts,
     contour_cost,
     contour_rays,
@@ -55,15 +54,14 @@ def propose_revolution(views: Views, options: RevolutionOptions = DEFAULTS) -> R
     """Axis and outer profile that explain the masks best; None when none comes near.
 
     What may be a stem below the body, or a cone that silhouettes leave beyond its lip, is believed only where the body
-    without it misses the masks. Where both do, one that begins a little longer is tried: outlines push back what is too
-    long, while a body that is too short leans to reach them.
+    without it misses the masks.
     """
     rays = contour_rays(views, options.silhouette)
     if len(np.unique(rays.view)) < options.silhouette.least_views:
         return None
     best, starts = None, axis_starts(views, options.silhouette)
-    for ends in (Ends(), Ends(stem=True), Ends(beyond=options.silhouette.beyond_cells)):
-        found = _propose(views, rays, starts, options, ends)
+    for stem in (False, True):
+        found = _propose(views, rays, starts, options, stem)
         if found is not None and (best is None or np.median(found.iou) > np.median(best.iou)):
             best = found
         if best is not None and np.median(best.iou) >= options.silhouette.believed_overlap:
@@ -72,17 +70,17 @@ def propose_revolution(views: Views, options: RevolutionOptions = DEFAULTS) -> R
 
 
 def _propose(
-    views: Views, rays: ContourRays, starts: list[SurfaceOfRevolution], options: RevolutionOptions, ends: Ends
+    views: Views, rays: ContourRays, starts: list[SurfaceOfRevolution], options: RevolutionOptions, stem: bool
 ) -> RevolutionProposal | None:
     own = options.silhouette
-    start = fit_outer(rays, starts, ends)
+    start = fit_outer(rays, starts, stem=stem)
     if start is None:
         return None
     residuals = silhouette_residuals(rays.at_most(own.start_points), start, rays.pixel)
     if contour_cost(residuals, own.judged_scale_px) > own.largest_start_cost:
         return None
     base, lid = (_count(end) for end in end_pixels(views, start, options.mouth.pixels))
-    surface = refine_outer(rays, start if lid >= base else start.turned_over(), ends)
+    surface = refine_outer(rays, start if lid >= base else start.turned_over(), stem=stem)
     if surface is None:
         return None
     found = silhouette_residuals(rays, surface, rays.pixel)

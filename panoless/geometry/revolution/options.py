@@ -34,9 +34,6 @@ class SilhouetteOptions:
     """A profile narrower than this ends in a tip."""
     blunt_cells: float = 4.0
     """A profile wider than this may end flat, where silhouettes stop telling its slope."""
-    beyond_cells: int = 1
-    """Cells by which a body begins longer than silhouettes tell, where it misses the masks. Chosen on goblets and cans
-    of the tests, whose axes are then off by at most 0.05°, in place of up to 3°."""
     widest_within: float = 0.6
     """The widest place of the body has a height below this, in radii of the object frame."""
     least_cells: int = 5
@@ -56,7 +53,7 @@ class SilhouetteOptions:
     least_views: int = 6
     """Fewer views with a contour propose nothing."""
     believed_overlap: float = 0.98
-    """Of the closed body with the masks, from which no other ends are tried: what model selection asks for."""
+    """Of the closed body with the masks, from which no stem is looked for: what model selection asks for."""
     scored_views: int = 16
     """Views over which the overlap of a proposal is measured."""
 

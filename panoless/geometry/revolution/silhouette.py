@@ -50,16 +50,6 @@ class ContourRays:
 
 
 @dataclass(frozen=True)
-class Ends:
-    """Where the envelope around an axis is closed."""
-
-    stem: bool = False
-    """With what may be a stem or a cone, or without."""
-    beyond: int = 0
-    """Cells beyond the ends that silhouettes tell."""
-
-
-@dataclass(frozen=True)
 class SilhouetteResiduals:
     """How the contour rays meet a surface of revolution: signed distances (px, outward) and where they touch."""
 
@@ -115,20 +105,22 @@ def _bare(origin: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"]) -> Surfa
     return SurfaceOfRevolution(origin - (origin @ axis) * axis, axis, np.zeros((0, 2)), 0)
 
 
-def outer_surface(rays: ContourRays, start: SurfaceOfRevolution, cell: float, ends: Ends) -> SurfaceOfRevolution | None:
-    """The envelope around an axis, closed flat at such ends; None where there is none."""
+def outer_surface(
+    rays: ContourRays, start: SurfaceOfRevolution, cell: float, *, stem: bool = False
+) -> SurfaceOfRevolution | None:
+    """The envelope around an axis, closed flat at both ends, with what may be a `stem` or a cone or without; None where
+    there is none.
+    """
     origins, directions = in_axis_frame(rays, start)
     cells = int(2 * TALLEST / cell)
     rank = int(rays.options.rank_share * len(rays.view) / (2 * TALLEST / cell)) + 1
     smallest = envelope(origins, directions, -TALLEST, cell, cells, rank + 1, REACH)[:, rank]
     radius = np.where(np.isfinite(smallest), smallest, 0.0)
     heights = -TALLEST + (np.arange(cells) + 0.5) * cell
-    told, wide = _ends(origins, heights, radius, cell, rays.options), np.flatnonzero(radius > 0)
-    for lowest, highest in reversed(told) if ends.stem else told:
+    ends = _ends(origins, heights, radius, cell, rays.options)
+    for lowest, highest in reversed(ends) if stem else ends:
         if highest - lowest >= rays.options.least_cells:
-            first = max(lowest - ends.beyond, min(wide[0], lowest))
-            last = min(highest + ends.beyond, max(wide[-1], highest))
-            outer = np.stack([radius, heights], 1)[first : last + 1]
+            outer = np.stack([radius, heights], 1)[lowest : highest + 1]
             profile = closed_profile(outer)
             return resample_profile(replace(start, profile=profile, lip=len(outer)), cell)
     return None
@@ -263,14 +255,16 @@ def contour_step(
     )
 
 
-def fit_outer(rays: ContourRays, starts: Sequence[SurfaceOfRevolution], ends: Ends) -> SurfaceOfRevolution | None:
+def fit_outer(
+    rays: ContourRays, starts: Sequence[SurfaceOfRevolution], *, stem: bool = False
+) -> SurfaceOfRevolution | None:
     """Axis and outer profile of the best of several starts, coarse to fine; None when no start has an envelope."""
     options = rays.options
     sparse = rays.at_most(options.start_points)
     cell = options.start_cell_px * rays.pixel
     best, least = None, np.inf
     for start in starts:
-        surface = _refine(sparse, start, cell, options.start_scales_px, ends)
+        surface = _refine(sparse, start, cell, options.start_scales_px, stem)
         if surface is not None:
             cost = contour_cost(silhouette_residuals(sparse, surface, cell), options.judged_scale_px)
             if cost < least:
@@ -278,16 +272,16 @@ def fit_outer(rays: ContourRays, starts: Sequence[SurfaceOfRevolution], ends: En
     return best
 
 
-def refine_outer(rays: ContourRays, start: SurfaceOfRevolution, ends: Ends) -> SurfaceOfRevolution | None:
+def refine_outer(rays: ContourRays, start: SurfaceOfRevolution, *, stem: bool = False) -> SurfaceOfRevolution | None:
     """Axis and profile at a pixel's spacing."""
-    return _refine(rays.at_most(rays.options.points), start, rays.pixel, rays.options.scales_px, ends)
+    return _refine(rays.at_most(rays.options.points), start, rays.pixel, rays.options.scales_px, stem)
 
 
 def _refine(
-    rays: ContourRays, start: SurfaceOfRevolution, cell: float, scales_px: Sequence[float], ends: Ends
+    rays: ContourRays, start: SurfaceOfRevolution, cell: float, scales_px: Sequence[float], stem: bool
 ) -> SurfaceOfRevolution | None:
     """The envelope around an axis after steps at those scales; None when there is none."""
-    surface = outer_surface(rays, start, cell, ends)
+    surface = outer_surface(rays, start, cell, stem=stem)
     if surface is None:
         return None
     for scale in scales_px:
