@@ -47,10 +47,12 @@ def with_focal_length(views: Views, fitted: Fitted, config: FitConfig, refit: Re
     if jointly is not None:
         geometry, change = jointly
         told = replace(fitted, geometry=geometry, corrections=_corrected(fitted, change, options.focal_error))
-        if options.lens != "on" and not _is_likely(told, change, options):
+        if options.lens == "on":
+            return told
+        if not _is_likely(told, change, options):
             return fitted
         settled = replace(fitted, geometry=family.after_as_many_steps(corrected, fitted.geometry, config))
-        return told if _is_believed(views, settled, told, change, config) else settled
+        return told if _focal_length_is_earned(views, settled, told, config) else settled
     trials = [_FocalTrial.of(views, 0.0, fitted, config)]
     pull = trials[0].pull
     least = options.least_focal_pull if fitted.geometry.poses is None else options.least_posed_focal_pull

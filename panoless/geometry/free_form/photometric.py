@@ -276,9 +276,9 @@ class Solution:
         """λ/2 ∫ |D³φ|² over the unknowns of a solution `before`: coefficients that come near the surface by a step have
         never been smoothed, and would count against it.
         """
-        bent = self.bent
-        if before is not self:
-            bent = self.smoothing * third_differences(self._rough, before.active, whole=before._whole)
+        if before is self:
+            return float((self.bent * self._rough).sum()) / 2
+        bent = self.smoothing * third_differences(self._rough, before.active, whole=before._whole)
         return float((bent * self._rough).sum()) / 2
 
     @cached_property
