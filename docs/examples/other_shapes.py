@@ -124,6 +124,16 @@ TRIALS = {
         45.0,
         (-15.0, 50.0),
     ),
+    "crate": Trial(
+        'kind = "superquadric", size = [0.95, 0.8, 0.7], exponents = [10.0, 10.0]',
+        (-12.0, 20.0, 35.0),
+        "city",
+        "plus",
+        3.7,
+        200.0,
+        50.0,
+        (-10.0, 55.0),
+    ),
     "twist": Trial(
         'kind = "superquadric", size = [0.9, 0.8, 1.3], exponents = [3.0, 2.5], twist_deg = 30.0',
         (10.0, 5.0, 40.0),
