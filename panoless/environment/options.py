@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from shinypartial.io.records import NonEmpty, Positive
+from shinypartial.io.records import NonEmpty, NonNegative, Positive
 
 
 @dataclass(frozen=True)
@@ -119,6 +119,13 @@ class MaterialOptions:
     least_gain: float = 0.02
     """Share by which the held-out error has to fall. It falls by 0.045 and 0.065 on golden copies of vase and
     sculpture; texels as wide as pixels leave much of it in any case."""
+    least_albedo: Positive = 0.02
+    """Share of scattered light, in the channel that has most of it, from which held-out views are asked. Not tuned."""
+    least_scattering_gain: Positive = 0.1
+    """Share by which scattered light has to lower the held-out error: 0.18 and 0.40 on copies of vase that are matte by
+    0.05 and 0.2; at most 0.003 on mirrors of a right shape, and up to 0.03 on those of a wrong one."""
+    least_scattering_error: NonNegative = 0.05
+    """Held-out error of a fit from which the shape is looked for again without scattered light, where there is some."""
     roughness: Literal["auto", "off"] = "auto"
     """Whether the mirror may be slightly rough; not of surfels, whose normals are too coarse to tell, and never in a
     high dynamic range."""

@@ -1,6 +1,8 @@
-"""What share of the light a metal mirrors, by what it shows of the same directions at different angles."""
+"""What share of the light a mirror mirrors, by what it shows of the same directions at different angles, and what it
+scatters beside.
+"""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -8,21 +10,29 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.encoding import SATURATED
-from panoless.environment.cubemap import texels_of
+from panoless.environment.cubemap import flat_texels
 from panoless.environment.options import MaterialOptions
 from panoless.environment.rays import Rays
 from panoless.numeric.robust import robust_weight
+from shinypartial.core.harmonics import real_harmonics
+from shinypartial.core.sphere import cube_directions, cube_solid_angles
 
 LEAST = 0.02
 """Of a reflectance at normal incidence, about that of water; no metal has less."""
+LAMBERT = np.repeat([1, 2 / 3, 1 / 4], [1, 3, 5])
+"""Of each harmonic of the light, what a matte surface shows of it (Ramamoorthi and Hanrahan 2001), albedo 1."""
 
 
 @dataclass(frozen=True)
 class Reflectance:
-    """F(θ) = F₀ + (1 − F₀)(1 − cos θ)⁵ at the angle of incidence θ (Schlick 1994)."""
+    """F(θ) = F₀ + (1 − F₀)(1 − cos θ)⁵ at the angle of incidence θ (Schlick 1994), and what is scattered evenly."""
 
     at_normal: Float[np.ndarray, "3"]
     """F₀ in (0, 1] of red, green and blue (linear)."""
+    albedo: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    """Share of the light that is scattered."""
+    scattered: Float[np.ndarray, "9 3"] = field(default_factory=lambda: np.zeros((9, 3)))
+    """That light: coefficients of the harmonics up to degree 2 of the normal."""
 
     @property
     def tint(self) -> tuple[float, float, float]:
@@ -30,10 +40,22 @@ class Reflectance:
         red, green, blue = self.at_normal.tolist()
         return red, green, blue
 
+    @property
+    def scattered_share(self) -> tuple[float, float, float] | None:
+        """The albedo as numbers; None where it is zero."""
+        red, green, blue = self.albedo.clip(0, 1).tolist()
+        return (red, green, blue) if self.albedo.any() else None
+
     def share(self, cosines: Float[Tensor, "*P"]) -> Float[Tensor, "3 *P"]:
         """F of cos θ in [0, 1]; grazing rays see all of the light."""
         at_normal = torch.from_numpy(self.at_normal).to(cosines).reshape(3, *[1] * cosines.ndim)
         return at_normal + (1 - at_normal) * grazing(cosines)
+
+    def scattering(self, normals_world: Float[Tensor, "3 *P"]) -> Float[Tensor, "3 *P"]:
+        """Radiance that unit normals scatter; zero where they are."""
+        normals = normals_world.flatten(1).T.double().cpu().numpy()
+        light = np.where(normals.any(1, keepdims=True), real_harmonics(normals, 2) @ self.scattered, 0.0)
+        return torch.from_numpy(np.maximum(light, 0)).to(normals_world).T.reshape(normals_world.shape)
 
 
 def grazing(cosines: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:
@@ -47,6 +69,12 @@ def cosines_of_incidence(rays: Rays) -> Float[Tensor, "P"]:
     return (rays.directions - rays.incoming).norm(dim=1) / 2
 
 
+def normals_of(rays: Rays) -> Float[Tensor, "P 3"]:
+    """Unit normals where rays were mirrored once: the direction of ω − v."""
+    assert rays.incoming is not None
+    return torch.nn.functional.normalize(rays.directions - rays.incoming, dim=1)
+
+
 def unsaturated(rays: Rays, saturation: Float[Tensor, "3"]) -> Rays:
     """The rays whose radiance is known in all channels, all trusted alike: those that graze see wide parts of a map and
     are trusted less for that, but tell most about the mirror.
@@ -55,19 +83,41 @@ def unsaturated(rays: Rays, saturation: Float[Tensor, "3"]) -> Rays:
     return replace(known, trust=None)
 
 
-def find_reflectance(rays: Rays, options: MaterialOptions) -> Reflectance:
-    """F₀ by min Σ w ‖c − F(θ) E‖² over it and the texels E of a map together.
+def lamp_light(rays: Rays, saturation: Float[Tensor, "3"], resolution: int) -> Float[np.ndarray, "9"]:
+    """Harmonics of the directions in which most rays are saturated: ∫ Y dω over these texels."""
+    lit = (rays.radiance >= SATURATED * saturation.to(rays.radiance)).any(1).cpu().numpy()
+    texel = flat_texels(rays.directions.double().cpu().numpy(), resolution)
+    count = np.bincount(texel, minlength=6 * resolution**2)
+    share = np.bincount(texel, lit, minlength=len(count)) / np.maximum(count, 1)
+    return _harmonics_of((share > 0.5).astype(np.float64)[:, None], resolution)[:, 0]
 
-    w are the rays' trust and Geman–McClure weights. Each round is a Gauss–Newton step of each channel's F₀, from which
-    the texels are eliminated: all that counts is how a direction looks at different angles. A plane in a far world
-    shows each direction at one angle and tells nothing; F₀ stays 1 there.
+
+def _harmonics_of(values: Float[np.ndarray, "N C"], resolution: int) -> Float[np.ndarray, "9 C"]:
+    """∫ v Y dω over the texels of a map."""
+    area = np.broadcast_to(cube_solid_angles(resolution), (6, resolution, resolution)).reshape(-1, 1)
+    basis = real_harmonics(cube_directions(resolution).reshape(-1, 3), 2)
+    found: Float[np.ndarray, "9 C"] = (basis * area).T @ values
+    return found
+
+
+def find_reflectance(rays: Rays, options: MaterialOptions, lamps: Float[np.ndarray, "9"] | None = None) -> Reflectance:
+    """F₀ in (0, 1] by min Σ w ‖c − F(θ) E‖² over it and the texels E of a map together.
+
+    Where the harmonics of `lamps` are given (see `lamp_light`), min Σ w ‖c − F(θ) E − ρ I(n) − q L(n)‖² over the albedo
+    ρ and q ≥ 0, too, with F₀ + ρ ≤ 1: I is the light of E that falls on a surface with the normal n, over π, and q L
+    what lamps add to it that photographs do not show.
+
+    w are the rays' trust and Geman–McClure weights. Each round is a Gauss–Newton step of each channel's unknowns, from
+    which the texels are eliminated: all that counts is how a direction looks at different angles. A plane in a far
+    world shows each direction at one angle and tells nothing; F₀ stays 1 and ρ zero there.
     """
-    return Reflectance(_Texels.of(rays, options).found(options))
+    return _Texels.of(rays, options).found(options, lamps)
 
 
 def left_unexplained(rays: Rays, reflectance: Reflectance, options: MaterialOptions) -> Float[np.ndarray, "P 3"]:
-    """c − F(θ) E with each texel of E the robust mean of the rays that are trusted; others are only predicted."""
+    """c − F(θ) E − D(n) with each texel of E the robust mean of the trusted rays; others are only predicted."""
     texels, weight = _Texels.of(rays, options), rays.initial_weight().double().cpu().numpy()
+    texels = texels.without(texels.basis @ reflectance.scattered)
     residual = texels.radiance
     for _ in range(options.rounds):
         share, light, _ = texels.solved(reflectance.at_normal, weight)
@@ -80,19 +130,31 @@ def left_unexplained(rays: Rays, reflectance: Reflectance, options: MaterialOpti
 class _Texels:
     """Rays by the texel that they fall into."""
 
+    place: Int[np.ndarray, "P"]
+    """Flat index of the texel in the map…"""
     texel: Int[np.ndarray, "P"]
+    """…and among those that are seen."""
     radiance: Float[np.ndarray, "P 3"]
     trust: Float[np.ndarray, "P"]
     grazing: Float[np.ndarray, "P 1"]
+    basis: Float[np.ndarray, "P 9"]
+    """Harmonics of the normals."""
 
     @classmethod
     def of(cls, rays: Rays, options: MaterialOptions) -> "_Texels":
+        place = flat_texels(rays.directions.double().cpu().numpy(), options.resolution)
         return cls(
-            texels_of(rays.directions.double().cpu().numpy(), options.resolution),
+            place,
+            np.unique(place, return_inverse=True)[1].reshape(-1),
             rays.radiance.double().cpu().numpy(),
             rays.initial_weight().double().cpu().numpy(),
             grazing(cosines_of_incidence(rays)).double().cpu().numpy()[:, None],
+            real_harmonics(normals_of(rays).double().cpu().numpy(), 2),
         )
+
+    def without(self, light: Float[np.ndarray, "P 3"]) -> "_Texels":
+        """The same less a part of the radiance."""
+        return replace(self, radiance=self.radiance - light)
 
     def summed(self, values: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
         """Over each ray's texel."""
@@ -106,15 +168,53 @@ class _Texels:
         squares = np.maximum(self.summed(weight[:, None] * share**2), 1e-12)
         return share, self.summed(weight[:, None] * share * self.radiance) / squares, squares
 
-    def found(self, options: MaterialOptions) -> Float[np.ndarray, "3"]:
-        """F₀."""
-        at_normal, weight = np.ones(3), self.trust
+    def falling(self, light: Float[np.ndarray, "P 3"], resolution: int) -> Float[np.ndarray, "9 3"]:
+        """Harmonics over the normal of what falls in over π, if texels that no ray sees are as those that are seen in
+        the mean.
+        """
+        count = np.bincount(self.place, minlength=6 * resolution**2)[:, None]
+        values = np.stack([np.bincount(self.place, each, len(count)) for each in light.T], 1) / np.maximum(count, 1)
+        values = np.where(count > 0, values, values[count[:, 0] > 0].mean(0))
+        return LAMBERT[:, None] * _harmonics_of(np.maximum(values, 0), resolution)
+
+    def found(self, options: MaterialOptions, lamps: Float[np.ndarray, "9"] | None) -> Reflectance:
+        """F₀ = 1 − m − ρ, and ρ and q where lamps are given, from where these are zero on; m is the share of the light
+        that is lost.
+        """
+        weight, matte = self.trust, np.zeros((2, 9, 3))
+        lost = np.zeros(3) if lamps is None else 1 - self.found(options, None).at_normal
+        shares = np.zeros((2, 3))
         for _ in range(options.rounds):
-            share, light, squares = self.solved(at_normal, weight)
-            residual = self.radiance - share * light
+            at_normal = np.maximum(1 - lost - shares[0], LEAST)
+            shown = self.without(self.basis @ (shares[:, None] * matte).sum(0))
+            share, light, squares = shown.solved(at_normal, weight)
+            residual = shown.radiance - share * light
             weight = self.trust * robust_weight(residual, options.robust_scale)
-            slope = (1 - self.grazing) * light
-            slope = slope - share * self.summed(weight[:, None] * share * slope) / squares
-            gain, curvature = ((weight[:, None] * slope * each).sum(0) for each in (residual, slope))
-            at_normal = np.clip(at_normal + gain / np.maximum(curvature, 1e-12), LEAST, 1)
-        return at_normal
+            slopes = [(self.grazing - 1) * light]
+            if lamps is not None:
+                unseen = LAMBERT[:, None] * np.repeat(lamps[:, None], 3, 1)
+                matte = np.stack([self.falling(light, options.resolution), unseen])
+                slopes += [self.basis @ matte[0] + slopes[0], self.basis @ matte[1]]
+            slopes = [each - share * self.summed(weight[:, None] * share * each) / squares for each in slopes]
+            for channel in range(3):
+                columns = np.stack([each[:, channel] for each in slopes], 1)
+                known = np.array([lost[channel], *shares[: len(slopes) - 1, channel]])
+                found = _positive_step(columns, residual[:, channel], weight, known)
+                lost[channel], shares[: len(slopes) - 1, channel] = found[0], found[1:]
+        return Reflectance(np.maximum(1 - lost - shares[0], LEAST), shares[0], (shares[:, None] * matte).sum(0))
+
+
+def _positive_step(
+    slopes: Float[np.ndarray, "P K"],
+    residual: Float[np.ndarray, "P"],
+    weight: Float[np.ndarray, "P"],
+    known: Float[np.ndarray, "K"],
+) -> Float[np.ndarray, "K"]:
+    """min Σ w (r − s·(x − x₀))² over x ≥ 0."""
+    from scipy.optimize import nnls
+
+    root, count = np.sqrt(weight)[:, None], len(known)
+    reduced = np.asarray(np.linalg.qr(np.concatenate([root * slopes, root * residual[:, None]], 1), mode="r"))
+    columns = reduced[:count, :count]
+    found: Float[np.ndarray, "K"] = nnls(columns, reduced[:count, count] + columns @ known)[0]
+    return found

@@ -119,6 +119,7 @@ def export_prediction(
         verdict=state.verdict,
         surroundings=_near_surroundings(around, state.frame),
         reflectance=None if state.reflectance is None else state.reflectance.tint,
+        albedo=None if state.reflectance is None else state.reflectance.scattered_share,
         roughness=state.roughness,
         blur_px=state.blur_px,
         left_out=LEFT_OUT.get(config.surfels.shading),

@@ -53,16 +53,18 @@ def render(
         specular.flatten(1)[:, pixels] = geometry.shade(environment, camera, pixels, normals_camera).T
         normals.flatten(1)[:, pixels] = rotation @ normalize(normals_camera, dim=0, eps=1e-8)
         tint = specular.new_tensor(config.tint)[:, None, None]
+        scattered = torch.zeros_like(specular)
         if reflectance is not None:
             tint = reflectance.share(buffers.cosines(camera))
+            scattered = buffers.alpha * reflectance.scattering(normals)
         radiance, albedo = compose(buffers.albedo, specular, buffers.alpha, config.alpha_applied), buffers.albedo
         if encoding.srgb:
             alpha = buffers.alpha.clamp(min=ALPHA_FLOOR)
             radiance, albedo = (alpha * encoding.decoded((part / alpha).clamp(0, 1)) for part in (radiance, albedo))
             specular = (radiance - albedo) / alpha
         return Decomposition(
-            radiance=tint * radiance,
-            albedo=tint * albedo,
+            radiance=tint * radiance + scattered,
+            albedo=tint * albedo + scattered,
             specular=tint * specular,
             alpha=buffers.alpha,
             normals_world=normals,

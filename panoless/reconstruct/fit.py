@@ -16,6 +16,7 @@ from panoless.reconstruct.recorder import Recorder, note_peak_memory, timed
 from panoless.reconstruct.snapshots import NO_SNAPSHOTS, SnapshotSchedule, require_snapshots
 from panoless.reconstruct.state import FitState, acquire_run, load_state, save_state
 from panoless.selection.choose import choose_geometry
+from panoless.selection.material import without_scattered_light
 from panoless.trust.evidence import gather_evidence
 from panoless.trust.verdict import judge
 from shinypartial.core.errors import InputError
@@ -84,8 +85,14 @@ def _tell_repairs(views: Views) -> None:
 
 
 def begin(views: Views, config: FitConfig) -> FitState:
-    """The state before the first step: the geometry that the scene needs, and what its training starts from."""
+    """The state before the first step: the geometry that the scene needs, and what its training starts from.
+
+    Where that geometry shows that the object scatters light, another is chosen by photographs without it.
+    """
     geometry, selection = choose_geometry(views, config)
+    shown = without_scattered_light(views, geometry, selection.held_out_error, config)
+    if shown is not None:
+        geometry, selection = choose_geometry(*shown)
     corrected = selection.corrections.applied(views, config)
     training = FAMILIES[geometry.kind].begin(usable_views(corrected, geometry), geometry, config)
     return FitState(geometry, views.object_frame, selection, training)

@@ -56,6 +56,12 @@ class Selection:
         return self.candidates[-1].corrections if self.candidates else NO_CORRECTIONS
 
     @property
+    def held_out_error(self) -> float:
+        """Of the kind that was chosen; one where it was not measured."""
+        error = self.candidates[-1].held_out_error if self.candidates else None
+        return 1.0 if error is None else error
+
+    @property
     def sentence(self) -> str:
         """The choice in one line."""
         *refused, chosen = self.candidates

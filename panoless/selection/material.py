@@ -1,5 +1,5 @@
-"""What the mirror is made of, by what a finished geometry explains: a metal's color, which pales at grazing angles, and
-how rough it is; or how blurred the pictures are that look as if it were.
+"""What the mirror is made of, by what a finished geometry explains: a metal's color, which pales at grazing angles,
+what it scatters, and how rough it is; or how blurred the pictures are that look as if it were.
 
 It is taken for a perfect mirror until held-out views speak against it.
 """
@@ -12,26 +12,27 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from panoless.capture.encoding import NO_TINT, RadianceEncoding, encoding_of
-from panoless.capture.views import Views, split_held_out
+from panoless.capture.encoding import NO_TINT, SATURATED, RadianceEncoding, encoding_of
+from panoless.capture.views import TrainView, Views, split_held_out
 from panoless.config import FitConfig
 from panoless.environment.footprints import PixelFootprints, thinned
 from panoless.environment.lobe import Lobe
 from panoless.environment.options import MaterialOptions
 from panoless.environment.rays import Rays, joined_rays
-from panoless.environment.reflectance import Reflectance, find_reflectance, left_unexplained, unsaturated
+from panoless.environment.reflectance import Reflectance, find_reflectance, lamp_light, left_unexplained, unsaturated
 from panoless.environment.resolution import ERROR_SCALE
 from panoless.environment.roughness import sharpened_map
 from panoless.environment.solve import solve_environment
-from panoless.geometry.base import Geometry, observe_views, pixel_areas
+from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, pixel_areas, usable_views
 from panoless.numeric.robust import bounded_error
 from panoless.selection.held_out import held_out_parts, is_clearly_lower
 
 
 def earned_reflectance(views: Views, geometry: Geometry, config: FitConfig) -> Reflectance | None:
     """The reflectance of the object, if held-out views are clearly better explained by it; else None. Views are those
-    of usable pixels.
+    of usable pixels. One that scatters light, too, has to explain them clearly better than one that does not.
 
     Four fifths of the views tell it and the map by which the others are judged, then all views tell it anew. Nobody
     asks where a tint is given, or in a high dynamic range.
@@ -40,17 +41,23 @@ def earned_reflectance(views: Views, geometry: Geometry, config: FitConfig) -> R
     if options.reflectance == "off" or encoding.high_dynamic_range or config.tint != NO_TINT:
         return None
     with torch.no_grad():
-        seen = [unsaturated(rays, encoding.saturation) for rays in observe_views(views, geometry, options.rays)]
+        rays = list(observe_views(views, geometry, options.rays))
+        seen = [unsaturated(each, encoding.saturation) for each in rays]
         kept, held_out = split_held_out(seen)
-        if not held_out or not any(len(rays.radiance) for rays in kept):
+        if not held_out or not any(len(each.radiance) for each in kept):
             return None
-        found = find_reflectance(joined_rays(kept), options)
-        if min(found.tint) > options.largest_reflectance:
+        lamps = lamp_light(joined_rays(rays), encoding.saturation, options.resolution)
+        earned, scatters = Reflectance(np.ones(3)), None
+        for light, least in ((None, options.least_gain), (lamps, options.least_scattering_gain)):
+            found = find_reflectance(joined_rays(kept), options, light)
+            if min(found.tint) > options.largest_reflectance and found.albedo.max() < options.least_albedo:
+                continue
+            other, best = (_errors(kept, held_out, each, options) for each in (found, earned))
+            if is_clearly_lower(other, best, replace(config.selection, least_gain=least)):
+                earned, scatters = found, light
+        if min(earned.tint) == 1 and not earned.albedo.any():
             return None
-        metal, perfect = (_errors(kept, held_out, each, options) for each in (found, Reflectance(np.ones(3))))
-        if not is_clearly_lower(metal, perfect, replace(config.selection, least_gain=options.least_gain)):
-            return None
-        return find_reflectance(joined_rays(seen), options)
+        return find_reflectance(joined_rays(seen), options, scatters)
 
 
 def _errors(
@@ -65,22 +72,42 @@ def _errors(
 
 
 def _without(
-    radiance: Float[Tensor, "3 *S"], share: Float[Tensor, "3 *S"], found: Reflectance
-) -> Float[Tensor, "3 *S"]:
-    """c/F, at most 1/F₀, which what is saturated becomes: it may be any brighter."""
-    at_normal = torch.tensor(found.tint).to(radiance).reshape(3, *[1] * (radiance.ndim - 1))
-    return RadianceEncoding(tint=found.tint).without_gain(radiance / at_normal, share / at_normal)
+    radiance: Float[Tensor, "3 H W"], posed: TrainView, surface: SurfaceBuffers, found: Reflectance
+) -> Float[Tensor, "3 H W"]:
+    """(c − D)/F, at most 1/F₀, which what is saturated becomes: it may be any brighter."""
+    normals = torch.einsum("ij,jhw->ihw", posed.camera_to_world_rotation, normalize(surface.normals_camera, dim=0))
+    mirrored = (radiance - found.scattering(normals)).clamp(min=0)
+    mirrored = torch.where(radiance >= SATURATED, radiance, mirrored)
+    at_normal = torch.tensor(found.tint).to(radiance)[:, None, None]
+    share = found.share(surface.cosines(posed.camera))
+    return RadianceEncoding(tint=found.tint).without_gain(mirrored / at_normal, share / at_normal)
 
 
 def as_perfect_mirror(views: Views, posed: Views, geometry: Geometry, reflectance: Reflectance) -> Views:
-    """The views as a perfect mirror would have shown them: c/F at every pixel, at most 1/F₀. `posed` are the same with
-    their cameras as the geometry has them.
+    """The views as a perfect mirror would have shown them. `posed` are the same with their cameras as the geometry has
+    them.
     """
     train = []
     for view, seen in zip(views.train, posed.train, strict=True):
-        share = reflectance.share(geometry.buffers(seen.camera).cosines(seen.camera))
-        train.append(replace(view, radiance=_without(view.radiance, share, reflectance)))
+        radiance = _without(view.radiance, seen, geometry.buffers(seen.camera), reflectance)
+        train.append(replace(view, radiance=radiance))
     return replace(views, train=tuple(train))
+
+
+def without_scattered_light(
+    views: Views, geometry: Geometry, error: float, config: FitConfig
+) -> tuple[Views, FitConfig] | None:
+    """The views as a perfect mirror would have shown them, if an object of that geometry is found to scatter light, and
+    held-out views are left with an `error` that this may have made; else None. The configuration says at which radiance
+    they are saturated.
+    """
+    if error < config.material.least_scattering_error:
+        return None
+    usable = usable_views(views, geometry)
+    found = earned_reflectance(usable, geometry, config)
+    if found is None or not found.albedo.any():
+        return None
+    return as_perfect_mirror(views, usable, geometry, found), replace(config, tint=found.tint)
 
 
 @dataclass(frozen=True)

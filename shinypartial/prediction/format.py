@@ -134,10 +134,11 @@ class PredictionInfo:
     finished steps of a snapshot, `model_selection` how the kind of model was chosen; `model` says the same in free
     words; `verdict` is what the method says of its result; `surroundings` how near it found them; `reflectance` what
     share of the light (linear red, green, blue) it found the object to mirror at normal incidence, where that is not
-    all of it; `roughness` how rough, in units of Blender's principled shader, where it is not smooth; `blur_px` by how
-    much it found the pictures blurred (standard deviation of a Gaussian), where they are not sharp; `masks` is
-    "dataset" where the method wrote none and its test views were cut out by the dataset's; `left_out` names the parts
-    of a published method that its re-implementation lacks. Each is None where it is unknown or has no meaning.
+    all of it; `albedo` what share it found to be scattered evenly; `roughness` how rough, in units of Blender's
+    principled shader, where it is not smooth; `blur_px` by how much it found the pictures blurred (standard deviation
+    of a Gaussian), where they are not sharp; `masks` is "dataset" where the method wrote none and its test views were
+    cut out by the dataset's; `left_out` names the parts of a published method that its re-implementation lacks. Each is
+    None where it is unknown or has no meaning.
     """
 
     method: str
@@ -157,6 +158,7 @@ class PredictionInfo:
     iteration: int | None = None
     surroundings: NearSurroundings | None = None
     reflectance: tuple[Share, Share, Share] | None = None
+    albedo: tuple[Share, Share, Share] | None = None
     roughness: Share | None = None
     blur_px: NonNegative | None = None
     masks: Literal["dataset"] | None = None

@@ -6,12 +6,22 @@ import numpy as np
 import pytest
 import torch
 
+from panoless.environment.cubemap import flat_texels
 from panoless.environment.options import MaterialOptions
 from panoless.environment.rays import Rays
-from panoless.environment.reflectance import Reflectance, cosines_of_incidence, find_reflectance, left_unexplained
+from panoless.environment.reflectance import (
+    Reflectance,
+    cosines_of_incidence,
+    find_reflectance,
+    lamp_light,
+    left_unexplained,
+    unsaturated,
+)
 from panoless.kernels.cubemap import cubemap_directions
+from shinypartial.core.sphere import cube_solid_angles
 
 GOLD = np.array([1.0, 0.77, 0.34])
+PALE = 0.75 * GOLD
 OPTIONS = MaterialOptions(resolution=8)
 OUTGOING = cubemap_directions(8).reshape(-1, 3).double()
 LIGHT = torch.rand(len(OUTGOING), 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64) / 2 + 0.1
@@ -73,3 +83,47 @@ def test_rays_without_trust_are_predicted_only() -> None:
     residual = left_unexplained(rays, Reflectance(GOLD), OPTIONS)
     assert residual[: len(known.radiance)] == pytest.approx(0, abs=1e-6)
     assert residual[len(known.radiance) :] == pytest.approx(0.2, abs=1e-6)
+
+
+def scattering_rays(albedo: np.ndarray, lamp: float) -> Rays:
+    """Random normals and cameras of one side, pale gold: c = F E + ρ ∫ E (n·ω)₊ dω/π by sums over the texels of E, one
+    of which is a lamp whose radiance is `lamp` and shown as 1.
+    """
+    random = np.random.default_rng(7)
+    normals, toward = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in random.normal(size=(2, 8000, 3)))
+    toward[:, 2] = np.abs(toward[:, 2])
+    seen = (normals * toward).sum(1) > 0.1
+    normals, incoming = normals[seen], -toward[seen]
+    cosines = -(normals * incoming).sum(1, keepdims=True)
+    outgoing = incoming + 2 * cosines * normals
+    light = LIGHT.numpy().copy()
+    light[40] = lamp
+    area = np.broadcast_to(cube_solid_angles(8), (6, 8, 8)).reshape(-1, 1)
+    scattered = np.maximum(normals @ OUTGOING.numpy().T, 0) @ (area * light) / np.pi
+    share = PALE + (1 - PALE) * (1 - cosines) ** 5
+    shown = np.minimum(share * np.minimum(light, 1)[flat_texels(outgoing, 8)] + albedo * scattered, 1)
+    shown[flat_texels(outgoing, 8) == 40] = 1
+    directions, radiance, came = (torch.from_numpy(each).float() for each in (outgoing, shown, incoming))
+    return Rays(directions, radiance, incoming=came)
+
+
+@pytest.mark.parametrize("lamp", [1.0, 60.0])
+def test_what_is_scattered_is_told_beside_what_is_mirrored(lamp: float) -> None:
+    """Though a lamp lights the surface by more than photographs show of it."""
+    albedo, saturation = np.array([0.2, 0.1, 0.05]), torch.ones(3)
+    rays = scattering_rays(albedo, lamp)
+    lamps, known = lamp_light(rays, saturation, 8), unsaturated(rays, saturation)
+    found = find_reflectance(known, OPTIONS, lamps)
+    assert found.at_normal == pytest.approx(PALE, abs=0.03)
+    assert found.albedo == pytest.approx(albedo, abs=0.03)
+    mirror = find_reflectance(known, OPTIONS)
+    errors = (np.abs(left_unexplained(known, each, OPTIONS)).mean() for each in (found, mirror))
+    assert next(errors) < 0.5 * next(errors)
+
+
+def test_a_perfect_metal_scatters_nothing() -> None:
+    """Where light may be scattered, too, the metal comes out as without."""
+    rays = joined(rays_at(20), rays_at(50), rays_at(75))
+    found = find_reflectance(rays, OPTIONS, np.zeros(9))
+    assert found.at_normal == pytest.approx(GOLD, abs=0.01)
+    assert found.scattered_share is None or max(found.scattered_share) < 0.01
