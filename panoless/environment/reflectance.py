@@ -8,13 +8,14 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from panoless.capture.encoding import SATURATED
 from panoless.environment.cubemap import flat_texels
 from panoless.environment.options import MaterialOptions
 from panoless.environment.rays import Rays
 from panoless.numeric.robust import robust_weight
-from shinypartial.core.harmonics import real_harmonics
+from shinypartial.core.harmonics import project, real_harmonics
 from shinypartial.core.sphere import cube_directions, cube_solid_angles
 
 LEAST = 0.02
@@ -72,7 +73,7 @@ def cosines_of_incidence(rays: Rays) -> Float[Tensor, "P"]:
 def normals_of(rays: Rays) -> Float[Tensor, "P 3"]:
     """Unit normals where rays were mirrored once: the direction of ω − v."""
     assert rays.incoming is not None
-    return torch.nn.functional.normalize(rays.directions - rays.incoming, dim=1)
+    return normalize(rays.directions - rays.incoming, dim=1)
 
 
 def unsaturated(rays: Rays, saturation: Float[Tensor, "3"]) -> Rays:
@@ -94,24 +95,31 @@ def lamp_light(rays: Rays, saturation: Float[Tensor, "3"], resolution: int) -> F
 
 def _harmonics_of(values: Float[np.ndarray, "N C"], resolution: int) -> Float[np.ndarray, "9 C"]:
     """∫ v Y dω over the texels of a map."""
-    area = np.broadcast_to(cube_solid_angles(resolution), (6, resolution, resolution)).reshape(-1, 1)
-    basis = real_harmonics(cube_directions(resolution).reshape(-1, 3), 2)
-    found: Float[np.ndarray, "9 C"] = (basis * area).T @ values
-    return found
+    return project(
+        values, cube_directions(resolution).reshape(-1, 3), np.tile(cube_solid_angles(resolution).ravel(), 6), 2
+    )
 
 
-def find_reflectance(rays: Rays, options: MaterialOptions, lamps: Float[np.ndarray, "9"] | None = None) -> Reflectance:
+def find_reflectance(
+    rays: Rays,
+    options: MaterialOptions,
+    lamps: Float[np.ndarray, "9"] | None = None,
+    metal: Reflectance | None = None,
+) -> Reflectance:
     """F₀ in (0, 1] by min Σ w ‖c − F(θ) E‖² over it and the texels E of a map together.
 
     Where the harmonics of `lamps` are given (see `lamp_light`), min Σ w ‖c − F(θ) E − ρ I(n) − q L(n)‖² over the albedo
     ρ and q ≥ 0, too, with F₀ + ρ ≤ 1: I is the light of E that falls on a surface with the normal n, over π, and q L
-    what lamps add to it that photographs do not show.
+    what lamps add to it that photographs do not show. That begins with what is found without, the `metal` where known.
 
     w are the rays' trust and Geman–McClure weights. Each round is a Gauss–Newton step of each channel's unknowns, from
     which the texels are eliminated: all that counts is how a direction looks at different angles. A plane in a far
     world shows each direction at one angle and tells nothing; F₀ stays 1 and ρ zero there.
     """
-    return _Texels.of(rays, options).found(options, lamps)
+    texels = _Texels.of(rays, options)
+    if metal is None:
+        metal = texels.found(options, Reflectance(np.ones(3)))
+    return metal if lamps is None else texels.found(options, metal, lamps)
 
 
 def left_unexplained(rays: Rays, reflectance: Reflectance, options: MaterialOptions) -> Float[np.ndarray, "P 3"]:
@@ -130,10 +138,8 @@ def left_unexplained(rays: Rays, reflectance: Reflectance, options: MaterialOpti
 class _Texels:
     """Rays by the texel that they fall into."""
 
-    place: Int[np.ndarray, "P"]
-    """Flat index of the texel in the map…"""
     texel: Int[np.ndarray, "P"]
-    """…and among those that are seen."""
+    """Its flat index in the map."""
     radiance: Float[np.ndarray, "P 3"]
     trust: Float[np.ndarray, "P"]
     grazing: Float[np.ndarray, "P 1"]
@@ -142,10 +148,8 @@ class _Texels:
 
     @classmethod
     def of(cls, rays: Rays, options: MaterialOptions) -> "_Texels":
-        place = flat_texels(rays.directions.double().cpu().numpy(), options.resolution)
         return cls(
-            place,
-            np.unique(place, return_inverse=True)[1].reshape(-1),
+            flat_texels(rays.directions.double().cpu().numpy(), options.resolution),
             rays.radiance.double().cpu().numpy(),
             rays.initial_weight().double().cpu().numpy(),
             grazing(cosines_of_incidence(rays)).double().cpu().numpy()[:, None],
@@ -169,21 +173,20 @@ class _Texels:
         return share, self.summed(weight[:, None] * share * self.radiance) / squares, squares
 
     def falling(self, light: Float[np.ndarray, "P 3"], resolution: int) -> Float[np.ndarray, "9 3"]:
-        """Harmonics over the normal of what falls in over π, if texels that no ray sees are as those that are seen in
-        the mean.
+        """Harmonics over the normal of what falls in over π, by the light of each ray's texel, if texels that no ray
+        sees are as those that are seen in the mean.
         """
-        count = np.bincount(self.place, minlength=6 * resolution**2)[:, None]
-        values = np.stack([np.bincount(self.place, each, len(count)) for each in light.T], 1) / np.maximum(count, 1)
-        values = np.where(count > 0, values, values[count[:, 0] > 0].mean(0))
+        values = np.full((6 * resolution**2, 3), np.nan)
+        values[self.texel] = light
+        values = np.where(np.isnan(values), np.nanmean(values, 0), values)
         return LAMBERT[:, None] * _harmonics_of(np.maximum(values, 0), resolution)
 
-    def found(self, options: MaterialOptions, lamps: Float[np.ndarray, "9"] | None) -> Reflectance:
-        """F₀ = 1 − m − ρ, and ρ and q where lamps are given, from where these are zero on; m is the share of the light
-        that is lost.
-        """
+    def found(
+        self, options: MaterialOptions, start: Reflectance, lamps: Float[np.ndarray, "9"] | None = None
+    ) -> Reflectance:
+        """F₀ = 1 − m − ρ from a metal on, and ρ and q where lamps are given; m is the share of light that is lost."""
         weight, matte = self.trust, np.zeros((2, 9, 3))
-        lost = np.zeros(3) if lamps is None else 1 - self.found(options, None).at_normal
-        shares = np.zeros((2, 3))
+        lost, shares = 1 - start.at_normal, np.zeros((2, 3))
         for _ in range(options.rounds):
             at_normal = np.maximum(1 - lost - shares[0], LEAST)
             shown = self.without(self.basis @ (shares[:, None] * matte).sum(0))

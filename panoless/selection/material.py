@@ -47,17 +47,19 @@ def earned_reflectance(views: Views, geometry: Geometry, config: FitConfig) -> R
         if not held_out or not any(len(each.radiance) for each in kept):
             return None
         lamps = lamp_light(joined_rays(rays), encoding.saturation, options.resolution)
-        earned, scatters = Reflectance(np.ones(3)), None
-        for light, least in ((None, options.least_gain), (lamps, options.least_scattering_gain)):
-            found = find_reflectance(joined_rays(kept), options, light)
+        known, perfect = joined_rays(kept), Reflectance(np.ones(3))
+        metal = find_reflectance(known, options)
+        matte = find_reflectance(known, options, lamps, metal)
+        earned = perfect
+        for found, least in ((metal, options.least_gain), (matte, options.least_scattering_gain)):
             if min(found.tint) > options.largest_reflectance and found.albedo.max() < options.least_albedo:
                 continue
             other, best = (_errors(kept, held_out, each, options) for each in (found, earned))
             if is_clearly_lower(other, best, replace(config.selection, least_gain=least)):
-                earned, scatters = found, light
-        if min(earned.tint) == 1 and not earned.albedo.any():
+                earned = found
+        if earned is perfect:
             return None
-        return find_reflectance(joined_rays(seen), options, scatters)
+        return find_reflectance(joined_rays(seen), options, lamps if earned is matte else None)
 
 
 def _errors(

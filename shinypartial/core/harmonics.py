@@ -33,6 +33,13 @@ def real_harmonics(directions: Float[np.ndarray, "*P 3"], degree: int) -> Float[
     return basis
 
 
+def project(
+    values: Float[np.ndarray, "P C"], directions: Float[np.ndarray, "P 3"], areas: Float[np.ndarray, "P"], degree: int
+) -> Float[np.ndarray, "K C"]:
+    """Coefficients c_lm = Σ L Y_lm dω of values at unit directions that stand for so many steradians each."""
+    return np.einsum("pk,pc->kc", real_harmonics(directions, degree) * areas[:, None], values.astype(np.float64))
+
+
 def project_latlong(
     latlong: Float[np.ndarray, "H W C"], degree: int, axes_world: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "K C"]:
@@ -40,6 +47,6 @@ def project_latlong(
 
     The columns of `axes_world` are the x, y and z of the harmonics.
     """
-    height = len(latlong)
-    basis = real_harmonics(latlong_directions(height) @ axes_world, degree) * latlong_solid_angles(height)[..., None]
-    return np.einsum("hwk,hwc->kc", basis, latlong.astype(np.float64))
+    height, channels = len(latlong), latlong.shape[-1]
+    directions = (latlong_directions(height) @ axes_world).reshape(-1, 3)
+    return project(latlong.reshape(-1, channels), directions, latlong_solid_angles(height).ravel(), degree)
