@@ -236,13 +236,19 @@ def take_round(
 
 
 def make_task(views: Views, settings: FreeFormRound, options: FreeFormOptions) -> Task:
-    """The pixels and outlines of a round, weighted as if `counted_rays` pixels took part."""
+    """The pixels and outlines of a round, weighted as if `counted_rays` pixels took part.
+
+    Under coarse maps pixels are wrong by the robust scale s, not by their noise σ: where outlines hold the surface,
+    they count (s/σ)² times as much.
+    """
     pixels, outlines = solid_pixels(views, settings.rays), outline_rays(views)
     total = max(views.num_solid, 1)
     chosen = outlines.chosen(slice(None, None, max(1, -(-len(outlines.size) // options.outline_points))))
     share = options.counted_rays / options.radiance_sigma**2 / max(len(pixels.inner_px), 1)
     density = options.counted_rays / total * len(outlines.size) / max(len(chosen.size), 1)
-    outlined, brightness = density / options.outline_sigma_px**2, max(float(pixels.radiance.mean()), LEAST_BRIGHTNESS)
+    believed = (settings.robust_scale / options.radiance_sigma) ** 2 if settings.held else 1.0
+    outlined = believed * density / options.outline_sigma_px**2
+    brightness = max(float(pixels.radiance.mean()), LEAST_BRIGHTNESS)
     return Task(pixels, chosen, share, outlined, settings, options, StatedCameras.of(views), brightness)
 
 

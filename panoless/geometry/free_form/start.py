@@ -60,25 +60,27 @@ def first_surfaces(views: Views, config: FitConfig) -> FirstSurfaces:
 
 
 def started(views: Views, first: FirstSurfaces, options: FreeFormOptions) -> LevelSet:
-    """What the best of the plates descends to, if pixels agree better under it than under the plain surface, both after
-    the first round of the fit.
+    """What the best of the plates descends to, held by outlines or by smoothness alone, if pixels agree better under it
+    than under the plain surface, all after the first round of the fit.
     """
     descent, plain = options.descent, first.surface
     if not descent.rounds:
         return plain
     short = replace(options, outline_points=min(descent.outline_points, options.outline_points), poses="off")
-    tried, rest = descent.rounds[: descent.tried], descent.rounds[descent.tried :]
-    steps = [each.steps for each in (*tried * len(first.plates), *rest, *options.rounds[:1] * 2)]
+    rounds = {held: tuple(replace(each, held=held) for each in descent.rounds) for held in (True, False)}
+    tried = descent.rounds[: descent.tried] * (len(first.plates) * len(rounds))
+    steps = [each.steps for each in (*tried, *descent.rounds[descent.tried :], *options.rounds[:1] * 2)]
     progress, disagreement = Progress("looking for a start", sum(steps)), _disagreement(views, options)
 
     def taken(surface: LevelSet, rounds: Sequence[FreeFormRound], options: FreeFormOptions) -> LevelSet:
         return coarse_stage(views, surface, rounds, options, progress).surface
 
     with torch.no_grad():
-        plates = (replace(plate, surroundings=first.surroundings) for plate in first.plates)
-        best = min((taken(plate, tried, short) for plate in plates), key=disagreement)
+        plates = [replace(plate, surroundings=first.surroundings) for plate in first.plates]
+        ways = [(held, taken(plate, rounds[held][: descent.tried], short)) for plate in plates for held in rounds]
+        held, best = min(ways, key=lambda way: disagreement(way[1]))
         return keep_if_better(
-            (plain, taken(best, rest, short)),
+            (plain, taken(best, rounds[held][descent.tried :], short)),
             lambda each: disagreement(taken(each, options.rounds[:1], options)),
             descent.least_gain,
         )
