@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 from panoless.capture.corrections import with_focal_factor
@@ -13,7 +14,7 @@ from panoless.capture.views import Views, views_of
 from panoless.config import FitConfig, SurfelConfig
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.free_form import fit
-from panoless.geometry.free_form.fit import Change, fit_free_form, gauss_newton_step, make_task
+from panoless.geometry.free_form.fit import Change, coarse_stage, fit_free_form, gauss_newton_step, make_task
 from panoless.geometry.free_form.kind import FreeFormFamily, FreeFormMirror
 from panoless.geometry.free_form.options import DEFAULTS, ConcaveOptions, DescentOptions, FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.photometric import Sights, Solution
@@ -345,9 +346,28 @@ def test_flat_faces_that_no_outline_shows_are_found_by_a_descent() -> None:
     assert error_deg(replace(OPTIONS, descent=DescentOptions())) < 1.0 < 3.0 < error_deg(OPTIONS)
 
 
+def test_outlines_hold_faces_that_maps_of_few_texels_would_turn() -> None:
+    """After two rounds of the descent from a rounded plate, by the mean of normals: 2.6° held, 21° by pixels alone."""
+    body = block(exponent=10.0)
+    views = body_views(body, VIEWS, SIZE_PX)
+    proposal = FreeFormFamily().propose(views, CONFIG, asked=True)
+    assert proposal is not None
+    first = proposal.shape.plates[-1]
+
+    def error_deg(*, held: bool) -> float:
+        rounds = [replace(each, held=held) for each in DescentOptions().rounds[:2]]
+        with torch.no_grad():
+            surface = coarse_stage(views, first, rounds, OPTIONS).surface
+        return float(np.mean(normal_errors_deg(surface, body, views, cameras_around(7, 60)[1::2])))
+
+    assert error_deg(held=True) < 4.0 < 12.0 < error_deg(held=False)
+
+
 @pytest.mark.slow
-def test_flat_faces_that_mirror_a_dark_ground_are_found_by_contrast() -> None:
-    """The median brightness is a tenth of the mean. As logarithms 1.6° are measured, and 41° without."""
+def test_flat_faces_that_mirror_a_dark_ground_are_found() -> None:
+    """The median brightness is a tenth of the mean. 0.5° are measured as logarithms and 0.6° as radiance; 41° in a
+    descent by pixels alone.
+    """
     views = body_views(block(), VIEWS, SIZE_PX)
     dark = replace(views, train=tuple(replace(view, radiance=5 * view.radiance**16) for view in views.train))
     config = replace(CONFIG, free_form=replace(OPTIONS, descent=DescentOptions()))
@@ -357,7 +377,8 @@ def test_flat_faces_that_mirror_a_dark_ground_are_found_by_contrast() -> None:
         surface = family.fit(dark, family.propose(dark, config, asked=True), config).surface
         return float(np.median(normal_errors_deg(surface, block(), dark, cameras_around(7, 60)[1::2])))
 
-    assert error_deg(config) < 3.0 < 10.0 < error_deg(replace(config, contrast=ContrastOptions(dark_share=0.0)))
+    assert error_deg(config) < 1.0
+    assert error_deg(replace(config, contrast=ContrastOptions(dark_share=0.0))) < 1.0
 
 
 def test_what_all_cameras_share_is_taken_back() -> None:
