@@ -123,7 +123,7 @@ class DescentOptions:
 
     Chosen on a block with flat faces, a twisted one and a torus, none of them a scene of the benchmark. Their first
     surfaces are wrong by 8.2°, 4.5° and 3.1° in the median. The first rounds alone end at 5.6°, 3.0° and 0.6°; after
-    these steps they end at 0.6°, 0.9° and 0.1°.
+    these steps they end at 0.3°, 0.2° and 0.1°.
     """
 
     rounds: tuple[FreeFormRound, ...] = (

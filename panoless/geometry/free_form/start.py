@@ -60,8 +60,8 @@ def first_surfaces(views: Views, config: FitConfig) -> FirstSurfaces:
 
 
 def started(views: Views, first: FirstSurfaces, options: FreeFormOptions) -> LevelSet:
-    """What the best of the plates descends to, held by outlines or by smoothness alone, if pixels agree better under it
-    than under the plain surface, all after the first round of the fit.
+    """What the best of the plates descends to, if pixels agree better under it than under the plain surface, both after
+    the first round of the fit. Each plate descends twice at first, held by outlines and not; pixels tell which goes on.
     """
     descent, plain = options.descent, first.surface
     if not descent.rounds:
