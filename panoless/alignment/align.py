@@ -97,6 +97,22 @@ class Alignment:
         medians = [np.median([rows.typical for rows in each]) for each in zip(*residuals, strict=True)]
         return [max(float(each) / NORMAL_MEDIAN, floor) for each, floor in zip(medians, least, strict=False)]
 
+    def uncertainty(self, geometry: Geometry) -> Float[np.ndarray, "V 6"]:
+        """Standard deviations of the turns (rad) and shifts (normalized frame) that a finished geometry has, with its
+        surface and map as they are: k √diag (Σ JᵀWJ/σ² + P)⁻¹ over outlines and colors of each view.
+
+        The factor k stands for pixels that err alike, and for a surface and a map that are wrong themselves.
+        """
+        assert geometry.poses is not None, "poses were found"
+        scene = Scene(geometry, known_map(self.views, geometry, self.options))
+        rows = [view.rows(scene, pose) for view, pose in zip(self._seen, geometry.poses.stacked, strict=True)]
+        noise, found = self._noise(rows), []
+        for each, prior in zip(rows, self.prior, strict=True):
+            parts = zip(each, noise, strict=True)
+            known = sum((part.equations(self.options.noise_multiple * sigma, sigma)[1] for part, sigma in parts), prior)
+            found.append(np.sqrt(np.diag(np.linalg.inv(known))))
+        return self.options.uncertainty_factor * np.array(found)
+
     def without_motion_of_object(self, turns: Poses) -> Poses:
         """Turns less what looks like a motion of the object, which outlines don't tell from one: by least squares.
 

@@ -44,6 +44,13 @@ class Corrections:
         """Standard deviation of log₂ of the balances; None where they are all alike."""
         return None if self.balances is None else float(np.log2(self.balances).std())
 
+    @property
+    def channel_gains(self) -> Float[np.ndarray, "V 3"] | None:
+        """Of each view and channel; None where they are all alike."""
+        if self.gains is None:
+            return None
+        return self.gains[:, None] * (np.ones((1, 3)) if self.balances is None else self.balances)
+
     def applied(self, views: Views, config: FitConfig) -> Views:
         """The views as they would be without these errors; themselves where there are none."""
         train = views.train
@@ -51,9 +58,8 @@ class Corrections:
             train = tuple(with_focal_factor(view, self.focal_factor) for view in train)
         if self.mask_offset_px:
             train = tuple(with_outline_moved(view, self.mask_offset_px) for view in train)
-        if self.gains is not None:
-            balances = np.ones((1, 3)) if self.balances is None else self.balances
-            gains = torch.from_numpy(self.gains[:, None] * balances).float()[..., None, None]
+        if self.channel_gains is not None:
+            gains = torch.from_numpy(self.channel_gains).float()[..., None, None]
             encoding, exposed = encoding_of(config), zip(train, gains, strict=True)
             train = tuple(
                 replace(view, radiance=encoding.without_gain(view.radiance, gain.to(view.radiance)))

@@ -44,6 +44,7 @@ from shinypartial.prediction.format import (
     INVERSE_DISTANCE,
     SNAPSHOTS,
     Candidate,
+    FoundCamera,
     ModelSelection,
     NearSurroundings,
     PredictionInfo,
@@ -116,6 +117,7 @@ def export_prediction(
         model_bytes=sum((folder / name).stat().st_size for name in (mesh_file, ENVIRONMENT)),
         model=state.selection.sentence,
         model_selection=_model_selection(state.selection),
+        cameras=_found_cameras(dataset, state),
         verdict=state.verdict,
         surroundings=_near_surroundings(around, state.frame),
         reflectance=None if state.reflectance is None else state.reflectance.tint,
@@ -261,6 +263,28 @@ def _model_selection(selection: Selection) -> ModelSelection:
         for each in selection.candidates
     )
     return ModelSelection(selection.chosen, tuple(rows))
+
+
+def _found_cameras(dataset: Dataset, state: FitState) -> tuple[FoundCamera, ...] | None:
+    """Poses and exposures of the training views, where they were unknowns."""
+    poses, sigmas, corrections = state.geometry.poses, state.pose_uncertainty, state.selection.corrections
+    if poses is None and corrections.gains is None:
+        return None
+    to_world, none = np.repeat([180 / np.pi, state.frame.radius], 3), [None] * len(dataset.train)
+    placed = none if poses is None else list(poses.stacked * to_world)
+    spread = none if sigmas is None else list(sigmas.numpy() * to_world)
+    gains = none if (channels := corrections.channel_gains) is None else list(channels)
+    return tuple(
+        FoundCamera(frame.name, _three(pose, 0), _three(pose, 3), _three(sigma, 0), _three(sigma, 3), _three(gain, 0))
+        for frame, pose, sigma, gain in zip(dataset.train, placed, spread, gains, strict=True)
+    )
+
+
+def _three(numbers: Float[np.ndarray, "N"] | None, first: int) -> tuple[float, float, float] | None:
+    if numbers is None:
+        return None
+    x, y, z = numbers[first : first + 3].tolist()
+    return x, y, z
 
 
 def _processor_name() -> str:

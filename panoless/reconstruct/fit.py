@@ -5,6 +5,7 @@ from pathlib import Path
 
 import torch
 
+from panoless.alignment.align import Alignment
 from panoless.capture.configured import configured_views
 from panoless.capture.views import Views
 from panoless.config import FitConfig, check_config
@@ -68,6 +69,10 @@ def fit(
             photographs = complete(state, photographs, config)
         with timed(state.seconds, "judge"):
             state.verdict = assess(state, photographs, config)
+            if state.geometry.poses is not None:
+                with torch.no_grad():
+                    found = Alignment(photographs, config.poses).uncertainty(state.geometry)
+                state.pose_uncertainty = torch.from_numpy(found)
         note_peak_memory(state)
         save_state(folder, state)
         return state.to(MAIN_MEMORY)

@@ -9,6 +9,7 @@ PREDICTION/decomposition.jpg          optional: what a test view is made of
 PREDICTION/snapshots/000250           optional: earlier moments of the fit, each a prediction folder
 """
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -125,20 +126,48 @@ class NearSurroundings:
 
 
 @dataclass(frozen=True)
+class FoundCamera:
+    """What a method found about a training view that its dataset says otherwise; None: it believed that.
+
+    The camera is turned about its own center by the rotation vector `turn_deg` (world axes) and then moved by `shift`
+    (world units). `turn_sigma_deg` and `shift_sigma` are standard deviations of their components. `gain` (linear red,
+    green, blue) is its exposure over that of the mean view.
+    """
+
+    name: Text
+    turn_deg: tuple[float, float, float] | None = None
+    shift: tuple[float, float, float] | None = None
+    turn_sigma_deg: tuple[NonNegative, NonNegative, NonNegative] | None = None
+    shift_sigma: tuple[NonNegative, NonNegative, NonNegative] | None = None
+    gain: tuple[NonNegative, NonNegative, NonNegative] | None = None
+
+    @property
+    def turn_length_deg(self) -> float:
+        """The angle of the turn, 0 where there is none."""
+        return math.hypot(*(self.turn_deg or (0.0,)))
+
+    @property
+    def shift_length(self) -> float:
+        """By how much its center is moved (world units), 0 where it is not."""
+        return math.hypot(*(self.shift or (0.0,)))
+
+
+@dataclass(frozen=True)
 class PredictionInfo:
     """Who made the prediction and at what cost; `curves` are per-iteration training series, for the report only.
 
-    `seconds` are those of making the model; their sum is its time in leaderboards and charts. `hardware` names under
-    `device` what the model was fitted on: "cpu", or the name of the GPU. `primitives` is the number of surfels,
-    Gaussians, voxels or vertices, `model_bytes` the size of the files that a renderer needs, `iteration` the number of
-    finished steps of a snapshot, `model_selection` how the kind of model was chosen; `model` says the same in free
-    words; `verdict` is what the method says of its result; `surroundings` how near it found them; `reflectance` what
-    share of the light (linear red, green, blue) it found the object to mirror at normal incidence, where that is not
-    all of it; `albedo` what share it found to be scattered evenly; `roughness` how rough, in units of Blender's
-    principled shader, where it is not smooth; `blur_px` by how much it found the pictures blurred (standard deviation
-    of a Gaussian), where they are not sharp; `masks` is "dataset" where the method wrote none and its test views were
-    cut out by the dataset's; `left_out` names the parts of a published method that its re-implementation lacks. Each is
-    None where it is unknown or has no meaning.
+    `seconds` are those of making the model; their sum is its time in leaderboards and charts. `hardware` names
+    under `device` what the model was fitted on: "cpu", or the name of the GPU. `primitives` is the number of
+    surfels, Gaussians, voxels or vertices, `model_bytes` the size of the files that a renderer needs, `iteration`
+    the number of finished steps of a snapshot, `model_selection` how the kind of model was chosen; `model` says the
+    same in free words; `cameras` what it found about each training view; `verdict` is what the method says of its
+    result; `surroundings` how near it found them; `reflectance` what share of the light (linear red, green, blue)
+    it found the object to mirror at normal incidence, where that is not all of it; `albedo` what share it found to
+    be scattered evenly; `roughness` how rough, in units of Blender's principled shader, where it is not smooth;
+    `blur_px` by how much it found the pictures blurred (standard deviation of a Gaussian), where they are not
+    sharp; `masks` is "dataset" where the method wrote none and its test views were cut out by the dataset's;
+    `left_out` names the parts of a published method that its re-implementation lacks. Each is None where it is
+    unknown or has no meaning.
     """
 
     method: str
@@ -152,6 +181,7 @@ class PredictionInfo:
     curves: dict[str, list[float]] = field(default_factory=dict)
     model: str | None = None
     model_selection: ModelSelection | None = None
+    cameras: tuple[FoundCamera, ...] | None = None
     verdict: Trust | None = None
     primitives: int | None = None
     model_bytes: int | None = None

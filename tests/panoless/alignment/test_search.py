@@ -80,6 +80,10 @@ def test_turned_cameras_of_a_flat_mirror_are_found() -> None:
     assert geometry.poses is not None
     assert left_deg(geometry.poses, wrong) < 0.05
     assert geometry.state_dict()["plane"]["normal"] @ NORMAL > np.cos(np.radians(0.3))
+    # What is left of the turns is as large as said, but for what pixels that err alike hide.
+    left = Rotation.from_rotvec(geometry.poses.turns) * Rotation.from_rotvec(wrong.turns)
+    errors = (left.mean().inv() * left).as_rotvec() / Alignment(turned, CONFIG.poses).uncertainty(geometry)[:, :3]
+    assert 0.2 < np.sqrt((errors**2).mean()) < 10
 
 
 def test_outlines_of_a_surface_of_revolution_turn_cameras_back() -> None:

@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData
+from scipy.spatial.transform import Rotation
 
+from panoless.capture.corrections import Corrections
 from panoless.capture.object_frame import ObjectFrame
-from panoless.capture.rays import raster_camera
+from panoless.capture.poses import Poses, moved_view
+from panoless.capture.rays import pose_of, raster_camera
+from panoless.capture.views import TrainView
 from panoless.environment.surroundings import Surroundings
 from panoless.export.mesh_files import write_ply
 from panoless.export.pictures import crop_to_object
@@ -269,6 +273,34 @@ def finished_state(geometry: Geometry, frame: ObjectFrame, candidate: Candidate)
     environment = clipped_environment(cubemap_directions(64)).permute(0, 3, 1, 2).contiguous()
     selection = Selection(geometry.kind, (candidate,))
     return FitState(geometry, frame, selection, environment=environment, visibility=torch.ones(6, 64, 64))
+
+
+def test_found_cameras_and_exposures_are_in_world_units(tmp_path: Path) -> None:
+    """Cameras of a dataset that are turned and shifted as stated are those that the fit ended with."""
+    plane, frame = plane_of(RECTANGLE), ObjectFrame(np.zeros(3), 2.0)
+    dataset, rng = make_plane_dataset(tmp_path / "plane", plane, train=3), np.random.default_rng(5)
+    poses, sigmas = Poses(*rng.normal(size=(2, 3, 3)) * 0.1), torch.from_numpy(rng.uniform(size=(3, 6)))
+    gains = np.array([0.8, 1.0, 1.2])
+    chosen = Candidate("plane", Verdict.CHOSEN, "it fits", corrections=Corrections(gains=gains))
+    state = finished_state(PlaneMirror(plane, poses=poses), frame, chosen)
+    folder = tmp_path / "prediction"
+    acquire_prediction(folder)
+    export_prediction(dataset, replace(state, pose_uncertainty=sigmas), tiny_config(), folder)
+    cameras = read_info(folder).cameras
+    assert cameras is not None
+    assert [each.name for each in cameras] == [each.name for each in dataset.train]
+    for index, (found, stated) in enumerate(zip(cameras, dataset.train, strict=True)):
+        view = TrainView(
+            raster_camera(stated.camera, frame, 0.1), torch.zeros(3, 1, 1), torch.zeros(1, 1), torch.zeros(0).long()
+        )
+        moved = moved_view(view, Rotation.from_rotvec(poses.turns[index]).as_matrix(), poses.shifts[index])
+        rotation, center = pose_of(moved.camera)
+        turned = Rotation.from_rotvec(found.turn_deg, degrees=True).as_matrix() @ stated.camera.camera_to_world[:3, :3]
+        np.testing.assert_allclose(rotation.T, turned, atol=1e-6)
+        np.testing.assert_allclose(2 * center, stated.camera.position_world + found.shift, atol=1e-6)
+        np.testing.assert_allclose(np.radians(found.turn_sigma_deg), sigmas[index, :3])
+        np.testing.assert_allclose(found.shift_sigma, 2 * sigmas[index, 3:])
+        assert found.gain == (gains[index],) * 3
 
 
 @pytest.fixture(scope="module")
