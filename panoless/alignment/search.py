@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from jaxtyping import Int
 
-from panoless.alignment.align import Alignment, Scene, known_map
-from panoless.capture.poses import Poses
+from panoless.alignment.align import Alignment, Scene, known_map, pose_prior
+from panoless.capture.poses import Poses, StatedCameras
 from panoless.capture.views import Views, split_held_out
 from panoless.config import FitConfig
 from panoless.environment.resolution import prediction_error
@@ -41,8 +41,10 @@ def align_proposal(family: Family, views: Views, proposal: Proposal, config: Fit
     Outlines hardly tell a shift across the line of sight from a turn, so cameras are only turned.
     """
     options = config.poses
-    if options.mode == "off" or family.finds_poses or not np.isfinite(proposal.silhouette_px):
+    if options.mode == "off" or not np.isfinite(proposal.silhouette_px):
         return None
+    if family.finds_poses:
+        return _outlined_proposal(family, views, proposal, config)
     outline = family.as_proposed(proposal, config)
     if outline is None:
         return None
@@ -63,6 +65,25 @@ def align_proposal(family: Family, views: Views, proposal: Proposal, config: Fit
     return PosedProposal(nearest, found) if options.mode == "on" or is_nearer else None
 
 
+def _outlined_proposal(family: Family, views: Views, proposal: Proposal, config: FitConfig) -> PosedProposal | None:
+    """The proposal of a kind that finds poses itself at the poses that outlines tell, as often as these ask."""
+    options, cameras, prior = config.poses, StatedCameras.of(views), pose_prior(views, config.poses)
+    found, there = None, views
+    for _ in range(options.silhouette_rounds):
+        told = family.poses_by_outlines(there, proposal, config)
+        if told is None:
+            break
+        poses = told.poses if found is None else found.after(told.poses.stacked)
+        poses = poses.without_common(cameras, poses.likely_prior(cameras, prior, options.stated_floor))[1]
+        again = family.propose(poses.moved(views), config, asked=False)
+        if again is None:
+            break
+        found, there, proposal = poses, poses.moved(views), replace(again, told=told)
+        if told.poses.turn_deg < options.outlined_deg:
+            break
+    return None if found is None else PosedProposal(proposal, found)
+
+
 def fit_with_poses(
     family: Family, source: Family, views: Views, start: PosedProposal, config: FitConfig
 ) -> Geometry | None:
@@ -76,8 +97,13 @@ def fit_with_poses(
     first = geometry = fit_at(family, views, start, config)
     if start.poses is None:
         return first
-    if options.mode == "auto" and start.proposal.fitted is None and not _is_asked_for(views, geometry, config):
-        return None
+    if options.mode == "auto" and start.proposal.fitted is None:
+        believed = _believed(family, views, start, geometry, config)
+        least_gain = options.least_outlined_gain if family.finds_poses else options.least_pose_gain
+        if not _is_asked_for(views, geometry, believed, least_gain, config):
+            return None
+    if family.finds_poses:
+        return geometry
     for _ in range(options.rounds):
         before, poses = geometry, _next_poses(views, geometry, config)
         geometry = fit_at(family, views, replace(start, poses=poses).after(before), config)
@@ -96,10 +122,24 @@ def fit_with_poses(
 
 
 def fit_at(family: Family, views: Views, start: PosedProposal, config: FitConfig) -> Geometry:
-    """The geometry of a kind by views at the poses of a proposal."""
+    """The geometry of a kind by views at the poses of a proposal, which it may change where it finds them itself."""
     if start.poses is None:
         return family.fit(views, start.proposal, config)
-    return family.fit(start.poses.moved(views), start.proposal, config).with_poses(start.poses)
+    proposal = start.proposal
+    if proposal.fitted is not None and proposal.fitted.poses is not None:
+        proposal = replace(proposal, fitted=proposal.fitted.with_poses(proposal.fitted.poses.beyond(start.poses)))
+    fitted = family.fit(start.poses.moved(views), proposal, config)
+    return fitted.with_poses(start.poses if fitted.poses is None else start.poses.after(fitted.poses.stacked))
+
+
+def _believed(family: Family, views: Views, start: PosedProposal, fitted: Geometry, config: FitConfig) -> Geometry:
+    """The same geometry with cameras as they are said to be; one that explains any outlines is fitted on by these, as
+    it settled under others.
+    """
+    believed = fitted.with_poses(None)
+    if not family.finds_poses:
+        return believed
+    return family.fit(views, replace(start.proposal, told=None, fitted=believed), config)
 
 
 def _next_poses(views: Views, geometry: Geometry, config: FitConfig) -> Poses:
@@ -119,20 +159,20 @@ def _turned_deg(before: Geometry, after: Geometry) -> float:
     return float(np.degrees(np.median(np.linalg.norm(after.poses.turns - before.poses.turns, axis=1))))
 
 
-def _is_asked_for(views: Views, geometry: Geometry, config: FitConfig) -> bool:
-    """Whether held-out views, under the map of the others, are explained better where their outlines have put them than
-    where they are said to be: by the share `least_pose_gain` of the error.
+def _is_asked_for(views: Views, geometry: Geometry, believed: Geometry, least_gain: float, config: FitConfig) -> bool:
+    """Whether held-out views, under the map of the others, are explained better where their poses have put them than
+    where they are said to be: by the share `least_gain` of the error.
 
-    Their colors have told nothing of where that is. True where there are too few views to hold any out.
+    True where there are too few views to hold any out.
     """
     solved, tested = _parts(views)
-    if not len(solved) or not len(tested) or geometry.poses is None:
+    if not len(solved) or not len(tested):
         return True
-    environment = known_map(_chosen(views, solved), _with_part(geometry, solved), config.poses)
-    part, found = _chosen(views, tested), _with_part(geometry, tested)
-    said = found.with_poses(Poses.none(len(tested)))
-    errors = [_error(part, each, environment, config) for each in (said, found)]
-    return errors[1] < (1 - config.poses.least_pose_gain) * errors[0]
+    errors = []
+    for each in (geometry, believed):
+        environment = known_map(_chosen(views, solved), _with_part(each, solved), config.poses)
+        errors.append(_error(_chosen(views, tested), _with_part(each, tested), environment, config))
+    return errors[0] < (1 - least_gain) * errors[1]
 
 
 def _held_out_error(views: Views, geometry: Geometry, config: FitConfig) -> float:
@@ -158,7 +198,8 @@ def _chosen(views: Views, numbers: Int[np.ndarray, "N"]) -> Views:
 
 
 def _with_part(geometry: Geometry, numbers: Int[np.ndarray, "N"]) -> Geometry:
-    assert geometry.poses is not None
+    if geometry.poses is None:
+        return geometry
     return geometry.with_poses(Poses(geometry.poses.turns[numbers], geometry.poses.shifts[numbers]))
 
 

@@ -71,6 +71,11 @@ class Poses:
         turns = Rotation.from_rotvec(change[:, :3]) * Rotation.from_rotvec(self.turns)
         return Poses(turns.as_rotvec(), self.shifts + change[:, 3:])
 
+    def beyond(self, first: "Poses") -> "Poses":
+        """What turns and shifts cameras from the first poses to these: `first.after` of it is these."""
+        turns = Rotation.from_rotvec(self.turns) * Rotation.from_rotvec(first.turns).inv()
+        return Poses(turns.as_rotvec(), self.shifts - first.shifts)
+
     def without_common(self, cameras: "StatedCameras", prior: Float[np.ndarray, "V 6 6"]) -> tuple[Similarity, "Poses"]:
         """What turns, shifts and scales all cameras alike, by least squares under the weights of the prior, and the
         poses in a world from which that was taken back.
@@ -84,6 +89,21 @@ class Poses:
         common = Similarity(1 + float(found[6]), Rotation.from_rotvec(found[:3]).as_matrix(), found[3:6])
         turns = Rotation.from_matrix(common.rotation.T) * Rotation.from_rotvec(self.turns)
         return common, Poses(turns.as_rotvec(), common.undone(cameras.centers + self.shifts) - cameras.centers)
+
+    def likely_prior(
+        self, cameras: "StatedCameras", prior: Float[np.ndarray, "V 6 6"], floor: float
+    ) -> Float[np.ndarray, "V 6 6"]:
+        """The prior with turns and shifts as large as they turn out to be, and no less than `floor` of their standard
+        deviations.
+
+        Positions of cameras that were only turned are right, and so are turns of those that were only shifted. With
+        x = turns or shifts without what they share under the prior P, σ² becomes (floor² + mean xᵀPx / 3) σ².
+        """
+        own = self.without_common(cameras, prior)[1].stacked
+        parts = [slice(0, 3), slice(3, 6)]
+        squares = [np.einsum("vi,vij,vj->v", own[:, k], prior[:, k, k], own[:, k]).mean() / 3 for k in parts]
+        scale = np.repeat(np.sqrt(floor**2 + np.array(squares)), 3)
+        return prior / np.outer(scale, scale)
 
     def lens_turn(self, cameras: "StatedCameras", prior: Float[np.ndarray, "V 6 6"]) -> Float[np.ndarray, "2"] | None:
         """By how much every camera is turned about its own x and y axis (rad), as by a wrong principal point.
@@ -123,6 +143,12 @@ class Poses:
             moved_view(view, turn, shift) for view, turn, shift in zip(views.train, turns, self.shifts, strict=True)
         ]
         return replace(views, train=tuple(moved))
+
+
+def with_pose_covariances(views: Views, covariances: Float[np.ndarray, "V 6 6"]) -> Views:
+    """The views with these covariances of their turns and shifts."""
+    stated = zip(views.train, covariances, strict=True)
+    return replace(views, train=tuple(replace(view, pose_covariance=each) for view, each in stated))
 
 
 def common_and_lens(

@@ -206,6 +206,17 @@ class Geometry(Protocol):
 
 
 @dataclass(frozen=True)
+class ToldPoses:
+    """Poses that outlines tell, and how well: of turns (rad) and shifts (normalized frame)."""
+
+    poses: Poses
+    covariances: Float[np.ndarray, "V 6 6"]
+    """Of what outlines leave open."""
+    prior: Float[np.ndarray, "V 6 6"]
+    """Inverse covariances before outlines, as large as turns and shifts turned out to be."""
+
+
+@dataclass(frozen=True)
 class Proposal:
     """A shape from silhouettes alone, and how well it explains them: medians over views."""
 
@@ -215,6 +226,9 @@ class Proposal:
     """Distance of the mask's contour from that of the shape; infinite where no view sees it."""
     overlap: float
     """Intersection of shape and mask over their union, in [0, 1]."""
+    told: ToldPoses | None = None
+    """By outlines, of a kind that finds poses itself, beyond those by which it was proposed; None: these are believed.
+    """
     fitted: Any = None
     """The geometry of an earlier fit to almost the same views. A kind whose fit is long goes on from it, in few steps.
     """
@@ -251,6 +265,10 @@ class Family(Protocol):
         """A proposal as a geometry, which tells what is wrong with cameras and masks and how near the surroundings are;
         None for a kind that has none to show.
         """
+        ...
+
+    def poses_by_outlines(self, views: Views, proposal: Proposal, config: FitConfig) -> ToldPoses | None:
+        """Of a kind that finds poses itself: those that outlines alone tell; None where these believe the cameras."""
         ...
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:

@@ -18,7 +18,16 @@ from panoless.environment.rays import Rays, normalize_confidence
 from panoless.environment.resolution import densest_resolution
 from panoless.environment.solve import solve_environment
 from panoless.environment.surroundings import Surroundings
-from panoless.geometry.base import Geometry, Training, TrainingObserver, from_plain, observe_views, to_plain
+from panoless.geometry.base import (
+    Geometry,
+    Proposal,
+    ToldPoses,
+    Training,
+    TrainingObserver,
+    from_plain,
+    observe_views,
+    to_plain,
+)
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.rasterize import RasterCamera
 from panoless.kernels.reference.objective import reflection_directions_world
@@ -106,6 +115,10 @@ class ExactFamily:
     finds_poses: ClassVar[bool] = False
     refines: ClassVar[str | None] = None
     needs_depth: ClassVar[bool] = True
+
+    def poses_by_outlines(self, views: Views, proposal: Proposal, config: FitConfig) -> ToldPoses | None:
+        """None: they are found beside the shape (see `panoless.alignment`)."""
+        return None
 
     def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
         """None: it is told by how far photographs pull (see `panoless.alignment.lens`)."""

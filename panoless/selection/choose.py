@@ -151,31 +151,8 @@ def _first_fit(
     for start in proposals:
         geometry = _fit_around(family, views, start, config, known)
         if geometry is not None:
-            found_poses = geometry.poses is not None and family.finds_poses and start.proposal.fitted is None
-            return Fitted(_fit_once_more(family, views, geometry, config) if found_poses else geometry, start)
+            return Fitted(geometry, start)
     return None
-
-
-def _fit_once_more(family: Family, views: Views, first: Geometry, config: FitConfig) -> Geometry:
-    """A fit by views at the poses that the first one found, unless that explains clearly more: turned cameras carve a
-    wrong hull, which tells neither how near surroundings are nor all of the poses. It is taken again as long as it
-    turns cameras by much.
-    """
-    for _ in range(config.poses.hull_rounds):
-        assert first.poses is not None
-        there = first.poses.moved(views)
-        proposal = _source(family).propose(there, config, asked=False)
-        again = None if proposal is None else _fit_around(family, there, PosedProposal(proposal), config, FAR)
-        if again is None:
-            return first
-        poses = first.poses if again.poses is None else first.poses.after(again.poses.stacked)
-        second = again.with_poses(poses)
-        if explains_clearly_more(views, first, second, config):
-            return first
-        first = second
-        if again.poses is None or again.poses.turn_deg < config.poses.hull_settled_deg:
-            break
-    return first
 
 
 def _fit_around(

@@ -1,5 +1,6 @@
 """A free-form surface from silhouettes and photographs: accepted Gauss–Newton steps, from coarse to fine."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -8,11 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from panoless.capture.poses import Poses, StatedCameras
+from panoless.capture.poses import Poses, StatedCameras, with_pose_covariances
 from panoless.capture.views import Views, split_held_out
 from panoless.environment.rays import Rays
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
+from panoless.geometry.base import ToldPoses
 from panoless.geometry.free_form.concave import concave_start
 from panoless.geometry.free_form.observations import outline_rays, solid_pixels
 from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions, FreeFormRound
@@ -43,6 +45,14 @@ class FitStage:
     """Of the views, where they are unknowns."""
     focal: float | None = None
     """The focal length, where it is unknown (see `Solution`)."""
+    cost: float = math.inf
+    """After that round."""
+
+    @property
+    def last(self) -> FreeFormRound:
+        """The round that led here."""
+        assert self.settings is not None, "a round was taken"
+        return self.settings
 
 
 @dataclass(frozen=True)
@@ -54,14 +64,13 @@ class Change:
 
 
 def fit_free_form(
-    views: Views, start: LevelSet, options: FreeFormOptions = DEFAULTS
+    views: Views, start: LevelSet, options: FreeFormOptions = DEFAULTS, *, free_poses: bool = False
 ) -> tuple[LevelSet, Trust, Poses | None]:
     """The surface that explains photographs and outlines best, no finer than held-out views want it, its trust, and the
     poses of the views where these are unknowns.
 
     Rounds are taken with four fifths of the views as long as the others gain by them, and the last of those once more
-    with all. After the rounds that are always taken, poses are set free, if outlines ask for it and held-out views
-    gain, or show nothing yet that could tell.
+    with all. After the rounds that are always taken poses are set `free`, under the prior that views state of them.
     """
     kept, held_out = split_held_out(views.train)
     solved = replace(views, train=tuple(kept)) if kept and held_out else views
@@ -82,26 +91,16 @@ def fit_free_form(
         if hollowed is not None:
             deeper = coarse_stage(solved, hollowed, options.concave.rounds, options)
             stage = better(stage, deeper, options.concave.least_held_out_gain) if held_out else deeper
-        pull = pose_pull(solved, stage, options) if held_out and options.poses == "auto" else 0.0
-        least = options.least_pose_pull
-        if options.least_doubted_pull < pull <= least and error(stage) > options.doubted_error:
-            least = options.least_doubted_pull
-        if pull > least:
-            settled, free = _settled(solved, stage, options.pose_steps, options), _with_poses(solved, start, options)
-            settled_error = error(settled)
-            untold = pull > options.outline_pull and settled_error > options.unexplained_error
-            gained = untold or error(free) < (1 - options.least_pose_gain) * settled_error
-            stage = free if gained else settled
+        if free_poses:
+            stage = take_round(solved, replace(stage, poses=Poses.none(len(solved.train))), stage.last, options)
         if held_out and options.finer:
             stage = keep_if_better(_stages(solved, stage, options, progress), error, options.least_held_out_gain)
-        assert stage.settings is not None, "a fit has rounds"
-        last = stage.settings if stage.poses is None else _freed(stage)
-        skipped = progress.total - progress.done - last.steps
+        skipped = progress.total - progress.done - stage.last.steps
         if skipped > 0:
             progress.advance(steps=skipped)
         if stage.poses is not None and held_out:
             stage = replace(stage, poses=_joined(stage.poses, found_poses(solved, tested, stage, options)))
-        stage = take_round(views, stage, last, options, progress)
+        stage = take_round(views, stage, stage.last, options, progress)
     return stage.surface, stage.trust, stage.poses
 
 
@@ -114,8 +113,7 @@ def follow_views(
     """
     rounds = [*options.rounds, *options.finer]
     last = next((each for each in reversed(rounds) if each.cells == fitted.surface.cells), rounds[-1])
-    stage = replace(fitted, settings=last)
-    settings = last if stage.poses is None else _freed(stage)
+    stage, settings = replace(fitted, settings=last), last
     with torch.no_grad():
         if stage.focal is not None:
             glance = replace(
@@ -130,48 +128,50 @@ def follow_views(
         return take_round(views, stage, settings, options, Progress("fitting on", settings.steps))
 
 
-def _settled(views: Views, stage: FitStage, steps: int, options: FreeFormOptions) -> FitStage:
-    """A stage after its round was taken again as it is: what more freedom is compared with, after as many steps."""
-    return replace(take_round(views, stage, _freed(stage, steps), options), settings=stage.settings)
-
-
-def _freed(stage: FitStage, steps: int | None = None) -> FreeFormRound:
-    """The round that led to a stage as one in which poses are free."""
-    assert stage.settings is not None, "a round was taken"
-    return replace(stage.settings, photon_share=0.0, steps=stage.settings.steps if steps is None else steps)
-
-
-def pose_pull(views: Views, stage: FitStage, options: FreeFormOptions) -> float:
-    """The share of the cost that one step of the poses alone would take: Σ ½ gᵀH⁻¹g of the views, over the cost."""
-    wide = replace(options, outline_scale_px=options.pull_scale_px)
-    task, poses = make_task(views, _freed(stage), wide), Poses.none(len(views.train))
-    solution = Solution.at(task, stage.surface, stage.trust, stage.environment, 0, poses)
-    gradient = solution.gradient()[1][0]
-    steps = np.linalg.solve(solution.beside[0].blocks, gradient[..., None])[..., 0]
-    return float((gradient * steps).sum()) / 2 / solution.cost(solution)
-
-
 def coarse_stage(
     views: Views,
     start: LevelSet,
     rounds: Sequence[FreeFormRound],
     options: FreeFormOptions,
     progress: Progress | None = None,
+    poses: Poses | None = None,
 ) -> FitStage:
-    """What rounds lead to from a first surface."""
-    poses = Poses.none(len(views.train)) if options.poses == "on" else None
+    """What rounds lead to from a first surface, and from poses where these are unknowns."""
     stage = FitStage(start, full_trust(start, options.trust_cells), None, options.damping, poses=poses)
     for settings in rounds:
         stage = take_round(views, stage, settings, options, progress)
     return stage
 
 
-def _with_poses(views: Views, start: LevelSet, options: FreeFormOptions) -> FitStage:
-    """What the rounds lead to from a first surface with poses free from the first step on, and more of the last one:
-    a surface that settled under wrong cameras holds them there.
+def poses_by_outlines(
+    views: Views, start: LevelSet, options: FreeFormOptions = DEFAULTS, *, always: bool = False
+) -> ToldPoses | None:
+    """Poses that outlines alone tell, beside a shape that starts from a first surface, under the prior that views state
+    of them; but `always` None where a shape under believed poses costs little more.
+
+    How far a face bulges is nothing to outlines, so a wrong shape can't draw cameras along, as it does by photographs.
+    From one view, a turn looks much like a shift. How large either is in all views is known better: what cameras are
+    turned about their lines of sight, or shifted along these, looks like nothing else. So poses are found again under a
+    prior of the sizes that turns and shifts were found to have.
     """
-    free = coarse_stage(views, start, options.rounds, replace(options, poses="on"))
-    return replace(take_round(views, free, _freed(free, options.pose_steps), options), settings=free.settings)
+    wide, settings = replace(options, outline_scale_px=options.pose_outline_scale_px), options.outline_round
+    with torch.no_grad():
+        told = coarse_stage(views, start, [settings], wide, poses=Poses.none(len(views.train)))
+        if not always:
+            believed = coarse_stage(views, start, [settings], wide)
+            if told.cost > options.largest_cost_left * believed.cost:
+                return None
+        task, cameras = make_task(views, settings, wide), StatedCameras.of(views)
+        stated = task.pose_prior
+        for _ in range(options.pose_prior_rounds):
+            assert told.poses is not None, "poses were free"
+            prior = told.poses.likely_prior(cameras, stated, options.least_pose_share)
+            views = with_pose_covariances(views, np.linalg.inv(prior))
+            told = coarse_stage(views, start, [settings], wide, poses=Poses.none(len(views.train)))
+            task = make_task(views, settings, wide)
+        assert told.poses is not None, "poses were free"
+        known = Solution.at(task, told.surface, told.trust, None, 0, told.poses).beside[0].blocks - task.pose_prior
+    return ToldPoses(told.poses, np.linalg.inv(options.outline_trust * known + task.pose_prior), task.pose_prior)
 
 
 def _joined(solved: Poses, tested: Poses) -> Poses:
@@ -183,12 +183,12 @@ def _joined(solved: Poses, tested: Poses) -> Poses:
 
 def found_poses(solved: Views, views: Views, stage: FitStage, options: FreeFormOptions) -> Poses:
     """Poses of views that took no part, under the surface and the map of those that did, which stay as they are."""
-    known = make_task(solved, _freed(stage), options)
+    known = make_task(solved, stage.last, options)
     environment = Solution.at(
         known, stage.surface, stage.trust, None, options.first_map_rounds, stage.poses
     ).environment
     still = replace(options, map_rounds=0, texel_prior=1e9)
-    task = make_task(views, _freed(stage, options.pose_steps), still)
+    task = make_task(views, replace(stage.last, steps=options.pose_steps), still)
     poses = Poses.none(len(views.train))
     solution = Solution.at(task, stage.surface, stage.trust, environment, 0, poses)
     moved = take_steps(solution, stage.damping, still=True)[0].poses
@@ -227,6 +227,7 @@ def take_round(
         settings=settings,
         poses=solution.poses,
         focal=solution.focal,
+        cost=solution.cost(solution),
     )
     if solution.poses is None:
         return found
@@ -244,7 +245,8 @@ def make_task(views: Views, settings: FreeFormRound, options: FreeFormOptions) -
     pixels, outlines = solid_pixels(views, settings.rays), outline_rays(views)
     total = max(views.num_solid, 1)
     chosen = outlines.chosen(slice(None, None, max(1, -(-len(outlines.size) // options.outline_points))))
-    share = options.counted_rays / options.radiance_sigma**2 / max(len(pixels.inner_px), 1)
+    counted = 0.0 if settings.outlines_alone else options.counted_rays
+    share = counted / options.radiance_sigma**2 / max(len(pixels.inner_px), 1)
     density = options.counted_rays / total * len(outlines.size) / max(len(chosen.size), 1)
     believed = (settings.robust_scale / options.radiance_sigma) ** 2 if settings.held else 1.0
     outlined = believed * density / options.outline_sigma_px**2

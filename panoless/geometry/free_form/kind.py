@@ -13,16 +13,25 @@ from torch.utils.weak import WeakIdKeyDictionary
 
 from panoless.capture.contrast import contrasted
 from panoless.capture.object_frame import ObjectFrame
-from panoless.capture.poses import Poses
+from panoless.capture.poses import Poses, StatedCameras, with_pose_covariances
 from panoless.capture.views import TrainView, Views, at_most_pixels, split_held_out
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays
 from panoless.environment.resolution import finest_resolution
 from panoless.environment.surroundings import Surroundings
-from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, poses_from_plain, to_plain
+from panoless.geometry.base import (
+    Geometry,
+    Mesh,
+    Proposal,
+    SurfaceBuffers,
+    ToldPoses,
+    from_plain,
+    poses_from_plain,
+    to_plain,
+)
 from panoless.geometry.exact import ExactFamily, ExactGeometry
-from panoless.geometry.free_form.fit import FitStage, fit_free_form, follow_views, held_out_error
+from panoless.geometry.free_form.fit import FitStage, fit_free_form, follow_views, held_out_error, poses_by_outlines
 from panoless.geometry.free_form.observations import PixelRays, inner_distance_px
 from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions
 from panoless.geometry.free_form.photometric import Sights
@@ -202,32 +211,41 @@ class FreeFormFamily(ExactFamily):
         trust = full_trust(surface, config.free_form.trust_cells)
         return _mirror(surface, trust, None, config)
 
+    def poses_by_outlines(self, views: Views, proposal: Proposal, config: FitConfig) -> ToldPoses | None:
+        """Beside a shape, from the plain first surface on."""
+        stated, always = with_pose_covariances(views, np.linalg.inv(_prior(views, config))), config.poses.mode == "on"
+        return poses_by_outlines(stated, proposal.shape.plain, config.free_form, always=always)
+
     def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
-        """On from a fit, in rounds with that logarithm among the unknowns."""
-        options = config.free_form
-        stage = _followed(views, fitted, options, focal=0.0)
+        """On from a fit, in rounds with that logarithm among the unknowns, at the poses that it found."""
+        start = replace(_stage(fitted), poses=None, focal=0.0)
+        stage = follow_views(fitted.corrected(views), start, config.free_form)
         assert stage.focal is not None, "the focal length was unknown"
         factor = float(np.exp(-stage.focal))
         surface, trust = stage.surface.scaled(factor), stage.trust.scaled(factor)
-        return _mirror(surface, trust, stage.poses, config), stage.focal
+        return _mirror(surface, trust, fitted.poses, config), stage.focal
 
     def after_as_many_steps(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:
         """On from a fit, in a round as long as with that unknown."""
-        stage = follow_views(views, _stage(fitted), config.free_form, longer=True)
-        return _mirror(stage.surface, stage.trust, stage.poses, config)
+        start = replace(_stage(fitted), poses=None)
+        stage = follow_views(fitted.corrected(views), start, config.free_form, longer=True)
+        return _mirror(stage.surface, stage.trust, fitted.poses, config)
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """All coefficients by outlines and photographs together; by logarithms of radiance where this leaves what is
         dark unexplained and they explain more of it in held-out views.
         """
+        told = proposal.told
         if proposal.fitted is not None:
-            found = _followed(views, proposal.fitted, config.free_form)
+            posed = views if told is None else with_pose_covariances(views, told.covariances)
+            found = follow_views(posed, _stage(proposal.fitted), config.free_form)
             return _mirror(found.surface, found.trust, found.poses, config)
-        fitted, shown = _fitted(views, proposal.shape, config), contrasted(views, config.contrast)
+        shown = contrasted(views, config.contrast)
+        fitted = _fitted(views, proposal.shape, told, config)
         if shown is views or (left := _unexplained(shown, fitted, config)) < config.contrast.explained:
             return fitted
         first = replace(first_surfaces(shown, config), surroundings=proposal.shape.surroundings)
-        again = _fitted(shown, first, config)
+        again = _fitted(shown, first, told, config)
         return again if _unexplained(shown, again, config) < left else fitted
 
 
@@ -235,9 +253,25 @@ def _mirror(surface: LevelSet, trust: Trust, poses: Poses | None, config: FitCon
     return FreeFormMirror(surface, trust, config.environment.trace, config.free_form, poses=poses)
 
 
-def _fitted(views: Views, first: FirstSurfaces, config: FitConfig) -> FreeFormMirror:
-    """From first surfaces on."""
-    return _mirror(*fit_free_form(views, started(views, first, config.free_form), config.free_form), config)
+def _fitted(views: Views, first: FirstSurfaces, told: ToldPoses | None, config: FitConfig) -> FreeFormMirror:
+    """From first surfaces on. Poses that are free under covariances that outlines `told` leave the world where it is
+    said to be: these say little of what all cameras share.
+    """
+    options, start = config.free_form, started(views, first, config.free_form)
+    if told is None:
+        return _mirror(*fit_free_form(views, start, options), config)
+    surface, trust, poses = fit_free_form(
+        with_pose_covariances(views, told.covariances), start, options, free_poses=True
+    )
+    assert poses is not None, "poses were free"
+    common, poses = poses.without_common(StatedCameras.of(views), told.prior)
+    return _mirror(surface.taken_back(common), trust, poses, config)
+
+
+def _prior(views: Views, config: FitConfig) -> Float[np.ndarray, "V 6 6"]:
+    """Inverse covariances of turns (rad) and shifts before anything tells more of them."""
+    options = config.poses
+    return StatedCameras.of(views).prior(np.radians(options.turn_deg), options.shift, options.stated_floor)
 
 
 def _unexplained(views: Views, fitted: FreeFormMirror, config: FitConfig) -> float:
@@ -247,13 +281,6 @@ def _unexplained(views: Views, fitted: FreeFormMirror, config: FitConfig) -> flo
         return 0.0
     stage, (solved, tested) = _stage(fitted), (replace(views, train=tuple(each)) for each in (known, unknown))
     return held_out_error(solved, tested, replace(stage, poses=None), config.free_form)
-
-
-def _followed(
-    views: Views, fitted: FreeFormMirror, options: FreeFormOptions, *, focal: float | None = None
-) -> FitStage:
-    """What a fit leads to from where it ended (see `follow_views`)."""
-    return follow_views(views, replace(_stage(fitted), focal=focal), options)
 
 
 def _stage(fitted: FreeFormMirror) -> FitStage:

@@ -30,6 +30,8 @@ class FreeFormRound:
     is 0: on sculpture with cameras turned by 0.5° it would take the mean from 3.8° to 6.4°."""
     anchored: bool = False
     """Whether the surface's change is to be smooth, in place of the surface: details that it has then stay."""
+    outlines_alone: bool = False
+    """Whether photographs have no say."""
     held: bool = False
     """Whether outlines hold the surface: pixels count as if their σ was the robust scale."""
 
@@ -278,14 +280,6 @@ class FreeFormOptions:
     """No coefficient moves by more in one step."""
     least_surroundings_share: float = 1e-3
     """Share of the trace of the surroundings' matrix that is added to its diagonal. Not tuned."""
-    poses: Literal["auto", "off", "on"] = "auto"
-    """Whether the cameras' poses are unknowns, too: where held-out views gain by it, never, or always."""
-    pose_turn_deg: float = 1.0
-    """Expected error of a camera's rotation."""
-    pose_shift: float = 0.02
-    """Expected error of its position, in radii of the object."""
-    pose_stated_floor: float = 0.1
-    """The share of both that is added, in squares, to a stated covariance; see `poses.stated_floor`."""
     focal_prior: float = 0.02
     """Expected error of the logarithm of the focal length, where it is unknown."""
     shared_steps: int = 8
@@ -299,27 +293,29 @@ class FreeFormOptions:
     it is right, and by 0.0055 and more where it is off by 0.5 % or 2 %."""
     least_shared_gain: float = 3e-4
     """Steps end, where that is unknown, when one lowers the cost by less than this share."""
+    outline_round: FreeFormRound = FreeFormRound(20, 4, 0.3, 1, 2_000, 1.0, 12, outlines_alone=True)
+    """By which outlines alone tell poses. On the trial shape brick with cameras turned by 0.5° they leave 0.08°; λ of
+    10 and 100 leave 0.33° and 0.90°, because poses make up for edges that such a surface is too smooth for."""
+    pose_outline_scale_px: float = 10.0
+    """Robust scale of outlines in these: they are this far off where cameras are by 2°."""
+    largest_cost_left: float = 0.8
+    """Poses are found where free ones leave no more than this share of the cost that believed ones do in it. With true
+    cameras it is 0.94 to 0.99 on sculpture, horseshoe, chrome-block and five trial shapes, and 0.75 on the trial shape
+    tray. With cameras turned by 0.1° it is 0.26 to 0.47 on the first three, and by 0.5° 0.72 on the trial shape crown,
+    whose points this surface is too coarse for. Held-out views refuse what is not needed."""
+    outline_trust: float = 10.0
+    """Photographs find poses under a prior of so many times the precision that outlines tell them with. On sculpture,
+    horseshoe and chrome-block with cameras turned by 0.5°, normals end with medians of 0.13°, 0.18° and 0.44°; 100
+    leaves less of the turns, and normals of 0.13°, 0.21° and 0.47°."""
+    pose_prior_rounds: int = 2
+    """Times that outlines are asked again under a prior of turns and shifts as large as these turned out to be. With
+    cameras turned by 0.5° it takes what is left of turns from 0.041° to 0.019° on sculpture, from 0.150° to 0.084° on
+    chrome-block, and from 0.037° to 0.024° on horseshoe; with cameras shifted by 0.3 % of their distance from 0.177° to
+    0.090° on chrome-block, and by little on the others. With both it takes 0.039° to 0.054° on sculpture."""
+    least_pose_share: float = 0.1
+    """Share of the stated standard deviations below which such a prior never goes. Not tuned."""
     pose_steps: int = 6
-    """Most steps of the round in which poses are set free, and of finding those of other views."""
-    least_pose_pull: float = 0.03
-    """Share of the cost that a step of the poses alone has to promise for them to be tried. On sculpture at 160 px it
-    is 0.003 with true cameras, and 0.26 and 0.14 with cameras turned by 0.25° and 2°; 0.016 with masks 2 px too large,
-    0.018 in a room at 10 radii; on chrome-block over a dark ground 0.02 with true ones."""
-    least_doubted_pull: float = 0.01
-    """The same, where the fit…"""
-    doubted_error: float = 0.2
-    """…leaves a larger held-out error than this: on the trial shape torus it is 0.41 with cameras turned by 0.5°, which
-    pull by 0.026, and 0.06 with true ones."""
-    pull_scale_px: float = 10.0
-    """Distance of outlines beyond which these have no say in that: they are this far off where cameras are by 2°."""
-    outline_pull: float = 0.1
-    """A share from which outlines alone decide…"""
-    unexplained_error: float = 0.4
-    """…where colors tell nothing of poses yet, because the held-out error is more than this. With cameras turned by 2°
-    it is 0.5 on sculpture, with and without poses as unknowns."""
-    least_pose_gain: float = 0.05
-    """Share of the held-out error by which poses as unknowns have to lower it. On the block true cameras gain 0.04 when
-    they are set free, and normals lose 0.3°."""
+    """Most steps of finding poses of views that took no part in a fit."""
     least_held_out_gain: float = 0.002
     """Share of the held-out error by which a finer round has to lower it."""
     held_out_rays: int = 200_000

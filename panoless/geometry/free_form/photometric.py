@@ -1,6 +1,5 @@
 """What pixels see by way of a level set under a map that follows it, and what it costs."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -94,9 +93,8 @@ class Task:
 
     @cached_property
     def pose_prior(self) -> Float[np.ndarray, "V 6 6"]:
-        """Weights of squared turns and shifts."""
-        options = self.options
-        return self.cameras.prior(math.radians(options.pose_turn_deg), options.pose_shift, options.pose_stated_floor)
+        """Weights of squared turns and shifts: the inverse of what the views state."""
+        return np.linalg.inv(np.array(self.cameras.covariances))
 
     def seen_from(self, rays: PixelRays, poses: Poses | None, focal: float | None) -> PixelRays:
         """Rays where their cameras are, through the lens that they have."""
@@ -311,7 +309,7 @@ class Solution:
     def _texel_total(self) -> Float[np.ndarray, "T"]:
         count = 6 * self.task.settings.resolution**2
         total = np.bincount(self.texels, self.photographs.weights, count)
-        return total + self.task.options.texel_prior * self.task.photograph_weight
+        return np.maximum(total + self.task.options.texel_prior * self.task.photograph_weight, np.finfo(float).tiny)
 
     def beyond_map(self, residual: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
         """(1 − Π) e: what the map does not take over."""
@@ -335,9 +333,11 @@ class Solution:
         return 1.0 if self.beside else self.task.options.photograph_curvature
 
     def _beside_poses(self, poses: Poses) -> Beside:
-        count = len(poses.turns)
-        blocks = sum(rows.blocks(count) for rows in self.pose_rows) + self.task.pose_prior
-        return Beside(*self.pose_rows, poses.stacked, self.task.pose_prior, blocks)
+        count, (seen, outlined) = len(poses.turns), self.pose_rows
+        if not self.task.settings.outlines_alone:
+            outlined = replace(outlined, rows=np.zeros_like(outlined.rows))
+        blocks = seen.blocks(count) + outlined.blocks(count) + self.task.pose_prior
+        return Beside(seen, outlined, poses.stacked, self.task.pose_prior, blocks)
 
     def _beside_shared(self) -> Beside:
         """Coefficients of the surroundings, and then the logarithm of the focal length. The prior of the former only

@@ -66,7 +66,7 @@ def started(views: Views, first: FirstSurfaces, options: FreeFormOptions) -> Lev
     descent, plain = options.descent, first.surface
     if not descent.rounds:
         return plain
-    short = replace(options, outline_points=min(descent.outline_points, options.outline_points), poses="off")
+    short = replace(options, outline_points=min(descent.outline_points, options.outline_points))
     rounds = {held: tuple(replace(each, held=held) for each in descent.rounds) for held in (True, False)}
     tried = descent.rounds[: descent.tried] * (len(first.plates) * len(rounds))
     steps = [each.steps for each in (*tried, *descent.rounds[descent.tried :], *options.rounds[:1] * 2)]

@@ -8,7 +8,7 @@ from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.environment.cubemap import initial_environment, resample
 from panoless.environment.solve import solve_environment
-from panoless.geometry.base import Geometry, Proposal, Training, TrainingObserver, observe_views
+from panoless.geometry.base import Geometry, Proposal, ToldPoses, Training, TrainingObserver, observe_views
 from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.geometry.surfels.placement import initial_surfels
 from panoless.geometry.surfels.shading.geometry import ShadedMirror
@@ -40,6 +40,10 @@ class SurfelFamily:
             return ShadedMirror.begun(start, config).to(views.train[0].mask.device)
         surfels = initial_surfels(views, config.surfels, config.seed, config.first_surface)
         return ShadedMirror.begun(SurfelMirror.of(surfels, config), config)
+
+    def poses_by_outlines(self, views: Views, proposal: Proposal, config: FitConfig) -> ToldPoses | None:
+        """None: cameras are where the geometry has them that surfels start on."""
+        return None
 
     def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
         """None: what surfels are trained on is believed."""
