@@ -16,6 +16,8 @@ class Verdict(StrEnum):
     CHOSEN = "chosen"
     REFUSED_BY_SILHOUETTES = "refused by silhouettes"
     REFUSED_BY_HELD_OUT_VIEWS = "refused by held-out views"
+    LEFT_TOO_MUCH = "left too much unexplained"
+    """Refused, unless nothing else explains held-out views clearly better."""
     NOT_PROPOSED = "not proposed"
 
 

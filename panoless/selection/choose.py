@@ -24,7 +24,6 @@ from panoless.selection.surroundings import brought_near, explains_clearly_more,
 from shinypartial.core.errors import InputError
 
 ANY = "auto"
-UNEXPLAINED = "leaves too much unexplained"
 LEAST = "leaves much unexplained, and nothing explains more"
 BENT = "a bend explains more than near surroundings do"
 
@@ -86,7 +85,7 @@ def least_unexplained(
     def error(each: tuple[Candidate, Geometry]) -> float:
         return each[0].held_out_error or 0.0
 
-    waiting = [each for each in fitted if each[0].reason == UNEXPLAINED and not is_refined(each[0].kind)]
+    waiting = [each for each in fitted if each[0].verdict == Verdict.LEFT_TOO_MUCH and not is_refined(each[0].kind)]
     if not waiting:
         return None
     enough = min(map(error, waiting)) / (1 - config.selection.least_gain)
@@ -252,12 +251,13 @@ def _examine(
     own, free = held_out_errors(usable_views(views, geometry), config, geometry, trial, asked_from)
     unexplained = float(own.mean()) > options.largest_error
     better = free is not None and is_clearly_lower(free, own, options)
-    verdict = Verdict.REFUSED_BY_HELD_OUT_VIEWS if unexplained or better else Verdict.CHOSEN
-    reason = "surfels are clearly better" if better else "surfels are no better"
-    if free is None:
-        reason = "leaves next to nothing unexplained"
-    if unexplained and not better:
-        reason = UNEXPLAINED
+    if better:
+        verdict, reason = Verdict.REFUSED_BY_HELD_OUT_VIEWS, "surfels are clearly better"
+    elif unexplained:
+        verdict, reason = Verdict.LEFT_TOO_MUCH, "leaves too much unexplained"
+    else:
+        no_more = "leaves next to nothing unexplained" if free is None else "surfels are no better"
+        verdict, reason = Verdict.CHOSEN, no_more
     errors = float(own.mean()), None if free is None else float(free.mean())
     cameras = _found_cameras(geometry, views, config)
     figures = (*evidence, *errors)

@@ -17,7 +17,7 @@ from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.reconstruct.fit import begin, fit
 from panoless.reconstruct.snapshots import SnapshotSchedule
 from panoless.selection.candidates import Candidate, Selection, Verdict
-from panoless.selection.choose import UNEXPLAINED, choose_geometry, least_unexplained
+from panoless.selection.choose import choose_geometry, least_unexplained
 from panoless.selection.options import CorrectionOptions
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
@@ -166,9 +166,11 @@ def test_a_plane_that_explains_nothing_goes_even_if_the_trial_does_no_better(ben
 def test_what_leaves_too_much_waits_for_kinds_that_explain_more() -> None:
     """The simplest of those that explain most stays, unless surfels explain clearly more."""
 
-    def left(kind: str, error: float, surfels: float, reason: str = UNEXPLAINED) -> tuple[Candidate, Geometry]:
+    def left(
+        kind: str, error: float, surfels: float, verdict: Verdict = Verdict.LEFT_TOO_MUCH
+    ) -> tuple[Candidate, Geometry]:
         geometry = PlaneMirror(plane_of(RECTANGLE))
-        return Candidate(kind, Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason, None, None, error, surfels), geometry
+        return Candidate(kind, verdict, "", None, None, error, surfels), geometry
 
     def kept(*fitted: tuple[Candidate, Geometry]) -> str | None:
         found = least_unexplained(fitted, CONFIG)
@@ -179,7 +181,7 @@ def test_what_leaves_too_much_waits_for_kinds_that_explain_more() -> None:
     assert kept(plane, bend, left("free_form", 0.39, 0.5)) == "height_field"
     assert kept(plane, bend, left("free_form", 0.32, 0.5)) == "free_form"
     assert kept(plane, bend, left("free_form", 0.32, 0.2)) is None
-    assert kept(plane, left("free_form", 0.2, 0.1, "surfels are clearly better")) is None
+    assert kept(plane, left("free_form", 0.2, 0.1, Verdict.REFUSED_BY_HELD_OUT_VIEWS)) is None
 
 
 def test_surfels_that_cover_nothing_do_not_beat_the_plane() -> None:
