@@ -152,10 +152,12 @@ class _Refinement:
         environment: Float[Tensor, "6 3 L L"],
     ) -> SurfaceOfRevolution:
         """The candidate, if it explains pixels of held-out views better than the surface does."""
-        limits = self.options.rendering.max_bounces, self.options.judged_scale
         return keep_if_better(
-            (surface, candidate), lambda each: held_out.error(each, environment, *limits), self.options.least_gain
+            (surface, candidate), lambda each: self._error(held_out, each, environment), self.options.least_gain
         )
+
+    def _error(self, pixels: PixelBundles, surface: SurfaceOfRevolution, environment: Tensor) -> float:
+        return pixels.error(surface, environment, self.options.rendering.max_bounces, self.options.judged_scale)
 
     def open_mouth(self) -> tuple[SurfaceOfRevolution, Tensor]:
         """The outside after coarse rounds with what is inside its lid, or inside its base if that is unclear; a map."""
@@ -173,8 +175,7 @@ class _Refinement:
             for candidate in (thin, search_interior(self.kept, surface, environment, self.pixel, own)):
                 if candidate is not None:
                     surface = self.keep_if_better(surface, candidate, seen, environment)
-            error = seen.error(surface, environment, self.options.rendering.max_bounces, self.options.judged_scale)
-            opened.append((error, surface, environment))
+            opened.append((self._error(seen, surface, environment), surface, environment))
         return min(opened, key=lambda each: each[0])[1:]
 
     def _held_out_ends(self, closed: SurfaceOfRevolution) -> PixelBundles:
@@ -242,7 +243,10 @@ class _Refinement:
         return self.keep_if_better(surface, candidate, judging, environment)
 
     def refine_lip(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
-        """The lip, where the wall is long enough and pixels mix it with what lies around it."""
+        """The lip, where the wall is long enough and pixels mix it with what lies around it.
+
+        It moves more of the wall than these pixels see, so the vessel as a whole must not be explained worse.
+        """
         own = self.options.lip
         if surface.arc_lengths[surface.lip] < 2 * own.length_px * self.pixel:
             return surface
@@ -251,4 +255,7 @@ class _Refinement:
         if min(len(seen.radiance), len(judging.radiance)) < own.least_pixels:
             return surface
         candidate = refine_lip(seen, surface, environment, self.pixel, self.options)
+        whole = PixelBundles.of(evenly(self.held_out, own.judged_pixels), CENTER)
+        if self._error(whole, candidate, environment) > self._error(whole, surface, environment):
+            return surface
         return self.keep_if_better(surface, candidate, judging, environment)

@@ -191,6 +191,8 @@ class LipOptions:
     """Mixed pixels of the refinement."""
     least_pixels: int = 500
     """Fewer tell nothing."""
+    judged_pixels: int = 30_000
+    """Pixels of the held-out views, all over the vessel, that a moved lip must not explain worse. Not tuned."""
     refined_steps: int = 3
     """Gauss–Newton steps of the refinement."""
     lengths: NonEmpty[float] = (4.0, 2.0, 1.0, 0.5)

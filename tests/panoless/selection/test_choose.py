@@ -211,7 +211,7 @@ def test_a_box_is_refused_by_its_silhouettes() -> None:
 
 def test_a_fit_remembers_why_it_took_its_kind() -> None:
     """The table becomes part of the state, from which it goes into the prediction."""
-    state = begin(pillar_views(around(10, SIZE_PX)), CONFIG)
+    state = begin(framed(0.0), CONFIG)
     assert state.selection.chosen == state.geometry.kind
     kinds = ["sphere", "plane", "height_field", "revolution", "free_form", "surfels"]
     assert [each.kind for each in state.selection.candidates] == kinds[: kinds.index(state.geometry.kind) + 1]

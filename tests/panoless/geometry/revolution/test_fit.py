@@ -80,12 +80,14 @@ def test_an_open_vessel_is_found_with_its_lip_its_wall_and_the_map() -> None:
 
 
 def test_a_closed_vessel_is_found_with_the_dish_in_its_lid() -> None:
-    """Measured: normals 0.12° in the median; 2.2° in the mean, nearly all at the corner of the dish, which is sharp."""
+    """Measured: normals 0.15° in the median and 0.7° in the mean, by one thread as by two. The mean is of the corner of
+    the dish, which is sharp.
+    """
     photographs, surface = fitted(dished_jar, False)
     errors = normal_errors_deg(photographs, surface)
     assert not surface.is_open
     assert np.median(errors) < 0.2
-    assert errors.mean() < 3.5
+    assert errors.mean() < 1.5
     assert map_error(photographs, surface, UPRIGHT) < 0.03
 
 

@@ -21,9 +21,11 @@ NAMES: tuple[TableName, ...] = get_args(TableName)
 
 
 def commands() -> Iterator[list[str]]:
+    """One of those that differ by their paths and seeds alone, which all read the same."""
     schedule = "--config.iterations 60 --config.surfels.count 500"
-    for job in make_plan(NAMES, (0, 1), Size(80, 12, 3), schedule=schedule).jobs:
-        yield shlex.split(job.command)
+    plan = make_plan(NAMES, (0,), Size(80, 12, 3), schedule=schedule)
+    words = [shlex.split(job.command) for job in plan.jobs]
+    yield from {tuple(word for word in each if "/" not in word): each for each in words}.values()
 
 
 def test_every_command_parses() -> None:
