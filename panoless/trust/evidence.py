@@ -70,6 +70,8 @@ class Evidence:
     """By which the fit turned the cameras: median over views."""
     views: int
     """Number of views in which the object is seen."""
+    viewed: float
+    """Share of all directions from which, or from near which, one of them sees it."""
     mask_offset_px: float = 0.0
     """By which the fit moved the outlines of all masks outward."""
     exposure_stops: float = 0.0
@@ -120,6 +122,7 @@ def gather_evidence(
         coverage=float((visibility > 0).float().mean()),
         camera_turn_deg=_median(np.array([_turn_deg(*each) for each in zip(seen, usable.train, strict=True)])),
         views=len(seen),
+        viewed=_viewed(seen, options),
         mask_offset_px=corrections.mask_offset_px,
         exposure_stops=corrections.exposure_stops or 0.0,
         white_balance_stops=corrections.white_balance_stops or 0.0,
@@ -137,6 +140,17 @@ def _evenly(views: Sequence[TrainView], count: int) -> list[TrainView]:
 
 def _median(values: Float[np.ndarray, "V"]) -> float:
     return float(np.median(values)) if len(values) else 0.0
+
+
+def _viewed(views: Sequence[TrainView], options: TrustOptions) -> float:
+    """Share of all directions that lie near that of a camera, as seen from the object."""
+    if not views:
+        return 0.0
+    height = (2 * np.arange(options.viewed_directions) + 1) / options.viewed_directions - 1
+    turn, across = np.pi * (1 + 5**0.5) * np.arange(options.viewed_directions), np.sqrt(1 - height**2)
+    directions = np.stack([across * np.cos(turn), across * np.sin(turn), height], 1)
+    cameras = np.stack([view.position / np.linalg.norm(view.position) for view in views])
+    return float(((directions @ cameras.T).max(1) > math.cos(options.viewed_within_rad)).mean())
 
 
 def _turn_deg(said: TrainView, found: TrainView) -> float:

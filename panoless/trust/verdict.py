@@ -19,7 +19,7 @@ MATTER = "Photograph a shinier object: this one shows its own color."
 SHAPE = "Look at poses, masks and exposure first; parts that are concave or see themselves may be wrong as well."
 PART = "Look at the confidence of the mesh: a hollow that no outline shows may have been missed, or be too deep."
 VIEWS = "Add views: at least five that see the object from different sides."
-BETWEEN = "Add views from between these, and look at the visibility map."
+AROUND = "Add views from between these and from farther around, and look at the visibility map."
 SHINE = "Photograph a shinier object: what a rough one blurs comes back in part only, beside lamps least of all."
 TEXTURE = "Take it to surroundings that differ from one direction to another, or expose longer."
 EXPOSURE = "Photograph with a shorter exposure, or in high dynamic range."
@@ -84,10 +84,10 @@ DOUBTS = (
         SHINE,
     ),
     _Doubt(
-        lambda found: 1 / max(found.views, 1),
-        lambda options: 1 / options.few_views,
-        lambda found: f"{found.views} views leave gaps between the directions that they see",
-        BETWEEN,
+        lambda found: 1 / max(found.viewed, 1e-3),
+        lambda options: 1 / options.least_viewed,
+        lambda found: f"{found.views} views see the object from {found.viewed:.0%} of all directions only",
+        AROUND,
     ),
     _Doubt(
         lambda found: found.saturated,
