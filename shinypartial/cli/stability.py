@@ -35,17 +35,21 @@ class Stability(Suite):
     page: Path | None = None
     """Page to write, such as docs/stability.md, with numbers and pictures beside it; OUTPUT/stability.md by default."""
 
+    join: tuple[Path, ...] = ()
+    """Numbers of other runs, such as docs/results/stability.json, whose further cells the page shows, too."""
+
     def run(self) -> None:
         """Run the plan, collect it and write the page."""
-        from shinypartial.suites.stability.collect import collect
+        from shinypartial.suites.stability.collect import collect, join_results, read_results
         from shinypartial.suites.stability.page import write_stability_page
         from shinypartial.suites.stability.plan import make_plan, parse_methods
 
+        others = tuple(map(read_results, self.join))
         methods = parse_methods(self.methods, self.method)
         plan = make_plan(self.plan, methods, self.seeds, scenes=self.scenes, axes=self.axes, size=self.size)
         results = self._collected(self.output, plan, collect)
         if results is None:
             return
         page = self.page or self.output / "stability.md"
-        write_stability_page(page, self.output, results)
+        write_stability_page(page, self.output, join_results(results, others))
         print(f"Page: {page}")

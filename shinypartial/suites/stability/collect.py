@@ -2,13 +2,15 @@
 
 import statistics
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from shinypartial.core.errors import InputError
 from shinypartial.evaluation.scores import read_scores
-from shinypartial.io.files import write_text
+from shinypartial.io.files import read_json, write_text
 from shinypartial.metrics.calibration import auroc
 from shinypartial.prediction.format import read_info
 from shinypartial.suites.attempt import read_record
@@ -122,6 +124,43 @@ def write_results(path: Path, results: Results) -> None:
 def _facts(outcome: Outcome) -> dict[str, object]:
     content = asdict(outcome)
     return {name: value for name, value in content.items() if name != "cell" and value not in (None, "", {})}
+
+
+def read_results(path: Path) -> Results:
+    """What `write_results` wrote. Raises InputError where the file is something else."""
+    content = read_json(path, "the numbers of a stability page")
+    try:
+        found = content["format"], content["format_version"]
+        if found != (FORMAT, FORMAT_VERSION):
+            raise KeyError("format")
+        return Results(Size(**content["size"]), tuple(map(_read_outcome, content["cells"])))
+    except (KeyError, TypeError) as error:
+        raise InputError(
+            expected=f"numbers of a stability page ({FORMAT}, version {FORMAT_VERSION}) in {path}",
+            found=f"a file that lacks or misuses {error}",
+            remedy="Give a stability.json that `shinypartial stability --page` wrote.",
+        ) from None
+
+
+def _read_outcome(content: dict[str, Any]) -> Outcome:
+    names = {each.name for each in fields(Cell)}
+    cell = Cell(**{name: content[name] for name in names})
+    return Outcome(cell, **{name: value for name, value in content.items() if name not in names})
+
+
+def join_results(results: Results, others: Iterable[Results]) -> Results:
+    """Results, then the cells that only others have. Raises InputError where datasets differ in size."""
+    outcomes = {each.cell: each for each in results.outcomes}
+    for other in others:
+        if other.size != results.size:
+            raise InputError(
+                expected=f"results of datasets of one size, {asdict(results.size)}",
+                found=f"others of {asdict(other.size)}",
+                remedy="Join results of runs with the same --resolution, --train and --test.",
+            )
+        for each in other.outcomes:
+            outcomes.setdefault(each.cell, each)
+    return Results(results.size, tuple(outcomes.values()))
 
 
 def crossing(positions: Sequence[float], losses: Sequence[float | None], limit: float) -> float | None:

@@ -68,7 +68,10 @@ def _draw(axes: "Axes", results: Results, axis: Axis, title: str, value: Value) 
 
 
 def write_pictures(folder: Path, suite: Path, results: Results, method: str) -> list[tuple[str, str]]:
-    """Sheets of environment maps at growing levels, as file names and captions; those without maps are left out."""
+    """Sheets of environment maps at growing levels, as file names and captions.
+
+    Where the suite has no maps of them, a sheet that is there stays, and one that is not is left out.
+    """
     made = []
     for scene, name in SHOWN:
         axis, pictures = BY_NAME[name], {}
@@ -77,8 +80,9 @@ def write_pictures(folder: Path, suite: Path, results: Results, method: str) -> 
             if (prediction / DESCRIPTION).exists() and not level[0].failure:
                 title = f"{axis.text(position).strip() if position else 'clean'}: {level[0].environment_db:.1f} dB"
                 pictures[title] = to_display(to_protocol_size(read_environment_map(prediction), MAP_HEIGHT))
+        path = folder / f"stability-{scene}-{name}.jpg"
         if len(pictures) > 1:
-            file_name = f"stability-{scene}-{name}.jpg"
-            write_picture_sheet(folder / file_name, pictures, tile_size=(2 * MAP_HEIGHT, MAP_HEIGHT), max_bytes=90_000)
-            made.append((file_name, f"{scene}, {axis.title.lower()}, method {method}"))
+            write_picture_sheet(path, pictures, tile_size=(2 * MAP_HEIGHT, MAP_HEIGHT), max_bytes=90_000)
+        if path.exists():
+            made.append((path.name, f"{scene}, {axis.title.lower()}, method {method}"))
     return made

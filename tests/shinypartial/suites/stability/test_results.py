@@ -6,13 +6,16 @@ from pathlib import Path
 
 import pytest
 
+from shinypartial.core.errors import InputError
 from shinypartial.suites.stability.axes import BY_NAME
 from shinypartial.suites.stability.collect import (
     Outcome,
     Results,
     crossing,
+    join_results,
     judged,
     limits,
+    read_results,
     verdict_auroc,
     write_results,
 )
@@ -74,6 +77,22 @@ def test_results_are_written_whole(tmp_path: Path) -> None:
     cells = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["cells"]
     found = [Outcome(Cell(**{key: each.pop(key) for key in Cell.__dataclass_fields__}), **each) for each in cells]
     assert tuple(found) == outcomes
+    assert read_results(tmp_path / "results.json") == Results(SIZE, outcomes)
+
+
+def test_joined_results_prefer_the_own_ones() -> None:
+    mirror = outcome(None, 30, 0.1, "mirror")
+    joined = join_results(RESULTS, [Results(SIZE, (outcome(0.5, 1), mirror)), Results(SIZE, (outcome(None, 2),))])
+    assert joined.outcomes == (*VASE, mirror)
+
+
+def test_results_of_another_size_or_file_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="one size"):
+        join_results(RESULTS, [Results(replace(SIZE, resolution=32), ())])
+    path = tmp_path / "scores.json"
+    path.write_text('{"format": "scores"}', encoding="utf-8")
+    with pytest.raises(InputError, match=r"stability\.json"):
+        read_results(path)
 
 
 def test_the_page_is_the_same_for_the_same_results(tmp_path: Path) -> None:
