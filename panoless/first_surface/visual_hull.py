@@ -6,7 +6,7 @@ doesn't show.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,8 +86,9 @@ def carve_hull(views: Views, resolution: int, votes: float, options: FirstSurfac
 
     Where m views may be wrong, the hull function is the (m + 1)-th largest distance, and the hull larger than that of
     all views. A wrong view cuts the hull away from the rays of the others; m is the least with which rays through the
-    outlines come as near to the hull as with the greatest. Raises InputError when nothing stays, which means masks
-    and poses contradict each other.
+    outlines come as near to the hull as with the greatest. Where even then most of them pass it by, because all
+    cameras are a little off, m is the least with which half of them meet it; but for `votes` of 1, with which all views
+    count. Raises InputError when nothing stays, which means masks and poses contradict each other.
     """
     outlines = [mask_distance(view) for view in views.train]
     half_side = max(HULL_HALF_SIDE, SPARE * views.object_frame.reach)
@@ -98,9 +99,18 @@ def carve_hull(views: Views, resolution: int, votes: float, options: FirstSurfac
     device = outlines[0].distance_px.device
     count = math.ceil((resolution - 1) / 2**levels) + 1
     points = _grid_points(np.arange(count**3), count, half_side, device)
-    grids = largest_distances(outlines, points, allowed + 1).view(-1, count, count, count).cpu().numpy()
-    wrong = _count_wrong_views(grids, half_side, outlines, pixel, options)
-    distance = grids[wrong]
+    tested = _points_on_rays(outlines, half_side, options)
+
+    def hulls(most: int) -> Iterator[Hull]:
+        grids = largest_distances(outlines, points, most + 1).view(-1, count, count, count).cpu().numpy()
+        return (Hull(grid, half_side, pixel) for grid in grids)
+
+    wrong, hull = _least_wrong(list(hulls(allowed)), tested, options)
+    most = math.floor((1 - min(votes, options.least_votes)) * len(views.train)) if votes < 1 else allowed
+    if most > allowed and _passed_by_px(hull, tested) > options.contradiction_px:
+        met = ((k, each) for k, each in enumerate(hulls(most)) if _passed_by_px(each, tested) <= 0)
+        wrong, hull = next(met, (wrong, hull))
+    distance = hull.distance
     for _ in range(levels):
         distance = _refine(distance, half_side, outlines, wrong, options.band_voxels)
     for axis in range(3):
@@ -149,20 +159,20 @@ def _refine(
     return fine
 
 
-def _count_wrong_views(
-    grids: Float[np.ndarray, "K N N N"],
-    half_side: float,
-    outlines: Sequence[MaskDistance],
-    pixel: float,
-    options: FirstSurfaceOptions,
-) -> int:
-    """How many of the largest distances to leave out: the fewest with which rays through outlines touch the hull."""
-    points = _points_on_rays(outlines, half_side, options)
+def _least_wrong(
+    hulls: Sequence[Hull], tested: Float[np.ndarray, "R S 3"], options: FirstSurfaceOptions
+) -> tuple[int, Hull]:
+    """How many views to leave out, and the hull of the others: the fewest with which rays through outlines touch it."""
     gaps = []
-    for grid in grids:
-        nearest = Hull(grid, half_side, pixel).at(points).min(1)
-        gaps.append(float((nearest / pixel).clip(0, options.largest_gap_px).mean()) if len(nearest) else 0.0)
-    return next(k for k, gap in enumerate(gaps) if gap <= gaps[-1] + options.worthwhile_px)
+    for hull in hulls:
+        nearest = hull.at(tested).min(1)
+        gaps.append(float((nearest / hull.pixel).clip(0, options.largest_gap_px).mean()) if len(nearest) else 0.0)
+    return next((k, hulls[k]) for k, gap in enumerate(gaps) if gap <= gaps[-1] + options.worthwhile_px)
+
+
+def _passed_by_px(hull: Hull, tested: Float[np.ndarray, "R S 3"]) -> float:
+    """At which distance from the hull rays through outlines pass, in the median (px); less than 0 if they enter it."""
+    return float(np.median(hull.at(tested).min(1))) / hull.pixel if len(tested) else 0.0
 
 
 def _points_on_rays(

@@ -69,7 +69,7 @@ def silhouette_rows(
         by_value = near.met / (slope * rays.size * np.where(near.met, near.distance / surface.spacing, 1.0))
         residual = near.derivatives[:, 0] * by_value
         weights = weight * near.met * robust_weight(residual, scale)
-        cost = weight * scale**2 * float((near.met * bounded_error(residual, scale)).sum())
+        cost = weight * scale**2 * float(np.where(near.met, bounded_error(residual, scale), 1.0).sum())
         distance = np.where(near.met, near.distance, 0.0) / surface.spacing
         by_pose = outline_pose_rows(near.derivatives[:, 1:4], rays.directions, distance, by_value)
         by_pose[..., 3:] /= surface.spacing

@@ -144,10 +144,10 @@ def coarse_stage(
 
 
 def poses_by_outlines(
-    views: Views, start: LevelSet, options: FreeFormOptions = DEFAULTS, *, always: bool = False
+    views: Views, starts: Sequence[LevelSet], options: FreeFormOptions = DEFAULTS, *, always: bool = False
 ) -> ToldPoses | None:
-    """Poses that outlines alone tell, beside a shape that starts from a first surface, under the prior that views state
-    of them; but `always` None where a shape under believed poses costs little more.
+    """Poses that outlines alone tell, beside a shape that starts from the best of some first surfaces, under the prior
+    that views state of them; but `always` None where a shape under believed poses costs little more.
 
     How far a face bulges is nothing to outlines, so a wrong shape can't draw cameras along, as it does by photographs.
     From one view, a turn looks much like a shift. How large either is in all views is known better: what cameras are
@@ -156,10 +156,12 @@ def poses_by_outlines(
     """
     wide, settings = replace(options, outline_scale_px=options.pose_outline_scale_px), options.outline_round
     with torch.no_grad():
-        told = coarse_stage(views, start, [settings], wide, poses=Poses.none(len(views.train)))
+        free = [coarse_stage(views, each, [settings], wide, poses=Poses.none(len(views.train))) for each in starts]
+        best = min(range(len(starts)), key=lambda index: free[index].cost)
+        told, start = free[best], starts[best]
         if not always:
-            believed = coarse_stage(views, start, [settings], wide)
-            if told.cost > options.largest_cost_left * believed.cost:
+            believed = min(coarse_stage(views, each, [settings], wide).cost for each in starts)
+            if told.cost > options.largest_cost_left * believed:
                 return None
         task, cameras = make_task(views, settings, wide), StatedCameras.of(views)
         stated = task.pose_prior

@@ -24,11 +24,12 @@ from shinypartial.io.progress import Progress
 
 @dataclass(frozen=True)
 class FirstSurfaces:
-    """What a fit may start from, in one world: the plate whose pixels disagree least, held inside the hull, and the
-    plates that descend.
+    """What a fit may start from, in one world: the plate whose pixels disagree least, held inside the hull, the hull
+    itself, and the plates that descend.
     """
 
     plain: LevelSet
+    hull: LevelSet
     plates: tuple[LevelSet, ...]
     surroundings: Surroundings = FAR
 
@@ -56,7 +57,7 @@ def first_surfaces(views: Views, config: FitConfig) -> FirstSurfaces:
     plates = {tension: level_set(completed(known, first, tension, rounds=1)) for tension in options.start_tensions}
     order = sorted(plates, key=lambda tension: disagreement(plates[tension]))
     followed = tuple(plates[tension] for tension in order[: options.descent.followed])
-    return FirstSurfaces(level_set(completed(known, first, order[0])), followed)
+    return FirstSurfaces(level_set(completed(known, first, order[0])), level_set(known.surface), followed)
 
 
 def started(views: Views, first: FirstSurfaces, options: FreeFormOptions) -> LevelSet:
