@@ -42,6 +42,8 @@ class Hull:
     distance: Float[np.ndarray, "N N N"]
     half_side: float
     pixel: float
+    left_out: int = 0
+    """How many views have no say at a point, because they contradict the others."""
 
     @property
     def voxel(self) -> float:
@@ -123,7 +125,7 @@ def carve_hull(views: Views, resolution: int, votes: float, options: FirstSurfac
             found=f"no point in space that {votes:.0%} of the masks contain",
             remedy="Check the axes of transform_matrix (OpenGL), and that masks mark one object, not the background.",
         )
-    return Hull(distance, half_side, pixel)
+    return Hull(distance, half_side, pixel, wrong)
 
 
 def _grid_points(

@@ -144,10 +144,16 @@ def coarse_stage(
 
 
 def poses_by_outlines(
-    views: Views, starts: Sequence[LevelSet], options: FreeFormOptions = DEFAULTS, *, always: bool = False
+    views: Views,
+    starts: Sequence[LevelSet],
+    options: FreeFormOptions = DEFAULTS,
+    *,
+    views_agree: bool = True,
+    always: bool = False,
 ) -> ToldPoses | None:
     """Poses that outlines alone tell, beside a shape that starts from the best of some first surfaces, under the prior
-    that views state of them; but `always` None where a shape under believed poses costs little more.
+    that views state of them; but `always` None where a shape under believed poses costs little more. The first start
+    that tells so is believed where `views_agree` on a hull.
 
     How far a face bulges is nothing to outlines, so a wrong shape can't draw cameras along, as it does by photographs.
     From one view, a turn looks much like a shift. How large either is in all views is known better: what cameras are
@@ -156,13 +162,18 @@ def poses_by_outlines(
     """
     wide, settings = replace(options, outline_scale_px=options.pose_outline_scale_px), options.outline_round
     with torch.no_grad():
-        free = [coarse_stage(views, each, [settings], wide, poses=Poses.none(len(views.train))) for each in starts]
-        best = min(range(len(starts)), key=lambda index: free[index].cost)
-        told, start = free[best], starts[best]
-        if not always:
-            believed = min(coarse_stage(views, each, [settings], wide).cost for each in starts)
-            if told.cost > options.largest_cost_left * believed:
+        cost, start, told = math.inf, starts[0], None
+        for each in starts:
+            free = coarse_stage(views, each, [settings], wide, poses=Poses.none(len(views.train)))
+            if told is None or free.cost < told.cost:
+                start, told = each, free
+            if not always:
+                cost = min(cost, coarse_stage(views, each, [settings], wide).cost)
+            if views_agree and told.cost > options.largest_cost_left * cost:
                 return None
+        assert told is not None, "there is a start"
+        if told.cost > options.largest_cost_left * cost:
+            return None
         task, cameras = make_task(views, settings, wide), StatedCameras.of(views)
         stated = task.pose_prior
         for _ in range(options.pose_prior_rounds):

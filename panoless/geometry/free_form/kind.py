@@ -214,8 +214,9 @@ class FreeFormFamily(ExactFamily):
     def poses_by_outlines(self, views: Views, proposal: Proposal, config: FitConfig) -> ToldPoses | None:
         """Beside a shape, from the plain first surface or the hull."""
         stated, always = with_pose_covariances(views, np.linalg.inv(_prior(views, config))), config.poses.mode == "on"
-        starts = proposal.shape.plain, proposal.shape.hull
-        return poses_by_outlines(stated, starts, config.free_form, always=always)
+        first: FirstSurfaces = proposal.shape
+        starts, agree = (first.plain, first.hull), first.views_agree
+        return poses_by_outlines(stated, starts, config.free_form, views_agree=agree, always=always)
 
     def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
         """On from a fit, in rounds with that logarithm among the unknowns, at the poses that it found."""

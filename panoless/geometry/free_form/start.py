@@ -31,6 +31,8 @@ class FirstSurfaces:
     plain: LevelSet
     hull: LevelSet
     plates: tuple[LevelSet, ...]
+    views_agree: bool = True
+    """Whether the hull is that of all views."""
     surroundings: Surroundings = FAR
 
     @property
@@ -57,7 +59,8 @@ def first_surfaces(views: Views, config: FitConfig) -> FirstSurfaces:
     plates = {tension: level_set(completed(known, first, tension, rounds=1)) for tension in options.start_tensions}
     order = sorted(plates, key=lambda tension: disagreement(plates[tension]))
     followed = tuple(plates[tension] for tension in order[: options.descent.followed])
-    return FirstSurfaces(level_set(completed(known, first, order[0])), level_set(known.surface), followed)
+    plain, hull = level_set(completed(known, first, order[0])), level_set(known.surface)
+    return FirstSurfaces(plain, hull, followed, known.hull.left_out == 0)
 
 
 def started(views: Views, first: FirstSurfaces, options: FreeFormOptions) -> LevelSet:
