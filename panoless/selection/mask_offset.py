@@ -31,9 +31,9 @@ def masks_are_doubted(views: Views, geometry: Geometry, errors: Float[np.ndarray
     options = config.corrections
     if another_takes_on(geometry, errors, config):
         return False
-    return (
-        bool(errors.mean() > options.largest_error) or abs(outline_pull_px(views, geometry)) > options.doubted_pull_px
-    )
+    if errors.mean() > options.largest_error:
+        return True
+    return not -options.doubted_inward_px <= outline_pull_px(views, geometry) <= options.doubted_outward_px
 
 
 def with_moved_masks(source: Family, views: Views, fitted: Fitted, config: FitConfig, refit: Refit) -> Fitted:

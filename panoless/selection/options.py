@@ -54,9 +54,12 @@ class CorrectionOptions:
     """Offsets are tried this far apart. Not tuned."""
     largest_px: Positive = 6.0
     """Largest offset that is tried."""
-    doubted_pull_px: Positive = 0.03
-    """Masks are doubted, too, where outlines of a fit give way to photographs by more. On sculpture it is 0.08 and 0.11
-    with masks that are off by 1 px; with masks that are right it is at most 0.021 on seven trial shapes."""
+    doubted_inward_px: Positive = 0.03
+    """Masks are doubted, too, where outlines of a fit give way to photographs by more: inward…"""
+    doubted_outward_px: Positive = 0.01
+    """…or outward. On sculpture it is 0.08 and 0.11 with masks that are off by 1 px. With masks that are right it is
+    0.004 outward there and none on seven trial shapes, but up to 0.021 inward: a surface that is too smooth for its
+    edges lies inside them. With masks that are 2 px too small it is 0.015 on the trial shape ellipsoid."""
     pull_share: Positive = 0.17
     """Share of a small offset by which outlines of a fit give way. On vase 0.18, on sculpture 0.16."""
     least_pull_px: Positive = 0.02
