@@ -17,7 +17,8 @@ def evolve(
 
     Points are drawn about a mean that follows the better half of them, with a covariance that follows their steps;
     `scales` are the first standard deviations. Constants are those of Hansen's tutorial (arXiv 1604.00772), without
-    the active update. The same seed gives the same points.
+    the active update. Points are drawn by the symmetric root of the covariance, which does not depend on the signs and
+    the order of its axes: so the same seed gives the same points on every machine, but for rounding.
     """
     rng, count = np.random.default_rng(seed), len(start)
     drawn = 4 + int(3 * np.log(count))
@@ -36,7 +37,7 @@ def evolve(
     for _ in range(max(evaluations // drawn, 0)):
         variances, axes = np.linalg.eigh(covariance)
         lengths = np.sqrt(np.maximum(variances, 1e-14))
-        steps = rng.normal(size=(drawn, count)) * lengths @ axes.T
+        steps = rng.normal(size=(drawn, count)) @ (axes * lengths @ axes.T)
         costs = np.array([cost(start + scales * (mean + sigma * step)) for step in steps])
         order = np.argsort(costs, kind="stable")
         if costs[order[0]] < least:

@@ -1,6 +1,7 @@
 """Minimization without derivatives on functions with known minima."""
 
 import numpy as np
+import pytest
 
 from panoless.numeric.evolution import evolve
 
@@ -29,3 +30,17 @@ def test_the_result_is_never_worse_than_the_start_and_the_same_each_time() -> No
     assert least == 0
     once, again = (evolve(valley, np.zeros(4), np.full(4, 0.5), 100, seed=3)[0] for _ in range(2))
     np.testing.assert_array_equal(once, again)
+
+
+def test_points_do_not_depend_on_the_axes_that_a_machine_finds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Axes of a covariance have any sign, and at first, where it is the identity, any direction."""
+    once, _ = evolve(valley, np.zeros(4), np.full(4, 0.5), 100)
+    eigh = np.linalg.eigh
+
+    def turned(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        variances, axes = eigh(matrix)
+        other, _ = np.linalg.qr(np.random.default_rng(1).normal(size=axes.shape))
+        return variances, other if np.allclose(matrix, np.eye(len(matrix))) else -axes
+
+    monkeypatch.setattr(np.linalg, "eigh", turned)
+    np.testing.assert_allclose(evolve(valley, np.zeros(4), np.full(4, 0.5), 100)[0], once, atol=1e-9)
