@@ -229,6 +229,16 @@ TRIALS = {
         ground=0.1,
         strength=0.5,
     ),
+    "die": Trial(
+        'kind = "superquadric", size = [1.1, 1.3, 1.0], exponents = [5.0, 4.0]',
+        (-15.0, 10.0, 60.0),
+        "night",
+        "plus",
+        3.6,
+        30.0,
+        45.0,
+        (-15.0, 50.0),
+    ),
     "drum": Trial(
         'kind = "superquadric", size = [1.6, 1.1, 1.0], exponents = [2.0, 8.0]',
         (35.0, 15.0, 20.0),

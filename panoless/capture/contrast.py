@@ -1,4 +1,4 @@
-"""Contrast: how much a difference of radiance counts, in photographs most of which are dark."""
+"""Exposure and contrast: how much a difference of radiance counts, in photographs that are dark or mostly dark."""
 
 import math
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ class Contrast:
 
         The share of the two does not depend on the exposure, but for what that saturates.
         """
-        brightness = torch.cat([view.radiance_at(view.solid).mean(1) for view in views.train])
+        brightness = _brightness(views)
         median = float(brightness.median()) if len(brightness) else 0.0
         if not len(brightness) or median >= options.dark_share * float(brightness.mean()):
             return cls()
@@ -45,6 +45,25 @@ class Contrast:
             return views
         shown = (replace(view, radiance=self.shown(view.radiance)) for view in views.train)
         return replace(views, train=tuple(shown))
+
+
+def _brightness(views: Views) -> Float[Tensor, "P"]:
+    """Of all pixels of the object: means of channels."""
+    return torch.cat([view.radiance_at(view.solid).mean(1) for view in views.train])
+
+
+def exposure_of(views: Views, options: ContrastOptions) -> float:
+    """The factor that gives the object of dark photographs the brightness of the options in the mean. Brighter ones stay
+    as they are: they have a scale, the radiance at which they are saturated.
+    """
+    brightness = _brightness(views)
+    mean = float(brightness.mean()) if len(brightness) else 0.0
+    return min(max(options.brightness / mean, 1.0), options.largest_exposure) if mean > 0 else 1.0
+
+
+def exposed(views: Views, exposure: float) -> Views:
+    """The views, that many times as bright, in a low dynamic range."""
+    return replace(views, train=tuple(replace(view, radiance=exposure * view.radiance) for view in views.train))
 
 
 def contrasted(views: Views, options: ContrastOptions) -> Views:

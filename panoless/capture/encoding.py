@@ -22,7 +22,8 @@ SATURATED = 0.998
 
 @dataclass(frozen=True)
 class RadianceEncoding:
-    """Encoding c ↦ f(c/F) of the radiance c of a mirror with the tint F, so that residuals mean the same everywhere.
+    """Encoding c ↦ f(g c/F) of the radiance c of a mirror with the tint F, so that residuals mean the same everywhere;
+    g is one exposure of all views.
 
     With a low dynamic range c is clipped to [0, 1], as photographs are, and f(x) = x. With a high one f(x) = x up to 1
     and 1 + ln x above: below 1 a fit works as ever, above it a residual is a relative one. f is increasing with a
@@ -33,6 +34,7 @@ class RadianceEncoding:
     tint: tuple[float, float, float] = NO_TINT
     srgb: bool = False
     """f is the curve of sRGB instead: values as they stand in an 8-bit image, in which other methods compute."""
+    exposure: float = 1.0
 
     def clipped(self, frame: Frame, view: View) -> Float[np.ndarray, "H W 3"]:
         """Radiance of a view, not encoded, without what its range excludes.
@@ -50,9 +52,9 @@ class RadianceEncoding:
     def encoded(
         self, radiance: Float[np.ndarray, "H W 3"], alpha: Float[np.ndarray, "H W"] | float = 1.0
     ) -> Float[np.ndarray, "H W 3"]:
-        """f(c/F). With sRGB α f(c/(α F)) of radiance c that is premultiplied by alpha, as such an image holds it."""
-        if self.tint != NO_TINT:
-            radiance = radiance / np.array(self.tint, radiance.dtype)
+        """f(g c/F). With sRGB α f(g c/(α F)) of radiance c premultiplied by alpha, as such an image holds it."""
+        if self.tint != NO_TINT or self.exposure != 1:
+            radiance = radiance * (self.exposure / np.array(self.tint, radiance.dtype))
         if self.srgb:
             share = np.asarray(alpha, radiance.dtype)[..., None]
             return share * linear_to_srgb((radiance / np.maximum(share, LEAST_ALPHA)).clip(0, 1))
@@ -61,8 +63,8 @@ class RadianceEncoding:
         return np.where(radiance > 1, 1 + np.log(np.maximum(radiance, 1)), radiance)
 
     def without_gain(self, encoded: Float[Tensor, "3 *S"], gain: float | Tensor) -> Float[Tensor, "3 *S"]:
-        """c/(F g), at most 1/F, of a photograph c/F that was exposed g times as long as others, in a low dynamic range;
-        a gain may differ from pixel to pixel.
+        """c/g, at most the saturation, of an encoded photograph c that was exposed g times as long as others, in a low
+        dynamic range; a gain may differ from pixel to pixel.
 
         What is saturated stays so: it may be any brighter.
         """
@@ -71,20 +73,22 @@ class RadianceEncoding:
 
     @property
     def saturation(self) -> Float[Tensor, "3"]:
-        """The largest encoded radiance that a view can show: 1/F, or ∞ with a high dynamic range."""
-        return torch.full((3,), math.inf) if self.high_dynamic_range else 1 / torch.tensor(self.tint)
+        """The largest encoded radiance that a view can show: g/F, or ∞ with a high dynamic range."""
+        return torch.full((3,), math.inf) if self.high_dynamic_range else self.exposure / torch.tensor(self.tint)
 
     def shown(self, radiance: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:
-        """f of radiance in [0, 1] of a mirror without tint; without a gradient."""
-        return torch.from_numpy(linear_to_srgb(radiance.cpu().numpy())).to(radiance) if self.srgb else radiance
+        """With sRGB f of g times radiance in [0, 1/g] of a mirror without tint, without a gradient; else radiance."""
+        if not self.srgb:
+            return radiance
+        return torch.from_numpy(linear_to_srgb(self.exposure * radiance.cpu().numpy())).to(radiance)
 
     def decoded(self, environment: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:
-        """f⁻¹ of a map: the radiance of the environment itself, before any mirror."""
+        """f⁻¹ of a map over g: the radiance of the environment itself, before any mirror."""
         if self.srgb:
-            return torch.from_numpy(srgb_to_linear(environment.cpu().numpy())).to(environment)
-        if not self.high_dynamic_range:
-            return environment
-        return torch.where(environment > 1, torch.exp(environment.clamp(min=1) - 1), environment)
+            environment = torch.from_numpy(srgb_to_linear(environment.cpu().numpy())).to(environment)
+        elif self.high_dynamic_range:
+            environment = torch.where(environment > 1, torch.exp(environment.clamp(min=1) - 1), environment)
+        return environment if self.exposure == 1 else environment / self.exposure
 
 
 #: Photographs in a mirror without color.
@@ -93,4 +97,5 @@ LDR = RadianceEncoding()
 
 def encoding_of(config: FitConfig) -> RadianceEncoding:
     """The encoding that a configuration asks for."""
-    return RadianceEncoding(config.environment.range == "hdr", config.tint, config.surfels.shading != "mirror")
+    high, srgb = config.environment.range == "hdr", config.surfels.shading != "mirror"
+    return RadianceEncoding(high, config.tint, srgb, config.exposure or 1.0)

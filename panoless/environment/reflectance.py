@@ -47,6 +47,10 @@ class Reflectance:
         red, green, blue = self.albedo.clip(0, 1).tolist()
         return (red, green, blue) if self.albedo.any() else None
 
+    def exposed(self, factor: float) -> "Reflectance":
+        """The same in light that many times as bright."""
+        return replace(self, scattered=factor * self.scattered)
+
     def share(self, cosines: Float[Tensor, "*P"]) -> Float[Tensor, "3 *P"]:
         """F of cos θ in [0, 1]; grazing rays see all of the light."""
         at_normal = torch.from_numpy(self.at_normal).to(cosines).reshape(3, *[1] * cosines.ndim)

@@ -32,10 +32,11 @@ def complete(state: FitState, views: Views, config: FitConfig) -> Views:
     if config.environment.solve or state.training is None:
         state.reflectance = earned_reflectance(usable, state.geometry, config)
     if state.reflectance is not None:
-        views = as_perfect_mirror(views, usable, state.geometry, state.reflectance)
+        views = as_perfect_mirror(views, usable, state.geometry, state.reflectance, encoding_of(config))
         shown = zip(usable.train, views.train, strict=True)
         usable = replace(usable, train=tuple(replace(part, radiance=view.radiance) for part, view in shown))
         config = replace(config, tint=state.reflectance.tint)
+        state.reflectance = state.reflectance.exposed(1 / encoding_of(config).exposure)
     softness = earned_softness(usable, state.geometry, config) if state.training is None else Softness()
     state.roughness, state.blur_px = softness.roughness, softness.blur_px
     _solve(state, usable if state.blur_px is None else replace(usable, blur_px=state.blur_px), config)
@@ -53,7 +54,8 @@ def _solve(state: FitState, views: Views, config: FitConfig) -> None:
                 environment = _of_rough_mirror(state.roughness, state.geometry, views, config, environment.shape[-1])
                 shown = Lobe.of(state.roughness, environment.shape[-1]).blurred(environment)
             if not config.environment.fill:
-                environment = torch.where(count_rays(rays, environment.shape[-1]) > 0, environment, GRAY)
+                gray = encoding.exposure * GRAY
+                environment = torch.where(count_rays(rays, environment.shape[-1]) > 0, environment, gray)
         else:
             rays = list(observe_views(views, state.geometry, config.environment.rays))
             sigmoid = config.environment.activation == "sigmoid"

@@ -52,7 +52,8 @@ def fit(
             return state
         seconds: dict[str, float] = {}
         with timed(seconds, "read views"):
-            views = configured_views(dataset, config).to(device)
+            views, config = configured_views(dataset, config)
+            views = views.to(device)
         if state is None:
             with timed(seconds, "initialize"):
                 _tell_repairs(views)

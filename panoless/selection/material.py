@@ -74,24 +74,31 @@ def _errors(
 
 
 def _without(
-    radiance: Float[Tensor, "3 H W"], posed: TrainView, surface: SurfaceBuffers, found: Reflectance
+    radiance: Float[Tensor, "3 H W"],
+    posed: TrainView,
+    surface: SurfaceBuffers,
+    found: Reflectance,
+    encoding: RadianceEncoding,
 ) -> Float[Tensor, "3 H W"]:
-    """(c − D)/F, at most 1/F₀, which what is saturated becomes: it may be any brighter."""
+    """(c − D)/F, at most the saturation over F₀, which what is saturated becomes: it may be any brighter."""
     normals = torch.einsum("ij,jhw->ihw", posed.camera_to_world_rotation, normalize(surface.normals_camera, dim=0))
     mirrored = (radiance - found.scattering(normals)).clamp(min=0)
-    mirrored = torch.where(radiance >= SATURATED, radiance, mirrored)
+    saturated = radiance >= SATURATED * encoding.saturation.to(radiance)[:, None, None]
+    mirrored = torch.where(saturated, radiance, mirrored)
     at_normal = torch.tensor(found.tint).to(radiance)[:, None, None]
     share = found.share(surface.cosines(posed.camera))
-    return RadianceEncoding(tint=found.tint).without_gain(mirrored / at_normal, share / at_normal)
+    return replace(encoding, tint=found.tint).without_gain(mirrored / at_normal, share / at_normal)
 
 
-def as_perfect_mirror(views: Views, posed: Views, geometry: Geometry, reflectance: Reflectance) -> Views:
+def as_perfect_mirror(
+    views: Views, posed: Views, geometry: Geometry, reflectance: Reflectance, encoding: RadianceEncoding
+) -> Views:
     """The views as a perfect mirror would have shown them. `posed` are the same with their cameras as the geometry has
     them.
     """
     train = []
     for view, seen in zip(views.train, posed.train, strict=True):
-        radiance = _without(view.radiance, seen, geometry.buffers(seen.camera), reflectance)
+        radiance = _without(view.radiance, seen, geometry.buffers(seen.camera), reflectance, encoding)
         train.append(replace(view, radiance=radiance))
     return replace(views, train=tuple(train))
 
@@ -109,7 +116,8 @@ def without_scattered_light(
     found = earned_reflectance(usable, geometry, config)
     if found is None or not found.albedo.any():
         return None
-    return as_perfect_mirror(views, usable, geometry, found), replace(config, tint=found.tint)
+    mirror = as_perfect_mirror(views, usable, geometry, found, encoding_of(config))
+    return mirror, replace(config, tint=found.tint)
 
 
 @dataclass(frozen=True)

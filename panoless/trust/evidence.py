@@ -118,7 +118,7 @@ def gather_evidence(
         view_shift_deg=float(np.degrees(np.sqrt(np.mean((shift / focal) ** 2)))) if len(shift) else 0.0,
         overlap=_median(overlap),
         left_out=1 - kept / solid,
-        saturated=_saturated(seen, options),
+        saturated=_saturated(seen, float(encoding_of(config).saturation.min()), options),
         coverage=float((visibility > 0).float().mean()),
         camera_turn_deg=_median(np.array([_turn_deg(*each) for each in zip(seen, usable.train, strict=True)])),
         views=len(seen),
@@ -204,7 +204,7 @@ def _light(
         "one_color": plain["one_color"].value,
         "matte": plain["matte"].value,
         "unexplained_part": parts.share_above(options.part_unexplained * plain["matte"].value),
-        "noise": noise,
+        "noise": noise / encoding_of(config).exposure,
         "error_in_noise": float(every.abs().median()) / max(noise, options.least_noise),
         "rank_correlation": _rank_correlation(sure, every.square().sum(1)),
     }
@@ -328,11 +328,11 @@ def _noise(view: TrainView) -> float:
     return float(values.abs().median()) / (NORMAL_MEDIAN * 6**0.5) if values.numel() else 0.0
 
 
-def _saturated(views: Sequence[TrainView], options: TrustOptions) -> float:
+def _saturated(views: Sequence[TrainView], saturation: float, options: TrustOptions) -> float:
     count, total = 0, 0
     for view in views:
         brightest = view.radiance_at(view.solid).amax(1)
-        count, total = count + int((brightest >= options.saturated).sum()), total + len(brightest)
+        count, total = count + int((brightest >= options.saturated * saturation).sum()), total + len(brightest)
     return count / max(total, 1)
 
 

@@ -29,7 +29,7 @@ class TrustOptions:
     part_unexplained: Positive = 0.6
     """A place is not explained from this share of the light on that a matte object would leave unexplained."""
     saturated: NonNegative = 0.998
-    """Radiance from which a pixel is saturated."""
+    """Share of the largest radiance from which a pixel is saturated."""
     views: Count = 20
     """Most views of either part, kept and held out, whose silhouettes and places are looked at."""
     shift_scale_px: Positive = 0.5

@@ -66,7 +66,7 @@ def watch(preset: str, steps: int, count: int) -> Flatness:
         environment=replace(config.environment, resolution=32, rays=100_000),
         density=replace(config.density, stop=1.0, max_surfels=2 * count),
     )
-    views = configured_views(open_dataset(bundled_dataset("tiny-vase")), config)
+    views, config = configured_views(open_dataset(bundled_dataset("tiny-vase")), config)
     mirror = SurfelMirror.of(initial_surfels(views, config.surfels, config.seed), config)
     family, noted = SurfelFamily(), _MemoryWatch()
     geometry, _ = family.train(views, mirror, family.begin(views, mirror, config), config, noted)

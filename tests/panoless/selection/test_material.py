@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from panoless.capture.encoding import LDR
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.options import MaterialOptions
@@ -60,14 +61,14 @@ def test_a_plane_does_not_tell_its_color() -> None:
 
 def test_views_of_gold_become_those_of_a_perfect_mirror(gold: Views) -> None:
     """At solid pixels; what is saturated has the largest value, for it may be any brighter."""
-    found = as_perfect_mirror(gold, gold, MIRROR, Reflectance(GOLD))
+    found = as_perfect_mirror(gold, gold, MIRROR, Reflectance(GOLD), LDR)
     for view, true in zip(found.train, PERFECT.train, strict=True):
         seen, truth = (each.radiance.flatten(1)[:, view.solid] for each in (view, true))
         unsaturated = truth < 0.99
         assert seen[unsaturated] == pytest.approx(truth[unsaturated].numpy(), abs=1e-4)
     bright = tuple(replace(view, radiance=torch.ones_like(view.radiance)) for view in gold.train[:1])
     one = replace(gold, train=bright)
-    largest = as_perfect_mirror(one, one, MIRROR, Reflectance(GOLD)).train[0].radiance.flatten(1)
+    largest = as_perfect_mirror(one, one, MIRROR, Reflectance(GOLD), LDR).train[0].radiance.flatten(1)
     assert largest[:, bright[0].solid[0]].numpy() == pytest.approx(1 / GOLD, rel=1e-5)
 
 

@@ -1,0 +1,82 @@
+"""Photographs are fitted at one brightness: their common exposure changes nothing but the units of the map."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from panoless.capture.configured import configured_views
+from panoless.capture.options import ContrastOptions
+from panoless.capture.views import load_views
+from panoless.config import FitConfig
+from panoless.geometry.surfels.mirror import SurfelMirror
+from panoless.presets import PRESETS
+from panoless.reconstruct.fit import fit
+from panoless.reconstruct.state import FitState
+from shinypartial.dataset.read import open_dataset, read_view
+from shinypartial.dataset.schema import Dataset
+from shinypartial.dataset.write import write_view
+from tests.support.mirror_sphere import tiny_config
+from tests.support.synthetic_dataset import make_sphere_dataset
+
+UNSATURATED = 0.2
+"""So exposed, the sun of the synthetic world is below 1."""
+
+
+def exposed_dataset(root: Path, factor: float, train: int = 6) -> Dataset:
+    """The synthetic sphere, its training views that many times as bright."""
+    dataset = make_sphere_dataset(root, resolution=40, train=train, test=1)
+    for frame in dataset.train:
+        view = read_view(frame)
+        write_view(frame, replace(view, radiance=factor * view.radiance))
+    return open_dataset(root)
+
+
+def test_views_are_as_bright_as_asked_however_they_were_exposed(tmp_path: Path) -> None:
+    bright, dark = (exposed_dataset(tmp_path / str(factor), factor) for factor in (UNSATURATED, UNSATURATED / 16))
+    config = FitConfig(contrast=ContrastOptions(brightness=0.3))
+    (views, told), (others, of_others) = (configured_views(each, config) for each in (bright, dark))
+    mean = torch.cat([view.radiance_at(view.solid) for view in views.train]).mean()
+    assert float(mean) == pytest.approx(0.3, rel=1e-5)
+    assert of_others.exposure == pytest.approx(16 * told.exposure, rel=1e-3)
+    for view, other in zip(views.train, others.train, strict=True):
+        # Half floats in the files keep three digits.
+        torch.testing.assert_close(view.radiance, other.radiance, rtol=2e-3, atol=1e-4)
+
+
+def test_black_photographs_stay_black(tmp_path: Path) -> None:
+    views, config = configured_views(exposed_dataset(tmp_path / "black", 0.0), FitConfig())
+    assert config.exposure == 1
+    assert all(float(view.radiance.max()) == 0 for view in views.train)
+
+
+@pytest.mark.parametrize("preset", ["paper", "3dgs-dr"])
+def test_methods_that_work_between_zero_and_one_take_photographs_as_they_are(
+    preset: str, sphere_dataset: Dataset
+) -> None:
+    config = replace(PRESETS[preset], crop_margin_px=2)
+    if preset == "paper":
+        views, told = configured_views(sphere_dataset, config)
+        assert torch.equal(views.train[0].radiance, load_views(sphere_dataset, 2).train[0].radiance)
+    else:
+        told = configured_views(sphere_dataset, config)[1]
+    assert told.exposure == 1
+
+
+def test_a_darker_exposure_gives_the_same_surface_and_a_darker_map(tmp_path: Path) -> None:
+    def fitted(factor: float) -> FitState:
+        dataset = exposed_dataset(tmp_path / f"data-{factor}", factor, train=14)
+        return fit(dataset, tiny_config(), tmp_path / f"run-{factor}")
+
+    bright, dark = fitted(UNSATURATED), fitted(UNSATURATED / 16)
+    assert isinstance(bright.geometry, SurfelMirror)
+    assert isinstance(dark.geometry, SurfelMirror)
+    assert bright.environment is not None
+    assert dark.environment is not None
+    assert dark.verdict is not None
+    assert bright.verdict is not None
+    assert dark.verdict.risk == pytest.approx(bright.verdict.risk, rel=0.05)
+    difference = (16 * dark.environment - bright.environment).abs().mean()
+    # Files of half floats and steps of single precision leave 0.2 %.
+    assert float(difference) < 0.01 * float(bright.environment.mean())
