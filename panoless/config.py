@@ -193,8 +193,8 @@ class FitConfig:
     tint: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
     """Known reflectance of the mirror in red, green and blue (linear): what it shows is tint · environment."""
     exposure: NonNegative = 0.0
-    """Factor of all photographs in a fit, which its map is divided by after it. 0: that which gives a darker object the
-    mean brightness `contrast.brightness`, so that a dark world is fitted as a bright one is."""
+    """Factor of all photographs by which a shape is chosen, fitted and judged; the map is solved from them as they are.
+    0: that which gives a darker object the mean brightness `contrast.brightness`."""
     alpha_applied: Literal["once", "paper"] = "once"
     """`paper`: (A + L)·α as Eq. 10 is written, though A is blended already; `once`: A + L·α."""
     downscale: Count = 1
@@ -291,7 +291,7 @@ def config_from_dict(content: Any) -> FitConfig:
 def check_config(config: FitConfig) -> None:
     """Raise InputError for a value outside the range of its field, and for options that exclude each other."""
     check_record(config, "the configuration", place=_option, remedy="See `panoless fit --help` for what it means.")
-    linear = works_in_unit_range(config)
+    linear = _works_in_unit_range(config)
     if config.surfels.shading != "mirror" and config.environment.solve:
         raise InputError(
             expected="the map that the steps leave, where primitives are shaded as another method does",
@@ -304,15 +304,23 @@ def check_config(config: FitConfig) -> None:
             found=f"options of the preset {config.preset} that work in [0, 1]",
             remedy="Use --preset fast, default or best, or leave --config.environment.range out.",
         )
-    if config.exposure not in (0, 1) and linear:
+    if config.exposure not in (0, 1) and not can_be_exposed(config):
         raise InputError(
-            expected="photographs as they are, where options work in [0, 1]",
-            found=f"--config.exposure {config.exposure:g} with those of the preset {config.preset}",
+            expected="photographs as they are, where options work in [0, 1], without a solved map or in hdr",
+            found=f"--config.exposure {config.exposure:g} with such options of the preset {config.preset}",
             remedy="Use --preset fast, default or best, or leave --config.exposure out.",
         )
 
 
-def works_in_unit_range(config: FitConfig) -> bool:
+def can_be_exposed(config: FitConfig) -> bool:
+    """Whether photographs may be brighter in a fit than they are: in a low dynamic range, with a map that is solved
+    after it, and where nothing works in [0, 1].
+    """
+    environment = config.environment
+    return environment.range == "ldr" and environment.solve and not _works_in_unit_range(config)
+
+
+def _works_in_unit_range(config: FitConfig) -> bool:
     """Whether a diffuse color, a term of the loss, a sigmoid or another method's shading takes radiance as it is."""
     of_paper = config.loss.photometric == "paper" or config.environment.activation == "sigmoid"
     return config.albedo or of_paper or config.surfels.shading != "mirror"

@@ -6,7 +6,7 @@ from panoless.capture.contrast import exposed, exposure_of
 from panoless.capture.encoding import encoding_of
 from panoless.capture.repair import with_repaired_masks
 from panoless.capture.views import Views, load_views
-from panoless.config import FitConfig, works_in_unit_range
+from panoless.config import FitConfig, can_be_exposed
 from shinypartial.dataset.schema import Dataset
 
 
@@ -14,20 +14,19 @@ def configured_views(dataset: Dataset, config: FitConfig) -> tuple[Views, FitCon
     """The training split as a configuration wants to see it, its masks repaired, and that configuration with the
     exposure that it left open.
 
-    Where options work in [0, 1] photographs stay as they are, and in a high dynamic range, which knows no brightest
-    radiance.
+    Photographs stay as they are where options don't bear another exposure.
     """
-    encoding = encoding_of(config)
     views = load_views(
         dataset,
         config.crop_margin_px,
         config.downscale,
-        encoding,
+        encoding_of(config),
         least_object_px=config.least_object_px,
         known_radius=config.sphere.radius,
     )
-    if config.exposure == 0:
-        as_it_is = encoding.high_dynamic_range or works_in_unit_range(config)
-        config = replace(config, exposure=1.0 if as_it_is else exposure_of(views, config.contrast))
-        views = exposed(views, config.exposure)
-    return with_repaired_masks(views, config.mask_repair), config
+    exposure, options = config.exposure, config.contrast
+    if exposure == 0:
+        found = exposure_of(views, options.brightness, options.largest_exposure)
+        exposure = found if can_be_exposed(config) else 1.0
+    config = replace(config, exposure=exposure)
+    return with_repaired_masks(exposed(views, exposure), config.mask_repair), config

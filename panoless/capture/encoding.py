@@ -22,8 +22,7 @@ SATURATED = 0.998
 
 @dataclass(frozen=True)
 class RadianceEncoding:
-    """Encoding c ↦ f(g c/F) of the radiance c of a mirror with the tint F, so that residuals mean the same everywhere;
-    g is one exposure of all views.
+    """Encoding c ↦ f(c/F) of the radiance c of a mirror with the tint F, so that residuals mean the same everywhere.
 
     With a low dynamic range c is clipped to [0, 1], as photographs are, and f(x) = x. With a high one f(x) = x up to 1
     and 1 + ln x above: below 1 a fit works as ever, above it a residual is a relative one. f is increasing with a
@@ -35,6 +34,7 @@ class RadianceEncoding:
     srgb: bool = False
     """f is the curve of sRGB instead: values as they stand in an 8-bit image, in which other methods compute."""
     exposure: float = 1.0
+    """By which encoded radiance is multiplied afterwards, in views of a low dynamic range."""
 
     def clipped(self, frame: Frame, view: View) -> Float[np.ndarray, "H W 3"]:
         """Radiance of a view, not encoded, without what its range excludes.
@@ -52,9 +52,9 @@ class RadianceEncoding:
     def encoded(
         self, radiance: Float[np.ndarray, "H W 3"], alpha: Float[np.ndarray, "H W"] | float = 1.0
     ) -> Float[np.ndarray, "H W 3"]:
-        """f(g c/F). With sRGB α f(g c/(α F)) of radiance c premultiplied by alpha, as such an image holds it."""
-        if self.tint != NO_TINT or self.exposure != 1:
-            radiance = radiance * (self.exposure / np.array(self.tint, radiance.dtype))
+        """f(c/F). With sRGB α f(c/(α F)) of radiance c that is premultiplied by alpha, as such an image holds it."""
+        if self.tint != NO_TINT:
+            radiance = radiance / np.array(self.tint, radiance.dtype)
         if self.srgb:
             share = np.asarray(alpha, radiance.dtype)[..., None]
             return share * linear_to_srgb((radiance / np.maximum(share, LEAST_ALPHA)).clip(0, 1))
@@ -73,22 +73,20 @@ class RadianceEncoding:
 
     @property
     def saturation(self) -> Float[Tensor, "3"]:
-        """The largest encoded radiance that a view can show: g/F, or ∞ with a high dynamic range."""
+        """The largest encoded radiance that a view can show: 1/F times its exposure, or ∞ with a high dynamic range."""
         return torch.full((3,), math.inf) if self.high_dynamic_range else self.exposure / torch.tensor(self.tint)
 
     def shown(self, radiance: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:
-        """With sRGB f of g times radiance in [0, 1/g] of a mirror without tint, without a gradient; else radiance."""
-        if not self.srgb:
-            return radiance
-        return torch.from_numpy(linear_to_srgb(self.exposure * radiance.cpu().numpy())).to(radiance)
+        """f of radiance in [0, 1] of a mirror without tint; without a gradient."""
+        return torch.from_numpy(linear_to_srgb(radiance.cpu().numpy())).to(radiance) if self.srgb else radiance
 
     def decoded(self, environment: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:
-        """f⁻¹ of a map over g: the radiance of the environment itself, before any mirror."""
+        """f⁻¹ of a map: the radiance of the environment itself, before any mirror."""
         if self.srgb:
-            environment = torch.from_numpy(srgb_to_linear(environment.cpu().numpy())).to(environment)
-        elif self.high_dynamic_range:
-            environment = torch.where(environment > 1, torch.exp(environment.clamp(min=1) - 1), environment)
-        return environment if self.exposure == 1 else environment / self.exposure
+            return torch.from_numpy(srgb_to_linear(environment.cpu().numpy())).to(environment)
+        if not self.high_dynamic_range:
+            return environment
+        return torch.where(environment > 1, torch.exp(environment.clamp(min=1) - 1), environment)
 
 
 #: Photographs in a mirror without color.

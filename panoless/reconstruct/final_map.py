@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from panoless.capture.contrast import exposed
 from panoless.capture.encoding import encoding_of
 from panoless.capture.views import Views
 from panoless.config import FitConfig
@@ -26,9 +27,11 @@ def complete(state: FitState, views: Views, config: FitConfig) -> Views:
     photographs. These are returned as a mirror of all light would have shown them.
 
     The map is solved in closed form, unless the configuration keeps that of an iterative fit, which knows no material.
+    It is that of photographs as they were taken: exposed more, their robust scales would leave out what is beside a
+    lamp, which counts most in a map.
     Only kinds in closed form are asked for a roughness: wrong normals blur a map as well.
     """
-    usable = usable_views(views, state.geometry)
+    usable, exposure = usable_views(views, state.geometry), encoding_of(config).exposure
     if config.environment.solve or state.training is None:
         state.reflectance = earned_reflectance(usable, state.geometry, config)
     if state.reflectance is not None:
@@ -36,10 +39,11 @@ def complete(state: FitState, views: Views, config: FitConfig) -> Views:
         shown = zip(usable.train, views.train, strict=True)
         usable = replace(usable, train=tuple(replace(part, radiance=view.radiance) for part, view in shown))
         config = replace(config, tint=state.reflectance.tint)
-        state.reflectance = state.reflectance.exposed(1 / encoding_of(config).exposure)
+        state.reflectance = state.reflectance.exposed(1 / exposure)
     softness = earned_softness(usable, state.geometry, config) if state.training is None else Softness()
     state.roughness, state.blur_px = softness.roughness, softness.blur_px
-    _solve(state, usable if state.blur_px is None else replace(usable, blur_px=state.blur_px), config)
+    taken = exposed(usable if state.blur_px is None else replace(usable, blur_px=state.blur_px), 1 / exposure)
+    _solve(state, taken, replace(config, exposure=1.0))
     return views if state.blur_px is None else replace(views, blur_px=state.blur_px)
 
 
@@ -54,8 +58,7 @@ def _solve(state: FitState, views: Views, config: FitConfig) -> None:
                 environment = _of_rough_mirror(state.roughness, state.geometry, views, config, environment.shape[-1])
                 shown = Lobe.of(state.roughness, environment.shape[-1]).blurred(environment)
             if not config.environment.fill:
-                gray = encoding.exposure * GRAY
-                environment = torch.where(count_rays(rays, environment.shape[-1]) > 0, environment, gray)
+                environment = torch.where(count_rays(rays, environment.shape[-1]) > 0, environment, GRAY)
         else:
             rays = list(observe_views(views, state.geometry, config.environment.rays))
             sigmoid = config.environment.activation == "sigmoid"

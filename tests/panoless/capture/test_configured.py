@@ -67,7 +67,8 @@ def test_methods_that_work_between_zero_and_one_take_photographs_as_they_are(
 def test_a_darker_exposure_gives_the_same_surface_and_a_darker_map(tmp_path: Path) -> None:
     def fitted(factor: float) -> FitState:
         dataset = exposed_dataset(tmp_path / f"data-{factor}", factor, train=14)
-        return fit(dataset, tiny_config(), tmp_path / f"run-{factor}")
+        config = replace(tiny_config(), contrast=ContrastOptions(brightness=0.5))
+        return fit(dataset, config, tmp_path / f"run-{factor}")
 
     bright, dark = fitted(UNSATURATED), fitted(UNSATURATED / 16)
     assert isinstance(bright.geometry, SurfelMirror)
