@@ -24,9 +24,8 @@ def configured_views(dataset: Dataset, config: FitConfig) -> tuple[Views, FitCon
         least_object_px=config.least_object_px,
         known_radius=config.sphere.radius,
     )
-    exposure, options = config.exposure, config.contrast
+    exposure = config.exposure
     if exposure == 0:
-        found = exposure_of(views, options.brightness, options.largest_exposure)
-        exposure = found if can_be_exposed(config) else 1.0
+        exposure = exposure_of(views, config.contrast) if can_be_exposed(config) else 1.0
     config = replace(config, exposure=exposure)
     return with_repaired_masks(exposed(views, exposure), config.mask_repair), config

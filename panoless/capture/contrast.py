@@ -52,13 +52,14 @@ def _brightness(views: Views) -> Float[Tensor, "P"]:
     return torch.cat([view.radiance_at(view.solid).mean(1) for view in views.train])
 
 
-def exposure_of(views: Views, brightness: float, largest: float) -> float:
-    """The factor, at most the largest one, that gives the object of dark photographs that brightness in the mean.
+def exposure_of(views: Views, options: ContrastOptions) -> float:
+    """The factor that gives the object of dark photographs the brightness of the options in the mean.
+
     Brighter ones stay as they are: they have a scale, the radiance at which they are saturated.
     """
-    shown = _brightness(views)
-    mean = float(shown.mean()) if len(shown) else 0.0
-    return min(max(brightness / mean, 1.0), largest) if mean > 0 else 1.0
+    brightness = _brightness(views)
+    mean = float(brightness.mean()) if len(brightness) else 0.0
+    return min(max(options.brightness / mean, 1.0), options.largest_exposure) if mean > 0 else 1.0
 
 
 def exposed(views: Views, exposure: float) -> Views:

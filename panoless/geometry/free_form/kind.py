@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
-from panoless.capture.contrast import contrasted, exposed, exposure_of
+from panoless.capture.contrast import contrasted
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.poses import Poses, StatedCameras, with_pose_covariances
 from panoless.capture.views import TrainView, Views, at_most_pixels, split_held_out
@@ -203,7 +203,7 @@ class FreeFormFamily(ExactFamily):
         """
         if len(views.train) < config.free_form.least_views and not asked:
             return None
-        return Proposal(first_surfaces(_exposed(views, config), config), 0.0, 1.0)
+        return Proposal(first_surfaces(views, config), 0.0, 1.0)
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The first surface, trusted everywhere."""
@@ -221,7 +221,7 @@ class FreeFormFamily(ExactFamily):
     def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
         """On from a fit, in rounds with that logarithm among the unknowns, at the poses that it found."""
         start = replace(_stage(fitted), poses=None, focal=0.0)
-        stage = follow_views(fitted.corrected(_exposed(views, config)), start, config.free_form)
+        stage = follow_views(fitted.corrected(views), start, config.free_form)
         assert stage.focal is not None, "the focal length was unknown"
         factor = float(np.exp(-stage.focal))
         surface, trust = stage.surface.scaled(factor), stage.trust.scaled(factor)
@@ -230,14 +230,14 @@ class FreeFormFamily(ExactFamily):
     def after_as_many_steps(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:
         """On from a fit, in a round as long as with that unknown."""
         start = replace(_stage(fitted), poses=None)
-        stage = follow_views(fitted.corrected(_exposed(views, config)), start, config.free_form, longer=True)
+        stage = follow_views(fitted.corrected(views), start, config.free_form, longer=True)
         return _mirror(stage.surface, stage.trust, fitted.poses, config)
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """All coefficients by outlines and photographs together; by logarithms of radiance where this leaves what is
         dark unexplained and they explain more of it in held-out views.
         """
-        told, views = proposal.told, _exposed(views, config)
+        told = proposal.told
         if proposal.fitted is not None:
             posed = views if told is None else with_pose_covariances(views, told.covariances)
             found = follow_views(posed, _stage(proposal.fitted), config.free_form)
@@ -249,11 +249,6 @@ class FreeFormFamily(ExactFamily):
         first = replace(first_surfaces(shown, config), surroundings=proposal.shape.surroundings)
         again = _fitted(shown, first, told, config)
         return again if _unexplained(shown, again, config) < left else fitted
-
-
-def _exposed(views: Views, config: FitConfig) -> Views:
-    """As bright as a shape is fitted by; the map and what is judged are those of the views as they are."""
-    return exposed(views, exposure_of(views, config.free_form.brightness, config.contrast.largest_exposure))
 
 
 def _mirror(surface: LevelSet, trust: Trust, poses: Poses | None, config: FitConfig) -> FreeFormMirror:

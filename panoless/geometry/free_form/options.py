@@ -190,8 +190,6 @@ class FreeFormOptions:
     """Coefficients within so many cells of the surface are unknowns: all whose support meets it. Not tuned."""
     counted_rays: float = 100_000.0
     """The photographs weigh as much as so many pixels, however many take part."""
-    brightness: Positive = 0.35
-    """X"""
     photograph_curvature: Positive = 0.5
     """Factor of the photographs' part of the Gauss–Newton matrix. Along steps on the trial shape twist, their cost has
     0.6 times the curvature that the matrix says where the map stays, and less where it follows. 0.3 is no better.

@@ -169,6 +169,9 @@ def test_pictures_of_8_bits_have_no_high_dynamic_range(tmp_path: Path) -> None:
         replace(FitConfig(), tint=(1.0, float("nan"), 1.0)),
         replace(PRESETS["paper"], environment=replace(PRESETS["paper"].environment, range="hdr")),
         replace(FitConfig(), albedo=True, environment=replace(FitConfig().environment, range="hdr")),
+        replace(FitConfig(), exposure=2.0, environment=replace(FitConfig().environment, range="hdr")),
+        replace(FitConfig(), exposure=2.0, environment=replace(FitConfig().environment, solve=False)),
+        replace(PRESETS["paper"], exposure=2.0),
     ],
 )
 def test_impossible_lights_are_refused(config: FitConfig) -> None:
