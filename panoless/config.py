@@ -194,7 +194,7 @@ class FitConfig:
     """Known reflectance of the mirror in red, green and blue (linear): what it shows is tint · environment."""
     exposure: NonNegative = 0.0
     """Factor of all photographs by which a shape is chosen, fitted and judged; the map is solved from them as they are.
-    0: that which gives a darker object the mean brightness `contrast.brightness`."""
+    0: that which gives a dark object the mean brightness `contrast.brightness`."""
     alpha_applied: Literal["once", "paper"] = "once"
     """`paper`: (A + L)·α as Eq. 10 is written, though A is blended already; `once`: A + L·α."""
     downscale: Count = 1

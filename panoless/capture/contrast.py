@@ -53,13 +53,13 @@ def _brightness(views: Views) -> Float[Tensor, "P"]:
 
 
 def exposure_of(views: Views, options: ContrastOptions) -> float:
-    """The factor that gives the object of dark photographs the brightness of the options in the mean.
+    """The factor that gives the object of dark photographs the brightness of the options in the mean; 1 for others.
 
-    Brighter ones stay as they are: they have a scale, the radiance at which they are saturated.
+    These have a scale: the radiance at which they are saturated.
     """
     brightness = _brightness(views)
     mean = float(brightness.mean()) if len(brightness) else 0.0
-    return min(max(options.brightness / mean, 1.0), options.largest_exposure) if mean > 0 else 1.0
+    return min(max(options.brightness / mean, 1.0), options.largest_exposure) if 0 < mean < options.dark else 1.0
 
 
 def exposed(views: Views, exposure: float) -> Views:

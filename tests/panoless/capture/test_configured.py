@@ -35,7 +35,7 @@ def exposed_dataset(root: Path, factor: float, train: int = 6) -> Dataset:
 
 def test_views_are_as_bright_as_asked_however_they_were_exposed(tmp_path: Path) -> None:
     bright, dark = (exposed_dataset(tmp_path / str(factor), factor) for factor in (UNSATURATED, UNSATURATED / 16))
-    config = FitConfig(contrast=ContrastOptions(brightness=0.3))
+    config = FitConfig(contrast=ContrastOptions(dark=1.0, brightness=0.3))
     (views, told), (others, of_others) = (configured_views(each, config) for each in (bright, dark))
     mean = torch.cat([view.radiance_at(view.solid) for view in views.train]).mean()
     assert float(mean) == pytest.approx(0.3, rel=1e-5)
@@ -43,6 +43,13 @@ def test_views_are_as_bright_as_asked_however_they_were_exposed(tmp_path: Path) 
     for view, other in zip(views.train, others.train, strict=True):
         # Half floats in the files keep three digits.
         torch.testing.assert_close(view.radiance, other.radiance, rtol=2e-3, atol=1e-4)
+
+
+def test_photographs_that_are_not_dark_stay_as_they_are(sphere_dataset: Dataset) -> None:
+    views, told = configured_views(sphere_dataset, FitConfig())
+    assert told.exposure == 1
+    for view, other in zip(views.train, load_views(sphere_dataset, FitConfig().crop_margin_px).train, strict=True):
+        assert torch.equal(view.radiance, other.radiance)
 
 
 def test_black_photographs_stay_black(tmp_path: Path) -> None:
@@ -67,7 +74,7 @@ def test_methods_that_work_between_zero_and_one_take_photographs_as_they_are(
 def test_a_darker_exposure_gives_the_same_surface_and_a_darker_map(tmp_path: Path) -> None:
     def fitted(factor: float) -> FitState:
         dataset = exposed_dataset(tmp_path / f"data-{factor}", factor, train=14)
-        config = replace(tiny_config(), contrast=ContrastOptions(brightness=0.5))
+        config = replace(tiny_config(), contrast=ContrastOptions(dark=1.0, brightness=0.5))
         return fit(dataset, config, tmp_path / f"run-{factor}")
 
     bright, dark = fitted(UNSATURATED), fitted(UNSATURATED / 16)
