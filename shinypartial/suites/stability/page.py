@@ -48,7 +48,7 @@ def page_lines(results: Results, pictures: Sequence[tuple[str, str]]) -> Iterato
     yield f"{_count(len(results.outcomes), 'fit')} on data that get worse step by step: {', '.join(counts)}."
     if TINY not in results.scenes:
         yield f"Datasets have {size.train} training views of {size.resolution} × {size.resolution} pixels."
-    yield from ("", f"- Scenes: {', '.join(results.scenes)}", f"- Methods: {', '.join(results.methods)}")
+    yield from ("", f"- Scenes: {', '.join(results.scenes)}", f"- Methods: {', '.join(_methods(results))}")
     yield f"- Numbers: [{RESULTS.name}]({RESULTS.as_posix()}), made with this page by `shinypartial stability --page`"
     yield from ("", "Environment: PSNR of linear light over the directions that the true training views observe.")
     yield "Normals: pooled over pixels of test views that see the environment."
@@ -70,6 +70,13 @@ def page_lines(results: Results, pictures: Sequence[tuple[str, str]]) -> Iterato
     if failed:
         yield from ("", "## Failed fits", "", "| Fit | Last line |", "| --- | --- |")
         yield from (f"| {each.cell.name} | {_escaped(each.failure)} |" for each in failed)
+
+
+def _methods(results: Results) -> Iterator[str]:
+    """Their names, with the scenes of those that were not fitted to all."""
+    for method in results.methods:
+        scenes = list(dict.fromkeys(each.cell.scene for each in results.outcomes if each.cell.method == method))
+        yield method if len(scenes) == len(results.scenes) else f"{method} ({', '.join(scenes)} only)"
 
 
 def _limit_table(results: Results) -> Iterator[str]:

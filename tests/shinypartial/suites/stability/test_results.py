@@ -115,3 +115,10 @@ def test_the_spread_over_seeds_is_stated() -> None:
     seeded = [replace(each, cell=replace(each.cell, seed=seed)) for seed, each in enumerate(outcomes)]
     page = "\n".join(page_lines(Results(SIZE, tuple(seeded)), []))
     assert "| vase | fast | 3 | 1.000 dB |" in page
+
+
+def test_the_page_names_the_scenes_of_a_method_that_was_not_fitted_to_all(tmp_path: Path) -> None:
+    other = outcome(None, 30, 0.1, "mirror")
+    slow = replace(other, cell=replace(other.cell, method="slow"))
+    write_stability_page(tmp_path / "page.md", tmp_path, Results(SIZE, (*VASE, other, slow)))
+    assert f"- Methods: {other.cell.method}, slow (mirror only)" in (tmp_path / "page.md").read_text(encoding="utf-8")
