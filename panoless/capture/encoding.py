@@ -34,7 +34,8 @@ class RadianceEncoding:
     srgb: bool = False
     """f is the curve of sRGB instead: values as they stand in an 8-bit image, in which other methods compute."""
     exposure: float = 1.0
-    """By which encoded radiance is multiplied afterwards, in views of a low dynamic range."""
+    """By which views of a low dynamic range were multiplied after they were encoded: saturation knows of it, while
+    `encoded` and `decoded` do not."""
 
     def clipped(self, frame: Frame, view: View) -> Float[np.ndarray, "H W 3"]:
         """Radiance of a view, not encoded, without what its range excludes.

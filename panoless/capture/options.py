@@ -58,7 +58,7 @@ class ContrastOptions:
     large. With 0 none are."""
     brightness: Positive = 0.35
     """Mean radiance to which dark ones are exposed, all together: about the geometric mean of these scenes. With 0.2
-    the trial shapes die and drum end at 0.75° and 0.52° in the median, with 0.35 at 0.19°."""
+    the trial shapes die and drum end at 0.75° and 0.52° in the median, with 0.35 at 0.19° and 0.17°."""
     largest_exposure: Positive = 100.0
     """More than so many times brighter nothing is made: darker photographs show noise. Not tuned."""
 

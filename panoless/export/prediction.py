@@ -143,16 +143,16 @@ def export_snapshots(dataset: Dataset, run: Path, config: FitConfig, prediction:
             found="none",
             remedy="Fit with `panoless fit --snapshots 6 --output NEW`.",
         )
-    views, exposed = None, config
+    views, configured = None, config
     for source in found:
         state, target = read_snapshot(source), prediction / SNAPSHOTS / source.name
         if _is_exported(target, state, config, dataset):
             continue
         if views is None:
-            loaded, exposed = configured_views(dataset, config)
-            views = state.selection.corrections.applied(loaded, exposed)
+            loaded, configured = configured_views(dataset, config)
+            views = state.selection.corrections.applied(loaded, configured)
         with timed(state.seconds, "solve environment"):
-            complete(state, views, exposed)
+            complete(state, views, configured)
         acquire_prediction(target)
         export_prediction(dataset, state, config, target, snapshot=True)
     return [prediction / SNAPSHOTS / source.name for source in found]
