@@ -159,7 +159,7 @@ PRESETS: dict[str, FitConfig] = {
         free_form=FreeFormOptions(
             rounds=(
                 FreeFormRound(20, 16, 0.30, 1, 20_000, 100.0, 5),
-                FreeFormRound(20, 32, 0.20, 1, 30_000, 100.0, 4),
+                FreeFormRound(28, 64, 0.80, 4, 40_000, 30.0, 8),
                 FreeFormRound(28, 64, 0.15, 4, 40_000, 30.0, 4),
             ),
             finer=(),

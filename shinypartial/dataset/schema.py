@@ -1,7 +1,7 @@
 """Names and types of the dataset folder: the only place where its layout is spelled out."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -120,8 +120,8 @@ class Dataset:
 
     root: Path
     manifest: dict[str, Any]
-    train: tuple[Frame, ...]
-    test: tuple[Frame, ...]
+    train: tuple[Frame, ...] = field(repr=False)
+    test: tuple[Frame, ...] = field(repr=False)
 
     @property
     def name(self) -> str:

@@ -12,7 +12,7 @@ from shinypartial.dataset.schema import Dataset
 from shinypartial.prediction.format import read_info
 
 ROOT = Path(__file__).resolve().parents[2]
-ITERATIONS = 400
+ITERATIONS = 150
 PROGRAM = """
 import sys
 from panoless.cli import main

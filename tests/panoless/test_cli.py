@@ -87,8 +87,7 @@ def test_a_tuned_number_deep_inside_can_be_set() -> None:
     assert config.selection.least_gain == 0.1
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("form", ["{} {}", "{}={}"])
+@pytest.mark.parametrize(("preset", "form"), [*((preset, "{} {}") for preset in PRESETS), ("paper", "{}={}")])
 def test_a_preset_sets_the_defaults(
     preset: str, form: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

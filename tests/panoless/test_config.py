@@ -3,6 +3,7 @@
 import ast
 import json
 from dataclasses import asdict, fields, is_dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ def test_a_configuration_of_another_version_is_named(damage: str) -> None:
         config_from_dict(content)
 
 
+@cache
 def reads() -> set[tuple[str, str]]:
     """(owner, name) of every attribute that any module but config.py reads: `config.loss.x` gives (loss, x)."""
     found = set()

@@ -1,6 +1,7 @@
 """Cameras that are turned are found beside a shape; those that are where they are said to be stay there."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -37,8 +38,14 @@ def left_deg(found: Poses, wrong: Poses) -> float:
     return float(np.degrees(np.median((left.mean().inv() * left).magnitude())))
 
 
+@cache
 def flat_views() -> Views:
     return reflecting_views(plane_of(RECTANGLE), arc(15))
+
+
+@cache
+def goblet_views() -> Views:
+    return revolution_views(goblet(), around(12))
 
 
 def turned_world(views: Views) -> Views:
@@ -53,7 +60,7 @@ def turned_world(views: Views) -> Views:
     [
         (PlaneFamily(), flat_views()),
         (PlaneFamily(), turned_world(flat_views())),
-        (RevolutionFamily(), revolution_views(goblet(), around(12))),
+        (RevolutionFamily(), goblet_views()),
     ],
 )
 def test_true_cameras_are_left_alone(family: Family, views: Views) -> None:
@@ -88,7 +95,7 @@ def test_turned_cameras_of_a_flat_mirror_are_found() -> None:
 
 def test_outlines_of_a_surface_of_revolution_turn_cameras_back() -> None:
     """To less than half of their error, without a look at colors."""
-    views, family = revolution_views(goblet(), around(12)), RevolutionFamily()
+    views, family = goblet_views(), RevolutionFamily()
     wrong = wrong_turns(views)
     turned = wrong.moved(views)
     proposal = family.propose(turned, CONFIG, asked=True)
@@ -152,7 +159,7 @@ def test_a_wrong_principal_point_is_told_from_a_motion_that_all_cameras_share() 
 
 @pytest.mark.parametrize(
     ("family", "views"),
-    [(PlaneFamily(), flat_views()), (RevolutionFamily(), revolution_views(goblet(), around(12)))],
+    [(PlaneFamily(), flat_views()), (RevolutionFamily(), goblet_views())],
 )
 def test_outlines_tell_a_principal_point_that_is_wrong_in_all_views(family: Family, views: Views) -> None:
     """To a tenth of it: all but a little looks like a motion of the object, and stays in the cameras nevertheless."""

@@ -32,6 +32,7 @@ def coarse_config() -> FitConfig:
     """As few surfels and steps as tell kinds apart, and maps as coarse as views of these few pixels resolve."""
     config = tiny_config(iterations=200, count=200)
     photometric, footprints = config.revolution.photometric, config.revolution.footprints
+    coarsest = replace(config.free_form.rounds[0], rays=5000)
     return replace(
         config,
         model="auto",
@@ -47,7 +48,7 @@ def coarse_config() -> FitConfig:
         ),
         free_form=replace(
             config.free_form,
-            rounds=tuple(replace(each, rays=5000) for each in config.free_form.rounds[:2]),
+            rounds=(coarsest, replace(coarsest, resolution=32, robust_scale=0.2, steps=4)),
             finer=(),
             concave=replace(config.free_form.concave, search=False),
             descent=replace(config.free_form.descent, rounds=()),
@@ -92,8 +93,7 @@ def dome(plane: Plane, bend: float, count: int) -> SurfelMirror:
     return SurfelMirror.of(replace(flat, quats=quats, curvatures=curvatures), config)
 
 
-@pytest.mark.parametrize("frame_height", [0.0, 0.1])
-@pytest.mark.parametrize("bend", [0.0, 0.1])
+@pytest.mark.parametrize(("frame_height", "bend"), [(0.0, 0.1), (0.1, 0.0), (0.1, 0.1)])
 def test_a_flat_mirror_takes_the_plane_and_a_bent_one_in_the_same_boundary_does_not(
     frame_height: float, bend: float
 ) -> None:
@@ -151,7 +151,7 @@ def test_surfels_that_explain_as_much_do_not_beat_the_plane() -> None:
     assert f"held-out error {row.held_out_error:.4f}" in selection.sentence
 
 
-@pytest.mark.parametrize("bend", [0.2, 0.3])
+@pytest.mark.parametrize("bend", [0.2, pytest.param(0.3, marks=pytest.mark.slow)])
 def test_a_plane_that_explains_nothing_goes_even_if_the_trial_does_no_better(bend: float) -> None:
     """A bent mirror in a flat boundary, and surfels that did not learn to bend: the plane goes, and heights come, also
     where so few of them leave too much as well, because nothing explains more.

@@ -22,6 +22,7 @@ from shinypartial.evaluation.evaluate import evaluate
 from shinypartial.io.files import read_json, sha256_of, write_json
 from shinypartial.io.images import write_png
 from tests.support.shiny_blender import make_shiny_blender_dataset
+from tests.support.synthetic_dataset import make_sphere_dataset
 from tests.support.truth_prediction import write_truth_prediction
 
 EVERYTHING = Perturbation(
@@ -203,14 +204,14 @@ def test_copies_validate(source: Dataset, tmp_path: Path, options: Perturbation)
     assert [each for each in validate(tmp_path / "copy") if not each.warning]
 
 
-def test_truth_scores_as_before(sphere_dataset: Dataset, tmp_path: Path) -> None:
+def test_truth_scores_as_before(tmp_path: Path) -> None:
+    source = make_sphere_dataset(tmp_path / "source", environment_height=256)
     options = Perturbation(
         CameraErrors(rotation_deg=1.0), MaskErrors(erode_px=1.0), SensorErrors(jpeg_quality=60), ViewChoice(keep=4)
     )
-    copy = open_dataset(perturb(sphere_dataset.root, tmp_path / "copy", options).root)
+    copy = open_dataset(perturb(source.root, tmp_path / "copy", options).root)
     scores = [
-        evaluate(write_truth_prediction(tmp_path / each.name, each), protocol="linear-v1")
-        for each in (sphere_dataset, copy)
+        evaluate(write_truth_prediction(tmp_path / each.name, each), protocol="linear-v1") for each in (source, copy)
     ]
     assert scores[0].normals == scores[1].normals
     assert scores[0].render == scores[1].render

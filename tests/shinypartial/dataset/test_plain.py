@@ -32,15 +32,20 @@ VIEW = "train/r_0"
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """All around, in the original layout; tests only read it."""
-    return make_shiny_blender_dataset(tmp_path_factory.mktemp("shiny") / "ball", 36, 24)
+    return make_shiny_blender_dataset(tmp_path_factory.mktemp("shiny") / "ball", 30, 24)
+
+
+@pytest.fixture(scope="module")
+def subset(source: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its subset with a manifest; tests only read it, too."""
+    return make_subset(source.root, tmp_path_factory.mktemp("subsets") / "partial", SubsetOptions()).root
 
 
 @pytest.fixture(params=["original", "subset"])
-def folder(request: pytest.FixtureRequest, source: Dataset, tmp_path: Path) -> Path:
-    """A folder to change: the original, or its subset with a manifest."""
-    if request.param == "original":
-        return Path(shutil.copytree(source.root, tmp_path / "ball"))
-    return make_subset(source.root, tmp_path / "partial", SubsetOptions()).root
+def folder(request: pytest.FixtureRequest, source: Dataset, subset: Path, tmp_path: Path) -> Path:
+    """A folder to change: a copy of the original, or of its subset."""
+    original = request.param == "original"
+    return Path(shutil.copytree(source.root if original else subset, tmp_path / ("ball" if original else "partial")))
 
 
 def checked(folder: Path) -> list[Violation]:

@@ -13,6 +13,7 @@ from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import newest_dataset, open_dataset, read_environment, read_view
 from shinypartial.dataset.schema import Dataset, Frame
 from shinypartial.io.images import read_exr, read_png, write_exr, write_png
+from tests.shinypartial.dataset.conftest import MAP_HEIGHT
 from tests.support.synthetic_dataset import environment_latlong, make_plain_sphere_dataset, render_sphere
 
 TRAIN = "transforms_train.json"
@@ -48,7 +49,9 @@ def test_a_dataset_comes_back_as_it_was_rendered(sphere_dataset: Dataset) -> Non
 
 
 def test_the_environment_comes_back(sphere_dataset: Dataset) -> None:
-    np.testing.assert_allclose(read_environment(sphere_dataset), environment_latlong(256), rtol=2**-11, atol=1e-6)
+    np.testing.assert_allclose(
+        read_environment(sphere_dataset), environment_latlong(MAP_HEIGHT), rtol=2**-11, atol=1e-6
+    )
 
 
 def test_names_and_files_of_a_frame(sphere_dataset: Dataset) -> None:

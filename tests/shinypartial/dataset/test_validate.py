@@ -18,8 +18,10 @@ from shinypartial.dataset.validate import validate
 from shinypartial.dataset.write import write_inverse_distance
 from shinypartial.io.files import sha256_of
 from shinypartial.io.images import read_exr, read_exr_rgb, read_png, write_exr, write_exr_rgb, write_png
+from tests.shinypartial.dataset.conftest import MAP_HEIGHT
 
 EXR = "train/r_000.exr"
+MAP_SHAPE = (MAP_HEIGHT, 2 * MAP_HEIGHT)
 
 
 def renew_checksums(root: Path) -> None:
@@ -194,10 +196,14 @@ DAMAGES = {
     "no face": (remove("environment/cube/px.exr"), "environment/cube/px.exr", "no such file"),
     "mirrored face": (edit_map("cube/ny.exr", lambda m: m[:, ::-1]), "environment/cube/ny.exr", "differ"),
     "small face": (edit_map("cube/pz.exr", lambda m: m[::2, ::2]), "environment/cube/pz.exr", "texels"),
-    "no object radius": (add_inverse_distance(np.ones((256, 512))), "dataset.json", "object_radius"),
-    "negative distance": (add_inverse_distance(np.full((256, 512), -1.0)), INVERSE_DISTANCE, "lowest value -1"),
-    "distance without end": (add_inverse_distance(np.full((256, 512), np.inf)), INVERSE_DISTANCE, "highest inf"),
-    "small map of distance": (add_inverse_distance(np.ones((16, 32))), INVERSE_DISTANCE, "512×256 texels"),
+    "no object radius": (add_inverse_distance(np.ones(MAP_SHAPE)), "dataset.json", "object_radius"),
+    "negative distance": (add_inverse_distance(np.full(MAP_SHAPE, -1.0)), INVERSE_DISTANCE, "lowest value -1"),
+    "distance without end": (add_inverse_distance(np.full(MAP_SHAPE, np.inf)), INVERSE_DISTANCE, "highest inf"),
+    "small map of distance": (
+        add_inverse_distance(np.ones((MAP_HEIGHT // 2, MAP_HEIGHT))),
+        INVERSE_DISTANCE,
+        f"{2 * MAP_HEIGHT}×{MAP_HEIGHT} texels",
+    ),
     "near, but where": (
         edit_json("dataset.json", lambda m: (m.update(format_minor=2), m["recipe"].update(world={"distance": 5.0}))),
         INVERSE_DISTANCE,

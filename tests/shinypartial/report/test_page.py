@@ -61,7 +61,7 @@ def evaluated(tmp_path_factory: pytest.TempPathFactory, sphere_dataset: Dataset)
     return prediction
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def page(evaluated: Path) -> str:
     return write_report(evaluated).read_text(encoding="utf-8")
 

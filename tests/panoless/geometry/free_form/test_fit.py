@@ -50,6 +50,8 @@ OPTIONS = FreeFormOptions(
     descent=DescentOptions(rounds=()),
 )
 COARSE = replace(OPTIONS.rounds[0], rays=5_000)
+SECOND = FreeFormRound(20, 32, 0.20, 1, 20_000, 100.0, 5)
+"""A round on the grid of the first, by pixels' centers."""
 CONFIG = replace(FitConfig(), free_form=OPTIONS, surfels=SurfelConfig(hull_resolution=56))
 VIEWS, SIZE_PX = 20, 64
 
@@ -144,8 +146,7 @@ def solution() -> Solution:
     views = with_pose_covariances(body_views(wavy_ball(), 12, 60), np.tile(1e-4 * np.eye(6), (12, 1, 1)))
     options = replace(OPTIONS, rounds=OPTIONS.rounds[:1])
     surface = fitted(views, options)
-    settings = OPTIONS.rounds[1]
-    return Solution.at(make_task(views, settings, options), surface, full_trust(surface, 20), None, 2)
+    return Solution.at(make_task(views, SECOND, options), surface, full_trust(surface, 20), None, 2)
 
 
 def test_a_step_with_the_map_made_anew_gains_what_its_equations_promise(solution: Solution) -> None:
@@ -241,7 +242,7 @@ def test_the_matrix_is_symmetric_and_positive(solution: Solution) -> None:
 def test_held_out_views_refuse_cells_that_a_ball_does_not_need() -> None:
     """Two more rounds are offered, and the one with a rough surface is not taken."""
     rough = FreeFormRound(34, 32, 0.15, 1, 10_000, 1e-6, 2)
-    options = replace(OPTIONS, rounds=(COARSE, replace(OPTIONS.rounds[1], rays=5_000)), finer=(rough,))
+    options = replace(OPTIONS, rounds=(COARSE, replace(SECOND, rays=5_000)), finer=(rough,))
     views = body_views(sphere(), 10, 40)
     surface = fitted(views, options)
     assert max(surface.shape) < 34
@@ -462,9 +463,8 @@ def left_deg(found: Poses, wrong: Poses) -> float:
     return float(np.degrees(np.median((left.mean().inv() * left).magnitude())))
 
 
-@pytest.mark.parametrize(
-    "body", [ellipsoid(), pytest.param(block(), marks=pytest.mark.slow)], ids=["ellipsoid", "block"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("body", [ellipsoid(), block()], ids=["ellipsoid", "block"])
 def test_outlines_tell_cameras_that_are_turned_by_two_degrees(body: Body) -> None:
     """These miss the hull of all views by a fifth of the object's radius, and no plate between its contacts is left."""
     views, family = body_views(body, 30, SIZE_PX), FreeFormFamily()
