@@ -39,7 +39,7 @@ lint: setup
 	$(BIN)/ruff format --check $(CODE)
 	$(BIN)/mypy shinypartial panoless
 	$(BIN)/lint-imports
-	$(BIN)/mkdocs build --quiet --strict -f docs/mkdocs.yml
+	$(BIN)/mkdocs build --strict -f docs/mkdocs.yml
 
 # A small fit compiles the kernels of surfels once, beside the checks, in place of once in every process of the tests.
 # Other kinds have few kernels: their fits take longer than compiling them twice.
