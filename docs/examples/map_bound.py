@@ -16,9 +16,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from self_reflection import window_of
 
 from panoless.capture.configured import configured_views
-from panoless.capture.contrast import exposed
 from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
@@ -26,6 +26,8 @@ from panoless.environment.rays import Rays
 from panoless.environment.resolution import finest_resolution
 from panoless.export.prediction import cube_to_latlong
 from panoless.geometry.exact import ExactGeometry
+from panoless.geometry.free_form.options import DEFAULTS
+from panoless.kernels.constants import SUB_PIXELS
 from panoless.reconstruct.state import read_description
 from shinypartial.core.camera import ray_directions_world, reflect
 from shinypartial.dataset.read import open_dataset, read_view, require_normals
@@ -34,9 +36,6 @@ from shinypartial.evaluation.evaluate import evaluate
 from shinypartial.evaluation.masks import environment_mask
 from shinypartial.io.files import read_json, write_json
 from shinypartial.prediction.format import write_environment_map
-
-WIDEST_RAD = 0.15
-"""Pixels that mirror more than so much take no part in the sharpening, as in a fit of a free form."""
 
 
 @dataclass(frozen=True)
@@ -60,12 +59,12 @@ class TrueMirror(ExactGeometry):
         return Rays(torch.from_numpy(directions[chosen.numpy()]).float(), view.radiance_at(chosen))
 
     def footprints(self, views: Views, max_pixels: int) -> Footprints | None:
-        """Four directions over each pixel that has neighbors on all sides and turns little."""
+        """Four directions over each pixel that has neighbors on all sides and turns little, as in a free form's fit."""
         found = []
         for view, pixels in at_most_pixels(views, max_pixels):
             directions, steps, clear = (each[pixels.numpy()] for each in self.known[id(view.mask)])
-            kept = clear & (np.linalg.norm(steps, axis=2).max(1) < WIDEST_RAD)
-            right, down = (np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]]) / 4)[..., None]
+            kept = clear & (np.linalg.norm(steps, axis=2).max(1) < DEFAULTS.widest_footprint_rad)
+            right, down = np.array(SUB_PIXELS[4]).T[..., None]
             over = directions[kept, None] + right * steps[kept, None, 0] + down * steps[kept, None, 1]
             chosen = pixels[torch.from_numpy(kept)]
             found.append(PixelFootprints(torch.from_numpy(over).float(), view.radiance_at(chosen)))
@@ -80,9 +79,7 @@ def true_mirror(dataset: Dataset, views: Views) -> TrueMirror:
 
 def seen(frame: Frame, view: TrainView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What `TrueMirror` knows of a view, which is cropped."""
-    truth, camera = read_view(frame), view.camera
-    left, top = round(frame.camera.cx - camera.cx), round(frame.camera.cy - camera.cy)
-    window = slice(top, top + camera.height), slice(left, left + camera.width)
+    truth, window = read_view(frame), window_of(frame, view)
     clear, normals = environment_mask(truth), require_normals(frame, truth)
     directions = reflect(ray_directions_world(frame.camera), normals.astype(np.float64))
     directions = np.where(clear[..., None], directions, np.nan)
@@ -93,11 +90,8 @@ def seen(frame: Frame, view: TrainView) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def solved(dataset: Dataset, config: FitConfig) -> np.ndarray:
-    """The map (H, 2H, 3) that a fit's solver makes of ground-truth normals."""
-    views, config = configured_views(dataset, config)
-    exposure, config = config.exposure, replace(config, exposure=1.0)
-    if exposure != 1:
-        views = exposed(views, 1 / exposure)
+    """The map (H, 2H, 3) that a fit's solver makes of ground-truth normals and photographs as they were taken."""
+    views, config = configured_views(dataset, replace(config, exposure=1.0))
     environment, _ = true_mirror(dataset, views).solve_map(views, config)
     return cube_to_latlong(environment, 2 * environment.shape[-1])
 

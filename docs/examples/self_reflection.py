@@ -21,7 +21,7 @@ from panoless.capture.views import TrainView, load_views
 from panoless.config import FitConfig
 from panoless.reconstruct.state import load_state
 from shinypartial.dataset.read import open_dataset, read_view
-from shinypartial.dataset.schema import Dataset
+from shinypartial.dataset.schema import Dataset, Frame
 from shinypartial.io.files import read_json, write_json
 
 MARGINS_PX = (0, 1, 2)
@@ -50,6 +50,13 @@ def main() -> None:
     print(json.dumps(found, indent=1))
 
 
+def window_of(frame: Frame, view: TrainView) -> tuple[slice, slice]:
+    """Rows and columns of a picture that its cropped view shows: cropping moves the principal point by whole pixels."""
+    camera = view.camera
+    left, top = round(frame.camera.cx - camera.cx), round(frame.camera.cy - camera.cy)
+    return slice(top, top + camera.height), slice(left, left + camera.width)
+
+
 def observed_pixels(geometry: Any, view: TrainView) -> np.ndarray:
     """Whether a geometry observes the surroundings through each pixel (flat)."""
     observed = np.zeros(view.mask.numel(), bool)
@@ -67,9 +74,7 @@ def score(dataset: Dataset, geometry: Any, every: int) -> dict[str, object]:
         truth = read_view(frame)
         if truth.self_reflection is None:
             raise SystemExit(f"{dataset.name} has no self-reflection mask")
-        rows, columns = np.nonzero(truth.alpha > 0)
-        top, left = max(rows.min() - CROP_MARGIN_PX, 0), max(columns.min() - CROP_MARGIN_PX, 0)
-        true = truth.self_reflection[top : top + view.camera.height, left : left + view.camera.width] > 0
+        true = truth.self_reflection[window_of(frame, view)] > 0
         solid = np.zeros(view.mask.numel(), bool)
         solid[view.solid.numpy()] = True
         observed = [observed_pixels(each, view) for each in (geometry, replace(geometry, occlusion_test=False))]

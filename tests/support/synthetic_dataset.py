@@ -32,6 +32,8 @@ FIELD_OF_VIEW_RAD = math.radians(36.0)
 ARC_HALF_ANGLE_DEG = 60.0
 SAMPLES_PER_SIDE = 5
 SUN_DIRECTION = np.array([0.6, 0.0, 0.8])
+#: Rows of the lat-long map of datasets that are not asked for a larger one.
+MAP_HEIGHT = 32
 
 
 def environment_radiance(directions: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
@@ -95,7 +97,7 @@ def _intersect(camera: Camera) -> tuple[Bool[np.ndarray, "H W"], Float[np.ndarra
 
 
 def make_sphere_dataset(
-    root: Path, resolution: int = 32, train: int = 6, test: int = 3, environment_height: int = 32
+    root: Path, resolution: int = 32, train: int = 6, test: int = 3, environment_height: int = MAP_HEIGHT
 ) -> Dataset:
     """Write the full format (EXR, companions, environment, checksums) to a new folder `root` and open it."""
     recipe = {"scene": "synthetic-sphere", "resolution": resolution, "train": train, "test": test}

@@ -109,7 +109,7 @@ def test_images_of_any_size_are_fine(size: tuple[int, int]) -> None:
 @pytest.mark.parametrize("name", TERMS)
 def test_the_definition_passes_gradcheck(name: str) -> None:
     """The weight of the robust term is held constant, so it is left out here."""
-    images, view = scene(4, 4, resolution=1, seed=3, holes=False)
+    images, view = scene(5, 6, resolution=2, seed=3, holes=False)
     leaves = [image.clone().requires_grad_() for image in images.values()]
     terms = replace(TERMS[name], robust_scale=0.0)
     assert torch.autograd.gradcheck(

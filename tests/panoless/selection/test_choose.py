@@ -93,7 +93,8 @@ def dome(plane: Plane, bend: float, count: int) -> SurfelMirror:
     return SurfelMirror.of(replace(flat, quats=quats, curvatures=curvatures), config)
 
 
-@pytest.mark.parametrize(("frame_height", "bend"), [(0.0, 0.1), (0.1, 0.0), (0.1, 0.1)])
+@pytest.mark.parametrize("frame_height", [0.0, 0.1])
+@pytest.mark.parametrize("bend", [0.0, 0.1])
 def test_a_flat_mirror_takes_the_plane_and_a_bent_one_in_the_same_boundary_does_not(
     frame_height: float, bend: float
 ) -> None:

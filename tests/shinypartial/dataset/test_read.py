@@ -13,8 +13,7 @@ from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import newest_dataset, open_dataset, read_environment, read_view
 from shinypartial.dataset.schema import Dataset, Frame
 from shinypartial.io.images import read_exr, read_png, write_exr, write_png
-from tests.shinypartial.dataset.conftest import MAP_HEIGHT
-from tests.support.synthetic_dataset import environment_latlong, make_plain_sphere_dataset, render_sphere
+from tests.support.synthetic_dataset import MAP_HEIGHT, environment_latlong, make_plain_sphere_dataset, render_sphere
 
 TRAIN = "transforms_train.json"
 

@@ -18,7 +18,7 @@ from shinypartial.dataset.validate import validate
 from shinypartial.dataset.write import write_inverse_distance
 from shinypartial.io.files import sha256_of
 from shinypartial.io.images import read_exr, read_exr_rgb, read_png, write_exr, write_exr_rgb, write_png
-from tests.shinypartial.dataset.conftest import MAP_HEIGHT
+from tests.support.synthetic_dataset import MAP_HEIGHT
 
 EXR = "train/r_000.exr"
 MAP_SHAPE = (MAP_HEIGHT, 2 * MAP_HEIGHT)
