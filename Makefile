@@ -11,7 +11,9 @@ BIN := $(VENV)/bin
 PYTHON ?= $(shell for p in python3.11 python3; do \
     $$p -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null && { echo $$p; break; }; done)
 NEED_PYTHON := expected Python 3.11 as python3.11 or python3 (the newest Blender module for it is the one in use)
-PIP_INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
+PIP_INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -c constraints.txt
+# On all cores, which pip does on one; templates that are no Python yet are passed over.
+COMPILE := $(BIN)/python -W ignore -m compileall -qq -j 0 $(VENV)/lib || true
 CODE := shinypartial panoless tests docs
 
 .PHONY: demo capture-demo test lint kernels results docs format setup clean
@@ -74,6 +76,7 @@ $(VENV)/.installed-demo $(VENV)/.installed-capture $(VENV)/.installed-dev: pypro
 	@test -x $(BIN)/pip || { echo "Making $(VENV) …"; $(PYTHON) -m venv --clear $(VENV); }
 	@echo "Installing panoless[$(extras)] into $(VENV): a minute here, longer where torch comes with CUDA …"
 	@$(PIP_INSTALL) -e '.[$(extras)]'
+	@$(COMPILE)
 	@touch $@
 
 clean:
