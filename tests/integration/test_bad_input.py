@@ -20,7 +20,7 @@ from shinypartial.dataset.write import write_view
 from shinypartial.io.images import read_exr, write_exr, write_png
 
 ROOT = Path(__file__).resolve().parents[2]
-TINY = [
+SIZES = [
     "--model", "surfels",
     "--config.iterations", "4",
     "--config.surfels.count", "40",
@@ -28,6 +28,7 @@ TINY = [
     "--config.environment.resolution", "8",
     "--config.environment.solve-resolution", "8",
 ]  # fmt: skip
+TINY = [*SIZES, "--set", "surroundings.mode=off", "material.reflectance=off"]
 
 
 @pytest.fixture(autouse=True)
@@ -40,13 +41,13 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture(scope="module")
-def finished_run(sphere_dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run that tests copy before they damage it."""
+def finished(sphere_dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a run and its prediction, which tests copy before they damage it."""
     place = tmp_path_factory.mktemp("finished")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
         assert main(["fit", str(sphere_dataset.root), "--output", "out", *TINY]) == 0
-    return place / "runs" / "out"
+    return place
 
 
 def assert_refused(capsys: pytest.CaptureFixture[str], code: int, *words: str) -> None:
@@ -199,9 +200,9 @@ def test_an_output_that_holds_something_else(workplace: Path, sphere_dataset: Da
     assert [path.name for path in (workplace / "thesis").iterdir()] == ["chapter.tex"]
 
 
-def test_a_run_of_another_configuration(workplace: Path, sphere_dataset: Dataset, capsys) -> None:
+def test_a_run_of_another_configuration(workplace: Path, finished: Path, sphere_dataset: Dataset, capsys) -> None:
+    shutil.copytree(finished, workplace, dirs_exist_ok=True)
     command = ["fit", str(sphere_dataset.root), "--output", "out", *TINY]
-    assert main(command) == 0
     before = {path: path.read_bytes() for path in sorted((workplace / "out").rglob("*")) if path.is_file()}
     capsys.readouterr()
     assert_refused(capsys, main([*command, "--config.seed", "1"]), "another dataset or configuration", "--output")
@@ -221,7 +222,7 @@ BAD_VALUES = {
 @pytest.mark.parametrize("options", BAD_VALUES.values(), ids=BAD_VALUES.keys())
 def test_a_value_out_of_range(options: str, workplace: Path, sphere_dataset: Dataset, capsys) -> None:
     name = options.split()[0]
-    code = main(["fit", str(sphere_dataset.root), *TINY, *options.split()])
+    code = main(["fit", str(sphere_dataset.root), *SIZES, *options.split()])
     assert_refused(capsys, code, name)
     assert_nothing_half_written(workplace)
 
@@ -244,10 +245,10 @@ def test_export_of_an_unfinished_run(workplace: Path, sphere_dataset: Dataset, c
 @pytest.mark.parametrize(
     "damage", ["missing", "no checkpoint", "broken checkpoint", "broken description", "old options"]
 )
-def test_export_of_what_is_no_run(damage: str, workplace: Path, finished_run: Path, capsys) -> None:
+def test_export_of_what_is_no_run(damage: str, workplace: Path, finished: Path, capsys) -> None:
     run = workplace / "runs" / "out"
     if damage != "missing":
-        shutil.copytree(finished_run, run)
+        shutil.copytree(finished / "runs" / "out", run)
     if damage == "no checkpoint":
         (run / "checkpoint.pt").unlink()
     if damage == "broken checkpoint":
@@ -285,10 +286,8 @@ def test_a_full_disk_while_the_checkpoint_is_written(workplace: Path, sphere_dat
     assert main(command) == 0
 
 
-def test_a_full_disk_while_the_prediction_is_written(workplace: Path, sphere_dataset: Dataset, capsys) -> None:
-    command = ["fit", str(sphere_dataset.root), "--output", "out", *TINY]
-    assert main(command) == 0
-    capsys.readouterr()
+def test_a_full_disk_while_the_prediction_is_written(workplace: Path, finished: Path) -> None:
+    shutil.copytree(finished, workplace, dirs_exist_ok=True)
     done = run_with_limit(["export", "runs/out", "--output", "again"], workplace, limit=3_000)
     assert done.returncode == 2, done.stderr
     assert_one_message(done.stderr, "free space")

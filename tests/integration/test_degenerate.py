@@ -10,6 +10,7 @@ import pytest
 
 import panoless
 from panoless.config import FitConfig
+from panoless.presets import PRESETS
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import open_dataset, read_view
 from shinypartial.dataset.schema import Dataset, View
@@ -17,7 +18,9 @@ from shinypartial.dataset.write import write_view
 from tests.support.mirror_sphere import tiny_config
 from tests.support.synthetic_dataset import make_sphere_dataset
 
-CONFIG: FitConfig = tiny_config("fast", iterations=20, count=150)
+CONFIG: FitConfig = replace(
+    tiny_config("fast", iterations=20, count=150), material=PRESETS["fast"].material, trust=PRESETS["fast"].trust
+)
 Change = Callable[[Path], None]
 
 

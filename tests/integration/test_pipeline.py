@@ -42,6 +42,7 @@ def test_generate_fit_evaluate_report(
     options = ["--config.iterations", "60", "--config.surfels.count", "400", "--config.surfels.hull-resolution", "40"]
     options += ["--config.environment.resolution", "24", "--config.environment.solve-resolution", "24"]
     options += ["--set", "corrections.masks=off", "corrections.exposure=off", "corrections.lens=off"]
+    options += ["surroundings.mode=off", "material.reflectance=off", "material.roughness=off", "material.blur=off"]
     assert shinypartial(["validate"]) == 0
     for model in (["surfels"], ["revolution", "--output", "predictions/round"]):
         assert panoless(["fit", *options, "--model", *model]) == 0

@@ -39,7 +39,8 @@ def clipped_environment(directions: Float[Tensor, "*S 3"]) -> Float[Tensor, "*S 
 
 def tiny_config(preset: str = "default", iterations: int = 80, count: int = 300) -> FitConfig:
     """A preset of surfels, few, with few texels and iterations; density control keeps a rhythm at this length. The
-    surroundings are far, as those of the synthetic sphere are, without a fit that asks whether they are.
+    surroundings are far and the mirror is perfect, as those of the synthetic sphere are, without fits that ask whether
+    they are; trust is judged under a coarse map.
     """
     config = PRESETS[preset]
     density = replace(config.density, start=0.1, stop=0.9, every=0.2, reset_every=0.4, propagate_every=0.3)
@@ -51,4 +52,6 @@ def tiny_config(preset: str = "default", iterations: int = 80, count: int = 300)
         environment=replace(config.environment, resolution=24, solve_resolution=24),
         density=density,
         surroundings=replace(config.surroundings, mode="off"),
+        material=replace(config.material, reflectance="off", roughness="off", blur="off"),
+        trust=replace(config.trust, resolution=32),
     )

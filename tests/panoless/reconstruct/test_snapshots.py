@@ -246,7 +246,7 @@ def test_the_commands_take_and_export_snapshots(
     monkeypatch.chdir(tmp_path)
     options = ["--config.iterations", "4", "--config.surfels.count", "40", "--config.surfels.hull-resolution", "24"]
     options += ["--config.environment.resolution", "16", "--config.environment.solve-resolution", "16"]
-    options += ["--model", "surfels"]
+    options += ["--model", "surfels", "--set", "surroundings.mode=off", "material.reflectance=off"]
     assert main(["fit", str(sphere_dataset.root), "--output", "p", "--snapshots", "2", *options]) == 0
     assert "panoless export runs/p --output p --snapshots" in capsys.readouterr().out
     assert main(["export", "runs/p", "--output", "p", "--snapshots"]) == 0
@@ -275,7 +275,12 @@ def test_what_takes_no_steps_has_no_snapshots_and_the_command_says_why(
         "16",
         "--set",
         "corrections.masks=off",
+        "corrections.exposure=off",
         "corrections.lens=off",
+        "surroundings.mode=off",
+        "material.reflectance=off",
+        "material.roughness=off",
+        "material.blur=off",
     ]
     assert main(["fit", str(many_views_dataset.root), "--output", "p", "--snapshots", "2", *options]) == 0
     assert f"No snapshots: this run took {name}" in capsys.readouterr().out
