@@ -1,4 +1,5 @@
-"""Compile Triton kernels for GPUs that need not be there: `python -m tests.support.triton_compilation < launches.json`.
+"""Compile Triton kernels for GPUs that need not be there, such as those of sm_80:
+`python -m tests.support.triton_compilation 80 < launches.json`.
 
 A process of its own, because Triton either interprets or compiles the kernels of a process. Prints a list of
 `CompiledKernel` as JSON.
@@ -13,7 +14,6 @@ from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
 
-ARCHITECTURES = (80, 90)
 POINTERS = {"torch.float32": "*fp32", "torch.int32": "*i32", "torch.int64": "*i64"}
 
 
@@ -99,9 +99,9 @@ def _resource_usage(triton_folder: Path, cubin: bytes) -> str:
 
 
 def main() -> None:
-    """Compile what standard input lists."""
+    """Compile what standard input lists for the architecture that the command names."""
     launches = [Launch(**{**launch, "types": tuple(launch["types"])}) for launch in json.load(sys.stdin)]
-    results = [asdict(compiled(launch, architecture)) for launch in launches for architecture in ARCHITECTURES]
+    results = [asdict(compiled(launch, int(sys.argv[1]))) for launch in launches]
     json.dump(results, sys.stdout)
 
 

@@ -132,7 +132,7 @@ def test_a_tinted_mirror_with_its_tint_gives_the_map_of_an_untinted_one(finished
         view = read_view(one)
         write_view(one, replace(view, radiance=np.minimum(view.radiance, 1)))
         write_view(other, replace(view, radiance=np.minimum(view.radiance, 1) * np.array(tint, np.float32)))
-    config = replace(finished.config, iterations=20)
+    config = replace(finished.config, iterations=10)
     given_tint = replace(config, tint=tint)
     states = [fit(plain, config, tmp_path / "a"), fit(tinted, given_tint, tmp_path / "b")]
     maps = [state.environment for state in states]

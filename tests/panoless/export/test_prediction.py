@@ -93,7 +93,7 @@ def test_the_written_visibility_is_that_of_the_fit(prediction: Path, finished: F
 
 
 def test_the_evaluator_scores_it(prediction: Path, finished: FinishedFit) -> None:
-    scores = evaluate(prediction, finished.dataset.root)
+    scores = evaluate(prediction, finished.dataset.root, protocol="linear-v1")
     assert (prediction / "scores.json").exists()
     # Far below what a second of fitting reaches (3°, 25 dB), far above what a wrong axis leaves.
     assert scores.normals is not None
@@ -322,7 +322,7 @@ def plane_prediction(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Pa
 
 
 def test_an_exact_plane_scores_perfect_normals(plane_prediction: tuple[Path, Path]) -> None:
-    scores = evaluate(*plane_prediction)
+    scores = evaluate(*plane_prediction, protocol="linear-v1")
     assert scores.normals is not None
     assert scores.normals.median_angular_error_deg < 0.01
 
@@ -375,7 +375,7 @@ def test_surfels_say_why_they_were_taken(prediction: Path, finished: FinishedFit
 @pytest.fixture(scope="module")
 def ball_prediction(tmp_path_factory: pytest.TempPathFactory, sphere_dataset: Dataset) -> Path:
     """The traced sphere as an exact surface of revolution, in a frame of twice the world's unit, exported."""
-    radius, center, sides = 2.0, np.array([0.3, -0.2, 0.1]), 720
+    radius, center, sides = 2.0, np.array([0.3, -0.2, 0.1]), 360
     angle = np.linspace(-np.pi / 2, np.pi / 2, sides + 1)
     profile = np.stack([np.cos(angle).clip(0), np.sin(angle)], 1) / radius
     axis = np.array([0.6, 0.0, 0.8])
@@ -391,8 +391,8 @@ def ball_prediction(tmp_path_factory: pytest.TempPathFactory, sphere_dataset: Da
 
 
 def test_an_exact_surface_of_revolution_scores_perfect_normals(ball_prediction: Path, sphere_dataset: Dataset) -> None:
-    """A side of the profile turns by a quarter of a degree, and interpolation goes between."""
-    scores = evaluate(ball_prediction, sphere_dataset.root)
+    """A side of the profile turns by half a degree, and interpolation goes between."""
+    scores = evaluate(ball_prediction, sphere_dataset.root, protocol="linear-v1")
     assert scores.normals is not None
     assert scores.normals.median_angular_error_deg < 0.02
 
@@ -416,7 +416,7 @@ def test_a_surface_of_revolution_is_described_as_what_it_is(ball_prediction: Pat
     info = read_info(ball_prediction)
     assert info.model == "revolution (asked for)"
     assert info.primitives == 1
-    assert info.parameter_counts == {"revolution parameters": 5 + 2 * 721, "environment parameters": 6 * 3 * 64 * 64}
+    assert info.parameter_counts == {"revolution parameters": 5 + 2 * 361, "environment parameters": 6 * 3 * 64 * 64}
     assert not (ball_prediction / "surfels.ply").exists()
     table = read_ply(ball_prediction / "revolution.ply")
     np.testing.assert_allclose(np.linalg.norm(vertices_of(table), axis=1), 1, atol=1e-6)

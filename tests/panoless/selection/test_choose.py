@@ -25,7 +25,7 @@ from tests.support.mirror_plane import NORMAL, RECTANGLE, arc, make_plane_datase
 from tests.support.mirror_revolution import around, goblet, pillar_views, revolution_views
 from tests.support.mirror_sphere import tiny_config
 
-SIZE_PX = 64
+SIZE_PX = 56
 
 
 def coarse_config() -> FitConfig:
@@ -52,6 +52,7 @@ def coarse_config() -> FitConfig:
             finer=(),
             concave=replace(config.free_form.concave, search=False),
             descent=replace(config.free_form.descent, rounds=()),
+            start_tensions=config.free_form.start_tensions[::2],
         ),
     )
 
@@ -93,10 +94,11 @@ def dome(plane: Plane, bend: float, count: int) -> SurfelMirror:
     return SurfelMirror.of(replace(flat, quats=quats, curvatures=curvatures), config)
 
 
-@pytest.mark.parametrize("frame_height", [0.0, 0.1])
-@pytest.mark.parametrize("bend", [0.0, 0.1])
+@pytest.mark.parametrize(
+    ("bend", "frame_height"), [(0.0, 0.0), (0.0, 0.1), pytest.param(0.1, 0.0, marks=pytest.mark.slow), (0.1, 0.1)]
+)
 def test_a_flat_mirror_takes_the_plane_and_a_bent_one_in_the_same_boundary_does_not(
-    frame_height: float, bend: float
+    bend: float, frame_height: float
 ) -> None:
     """A dome whose normals turn by 4° at most has the same masks; a frame that mirrors itself misleads neither."""
     geometry, selection = choose_geometry(framed(frame_height, bend), CONFIG)

@@ -109,7 +109,7 @@ def out_of_order(function: Callable[[object], object], items: Sequence[object]) 
 
 def test_a_failing_map_and_a_failing_view_both_end_the_evaluation(truth: Path, sphere_dataset: Dataset) -> None:
     """Although they are scored beside each other; the scores of an earlier evaluation stay as they were."""
-    evaluate(truth)
+    evaluate(truth, protocol="linear-v1")
     before = (truth / "scores.json").read_bytes()
     write_environment_map(truth, np.zeros((32, 32, 3), np.float32))
     with pytest.raises(InputError, match=r"environment\.exr"):
@@ -158,7 +158,7 @@ def test_a_rotated_environment_has_the_analytic_loss(damaged_dataset: Path, tmp_
     write_environment(damaged_dataset, radiance, cube_resolution=8)
     prediction = write_truth_prediction(tmp_path / "rotated", open_dataset(damaged_dataset))
     write_environment_map(prediction, np.roll(radiance, texels, 1))
-    scores = evaluate(prediction).environment
+    scores = evaluate(prediction, protocol="linear-v1").environment
     assert scores is not None
     amplitude = 0.8 * math.sin(math.pi * texels / (2 * height))
     # Half floats round radiance by up to 2.5e-4: 2e-3 dB at this loss.
@@ -301,7 +301,7 @@ def test_visibility_outside_its_range_is_named(truth: Path, value: float) -> Non
     visibility[3, 4] = value
     write_visibility(truth, visibility)
     with pytest.raises(InputError, match=r"visibility\.exr"):
-        evaluate(truth)
+        evaluate(truth, protocol="linear-v1")
 
 
 def test_an_environment_that_is_not_two_to_one_is_named(truth: Path) -> None:

@@ -107,14 +107,15 @@ def test_a_named_baseline_must_be_of_this_dataset(
     oracle: Oracle, dataset: Dataset, sphere_dataset: Dataset, tmp_path: Path
 ) -> None:
     other, mine = (write_truth_prediction(tmp_path / each.name, each) for each in (sphere_dataset, dataset))
-    assert read_oracle_baseline(mine, evaluate(mine, oracle=oracle.root)) is not None
+    scores = evaluate(mine, protocol="linear-v1", oracle=oracle.root)
+    assert read_oracle_baseline(mine, scores) is not None
     with pytest.raises(InputError, match="the oracle of sphere"):
         evaluate(other, oracle=oracle.root)
     assert "shinypartial oracle" in "\n".join(summary_lines(_scored_alone(other)))
 
 
 def _scored_alone(prediction: Path) -> Path:
-    evaluate(prediction)
+    evaluate(prediction, protocol="linear-v1")
     return prediction
 
 
@@ -161,14 +162,15 @@ def test_without_normals_there_is_no_baseline(tmp_path: Path) -> None:
 
 
 def test_the_command_writes_beside_the_predictions_and_never_into_the_dataset(
-    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    sphere_dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    root = sphere_dataset.root
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(perceptual, "CACHE", tmp_path / "no-cache")
-    before = {path: path.stat().st_mtime_ns for path in dataset.root.rglob("*")}
-    assert main(["oracle", str(dataset.root)]) == 0
-    assert (tmp_path / "predictions" / "ball-oracle" / "scores.json").is_file()
-    assert {path: path.stat().st_mtime_ns for path in dataset.root.rglob("*")} == before
+    before = {path: path.stat().st_mtime_ns for path in root.rglob("*")}
+    assert main(["oracle", str(root)]) == 0
+    assert (tmp_path / "predictions" / "sphere-oracle" / "scores.json").is_file()
+    assert {path: path.stat().st_mtime_ns for path in root.rglob("*")} == before
     out = capsys.readouterr().out
     assert "averaged" in out
     assert "taken" in out

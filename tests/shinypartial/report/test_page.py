@@ -111,17 +111,17 @@ def test_a_method_cannot_write_into_the_page(evaluated: Path) -> None:
     write_info(evaluated, info)
 
 
-def test_the_choice_of_the_model_is_a_table_and_a_sentence(evaluated: Path) -> None:
+def test_the_choice_of_the_model_is_a_table_and_a_sentence(evaluated: Path, page: str) -> None:
     info = read_info(evaluated)
-    assert "Model selection" not in write_report(evaluated).read_text(encoding="utf-8")
+    assert "Model selection" not in page
     candidates = (
         Candidate("plane", 16.2, 0.651, None, "rejected", "16 px away"),
         Candidate("revolution", 0.0534, 0.9992, 0.03111, "chosen", "<better> by 4 σ"),
     )
     write_info(evaluated, replace(info, model_selection=ModelSelection("revolution", candidates)))
-    parsed = Page(write_report(evaluated).read_text(encoding="utf-8"))
-    assert parsed.open == []
-    text = re.sub(r"<[^>]+>", " ", write_report(evaluated).read_text(encoding="utf-8"))
+    with_table = write_report(evaluated).read_text(encoding="utf-8")
+    assert Page(with_table).open == []
+    text = re.sub(r"<[^>]+>", " ", with_table)
     assert "revolution was chosen (&lt;better&gt; by 4 σ); plane: rejected (16 px away)." in text
     for word in ("16.2 px", "65.1%", "–", "0.0534 px", "99.9%", "0.0311"):
         assert word in text
