@@ -159,7 +159,7 @@ def test_a_wrong_principal_point_is_told_from_a_motion_that_all_cameras_share() 
 
 @pytest.mark.parametrize(
     ("family", "views"),
-    [(PlaneFamily(), flat_views()), (RevolutionFamily(), goblet_views())],
+    [(PlaneFamily(), flat_views()), pytest.param(RevolutionFamily(), goblet_views(), marks=pytest.mark.slow)],
 )
 def test_outlines_tell_a_principal_point_that_is_wrong_in_all_views(family: Family, views: Views) -> None:
     """To a tenth of it: all but a little looks like a motion of the object, and stays in the cameras nevertheless."""

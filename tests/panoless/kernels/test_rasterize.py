@@ -188,12 +188,12 @@ def test_backends_cull_the_same_surfels(count: int):
 
 #: In the first two each image is wanted once and unwanted once; a kernel for each choice takes seconds to compile.
 CHOICES = [
-    Channels(True, False, False),
-    Channels(False, True, True),
+    (False, Channels(True, False, False)),
+    (True, Channels(False, True, True)),
     *(
-        pytest.param(Channels(*wanted), marks=pytest.mark.slow)
-        for wanted in itertools.product((True, False), repeat=3)
-        if wanted not in ((True, False, False), (False, True, True))
+        pytest.param(curved, Channels(*wanted), marks=pytest.mark.slow)
+        for curved, *wanted in itertools.product((False, True), repeat=4)
+        if (curved, *wanted) not in ((False, True, False, False), (True, False, True, True))
     ),
 ]
 IMAGES_OF = {
@@ -219,8 +219,7 @@ def weighted_gradients(scene: SurfelScene, names: list[str], backend: str, **opt
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("channels", CHOICES)
-@pytest.mark.parametrize("curved", [False, True])
+@pytest.mark.parametrize(("curved", "channels"), CHOICES)
 def test_channels_that_are_not_wanted_change_nothing_else(curved: bool, channels: Channels, backend: str):
     """They are zero; the other images and their gradients are those of the full computation."""
     scene = random_scene(20, 21, curved, tilted_camera())

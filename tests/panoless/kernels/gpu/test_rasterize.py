@@ -139,7 +139,7 @@ def test_an_opaque_surfel_hides_what_lies_behind(device: torch.device):
     assert all((gradient[0] != 0).any() for name, gradient in pulled.items() if name in ("colors", "means"))
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("value", [math.nan, pytest.param(math.inf, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("parameter", ["means", "quats", "scales", "opacities", "colors", "curvatures"])
 def test_a_surfel_that_is_not_finite_is_culled(parameter: str, value: float, device: torch.device):
     scene = random_scene(3, 5, True, tilted_camera(width=21, height=18))
