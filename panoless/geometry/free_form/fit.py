@@ -27,6 +27,8 @@ from shinypartial.io.progress import Progress
 
 THIRD_DIFFERENCE_DIAGONAL = 3 * 20 + 6 * 3 * 12 + 6 * 8
 """Of DᵀD: Σ over the kinds of how often one counts in |D³c|² times its squared factors."""
+KNOWN = 1e9
+"""Rays a texel that ask for nothing, under which the map stays."""
 LEAST_BRIGHTNESS = 1e-6
 """Photographs that are black count as this bright (linear radiance)."""
 
@@ -70,7 +72,8 @@ def fit_free_form(
     poses of the views where these are unknowns.
 
     Rounds are taken with four fifths of the views as long as the others gain by them, and the last of those once more
-    with all. After the rounds that are always taken poses are set `free`, under the prior that views state of them.
+    with all. After the rounds that are always taken, parts that pixels distrust are mended, and poses are set `free`,
+    under the prior that views state of them.
     """
     kept, held_out = split_held_out(views.train)
     solved = replace(views, train=tuple(kept)) if kept and held_out else views
@@ -86,6 +89,8 @@ def fit_free_form(
 
     with torch.no_grad():
         stage = coarse_stage(solved, start, options.rounds, options, progress)
+        if held_out:
+            stage = keep_if_better(mended_stages(solved, stage, options), error, options.least_mending_gain)
         search = options.concave.search
         hollowed = concave_start(solved, start, stage.surface, options.concave) if search else None
         if hollowed is not None:
@@ -200,8 +205,8 @@ def found_poses(solved: Views, views: Views, stage: FitStage, options: FreeFormO
     environment = Solution.at(
         known, stage.surface, stage.trust, None, options.first_map_rounds, stage.poses
     ).environment
-    still = replace(options, map_rounds=0, texel_prior=1e9)
-    task = make_task(views, replace(stage.last, steps=options.pose_steps), still)
+    settings = replace(stage.last, steps=options.pose_steps, under_known_map=True)
+    task = make_task(views, settings, options)
     poses = Poses.none(len(views.train))
     solution = Solution.at(task, stage.surface, stage.trust, environment, 0, poses)
     moved = take_steps(solution, stage.damping, still=True)[0].poses
@@ -215,6 +220,31 @@ def _stages(views: Views, stage: FitStage, options: FreeFormOptions, progress: P
     for settings in options.finer:
         stage = take_round(views, stage, settings, options, progress)
         yield stage
+
+
+def mended_stages(views: Views, stage: FitStage, options: FreeFormOptions) -> Iterator[FitStage]:
+    """A stage, and those after each mending of its distrusted parts.
+
+    A part that the first surface has wrong lost its say, and few pixels are left to mend it by. But the others tell
+    the map, so under that all pixels pull such a part to where it belongs: coarsely at first, from far off.
+    """
+    yield stage
+    for _ in range(options.most_mendings if options.mending else 0):
+        if distrusted_share(views, stage, options) < options.least_distrusted:
+            return
+        settings, progress = stage.last, Progress("mending", sum(each.steps for each in options.mending))
+        for each in options.mending:
+            stage = take_round(views, stage, each, options, progress)
+        stage = replace(stage, settings=settings)
+        yield stage
+
+
+def distrusted_share(views: Views, stage: FitStage, options: FreeFormOptions) -> float:
+    """Of the pixels that see the surroundings: how many lie where trust is low."""
+    surface, rays = stage.surface, solid_pixels(views, options.held_out_rays).rays
+    sights = Sights.of(surface, rays, 1, options.least_cosine)
+    trust = stage.trust.at(surface.points(sights.hits.places[sights.clear]))
+    return float((trust < options.distrusted).mean()) if len(trust) else 0.0
 
 
 def take_round(
@@ -255,6 +285,8 @@ def make_task(views: Views, settings: FreeFormRound, options: FreeFormOptions) -
     Under coarse maps pixels are wrong by the robust scale s, not by their noise σ: where outlines hold the surface,
     they count (s/σ)² times as much.
     """
+    if settings.under_known_map:
+        options = replace(options, map_rounds=0, texel_prior=KNOWN)
     pixels, outlines = solid_pixels(views, settings.rays), outline_rays(views)
     total = max(views.num_solid, 1)
     chosen = outlines.chosen(slice(None, None, max(1, -(-len(outlines.size) // options.outline_points))))
@@ -262,7 +294,7 @@ def make_task(views: Views, settings: FreeFormRound, options: FreeFormOptions) -
     share = counted / options.radiance_sigma**2 / max(len(pixels.inner_px), 1)
     density = options.counted_rays / total * len(outlines.size) / max(len(chosen.size), 1)
     believed = (settings.robust_scale / options.radiance_sigma) ** 2 if settings.held else 1.0
-    outlined = believed * density / options.outline_sigma_px**2
+    outlined = settings.outline_gain * believed * density / options.outline_sigma_px**2
     brightness = max(float(pixels.radiance.mean()), LEAST_BRIGHTNESS)
     return Task(pixels, chosen, share, outlined, settings, options, StatedCameras.of(views), brightness)
 

@@ -17,12 +17,22 @@ from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import Geometry
 from panoless.geometry.free_form import fit
 from panoless.geometry.free_form.equations import silhouette_rows
-from panoless.geometry.free_form.fit import Change, coarse_stage, fit_free_form, gauss_newton_step, make_task
+from panoless.geometry.free_form.fit import (
+    Change,
+    FitStage,
+    coarse_stage,
+    distrusted_share,
+    fit_free_form,
+    gauss_newton_step,
+    make_task,
+    mended_stages,
+    take_round,
+)
 from panoless.geometry.free_form.kind import FreeFormFamily, FreeFormMirror
 from panoless.geometry.free_form.observations import outline_rays
 from panoless.geometry.free_form.options import DEFAULTS, ConcaveOptions, DescentOptions, FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.photometric import Sights, Solution
-from panoless.geometry.free_form.start import FirstSurfaces, started
+from panoless.geometry.free_form.start import FirstSurfaces, first_surfaces, started
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import full_trust
 from panoless.kernels.level_set import seen_with_slopes
@@ -49,6 +59,12 @@ OPTIONS = FreeFormOptions(
     concave=ConcaveOptions(search=False),
     descent=DescentOptions(rounds=()),
     start_tensions=DEFAULTS.start_tensions[::2],
+)
+FEW_PIXELS = replace(
+    OPTIONS,
+    rounds=tuple(replace(settings, rays=8_000) for settings in OPTIONS.rounds),
+    mending=tuple(replace(settings, rays=8_000) for settings in OPTIONS.mending),
+    most_mendings=1,
 )
 COARSE = replace(OPTIONS.rounds[0], rays=5_000)
 SECOND = FreeFormRound(20, 32, 0.20, 1, 20_000, 100.0, 5)
@@ -117,6 +133,36 @@ def test_the_hole_of_a_ring_stays_open(ring: tuple[Views, FreeFormMirror]) -> No
     faces = mesh.vertices[mesh.triangles]
     across = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
     assert ((across * normals[mesh.triangles].sum(1)).sum(1) > 0).mean() > 0.999
+
+
+@pytest.fixture(scope="module")
+def dented() -> tuple[Body, Views, FitStage]:
+    """An ellipsoid with a dent where cameras face it, and what a step under a fine map believes of it."""
+    body = ellipsoid()
+    views = body_views(body, 12, 56)
+    right = coarse_stage(views, first_surfaces(views, CONFIG).plain, FEW_PIXELS.rounds, FEW_PIXELS).surface
+    camera = cameras_around(VIEWS, SIZE_PX)[VIEWS // 2]
+    origin, direction = (each.mean(0, keepdims=True) for each in camera_rays_world(camera, 1))
+    hit = right.hits(in_frame(views.object_frame, origin), direction / np.linalg.norm(direction))
+    away = right.spacing * np.linalg.norm(right.nodes() - hit.places, axis=3)
+    dent = replace(right, coefficients=right.coefficients + 1.5 * np.exp(-0.5 * (away / 0.2) ** 2))
+    believed = FitStage(dent, full_trust(dent, OPTIONS.trust_cells), None, OPTIONS.damping)
+    return body, views, take_round(views, believed, replace(FEW_PIXELS.rounds[-1], steps=1), FEW_PIXELS)
+
+
+def test_parts_that_pixels_distrust_are_mended(dented: tuple[Body, Views, FitStage]) -> None:
+    body, views, stage = dented
+    cameras = cameras_around(7, 60)[1::2]
+    *_, mended = mended_stages(views, stage, FEW_PIXELS)
+    before, after = (normal_errors_deg(each.surface, body, views, cameras) for each in (stage, mended))
+    assert after.mean() < before.mean() / 3
+    assert distrusted_share(views, mended, FEW_PIXELS) < distrusted_share(views, stage, FEW_PIXELS) / 3
+
+
+def test_what_pixels_trust_is_not_mended(dented: tuple[Body, Views, FitStage]) -> None:
+    _, views, stage = dented
+    trusted = replace(stage, trust=full_trust(stage.surface, FEW_PIXELS.trust_cells))
+    assert list(mended_stages(views, trusted, FEW_PIXELS)) == [trusted]
 
 
 @pytest.mark.slow
