@@ -18,7 +18,6 @@ from panoless.geometry.free_form.fit import coarse_stage
 from panoless.geometry.free_form.observations import solid_pixels
 from panoless.geometry.free_form.options import FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.surface import LevelSet, level_set_of
-from panoless.numeric.gauss_newton import keep_if_better
 from shinypartial.io.progress import Progress
 
 
@@ -66,6 +65,7 @@ def first_surfaces(views: Views, config: FitConfig) -> FirstSurfaces:
 def started(views: Views, first: FirstSurfaces, options: FreeFormOptions) -> LevelSet:
     """What the best of the plates descends to, if pixels agree better under it than under the plain surface, both after
     the first round of the fit. Each plate descends twice at first, held by outlines and not; pixels tell which goes on.
+    Where they agree well under the plain surface, nothing descends.
     """
     descent, plain = options.descent, first.surface
     if not descent.rounds:
@@ -73,21 +73,23 @@ def started(views: Views, first: FirstSurfaces, options: FreeFormOptions) -> Lev
     short = replace(options, outline_points=min(descent.outline_points, options.outline_points))
     rounds = {held: tuple(replace(each, held=held) for each in descent.rounds) for held in (True, False)}
     tried = descent.rounds[: descent.tried] * (len(first.plates) * len(rounds))
-    steps = [each.steps for each in (*tried, *descent.rounds[descent.tried :], *options.rounds[:1] * 2)]
-    progress, disagreement = Progress("looking for a start", sum(steps)), _disagreement(views, options)
+    steps = [each.steps for each in (*tried, *descent.rounds[descent.tried :], *options.rounds[:1])]
+    disagreement = _disagreement(views, options)
 
     def taken(surface: LevelSet, rounds: Sequence[FreeFormRound], options: FreeFormOptions) -> LevelSet:
         return coarse_stage(views, surface, rounds, options, progress).surface
 
     with torch.no_grad():
+        left = disagreement(coarse_stage(views, plain, options.rounds[:1], options).surface)
+        if left < descent.least_disagreement:
+            return plain
+        progress = Progress("looking for a start", sum(steps))
         plates = [replace(plate, surroundings=first.surroundings) for plate in first.plates]
         ways = [(held, taken(plate, rounds[held][: descent.tried], short)) for plate in plates for held in rounds]
         held, best = min(ways, key=lambda way: disagreement(way[1]))
-        return keep_if_better(
-            (plain, taken(best, rounds[held][descent.tried :], short)),
-            lambda each: disagreement(taken(each, options.rounds[:1], options)),
-            descent.least_gain,
-        )
+        descended = taken(best, rounds[held][descent.tried :], short)
+        better = disagreement(taken(descended, options.rounds[:1], options)) < (1 - descent.least_gain) * left
+        return descended if better else plain
 
 
 def _disagreement(views: Views, options: FreeFormOptions) -> Callable[[LevelSet], float]:

@@ -265,6 +265,11 @@ def test_beside_photographs_outlines_move_no_poses(solution: Solution) -> None:
 
 
 @pytest.mark.slow
+def with_waves(surface: LevelSet) -> LevelSet:
+    waves = 4 * np.sin(0.5 * np.arange(surface.shape[0]))[:, None, None]
+    return replace(surface, coefficients=surface.coefficients + waves)
+
+
 def test_a_start_that_descended_is_taken_where_pixels_agree_better() -> None:
     """Not a hull with waves but what the hull leads to; and the hull itself where no gain is enough."""
     views = body_views(sphere(), 8, 32)
@@ -272,10 +277,21 @@ def test_a_start_that_descended_is_taken_where_pixels_agree_better() -> None:
     assert proposal is not None
     right, one = proposal.shape.surface, FreeFormRound(12, 4, 0.5, 1, 500, 100.0, 1, anchored=True)
     options = replace(OPTIONS, rounds=(replace(one, anchored=False),), descent=DescentOptions(rounds=(one,), tried=1))
-    wrong = replace(right, coefficients=right.coefficients + 4 * np.sin(0.5 * np.arange(right.shape[0]))[:, None, None])
+    wrong = with_waves(right)
     assert started(views, FirstSurfaces(wrong, wrong, (right,)), options).cells == one.cells
     never = replace(options, descent=replace(options.descent, least_gain=1.0))
     assert started(views, FirstSurfaces(right, right, (wrong,)), never).cells == right.cells
+
+
+def test_nothing_descends_where_pixels_agree_on_the_plain_surface() -> None:
+    """Where any disagreement is little enough, a hull with waves stays as it is, though a ball would be at hand."""
+    views = body_views(sphere(), 8, 32)
+    right = first_surfaces(views, CONFIG).plain
+    wrong = with_waves(right)
+    one = FreeFormRound(12, 4, 0.5, 1, 500, 100.0, 1, anchored=True)
+    content = DescentOptions(rounds=(one,), tried=1, least_disagreement=np.inf)
+    options = replace(OPTIONS, rounds=(replace(one, anchored=False),), descent=content)
+    assert started(views, FirstSurfaces(wrong, wrong, (right,)), options).coefficients is wrong.coefficients
 
 
 def test_the_matrix_is_symmetric_and_positive(solution: Solution) -> None:
