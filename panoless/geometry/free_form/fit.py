@@ -98,7 +98,7 @@ def fit_free_form(
             stage = better(stage, deeper, options.concave.least_held_out_gain) if held_out else deeper
         if free_poses:
             stage = take_round(solved, replace(stage, poses=Poses.none(len(solved.train))), stage.last, options)
-        if held_out and options.finer:
+        if held_out:
             stage = keep_if_better(_stages(solved, stage, options, progress), error, options.least_held_out_gain)
         skipped = progress.total - progress.done - stage.last.steps
         if skipped > 0:

@@ -18,6 +18,7 @@ from panoless.geometry.free_form.fit import coarse_stage
 from panoless.geometry.free_form.observations import solid_pixels
 from panoless.geometry.free_form.options import FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.surface import LevelSet, level_set_of
+from panoless.numeric.gauss_newton import keep_if_better
 from shinypartial.io.progress import Progress
 
 
@@ -76,20 +77,23 @@ def started(views: Views, first: FirstSurfaces, options: FreeFormOptions) -> Lev
     steps = [each.steps for each in (*tried, *descent.rounds[descent.tried :], *options.rounds[:1])]
     disagreement = _disagreement(views, options)
 
-    def taken(surface: LevelSet, rounds: Sequence[FreeFormRound], options: FreeFormOptions) -> LevelSet:
-        return coarse_stage(views, surface, rounds, options, progress).surface
+    def taken(surface: LevelSet, rounds: Sequence[FreeFormRound]) -> LevelSet:
+        return coarse_stage(views, surface, rounds, short, progress).surface
+
+    def left(surface: LevelSet, progress: Progress | None = None) -> float:
+        return disagreement(coarse_stage(views, surface, options.rounds[:1], options, progress).surface)
 
     with torch.no_grad():
-        left = disagreement(coarse_stage(views, plain, options.rounds[:1], options).surface)
-        if left < descent.least_disagreement:
+        disagreed = left(plain)
+        if disagreed < descent.least_disagreement:
             return plain
         progress = Progress("looking for a start", sum(steps))
         plates = [replace(plate, surroundings=first.surroundings) for plate in first.plates]
-        ways = [(held, taken(plate, rounds[held][: descent.tried], short)) for plate in plates for held in rounds]
+        ways = [(held, taken(plate, rounds[held][: descent.tried])) for plate in plates for held in rounds]
         held, best = min(ways, key=lambda way: disagreement(way[1]))
-        descended = taken(best, rounds[held][descent.tried :], short)
-        better = disagreement(taken(descended, options.rounds[:1], options)) < (1 - descent.least_gain) * left
-        return descended if better else plain
+        descended = taken(best, rounds[held][descent.tried :])
+        costs = (plain, disagreed), (descended, left(descended, progress))
+        return keep_if_better(costs, lambda each: each[1], descent.least_gain)[0]
 
 
 def _disagreement(views: Views, options: FreeFormOptions) -> Callable[[LevelSet], float]:

@@ -264,12 +264,12 @@ def test_beside_photographs_outlines_move_no_poses(solution: Solution) -> None:
     assert np.abs(alone[0].gradient()[1][0] - alone[1].gradient()[1][0]).max() > 1e-3 * np.abs(seen).max()
 
 
-@pytest.mark.slow
 def with_waves(surface: LevelSet) -> LevelSet:
     waves = 4 * np.sin(0.5 * np.arange(surface.shape[0]))[:, None, None]
     return replace(surface, coefficients=surface.coefficients + waves)
 
 
+@pytest.mark.slow
 def test_a_start_that_descended_is_taken_where_pixels_agree_better() -> None:
     """Not a hull with waves but what the hull leads to; and the hull itself where no gain is enough."""
     views = body_views(sphere(), 8, 32)
