@@ -23,7 +23,6 @@ from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays
-from panoless.environment.resolution import finest_resolution
 from panoless.export.prediction import cube_to_latlong
 from panoless.geometry.exact import ExactGeometry
 from panoless.geometry.free_form.options import DEFAULTS
@@ -47,10 +46,6 @@ class TrueMirror(ExactGeometry):
     """By the identity of each view's mask: mirrored directions (…, 3) of its pixels, their changes by a pixel to the
     right and down (…, 2, 3), and which of them see the environment.
     """
-
-    def map_resolution(self, rays: list[Rays]) -> int:
-        """As a free form's."""
-        return finest_resolution(rays)
 
     def observe(self, view: TrainView, pixels: torch.Tensor) -> Rays:
         """Those of the pixels that see the environment."""

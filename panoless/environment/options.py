@@ -10,16 +10,28 @@ from shinypartial.io.records import NonEmpty, NonNegative, Positive
 
 @dataclass(frozen=True)
 class FootprintMapOptions:
-    """How a map of pixel centers is sharpened by pixel footprints."""
+    """How a map of pixel centers is sharpened by pixel footprints.
+
+    "Not tuned" is what only has to be large or small enough.
+    """
 
     robust_scale: float = 0.16
     """Of radiance errors. Chosen by the true maps of Vase and Cola; held-out views would take 0.3."""
-    pull: float = 0.2
-    """Weight λ of the start, in rays."""
+    smoothness: NonEmpty[float] = (0.01, 0.05, 0.25)
+    """Weights λ of differences between neighboring texels, in pixels, among which held-out pixels choose. On Sculpture
+    and Vase they take the least where pixels have no noise, and the largest where it is 0.02."""
+    held_out: Annotated[int, Meta(ge=2)] = 5
+    """Of so many pixels one is held out. Not tuned."""
+    least_gain: float = 0.002
+    """Share of the error of held-out pixels by which a map of twice the resolution has to lower it. Not tuned."""
+    pull: float = 0.002
+    """Weight ε of the start, in pixels. Not tuned."""
     rounds: int = 4
     """Rounds in which weights are found anew."""
-    steps: int = 2
+    steps: int = 6
     """Conjugate-gradient steps of a round."""
+    trial_steps: int = 2
+    """The same in maps that only choose resolution and smoothness: on seven shapes they choose as six do."""
     saturated: float = 0.998
     """Share of the largest value from which a pixel is saturated."""
     lit: float = 0.95
@@ -32,6 +44,8 @@ class FootprintMapOptions:
     """Rounds of it."""
     coarse_steps: int = 6
     """Conjugate-gradient steps of such a round."""
+    coarse_pull: float = 0.2
+    """Weight of what they add, in pixels."""
     coarse_scale: float = 1.0
     """Robust scale there: while a lamp is far too dark, pixels that see it in part must keep their votes."""
 

@@ -1,5 +1,6 @@
 """What kinds in closed form share: exact rays, one map, no steps of optimization."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, cast
 
@@ -11,11 +12,12 @@ from torch import Tensor
 from panoless.capture.encoding import encoding_of
 from panoless.capture.poses import Poses
 from panoless.capture.rays import pixel_rays, unit_rays_camera
-from panoless.capture.views import Views
+from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
-from panoless.environment.footprints import Footprints, deblur_map
+from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays, normalize_confidence
-from panoless.environment.resolution import densest_resolution
+from panoless.environment.resolution import RESOLUTIONS, densest_resolution
+from panoless.environment.sharpening import sharpest_map
 from panoless.environment.solve import solve_environment
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import (
@@ -28,6 +30,7 @@ from panoless.geometry.base import (
     observe_views,
     to_plain,
 )
+from panoless.kernels.constants import SUB_PIXELS
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.rasterize import RasterCamera
 from panoless.kernels.reference.objective import reflection_directions_world
@@ -57,10 +60,6 @@ class ExactGeometry:
         """None: a pixel is its center."""
         return None
 
-    def map_resolution(self, rays: list[Rays]) -> int:
-        """Texels along a face side of a map from these rays: as many as they fill."""
-        return densest_resolution(rays)
-
     def solve_map(self, views: Views, config: FitConfig) -> tuple[Float[Tensor, "6 3 L L"], list[Rays]]:
         """The map from all rays, and from footprints where the kind has them.
 
@@ -68,16 +67,13 @@ class ExactGeometry:
         they take no part where radiance is encoded.
         """
         rays = normalize_confidence(list(observe_views(views, cast(Geometry, self), config.environment.rays)))
-        resolution = config.environment.solve_resolution or self.map_resolution(rays)
-        environment = solve_environment(rays, resolution)
-        encoding = encoding_of(config)
-        if not encoding.high_dynamic_range:
-            footprints = self.footprints(views, config.environment.rays)
-            if footprints is not None:
-                environment = deblur_map(
-                    footprints.widened(views.blur_px), environment, encoding.saturation, config.footprint_map
-                )
-        return environment, rays
+        resolution, encoding = config.environment.solve_resolution, encoding_of(config)
+        footprints = None if encoding.high_dynamic_range else self.footprints(views, config.environment.rays)
+        if footprints is None or not footprints.smooth:
+            return solve_environment(rays, resolution or densest_resolution(rays)), rays
+        resolutions = (resolution,) if resolution else RESOLUTIONS
+        widened = footprints.widened(views.blur_px)
+        return sharpest_map(widened, rays, resolutions, encoding.saturation, config.footprint_map), rays
 
     def shade(
         self,
@@ -137,6 +133,32 @@ class ExactFamily:
     ) -> tuple[Geometry, Training]:
         """Never called, as `begin` gives nothing to train."""
         raise ValueError("a kind in closed form is not trained")
+
+
+def areas_of_pixels(
+    views: Views,
+    max_pixels: int,
+    seen: Callable[[TrainView, Int[Tensor, "P"]], tuple[Int[Tensor, "Q"], Float[Tensor, "Q 3"]]],
+) -> Footprints | None:
+    """Four directions over each of about so many pixels at most; None where no pixel has all of them.
+
+    `seen` tells which of a view's pixels see the surroundings by their centers, in order, and where these look in the
+    map. It is asked for pictures that are shifted by parts of a pixel.
+    """
+    found = []
+    for view, pixels in at_most_pixels(views, max_pixels):
+        parts = [seen(_shifted(view, *place), pixels) for place in SUB_PIXELS[4]]
+        count = torch.bincount(torch.cat([each for each, _ in parts]), minlength=view.mask.numel())
+        whole = count == len(parts)
+        directions = torch.stack([looks[whole[each]] for each, looks in parts], 1)
+        found.append(PixelFootprints(directions, view.radiance_at(pixels[whole[pixels]])))
+    return Footprints.of(found)
+
+
+def _shifted(view: TrainView, right: float, down: float) -> TrainView:
+    """A view whose rays through pixel centers are those through other places within the pixels."""
+    camera = view.camera
+    return replace(view, camera=replace(camera, cx=camera.cx - right, cy=camera.cy - down))
 
 
 def shade_centers(

@@ -22,8 +22,9 @@ from panoless.capture.masks import MASK_LEVEL
 from panoless.capture.silhouettes import mask_distance_px, silhouette_distance_px
 from panoless.capture.views import TrainView, Views, at_most_pixels, split_held_out
 from panoless.config import FitConfig
-from panoless.environment.footprints import Footprints, PixelFootprints, deblur_map, thinned
+from panoless.environment.footprints import Footprints, PixelFootprints, thinned
 from panoless.environment.resolution import densest_resolution
+from panoless.environment.sharpening import deblur_map
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, overlap, pixel_areas, usable_views
 from panoless.kernels.cubemap import sample_cubemap
@@ -222,9 +223,10 @@ def _predicting_map(areas: Sequence[PixelFootprints], config: FitConfig) -> Floa
     """The map of these pixels, as fine as they are dense."""
     rays = [each.rays() for each in areas]
     environment = solve_environment(rays, min(config.trust.resolution, densest_resolution(rays)))
-    options = replace(config.footprint_map, coarse_rounds=0)
+    options = replace(config.footprint_map, coarse_rounds=0, steps=config.footprint_map.trial_steps)
     footprints = Footprints(list(areas), lambda: PixelFootprints.joined(areas))
-    return deblur_map(footprints, environment, encoding_of(config).saturation, options)
+    smoothness = options.smoothness[len(options.smoothness) // 2]
+    return deblur_map(footprints, environment, encoding_of(config).saturation, smoothness, options)
 
 
 @dataclass

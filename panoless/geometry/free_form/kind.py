@@ -18,7 +18,6 @@ from panoless.capture.views import TrainView, Views, at_most_pixels, split_held_
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays
-from panoless.environment.resolution import finest_resolution
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import (
     Geometry,
@@ -128,10 +127,6 @@ class FreeFormMirror(ExactGeometry):
     def _traces(self) -> MutableMapping[Tensor, "_Traces"]:
         """Of the pixels of each view, by its mask."""
         return WeakIdKeyDictionary()
-
-    def map_resolution(self, rays: list[Rays]) -> int:
-        """As fine as held-out views want it."""
-        return finest_resolution(rays)
 
     def footprints(self, views: Views, max_pixels: int) -> Footprints | None:
         """Four directions over each of at most `footprints` pixels that are trusted and turn little."""

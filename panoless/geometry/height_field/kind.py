@@ -4,16 +4,18 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Int
+import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
+from panoless.environment.footprints import Footprints
 from panoless.environment.rays import Rays
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers
-from panoless.geometry.exact import ExactFamily, ExactGeometry
+from panoless.geometry.exact import ExactFamily, ExactGeometry, areas_of_pixels
 from panoless.geometry.height_field.fit import fit_height_field
 from panoless.geometry.height_field.model import (
     HeightField,
@@ -57,6 +59,15 @@ class HeightFieldMirror(ExactGeometry):
     def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
         """The rays of those of the pixels whose reflected rays pass the frame."""
         return height_field_rays(self.height_field, view, pixels)
+
+    def footprints(self, views: Views, max_pixels: int) -> Footprints | None:
+        """Of the pixels whose reflected rays pass the frame."""
+
+        def seen(view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Int[Tensor, "Q"], Float[Tensor, "Q 3"]]:
+            visible = visible_reflections(self.height_field, view, pixels)
+            return visible.pixels, torch.from_numpy(visible.outgoing).to(view.radiance)
+
+        return areas_of_pixels(views, max_pixels, seen)
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
         """Coverage by the mirror's edge; depth and normals by intersection."""

@@ -4,16 +4,17 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
+from panoless.environment.footprints import Footprints
 from panoless.environment.rays import Rays
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import SOLID_SURFACE_ALPHA, Geometry, Mesh, Proposal, SurfaceBuffers
-from panoless.geometry.exact import ExactFamily, ExactGeometry, looked_up, mirrored_directions
+from panoless.geometry.exact import ExactFamily, ExactGeometry, areas_of_pixels, looked_up, mirrored_directions
 from panoless.geometry.plane.fit import fit_plane
 from panoless.geometry.plane.model import Plane, plane_buffers, unoccluded_share
 from panoless.geometry.surfels.mirror import SurfelMirror
@@ -56,12 +57,18 @@ class PlaneMirror(ExactGeometry):
 
     def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
         """The rays of those of the pixels that the plane covers."""
+        pixels, directions = self._seen(view, pixels)
+        return Rays(directions, view.radiance_at(pixels), incoming=view.directions_world(pixels))
+
+    def footprints(self, views: Views, max_pixels: int) -> Footprints | None:
+        """Of the pixels that the plane covers."""
+        return areas_of_pixels(views, max_pixels, self._seen)
+
+    def _seen(self, view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Int[Tensor, "Q"], Float[Tensor, "Q 3"]]:
         buffers = plane_buffers(self.plane, view.camera)
         pixels = pixels[buffers.alpha.flatten()[pixels] > SOLID_SURFACE_ALPHA]
         directions = mirrored_directions(view.camera, pixels, buffers.normals_camera.flatten(1)[:, pixels])
-        directions = looked_up(self.surroundings, view.camera, buffers.depth, pixels, directions)
-        radiance = view.radiance_at(pixels)
-        return Rays(directions, radiance, incoming=view.directions_world(pixels))
+        return pixels, looked_up(self.surroundings, view.camera, buffers.depth, pixels, directions)
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
         """Exact coverage and depth."""

@@ -177,3 +177,25 @@ def test_the_mesh_lies_on_the_height_field_within_the_outline() -> None:
     across, up = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
     area = (across[:, 0] * up[:, 1] - across[:, 1] * up[:, 0]).sum()
     assert area == pytest.approx(1.2 * 1.0 - 0.6 * 0.4, rel=0.1)
+
+
+@pytest.mark.parametrize("mirror", [PlaneMirror(PLANE), HeightFieldMirror(bumpy(PLANE, 0.02))])
+def test_an_area_is_what_four_pixels_of_half_the_width_see(mirror: PlaneMirror | HeightFieldMirror) -> None:
+    """In row-major order, and only where a camera with twice as many pixels sees the surroundings in all four."""
+    camera = arc(3)[1]
+    fine = replace(
+        camera,
+        **{name: 2 * getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")},
+    )
+    coarse_view, fine_view = (train_view(each, mirror.buffers(each).alpha.double().numpy()) for each in (camera, fine))
+    numbered = torch.arange(coarse_view.mask.numel()).reshape(1, *coarse_view.mask.shape).expand(3, -1, -1).float()
+    views = replace(mirror_views(PLANE, [camera]), train=(replace(coarse_view, radiance=numbered),))
+    areas = mirror.footprints(views, 10**6)
+    assert areas is not None
+    pixels = areas.smooth[0].radiance[:, 0].long()
+    assert len(pixels) > 0.9 * len(coarse_view.solid)
+    row, column = pixels // camera.width, pixels % camera.width
+    quarters = torch.stack([(2 * row + down) * fine.width + 2 * column + right for down in (0, 1) for right in (0, 1)])
+    for index, quarter in enumerate(quarters):
+        seen = mirror.observe(fine_view, quarter)
+        torch.testing.assert_close(areas.smooth[0].directions[:, index], seen.directions, rtol=0, atol=2e-6)

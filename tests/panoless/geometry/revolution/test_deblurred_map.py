@@ -7,7 +7,8 @@ import torch
 from torch.nn.functional import max_pool2d, normalize
 
 from panoless.capture.views import Views
-from panoless.environment.footprints import PixelFootprints, deblur_map
+from panoless.environment.footprints import PixelFootprints
+from panoless.environment.sharpening import deblur_map
 from panoless.environment.solve import solve_environment
 from panoless.geometry.revolution.deblurred_map import pixel_footprints
 from panoless.geometry.revolution.model import revolution_buffers, revolution_rays
@@ -15,7 +16,7 @@ from panoless.geometry.revolution.render import mean_light
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap
 from tests.support.mirror_revolution import around, bowl, revolution_views
 
-ONE = torch.ones(3)
+ONE, SMOOTHNESS = torch.ones(3), 0.05
 
 
 def scene(resolution: int) -> torch.Tensor:
@@ -58,7 +59,7 @@ def under_a_lamp() -> tuple[torch.Tensor, torch.Tensor]:
     """Maps of centers and sharpened, of the bowl under the lamp."""
     views = photographed(lit_scene(64))
     start = solve_environment([revolution_rays(bowl(), view, view.solid)[0] for view in views.train], 64)
-    return start, deblur_map(pixel_footprints(views, bowl()), start, ONE)
+    return start, deblur_map(pixel_footprints(views, bowl()), start, ONE, SMOOTHNESS)
 
 
 def test_areas_tell_the_map_better_than_centers(photographs) -> None:
@@ -69,7 +70,7 @@ def test_areas_tell_the_map_better_than_centers(photographs) -> None:
     directions = torch.cat([each.directions.flatten(0, 1) for each in pixel_footprints(views, surface).smooth])
     errors = [
         float((sample_cubemap(found, directions) - sample_cubemap(truth, directions)).square().mean())
-        for found in (start, deblur_map(pixel_footprints(views, surface), start, ONE))
+        for found in (start, deblur_map(pixel_footprints(views, surface), start, ONE, SMOOTHNESS))
     ]
     assert errors[1] < 0.6 * errors[0]
 
@@ -77,7 +78,7 @@ def test_areas_tell_the_map_better_than_centers(photographs) -> None:
 def test_the_true_map_stays(photographs) -> None:
     """Its pixels are what was photographed, but for the difference of 4 and of 16 rays."""
     truth = scene(64)
-    found = deblur_map(pixel_footprints(photographs, bowl()), truth, ONE)
+    found = deblur_map(pixel_footprints(photographs, bowl()), truth, ONE, SMOOTHNESS)
     assert float((found - truth).abs().mean()) < 0.02
 
 
@@ -131,7 +132,7 @@ def test_without_saturated_pixels_saturation_is_nothing(photographs) -> None:
     """Views that end at 1 and views without an end give the same map, where nothing is brighter than 0.9."""
     start = solve_environment([revolution_rays(bowl(), view, view.solid)[0] for view in photographs.train], 64)
     ended, endless = (
-        deblur_map(pixel_footprints(photographs, bowl()), start, each * ONE) for each in (1.0, float("inf"))
+        deblur_map(pixel_footprints(photographs, bowl()), start, each * ONE, SMOOTHNESS) for each in (1.0, float("inf"))
     )
     torch.testing.assert_close(ended, endless.clamp(max=1))
 

@@ -1,0 +1,278 @@
+"""The map from pixels as areas, in the resolution and smoothness that pixels which took no part in it choose.
+
+min_E Σ w ‖mean_k E(ω_k) − c‖² + λ Σ v ‖E_i − E_j‖² + ε ‖E − E₀‖², over 2×2 directions ω_k of each pixel and over
+neighboring texels that pixels see, by conjugate gradients from the map E₀ of pixel centers. With v = 1/(1 + ‖E_i −
+E_j‖²/s²) edges of lamps and windows stay, and noise does not. Views are clipped at some largest radiance, c = min(S,
+mean_k E(ω_k)): a saturated pixel has no error while its prediction is saturated too, and light above S is told by
+pixels that see a lamp in part.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from panoless.environment.cubemap import resample
+from panoless.environment.fill import texel_neighbors
+from panoless.environment.footprints import Footprints, PixelFootprints
+from panoless.environment.options import DEFAULTS, FootprintMapOptions
+from panoless.environment.rays import Rays
+from panoless.environment.solve import solve_environment
+from panoless.kernels.cubemap import cubemap_directions, scatter_cubemap
+from panoless.numeric.conjugate_gradients import conjugate_gradients
+from panoless.numeric.robust import bounded_error
+
+MOVES = ((1, 0), (0, 1), (0, -1))
+"""Steps to a finer map, a smoother one and a sharper one, as they are tried."""
+
+
+@dataclass(frozen=True)
+class Sharpness:
+    """How fine a map is, and how much its neighboring texels agree."""
+
+    resolution: int
+    """Texels along a face side."""
+    smoothness: float
+    """λ, in pixels."""
+
+
+def sharpest_map(
+    footprints: Footprints,
+    rays: Sequence[Rays],
+    resolutions: Sequence[int],
+    saturation: Float[Tensor, "3"],
+    options: FootprintMapOptions = DEFAULTS,
+) -> Float[Tensor, "6 3 L L"]:
+    """The map of all pixels: `rays` are their centers, also of those without footprints. Its resolution is
+    one of some, from the coarsest to the finest.
+    """
+    chosen = chosen_sharpness(footprints.smooth, resolutions, saturation, options)
+    return deblur_map(footprints, solve_environment(rays, chosen.resolution), saturation, chosen.smoothness, options)
+
+
+def chosen_sharpness(
+    areas: Sequence[PixelFootprints],
+    resolutions: Sequence[int],
+    saturation: Float[Tensor, "3"],
+    options: FootprintMapOptions = DEFAULTS,
+) -> Sharpness:
+    """What explains every fifth pixel best by the others. From the coarsest map on, a finer, a smoother and a
+    sharper one are tried as long as one is better, a finer one by the share `least_gain`.
+    """
+    trial, size, rung = _Trial(areas, saturation, options), 0, len(options.smoothness) // 2
+    tried = {(size, rung): trial.error(resolutions[size], options.smoothness[rung])}
+    moves = list(MOVES)
+    while moves:
+        (finer, smoother), *moves = moves
+        there = size + finer, rung + smoother
+        if there in tried or there[0] >= len(resolutions) or not 0 <= there[1] < len(options.smoothness):
+            continue
+        tried[there] = trial.error(resolutions[there[0]], options.smoothness[there[1]])
+        if tried[there] < tried[size, rung] * (1 - finer * options.least_gain):
+            (size, rung), moves = there, list(MOVES)
+    return Sharpness(resolutions[size], options.smoothness[rung])
+
+
+class _Trial:
+    """Maps of four fifths of the pixels, and how well they explain the others."""
+
+    def __init__(
+        self, areas: Sequence[PixelFootprints], saturation: Float[Tensor, "3"], options: FootprintMapOptions
+    ) -> None:
+        self.kept = [each.without(options.held_out, index % options.held_out) for index, each in enumerate(areas)]
+        self.asked = [each.every(options.held_out, index % options.held_out) for index, each in enumerate(areas)]
+        self.saturation, self.options = saturation, replace(options, coarse_rounds=0, steps=options.trial_steps)
+        self._starts: dict[int, Tensor] = {}
+
+    def error(self, resolution: int, smoothness: float) -> float:
+        """Mean of ‖e‖²/(‖e‖² + s²) over the pixels that were held out, weighted by trust."""
+        if resolution not in self._starts:
+            self._starts[resolution] = solve_environment([each.rays() for each in self.kept], resolution)
+        kept = Footprints(self.kept, lambda: PixelFootprints.joined(self.kept))
+        environment = deblur_map(kept, self._starts[resolution], self.saturation, smoothness, self.options)
+        summed, weights = 0.0, 0.0
+        for each in self.asked:
+            weight = each.rays().initial_weight()
+            error = each.seen(environment).minimum(self.saturation.to(environment)) - each.radiance
+            summed += float((weight * bounded_error(error, self.options.robust_scale)).sum())
+            weights += float(weight.sum())
+        return summed / max(weights, 1e-9)
+
+
+def deblur_map(
+    footprints: Footprints,
+    environment: Float[Tensor, "6 3 L L"],
+    saturation: Float[Tensor, "3"],
+    smoothness: float,
+    options: FootprintMapOptions = DEFAULTS,
+) -> Float[Tensor, "6 3 L L"]:
+    """The map E₀ of pixel centers, sharpened; texels that no footprint touches stay. Views are clipped at `saturation`.
+
+    It lies between 0 and that, or `ceiling` times that in channels in which pixels are saturated. Before each round,
+    pixels that bend the light much, or reflect it often, and so see wide parts of it, tell how bright the inside of
+    saturated regions is, coarsely.
+    """
+    if not footprints.smooth:
+        return environment
+    saturation = saturation.to(environment)
+    lit = torch.stack([(each.radiance >= options.saturated * saturation).any(0) for each in footprints.smooth]).any(0)
+    highest = (saturation * torch.where(lit, options.ceiling, 1.0))[:, None, None]
+    inner = _eroded(environment >= options.lit * saturation[:, None, None])
+    others = footprints.trace_others() if options.coarse_rounds and inner.any() else None
+    for _ in range(options.rounds):
+        if others is not None:
+            environment = _brightened(environment, others, inner, saturation, options).minimum(highest)
+        change = _sharpening(environment, footprints.smooth, saturation, smoothness, options)
+        environment = (environment + change).clamp(min=0).minimum(highest)
+    return environment
+
+
+def _sharpening(
+    environment: Float[Tensor, "6 3 L L"],
+    areas: Sequence[PixelFootprints],
+    saturation: Float[Tensor, "3"],
+    smoothness: float,
+    options: FootprintMapOptions,
+) -> Float[Tensor, "6 3 L L"]:
+    """The change of a map that explains pixels best, as they and its differences weigh under that map."""
+    equations = _Equations.at(environment, areas, saturation, options.robust_scale, options.pull, options.saturated)
+    agreeing = _Smoothness.at(environment, equations.total, smoothness, options.robust_scale)
+    return conjugate_gradients(
+        lambda image: equations.product(image) + agreeing.product(image),
+        torch.zeros_like(environment),
+        equations.right_side - agreeing.product(environment),
+        1 / (options.pull + equations.total + agreeing.diagonal),
+        options.steps,
+    )
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """Normal equations of a change of the map: AᵀWA + ε and AᵀW (c − A E)."""
+
+    areas: Sequence[PixelFootprints]
+    weights: Sequence[Float[Tensor, "_ 3"]]
+    right_side: Float[Tensor, "6 3 L L"]
+    total: Float[Tensor, "6 3 L L"]
+    """The weight that lies on each texel."""
+    pull: float
+
+    @classmethod
+    def at(
+        cls,
+        environment: Float[Tensor, "6 3 L L"],
+        areas: Sequence[PixelFootprints],
+        saturation: Float[Tensor, "3"],
+        scale: float,
+        pull: float,
+        saturated: float,
+    ) -> "_Equations":
+        """Weighed by what is seen of a map."""
+        resolution = environment.shape[-1]
+        weights, residual, total = [], torch.zeros_like(environment), torch.zeros_like(environment)
+        for each in areas:
+            seen = each.seen(environment)
+            weights.append(each.weights(seen, saturation, scale, saturated))
+            residual += each.spread((each.radiance - seen) * weights[-1], resolution)
+            total += each.spread(weights[-1], resolution)
+        return cls(areas, weights, residual, total, pull)
+
+    def product(self, image: Float[Tensor, "6 3 L L"]) -> Float[Tensor, "6 3 L L"]:
+        """The matrix times a change."""
+        found = self.pull * image
+        for each, weight in zip(self.areas, self.weights, strict=True):
+            found += each.spread(each.seen(image) * weight, image.shape[-1])
+        return found
+
+
+@dataclass(frozen=True)
+class _Smoothness:
+    """λ Σ v ‖E_i − E_j‖² over neighboring texels on which pixels fell."""
+
+    around: Tensor
+    weights: Float[Tensor, "4 T 1"]
+    """λ v of a texel and each of its neighbors."""
+
+    @classmethod
+    def at(
+        cls,
+        environment: Float[Tensor, "6 3 L L"],
+        total: Float[Tensor, "6 3 L L"],
+        smoothness: float,
+        scale: float,
+    ) -> "_Smoothness":
+        """With v of the differences of a map."""
+        around = texel_neighbors(environment.shape[-1]).to(environment.device)
+        texels, touched = _by_texel(environment), _by_texel(total).amax(1) > 0
+        apart = (texels[around] - texels).square().sum(2, keepdim=True)
+        return cls(around, smoothness * (touched[around] & touched)[..., None] / (1 + apart / scale**2))
+
+    def product(self, image: Float[Tensor, "6 3 L L"]) -> Float[Tensor, "6 3 L L"]:
+        """The matrix times a change."""
+        texels = _by_texel(image)
+        return _by_face((self.weights * (texels - texels[self.around])).sum(0), image.shape[-1])
+
+    @property
+    def diagonal(self) -> Float[Tensor, "6 1 L L"]:
+        """Of the matrix."""
+        total = self.weights.sum(0)
+        return _by_face(total, round((len(total) / 6) ** 0.5))
+
+
+def _by_texel(image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "T C"]:
+    return image.movedim(1, -1).reshape(-1, image.shape[1])
+
+
+def _by_face(texels: Float[Tensor, "T C"], resolution: int) -> Float[Tensor, "6 C L L"]:
+    return texels.reshape(6, resolution, resolution, -1).movedim(-1, 1)
+
+
+def _brightened(
+    environment: Float[Tensor, "6 3 L L"],
+    areas: PixelFootprints,
+    inner: Float[Tensor, "6 3 L L"],
+    saturation: Float[Tensor, "3"],
+    options: FootprintMapOptions,
+) -> Float[Tensor, "6 3 L L"]:
+    """The map plus what a coarse one adds within saturated regions; nothing there falls below saturation for it."""
+    lowest = environment.minimum(saturation[:, None, None])
+    for _ in range(options.coarse_rounds):
+        environment = (environment + _brightening(environment, areas, inner, saturation, options)).maximum(lowest)
+    return environment
+
+
+def _brightening(
+    environment: Float[Tensor, "6 3 L L"],
+    areas: PixelFootprints,
+    inner: Float[Tensor, "6 3 L L"],
+    saturation: Float[Tensor, "3"],
+    options: FootprintMapOptions,
+) -> Float[Tensor, "6 3 L L"]:
+    """B X of min_X Σ w ‖A (E + B X) − c‖² + ε ‖X‖², with B `finer` and `coarser` its adjoint."""
+    resolution = environment.shape[-1]
+    texels = cubemap_directions(resolution, device=environment.device).reshape(-1, 3)
+
+    def finer(coarse: Float[Tensor, "6 C M M"]) -> Float[Tensor, "6 C L L"]:
+        return inner * resample(coarse, resolution)
+
+    def coarser(image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "6 C M M"]:
+        return scatter_cubemap(_by_texel(inner * image), texels, options.coarse_resolution)
+
+    equations = _Equations.at(environment, [areas], saturation, options.coarse_scale, 0.0, options.saturated)
+    right_side = coarser(equations.right_side)
+    found = conjugate_gradients(
+        lambda coarse: options.coarse_pull * coarse + coarser(equations.product(finer(coarse))),
+        torch.zeros_like(right_side),
+        right_side,
+        1 / (options.coarse_pull + coarser(equations.total)),
+        options.coarse_steps,
+    )
+    return finer(found)
+
+
+def _eroded(mask: Tensor) -> Float[Tensor, "6 3 L L"]:
+    """1 where a texel and its eight neighbors on the same face are in a mask, and 0 elsewhere."""
+    return -max_pool2d(-mask.float(), 3, 1, 1)

@@ -1,0 +1,117 @@
+"""Maps of pixels as areas: how smooth and how fine they are is told by pixels that took no part."""
+
+from dataclasses import replace
+
+import torch
+from torch.nn.functional import normalize
+
+from panoless.environment.footprints import Footprints, PixelFootprints
+from panoless.environment.options import FootprintMapOptions
+from panoless.environment.sharpening import _Smoothness, chosen_sharpness, deblur_map, sharpest_map
+from panoless.environment.solve import solve_environment
+from panoless.kernels.cubemap import cubemap_directions
+
+ONE = torch.ones(3)
+OPTIONS = FootprintMapOptions()
+WIDTH = 0.06
+"""Of a pixel, in radians."""
+SIZES = (16, 32)
+"""Texels along a face side."""
+
+
+def light(directions: torch.Tensor, waves: float, window: float = 0.3) -> torch.Tensor:
+    """Waves across the sky, and a window with sharp edges, so much brighter."""
+    smooth = 0.4 + 0.2 * torch.sin(waves * directions)
+    inside = (directions[..., :1] > 0.5) & (directions[..., 1:2].abs() < 0.3)
+    return smooth + window * inside
+
+
+def photographed(count: int, noise: float, waves: float = 6.0, window: float = 0.3) -> PixelFootprints:
+    """Square pixels at random places, each the mean of 4×4 rays over its area, with the four directions of a fit."""
+    generator = torch.Generator().manual_seed(1)
+    middle = normalize(torch.randn(count, 3, generator=generator), dim=1)
+    across = normalize(torch.linalg.cross(middle, torch.randn(count, 3, generator=generator)), dim=1)
+    down = torch.linalg.cross(middle, across)
+
+    def rays(side: int) -> torch.Tensor:
+        places = ((torch.arange(side) + 0.5) / side - 0.5) * WIDTH
+        right, below = (each.flatten()[:, None] for each in torch.meshgrid(places, places, indexing="ij"))
+        return normalize(middle[:, None] + right * across[:, None] + below * down[:, None], dim=2)
+
+    radiance = light(rays(4), waves, window).mean(1) + noise * torch.randn(count, 3, generator=generator)
+    return PixelFootprints(rays(2).contiguous(), radiance.clamp(0, 1))
+
+
+def error(environment: torch.Tensor, waves: float = 6.0) -> float:
+    """Mean squared error of a map."""
+    truth = light(cubemap_directions(environment.shape[-1]), waves).permute(0, 3, 1, 2)
+    return float((environment - truth).square().mean())
+
+
+def test_noise_makes_held_out_pixels_ask_for_smoothness() -> None:
+    """They take the most that is offered, and not without noise. That map is the nearest to the truth by far."""
+    least, most = OPTIONS.smoothness[0], OPTIONS.smoothness[-1]
+    assert chosen_sharpness([photographed(10_000, 0.0)], SIZES[-1:], ONE).smoothness < most
+    noisy = photographed(10_000, 0.05)
+    assert chosen_sharpness([noisy], SIZES[-1:], ONE).smoothness == most
+    start = solve_environment([noisy.rays()], SIZES[-1])
+    errors = [error(deblur_map(Footprints.of([noisy]), start, ONE, each, OPTIONS)) for each in (least, most)]
+    assert errors[1] < errors[0] / 2
+
+
+def test_a_map_is_as_fine_as_held_out_pixels_want_it() -> None:
+    """Noisy pixels of slow waves need few texels, clean ones of fast waves many."""
+    slow, fast = photographed(5_000, 0.05, waves=2.0, window=0.0), photographed(20_000, 0.0, waves=20.0)
+    assert chosen_sharpness([slow], SIZES, ONE).resolution == SIZES[0]
+    assert sharpest_map(Footprints.of([fast]), [fast.rays()], SIZES, ONE).shape[-1] == SIZES[-1]
+
+
+def test_edges_stay_under_the_largest_smoothness() -> None:
+    """Across the window's edge a map of noisy pixels keeps nine tenths of the step."""
+    areas = photographed(10_000, 0.05)
+    found = sharpest_map(Footprints.of([areas]), [areas.rays()], SIZES[-1:], ONE)
+    directions = cubemap_directions(32)
+    beside = (directions[..., 1].abs() < 0.2) & (directions[..., 2] > 0)
+    within, without = ((directions[..., 0] - x).abs() < 0.04 for x in (0.57, 0.43))
+    truth = light(directions, 6.0)[..., 1]
+    steps = [float(each[within & beside].mean() - each[without & beside].mean()) for each in (found[:, 1], truth)]
+    assert steps[0] > 0.9 * steps[1]
+
+
+def test_smoothing_is_symmetric_and_leaves_constants() -> None:
+    """⟨u, S v⟩ = ⟨S u, v⟩, S 1 = 0, and its diagonal is what unit images give."""
+    generator = torch.Generator().manual_seed(0)
+    map_, first, second = torch.rand(3, 6, 3, 8, 8, generator=generator)
+    total = (torch.rand(6, 3, 8, 8, generator=generator) > 0.2).float()
+    smoothness = _Smoothness.at(map_, total, 0.3, 0.16)
+    left, right = (first * smoothness.product(second)).sum(), (smoothness.product(first) * second).sum()
+    torch.testing.assert_close(left, right)
+    assert float(smoothness.product(torch.ones_like(map_)).abs().max()) < 1e-6
+    units = torch.eye(8)[:, None, None, None, :] * torch.eye(8)[3][:, None]
+    for k, unit in enumerate(units):
+        image = unit.expand(6, 3, 8, 8) * (torch.arange(6) == 2)[:, None, None, None]
+        torch.testing.assert_close(smoothness.product(image)[2, 0, 3, k], smoothness.diagonal[2, 0, 3, k])
+
+
+def test_texels_that_no_pixel_touches_stay() -> None:
+    """They are what the start says, even beside others, under any smoothness."""
+    areas = photographed(5_000, 0.0)
+    upper = areas.directions[..., 2].amin(1) > 0.1
+    areas = PixelFootprints(areas.directions[upper].contiguous(), areas.radiance[upper])
+    start = torch.rand(6, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    found = deblur_map(Footprints.of([areas]), start, ONE, 0.25, OPTIONS)
+    below = (cubemap_directions(32)[..., 2] < 0)[:, None].expand_as(start)
+    assert torch.equal(found[below], start[below])
+
+
+def test_a_held_out_pixel_has_no_say() -> None:
+    """Whatever it saw, the map of the others is the same."""
+    areas = photographed(5_000, 0.0)
+    other = areas.radiance.clone()
+    other[2::5] = 0.9
+    start = solve_environment([areas.rays()], 32)
+    maps = [
+        deblur_map(Footprints.of([replace(areas, radiance=each).without(5, 2)]), start, ONE, 0.05, OPTIONS)
+        for each in (areas.radiance, other)
+    ]
+    assert torch.equal(*maps)
