@@ -59,6 +59,8 @@ class Evidence:
     """The same as a turn of the camera."""
     overlap: float
     """Intersection over union of fit and mask: median over views."""
+    missed: float
+    """Share of the pixels well inside the masks that the fitted surface does not cover: mean over views."""
     left_out: float
     """Share of the object's pixels that show the object again and are left out of the map."""
     saturated: float
@@ -110,7 +112,7 @@ def gather_evidence(
     surfaces = [[(view, geometry.buffers(view.camera)) for view in part] for part in looked_at]
     light = _light(usable, surfaces, geometry, visibility, config)
     silhouettes = [_silhouette(*each, options) for part in surfaces for each in part]
-    distance, shift, overlap = (np.array([each[i] for each in silhouettes]) for i in range(3))
+    distance, shift, overlap, missed = (np.array([each[i] for each in silhouettes]) for i in range(4))
     focal = np.array([view.camera.fx for part in looked_at for view in part])
     return Evidence(
         **light,
@@ -118,6 +120,7 @@ def gather_evidence(
         view_shift_px=float(np.sqrt(np.mean(shift**2))) if len(shift) else 0.0,
         view_shift_deg=float(np.degrees(np.sqrt(np.mean((shift / focal) ** 2)))) if len(shift) else 0.0,
         overlap=_median(overlap),
+        missed=float(missed.mean()) if len(missed) else 0.0,
         left_out=1 - kept / solid,
         saturated=_saturated(seen, float(encoding_of(config).saturation.min()), options),
         coverage=float((visibility > 0).float().mean()),
@@ -288,22 +291,25 @@ class _Cells:
         return (grid[0] * self.side + grid[1]) * self.side + grid[2]
 
 
-def _silhouette(view: TrainView, surface: SurfaceBuffers, options: TrustOptions) -> tuple[float, float, float]:
-    """Median distance (px) of the two contours, the shift (px) that explains most of it, and intersection over union.
+def _silhouette(view: TrainView, surface: SurfaceBuffers, options: TrustOptions) -> tuple[float, float, float, float]:
+    """Median distance (px) of the two contours, the shift (px) that explains most of it, intersection over union, and
+    the share of the pixels well inside the mask that are not covered.
 
     A pixel near the fitted contour has the mask's signed distance less the fitted one; a shift t changes it by n·t.
     """
     mask, alpha, shared = view.mask.cpu().numpy(), surface.alpha.cpu().numpy(), overlap(surface.alpha, view.mask)
     if min(mask.max(), alpha.max()) < MASK_LEVEL or max(mask.min(), alpha.min()) > MASK_LEVEL:
-        return float(max(mask.shape)), float(max(mask.shape)), shared
+        return float(max(mask.shape)), float(max(mask.shape)), shared, 1.0
     of_mask, of_fit = silhouette_distance_px(view.mask).cpu().numpy(), mask_distance_px(alpha)
+    inside = np.abs(of_mask)[mask > MASK_LEVEL] > options.missed_inside_px
+    missed = float((alpha[mask > MASK_LEVEL][inside] < MASK_LEVEL).mean()) if inside.any() else 0.0
     rows, columns = np.gradient(of_fit)
     near = np.abs(of_fit) < 1
     near[[0, -1]], near[:, [0, -1]] = False, False
     if not near.any():
-        return float(max(mask.shape)), float(max(mask.shape)), shared
+        return float(max(mask.shape)), float(max(mask.shape)), shared, missed
     normals, away = np.stack([columns[near], rows[near]], 1), (of_mask - of_fit)[near]
-    return float(np.median(np.abs(away))), float(np.linalg.norm(_shift(normals, away, options))), shared
+    return float(np.median(np.abs(away))), float(np.linalg.norm(_shift(normals, away, options))), shared, missed
 
 
 def _shift(

@@ -78,6 +78,12 @@ DOUBTS = (
         PART,
     ),
     _Doubt(
+        lambda found: found.missed,
+        lambda options: options.largest_missed,
+        lambda found: f"the shape leaves {found.missed:.0%} of what lies well inside the masks bare",
+        PART,
+    ),
+    _Doubt(
         lambda found: found.roughness,
         lambda options: options.largest_roughness,
         lambda found: f"the object has a roughness of {found.roughness:.2g}, which blurs what it mirrors",

@@ -72,8 +72,8 @@ def fit_free_form(
     poses of the views where these are unknowns.
 
     Rounds are taken with four fifths of the views as long as the others gain by them, and the last of those once more
-    with all. After the rounds that are always taken, parts that pixels distrust are mended, and poses are set `free`,
-    under the prior that views state of them.
+    with all. After the rounds that are always taken, hollows are searched, parts that pixels distrust are mended, and
+    poses are set `free`, under the prior that views state of them.
     """
     kept, held_out = split_held_out(views.train)
     solved = replace(views, train=tuple(kept)) if kept and held_out else views
@@ -89,13 +89,13 @@ def fit_free_form(
 
     with torch.no_grad():
         stage = coarse_stage(solved, start, options.rounds, options, progress)
-        if held_out:
-            stage = keep_if_better(mended_stages(solved, stage, options), error, options.least_mending_gain)
         search = options.concave.search
         hollowed = concave_start(solved, start, stage.surface, options.concave) if search else None
         if hollowed is not None:
             deeper = coarse_stage(solved, hollowed, options.concave.rounds, options)
             stage = better(stage, deeper, options.concave.least_held_out_gain) if held_out else deeper
+        if held_out:
+            stage = keep_if_better(mended_stages(solved, stage, options), error, options.least_mending_gain)
         if free_poses:
             stage = take_round(solved, replace(stage, poses=Poses.none(len(solved.train))), stage.last, options)
         if held_out:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from torch.nn.functional import normalize
+from torch.nn.functional import max_pool2d, normalize
 
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
@@ -77,6 +77,25 @@ def test_the_share_of_places_that_are_not_explained_is_measured_and_named(views:
     verdict = judge(mixed, replace(OPTIONS, largest_unexplained=1.0))
     assert verdict.verdict == "do not trust"
     assert "lies where its shape explains little of it" in verdict.reason
+
+
+def test_what_the_shape_leaves_bare_is_measured_and_named(views: Views) -> None:
+    """A corner of each picture that masks show and the shape lacks, but not the edge of masks that are too large."""
+
+    def with_a_corner(index: int, view: TrainView) -> TrainView:
+        mask = view.mask.clone()
+        mask[: mask.shape[0] // 3, : mask.shape[1] // 3] = 1
+        return replace(view, mask=mask)
+
+    def wider(index: int, view: TrainView) -> TrainView:
+        return replace(view, mask=max_pool2d(view.mask[None], 5, 1, 2)[0])
+
+    bare = evidence(each(views, with_a_corner))
+    assert evidence(views).missed == evidence(each(views, wider)).missed == 0
+    assert bare.missed > OPTIONS.largest_missed
+    verdict = judge(bare, replace(OPTIONS, largest_silhouette_px=100.0, largest_view_shift_px=100.0))
+    assert verdict.verdict != "trust"
+    assert "bare" in verdict.reason
 
 
 def test_turned_cameras_are_measured_and_named(views: Views) -> None:
