@@ -386,22 +386,25 @@ def measured_trust(solution: Solution) -> Trust:
 
 
 def held_out_error(solved: Views, tested: Views, stage: FitStage, options: FreeFormOptions) -> float:
-    """Mean of ‖e‖²/(‖e‖² + s²) over rays of views that neither surface nor map have seen.
+    """Mean of ‖e‖²/(‖e‖² + s²) over rays of views that neither surface nor map have seen, and 1 for those that miss the
+    surface.
 
     Where poses are unknowns, those of the tested views are found first: six numbers each, against thousands of pixels.
     """
     poses = None if stage.poses is None else found_poses(solved, tested, stage, options)
-    known = _rays(solved, stage.surface, stage.poses, options)
-    unknown = _rays(tested, stage.surface, poses, options)
-    return prediction_error([unknown], solve_environment([known], options.held_out_resolution))
+    known, _ = _rays(solved, stage.surface, stage.poses, options)
+    unknown, missed = _rays(tested, stage.surface, poses, options)
+    error = prediction_error([unknown], solve_environment([known], options.held_out_resolution))
+    return (len(unknown.directions) * error + missed) / max(len(unknown.directions) + missed, 1)
 
 
-def _rays(views: Views, surface: LevelSet, poses: Poses | None, options: FreeFormOptions) -> Rays:
+def _rays(views: Views, surface: LevelSet, poses: Poses | None, options: FreeFormOptions) -> tuple[Rays, int]:
+    """Of pixels well inside the masks: those that see the surroundings, and how many miss the surface."""
     pixels = solid_pixels(views, options.held_out_rays)
     rays = pixels.rays if poses is None else pixels.rays.moved(poses)
-    sights = Sights.of(surface, rays, 1, options.least_cosine)
-    clear = sights.clear & (pixels.inner_px > options.inner_px)
+    sights, inner = Sights.of(surface, rays, 1, options.least_cosine), pixels.inner_px > options.inner_px
+    clear = sights.clear & inner
     outgoing, radiance = (
         torch.from_numpy(values[clear]).float() for values in (sights.outgoing[:, 0], pixels.radiance)
     )
-    return Rays(outgoing, radiance)
+    return Rays(outgoing, radiance), int((inner & ~sights.hits.met).sum())

@@ -24,12 +24,13 @@ from panoless.geometry.free_form.fit import (
     distrusted_share,
     fit_free_form,
     gauss_newton_step,
+    held_out_error,
     make_task,
     mended_stages,
     take_round,
 )
 from panoless.geometry.free_form.kind import FreeFormFamily, FreeFormMirror
-from panoless.geometry.free_form.observations import outline_rays
+from panoless.geometry.free_form.observations import outline_rays, solid_pixels
 from panoless.geometry.free_form.options import DEFAULTS, ConcaveOptions, DescentOptions, FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.photometric import Sights, Solution
 from panoless.geometry.free_form.start import FirstSurfaces, first_surfaces, started
@@ -166,6 +167,23 @@ def test_what_pixels_trust_is_not_mended(dented: tuple[Body, Views, FitStage]) -
 
 
 @pytest.mark.slow
+def test_held_out_pixels_that_miss_the_surface_are_unexplained() -> None:
+    """Under one color all around, which any surface explains, the error is the share of the pixels that miss it."""
+    views = body_views(sphere(), 10, 48)
+    train = [replace(view, radiance=torch.full_like(view.radiance, 0.5)) for view in views.train]
+    solved, tested = (replace(views, train=tuple(part)) for part in (train[:8], train[8:]))
+    whole = first_surfaces(views, CONFIG).hull
+    small = replace(whole, coefficients=whole.coefficients + 0.3 / whole.spacing)
+    pixels = solid_pixels(tested, OPTIONS.held_out_rays)
+    for surface, bare in ((whole, False), (small, True)):
+        stage = FitStage(surface, full_trust(surface, OPTIONS.trust_cells), None, OPTIONS.damping)
+        sights = Sights.of(surface, pixels.rays, 1, OPTIONS.least_cosine)
+        inner = pixels.inner_px > OPTIONS.inner_px
+        missed, clear = (inner & ~sights.hits.met).sum(), (inner & sights.clear).sum()
+        assert (missed > 0.2 * clear) == bare
+        assert held_out_error(solved, tested, stage, OPTIONS) == pytest.approx(missed / (missed + clear), abs=1e-3)
+
+
 def test_a_world_that_is_turned_and_scaled_gives_the_same_surface() -> None:
     """Up to the grid, whose axes are those of the world: normals agree far below their errors' scale."""
     body, turn = ellipsoid(), np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
