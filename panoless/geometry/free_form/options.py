@@ -235,8 +235,10 @@ class FreeFormOptions:
     """Robust scale of outlines."""
     outline_points: int = 30_000
     """Most outline points of all views. Not tuned."""
-    miss_weight: float = 0.3
-    """Weight of a pixel on the object that misses the surface, against an outline's point."""
+    miss_weight: float = 3.0
+    """Weight of a pixel on the object that misses the surface, against an outline's point where those count once. With
+    0.3 Sculpture ends at 1.19° under masks that are 1 px too large, and Pawn loses 6 % of its pixels in the rounds of
+    `fast`; with 3 at 0.15° and 4 %, with 10 at 3 %. Without missed pixels nothing depends on it."""
     miss_scale_px: float = 20.0
     """Its robust scale."""
     gauge: float = 10.0
