@@ -46,8 +46,8 @@ def sharpest_map(
     saturation: Float[Tensor, "3"],
     options: FootprintMapOptions = DEFAULTS,
 ) -> Float[Tensor, "6 3 L L"]:
-    """The map of all pixels: `rays` are their centers, also of those without footprints. Its resolution is
-    one of some, from the coarsest to the finest.
+    """The map of all pixels: `rays` are their centers, also of those without footprints. The resolutions that it may
+    have go from coarse to fine.
     """
     chosen = chosen_sharpness(footprints.smooth, resolutions, saturation, options)
     return deblur_map(footprints, solve_environment(rays, chosen.resolution), saturation, chosen.smoothness, options)

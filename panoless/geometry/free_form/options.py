@@ -152,7 +152,7 @@ class DescentOptions:
     least_disagreement: NonNegative = 0.15
     """Of pixels under the plain surface, after the first round of the fit, from which anything descends: below it they
     agree well enough. It is 0.10, 0.12 and 0.14 on sculpture, chrome-block and ellipsoid, where nothing is gained, and
-    0.20 to 0.60 on horseshoe, twist, drum, jug, crate and bust, which start better by it."""
+    0.17 to 0.60 on die, horseshoe, twist, drum, jug, crate and bust, which start better by it."""
     least_gain: float = 0.02
     """Share of the disagreement, after the first round of the fit, by which what descended has to lower it."""
 
