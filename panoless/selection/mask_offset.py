@@ -39,16 +39,25 @@ def masks_are_doubted(views: Views, geometry: Geometry, errors: Float[np.ndarray
 def with_moved_masks(source: Family, views: Views, fitted: Fitted, config: FitConfig, refit: Refit) -> Fitted:
     """Fitted anew to masks that are larger or smaller, if held-out views are clearly better explained by that; then
     once more where photographs pull that surface's outlines off the moved ones.
+
+    Proposals of moved outlines tell the offset. Where these are far from the shape, as of flat faces, they tell
+    nothing, and masks are moved by a pixel to where photographs pull the outlines of the fit.
     """
-    options = config.corrections
+    options, pulled = config.corrections, outline_pull_px(fitted.corrections.applied(views, config), fitted.geometry)
 
     def moved_by(offset: float) -> Fitted | None:
         corrections = replace(fitted.corrections, mask_offset_px=offset)
         again = refit(corrections.applied(views, config), fitted, anew=True) if offset else None
         return None if again is None else replace(again, corrections=corrections)
 
-    found = moved_by(find_mask_offset(source, fitted.corrections.applied(views, config), fitted, config))
-    if found is None or not _offset_is_earned(views, fitted, found, config):
+    def earned(offset: float) -> Fitted | None:
+        found = moved_by(offset)
+        return found if found is not None and _offset_is_earned(views, fitted, found, config) else None
+
+    found = earned(find_mask_offset(source, fitted.corrections.applied(views, config), fitted, config))
+    if found is None and not -options.doubted_inward_px <= pulled <= options.doubted_outward_px:
+        found = earned(float(np.copysign(options.pulled_step_px, pulled)))
+    if found is None:
         return fitted
     pull = outline_pull_px(found.corrections.applied(views, config), found.geometry)
     if abs(pull) < options.least_pull_px:

@@ -62,6 +62,8 @@ class CorrectionOptions:
     edges lies inside them. With masks that are 2 px too small it is 0.015 on the trial shape ellipsoid."""
     pull_share: Positive = 0.17
     """Share of a small offset by which outlines of a fit give way. On vase 0.18, on sculpture 0.16."""
+    pulled_step_px: Positive = 1.0
+    """By so much masks are moved where only that pull tells that they are off. Not tuned."""
     least_pull_px: Positive = 0.02
     """The fit to moved masks stays where its outlines lie nearer to them than this. With masks that are right it is
     0.001 on vase and 0.004 on sculpture."""
