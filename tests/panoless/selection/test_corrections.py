@@ -14,6 +14,7 @@ from panoless.geometry.base import Geometry, Proposal
 from panoless.geometry.plane.kind import PlaneFamily, PlaneMirror
 from panoless.geometry.registry import FAMILIES
 from panoless.presets import PRESETS
+from panoless.selection import mask_offset
 from panoless.selection.candidates import Candidate, Selection, Verdict, selection_from_plain, selection_to_plain
 from panoless.selection.choose import choose_geometry
 from panoless.selection.corrections import with_corrections
@@ -145,6 +146,28 @@ def test_outlines_of_the_true_surface_lie_where_masks_were(offset_px: float) -> 
     """Outside of masks that were shrunk, inside of those that were grown."""
     views = with_masks(reflecting_views(MIRROR.plane, arc(6, size=64)), offset_px)
     assert outline_pull_px(views, MIRROR) == pytest.approx(-offset_px, abs=0.1)
+
+
+@pytest.mark.parametrize(("grown_px", "tried"), [(1.0, [-2.0, -1.0]), (-1.0, [-2.0, 1.0]), (0.0, [-2.0])])
+def test_where_proposals_tell_no_offset_masks_move_to_where_outlines_are_pulled(
+    monkeypatch: pytest.MonkeyPatch, grown_px: float, tried: list[float]
+) -> None:
+    """A wrong offset by proposals is refused; then a pixel toward the true outlines is tried, where they are pulled."""
+    views, proposal = (
+        with_masks(reflecting_views(MIRROR.plane, arc(6, size=64)), grown_px),
+        Proposal(MIRROR.plane, 0, 1),
+    )
+    first, moved = Fitted(MIRROR, PosedProposal(proposal)), []
+
+    def earned(_views: Views, _before: Fitted, after: Fitted, _config: FitConfig) -> bool:
+        moved.append(after.corrections.mask_offset_px)
+        return after.corrections.mask_offset_px == pytest.approx(-grown_px)
+
+    monkeypatch.setattr(mask_offset, "find_mask_offset", lambda *_: -2.0)
+    monkeypatch.setattr(mask_offset, "_offset_is_earned", earned)
+    found = mask_offset.with_moved_masks(FAMILIES["plane"], views, first, CONFIG, lambda _, before, anew: first)
+    assert moved == tried
+    assert found.corrections.mask_offset_px == (-grown_px if grown_px else 0.0)
 
 
 @pytest.mark.slow
