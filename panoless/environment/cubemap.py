@@ -39,7 +39,17 @@ def resample(environment: Float[Tensor, "6 C L L"], resolution: int) -> Float[Te
     """The map at the texel centers of another resolution, bilinear and seamless."""
     directions = cubemap_directions(resolution, dtype=environment.dtype, device=environment.device).reshape(-1, 3)
     sampled = sample_cubemap(environment, directions)
-    return sampled.view(6, resolution, resolution, -1).permute(0, 3, 1, 2).contiguous()
+    return by_face(sampled, resolution).contiguous()
+
+
+def by_texel(image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "T C"]:
+    """The texels of all faces, row after row."""
+    return image.movedim(1, -1).reshape(-1, image.shape[1])
+
+
+def by_face(texels: Float[Tensor, "T C"], resolution: int) -> Float[Tensor, "6 C L L"]:
+    """The image whose texels these are, the inverse of `by_texel`."""
+    return texels.reshape(6, resolution, resolution, -1).movedim(-1, 1)
 
 
 def flat_texels(directions: Float[np.ndarray, "*P 3"], resolution: int) -> Int[np.ndarray, "*P"]:

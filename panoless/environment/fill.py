@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from panoless.environment.cubemap import flat_texels, resample
+from panoless.environment.cubemap import by_face, by_texel, flat_texels, resample
 from shinypartial.core.sphere import cube_to_directions
 
 #: A level of L texels a side is relaxed this often over L: the coarse ones, which carry far and cost little, most.
@@ -48,11 +48,11 @@ def _relax(
         return color
     around = texel_neighbors(resolution).to(gaps.device)[:, gaps]
     free = (1 - known.flatten()[gaps])[:, None]
-    fixed = color.permute(0, 2, 3, 1).flatten(0, 2)[gaps]
-    texels = (color + (1 - known) * start).permute(0, 2, 3, 1).flatten(0, 2)
+    fixed = by_texel(color)[gaps]
+    texels = by_texel(color + (1 - known) * start)
     for _ in range(math.ceil(RELAXED_TEXELS / resolution)):
         texels[gaps] = torch.lerp(texels[gaps], fixed + free * texels[around].mean(0), DAMPING)
-    return texels.view(6, resolution, resolution, -1).permute(0, 3, 1, 2).contiguous()
+    return by_face(texels, resolution).contiguous()
 
 
 @lru_cache(maxsize=16)

@@ -98,12 +98,14 @@ class Footprints:
 
     smooth: list[PixelFootprints]
     """Of pixels that see the environment smoothly, a few views to a batch."""
-    trace_others: Callable[[], PixelFootprints]
-    """Traces those of a sample of the other pixels, which bend the light much or reflect it often."""
+    trace_others: Callable[[], PixelFootprints] | None = None
+    """Traces those of a sample of the other pixels, which bend the light much or reflect it often; None: none."""
 
     def widened(self, blur_px: float) -> "Footprints":
         """Those of a picture that was blurred."""
-        return Footprints([each.widened(blur_px) for each in self.smooth], lambda: self.trace_others().widened(blur_px))
+        others = self.trace_others
+        traced = None if others is None else lambda: others().widened(blur_px)
+        return Footprints([each.widened(blur_px) for each in self.smooth], traced)
 
     @classmethod
     def of(cls, parts: Sequence[PixelFootprints]) -> "Footprints | None":

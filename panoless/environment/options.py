@@ -18,8 +18,8 @@ class FootprintMapOptions:
     robust_scale: float = 0.16
     """Of radiance errors. Chosen by the true maps of Vase and Cola; held-out views would take 0.3."""
     smoothness: NonEmpty[float] = (0.01, 0.05, 0.25)
-    """Weights λ of differences between neighboring texels, in pixels, among which held-out pixels choose. On Sculpture
-    and Vase they take the least where pixels have no noise, and the largest where it is 0.02."""
+    """Weights λ of differences between neighboring texels, in pixels, among which held-out pixels choose, from the
+    middle one on. On Sculpture and Vase they take that where pixels have no noise, and the largest where it is 0.02."""
     held_out: Annotated[int, Meta(ge=2)] = 5
     """Of so many pixels one is held out. Not tuned."""
     least_gain: float = 0.002
@@ -48,6 +48,11 @@ class FootprintMapOptions:
     """Weight of what they add, in pixels."""
     coarse_scale: float = 1.0
     """Robust scale there: while a lamp is far too dark, pixels that see it in part must keep their votes."""
+
+    @property
+    def middle(self) -> int:
+        """The index of the smoothness that is tried first, and taken where nobody asks held-out pixels."""
+        return len(self.smoothness) // 2
 
 
 DEFAULTS = FootprintMapOptions()

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from panoless.environment.cubemap import resample
+from panoless.environment.cubemap import by_face, by_texel, resample
 from panoless.environment.fill import texel_neighbors
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.options import DEFAULTS, FootprintMapOptions
@@ -62,7 +62,7 @@ def chosen_sharpness(
     """What explains every fifth pixel best by the others. From the coarsest map on, a finer, a smoother and a
     sharper one are tried as long as one is better, a finer one by the share `least_gain`.
     """
-    trial, size, rung = _Trial(areas, saturation, options), 0, len(options.smoothness) // 2
+    trial, size, rung = _Trial(areas, saturation, options), 0, options.middle
     tried = {(size, rung): trial.error(resolutions[size], options.smoothness[rung])}
     moves = list(MOVES)
     while moves:
@@ -84,15 +84,15 @@ class _Trial:
     ) -> None:
         self.kept = [each.without(options.held_out, index % options.held_out) for index, each in enumerate(areas)]
         self.asked = [each.every(options.held_out, index % options.held_out) for index, each in enumerate(areas)]
-        self.saturation, self.options = saturation, replace(options, coarse_rounds=0, steps=options.trial_steps)
+        self.saturation, self.options = saturation, replace(options, steps=options.trial_steps)
         self._starts: dict[int, Tensor] = {}
 
     def error(self, resolution: int, smoothness: float) -> float:
         """Mean of ‖e‖²/(‖e‖² + s²) over the pixels that were held out, weighted by trust."""
         if resolution not in self._starts:
             self._starts[resolution] = solve_environment([each.rays() for each in self.kept], resolution)
-        kept = Footprints(self.kept, lambda: PixelFootprints.joined(self.kept))
-        environment = deblur_map(kept, self._starts[resolution], self.saturation, smoothness, self.options)
+        start = self._starts[resolution]
+        environment = deblur_map(Footprints(self.kept), start, self.saturation, smoothness, self.options)
         summed, weights = 0.0, 0.0
         for each in self.asked:
             weight = each.rays().initial_weight()
@@ -121,7 +121,7 @@ def deblur_map(
     lit = torch.stack([(each.radiance >= options.saturated * saturation).any(0) for each in footprints.smooth]).any(0)
     highest = (saturation * torch.where(lit, options.ceiling, 1.0))[:, None, None]
     inner = _eroded(environment >= options.lit * saturation[:, None, None])
-    others = footprints.trace_others() if options.coarse_rounds and inner.any() else None
+    others = footprints.trace_others() if footprints.trace_others is not None and inner.any() else None
     for _ in range(options.rounds):
         if others is not None:
             environment = _brightened(environment, others, inner, saturation, options).minimum(highest)
@@ -206,28 +206,20 @@ class _Smoothness:
     ) -> "_Smoothness":
         """With v of the differences of a map."""
         around = texel_neighbors(environment.shape[-1]).to(environment.device)
-        texels, touched = _by_texel(environment), _by_texel(total).amax(1) > 0
+        texels, touched = by_texel(environment), by_texel(total).amax(1) > 0
         apart = (texels[around] - texels).square().sum(2, keepdim=True)
         return cls(around, smoothness * (touched[around] & touched)[..., None] / (1 + apart / scale**2))
 
     def product(self, image: Float[Tensor, "6 3 L L"]) -> Float[Tensor, "6 3 L L"]:
         """The matrix times a change."""
-        texels = _by_texel(image)
-        return _by_face((self.weights * (texels - texels[self.around])).sum(0), image.shape[-1])
+        texels = by_texel(image)
+        return by_face((self.weights * (texels - texels[self.around])).sum(0), image.shape[-1])
 
     @property
     def diagonal(self) -> Float[Tensor, "6 1 L L"]:
         """Of the matrix."""
         total = self.weights.sum(0)
-        return _by_face(total, round((len(total) / 6) ** 0.5))
-
-
-def _by_texel(image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "T C"]:
-    return image.movedim(1, -1).reshape(-1, image.shape[1])
-
-
-def _by_face(texels: Float[Tensor, "T C"], resolution: int) -> Float[Tensor, "6 C L L"]:
-    return texels.reshape(6, resolution, resolution, -1).movedim(-1, 1)
+        return by_face(total, round((len(total) / 6) ** 0.5))
 
 
 def _brightened(
@@ -237,40 +229,35 @@ def _brightened(
     saturation: Float[Tensor, "3"],
     options: FootprintMapOptions,
 ) -> Float[Tensor, "6 3 L L"]:
-    """The map plus what a coarse one adds within saturated regions; nothing there falls below saturation for it."""
-    lowest = environment.minimum(saturation[:, None, None])
-    for _ in range(options.coarse_rounds):
-        environment = (environment + _brightening(environment, areas, inner, saturation, options)).maximum(lowest)
-    return environment
+    """The map plus what a coarse one adds within saturated regions; nothing there falls below saturation for it.
 
-
-def _brightening(
-    environment: Float[Tensor, "6 3 L L"],
-    areas: PixelFootprints,
-    inner: Float[Tensor, "6 3 L L"],
-    saturation: Float[Tensor, "3"],
-    options: FootprintMapOptions,
-) -> Float[Tensor, "6 3 L L"]:
-    """B X of min_X Σ w ‖A (E + B X) − c‖² + ε ‖X‖², with B `finer` and `coarser` its adjoint."""
+    That is B X of min_X Σ w ‖A (E + B X) − c‖² + ε ‖X‖², with B `finer` and `coarser` its adjoint.
+    """
     resolution = environment.shape[-1]
     texels = cubemap_directions(resolution, device=environment.device).reshape(-1, 3)
+    lowest = environment.minimum(saturation[:, None, None])
 
     def finer(coarse: Float[Tensor, "6 C M M"]) -> Float[Tensor, "6 C L L"]:
         return inner * resample(coarse, resolution)
 
     def coarser(image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "6 C M M"]:
-        return scatter_cubemap(_by_texel(inner * image), texels, options.coarse_resolution)
+        return scatter_cubemap(by_texel(inner * image), texels, options.coarse_resolution)
 
-    equations = _Equations.at(environment, [areas], saturation, options.coarse_scale, 0.0, options.saturated)
-    right_side = coarser(equations.right_side)
-    found = conjugate_gradients(
-        lambda coarse: options.coarse_pull * coarse + coarser(equations.product(finer(coarse))),
-        torch.zeros_like(right_side),
-        right_side,
-        1 / (options.coarse_pull + coarser(equations.total)),
-        options.coarse_steps,
-    )
-    return finer(found)
+    def change_of(environment: Float[Tensor, "6 3 L L"]) -> Float[Tensor, "6 3 L L"]:
+        equations = _Equations.at(environment, [areas], saturation, options.coarse_scale, 0.0, options.saturated)
+        right_side = coarser(equations.right_side)
+        found = conjugate_gradients(
+            lambda coarse: options.coarse_pull * coarse + coarser(equations.product(finer(coarse))),
+            torch.zeros_like(right_side),
+            right_side,
+            1 / (options.coarse_pull + coarser(equations.total)),
+            options.coarse_steps,
+        )
+        return finer(found)
+
+    for _ in range(options.coarse_rounds):
+        environment = (environment + change_of(environment)).maximum(lowest)
+    return environment
 
 
 def _eroded(mask: Tensor) -> Float[Tensor, "6 3 L L"]:

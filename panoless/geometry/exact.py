@@ -1,6 +1,5 @@
 """What kinds in closed form share: exact rays, one map, no steps of optimization."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, cast
 
@@ -135,24 +134,30 @@ class ExactFamily:
         raise ValueError("a kind in closed form is not trained")
 
 
-def areas_of_pixels(
-    views: Views,
-    max_pixels: int,
-    seen: Callable[[TrainView, Int[Tensor, "P"]], tuple[Int[Tensor, "Q"], Float[Tensor, "Q 3"]]],
-) -> Footprints | None:
-    """Four directions over each of about so many pixels at most; None where no pixel has all of them.
-
-    `seen` tells which of a view's pixels see the surroundings by their centers, in order, and where these look in the
-    map. It is asked for pictures that are shifted by parts of a pixel.
+class SeenByCenters(ExactGeometry):
+    """A surface that tells what pixels see by their centers. Over its area, a pixel sees what centers do in pictures
+    that are shifted by parts of a pixel.
     """
-    found = []
-    for view, pixels in at_most_pixels(views, max_pixels):
-        parts = [seen(_shifted(view, *place), pixels) for place in SUB_PIXELS[4]]
-        count = torch.bincount(torch.cat([each for each, _ in parts]), minlength=view.mask.numel())
-        whole = count == len(parts)
-        directions = torch.stack([looks[whole[each]] for each, looks in parts], 1)
-        found.append(PixelFootprints(directions, view.radiance_at(pixels[whole[pixels]])))
-    return Footprints.of(found)
+
+    def seen(self, view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Int[Tensor, "Q"], Float[Tensor, "Q 3"]]:
+        """Which of the pixels see the surroundings, in order, and where these look in the map."""
+        raise NotImplementedError
+
+    def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
+        """The rays of those of the pixels that see the surroundings."""
+        chosen, directions = self.seen(view, pixels)
+        return Rays(directions, view.radiance_at(chosen), incoming=view.directions_world(chosen))
+
+    def footprints(self, views: Views, max_pixels: int) -> Footprints | None:
+        """Four directions over each of about so many pixels at most; None where no pixel has all of them."""
+        found = []
+        for view, pixels in at_most_pixels(views, max_pixels):
+            parts = [self.seen(_shifted(view, *place), pixels) for place in SUB_PIXELS[4]]
+            count = torch.bincount(torch.cat([each for each, _ in parts]), minlength=view.mask.numel())
+            whole = count == len(parts)
+            directions = torch.stack([looks[whole[each]] for each, looks in parts], 1)
+            found.append(PixelFootprints(directions, view.radiance_at(pixels[whole[pixels]])))
+        return Footprints.of(found)
 
 
 def _shifted(view: TrainView, right: float, down: float) -> TrainView:

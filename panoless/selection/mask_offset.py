@@ -33,7 +33,13 @@ def masks_are_doubted(views: Views, geometry: Geometry, errors: Float[np.ndarray
         return False
     if errors.mean() > options.largest_error:
         return True
-    return not -options.doubted_inward_px <= outline_pull_px(views, geometry) <= options.doubted_outward_px
+    return bool(_doubted_pull_px(views, geometry, config))
+
+
+def _doubted_pull_px(views: Views, geometry: Geometry, config: FitConfig) -> float:
+    """How far photographs pull outlines off those of the masks; zero where masks that are right leave as much."""
+    pull, options = outline_pull_px(views, geometry), config.corrections
+    return 0.0 if -options.doubted_inward_px <= pull <= options.doubted_outward_px else pull
 
 
 def with_moved_masks(source: Family, views: Views, fitted: Fitted, config: FitConfig, refit: Refit) -> Fitted:
@@ -43,7 +49,7 @@ def with_moved_masks(source: Family, views: Views, fitted: Fitted, config: FitCo
     Proposals of moved outlines tell the offset. Where these are far from the shape, as of flat faces, they tell
     nothing, and masks are moved by a pixel to where photographs pull the outlines of the fit.
     """
-    options, pulled = config.corrections, outline_pull_px(fitted.corrections.applied(views, config), fitted.geometry)
+    options, said = config.corrections, fitted.corrections.applied(views, config)
 
     def moved_by(offset: float) -> Fitted | None:
         corrections = replace(fitted.corrections, mask_offset_px=offset)
@@ -54,8 +60,8 @@ def with_moved_masks(source: Family, views: Views, fitted: Fitted, config: FitCo
         found = moved_by(offset)
         return found if found is not None and _offset_is_earned(views, fitted, found, config) else None
 
-    found = earned(find_mask_offset(source, fitted.corrections.applied(views, config), fitted, config))
-    if found is None and not -options.doubted_inward_px <= pulled <= options.doubted_outward_px:
+    found = earned(find_mask_offset(source, said, fitted, config))
+    if found is None and (pulled := _doubted_pull_px(said, fitted.geometry, config)):
         found = earned(float(np.copysign(options.pulled_step_px, pulled)))
     if found is None:
         return fitted

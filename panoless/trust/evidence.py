@@ -226,10 +226,9 @@ def _predicting_map(areas: Sequence[PixelFootprints], config: FitConfig) -> Floa
     """The map of these pixels, as fine as they are dense."""
     rays = [each.rays() for each in areas]
     environment = solve_environment(rays, min(config.trust.resolution, densest_resolution(rays)))
-    options = replace(config.footprint_map, coarse_rounds=0, steps=config.footprint_map.trial_steps)
-    footprints = Footprints(list(areas), lambda: PixelFootprints.joined(areas))
-    smoothness = options.smoothness[len(options.smoothness) // 2]
-    return deblur_map(footprints, environment, encoding_of(config).saturation, smoothness, options)
+    options = replace(config.footprint_map, steps=config.footprint_map.trial_steps)
+    saturation, smoothness = encoding_of(config).saturation, options.smoothness[options.middle]
+    return deblur_map(Footprints(list(areas)), environment, saturation, smoothness, options)
 
 
 @dataclass
@@ -301,8 +300,8 @@ def _silhouette(view: TrainView, surface: SurfaceBuffers, options: TrustOptions)
     if min(mask.max(), alpha.max()) < MASK_LEVEL or max(mask.min(), alpha.min()) > MASK_LEVEL:
         return float(max(mask.shape)), float(max(mask.shape)), shared, 1.0
     of_mask, of_fit = silhouette_distance_px(view.mask).cpu().numpy(), mask_distance_px(alpha)
-    inside = np.abs(of_mask)[mask > MASK_LEVEL] > options.missed_inside_px
-    missed = float((alpha[mask > MASK_LEVEL][inside] < MASK_LEVEL).mean()) if inside.any() else 0.0
+    inside = of_mask < -options.missed_inside_px
+    missed = float((alpha[inside] < MASK_LEVEL).mean()) if inside.any() else 0.0
     rows, columns = np.gradient(of_fit)
     near = np.abs(of_fit) < 1
     near[[0, -1]], near[:, [0, -1]] = False, False

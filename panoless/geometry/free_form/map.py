@@ -3,6 +3,7 @@
 from jaxtyping import Float
 from torch import Tensor
 
+from panoless.environment.cubemap import by_face, by_texel
 from panoless.environment.fill import fill_unobserved, texel_neighbors
 from panoless.environment.footprints import PixelFootprints
 from panoless.numeric.conjugate_gradients import conjugate_gradients
@@ -28,9 +29,8 @@ def smoothed_map(
     around = texel_neighbors(resolution).to(environment.device)
 
     def differences(image: Tensor) -> Tensor:
-        texels = image.movedim(1, -1).reshape(-1, image.shape[1])
-        change = 4 * texels - texels[around].sum(0)
-        return change.reshape(6, resolution, resolution, -1).movedim(-1, 1)
+        texels = by_texel(image)
+        return by_face(4 * texels - texels[around].sum(0), resolution)
 
     def product(image: Tensor) -> Tensor:
         return pixels.spread(pixels.seen(image) * weights[:, None], resolution) + smoothness * differences(image)

@@ -11,17 +11,14 @@ from torch import Tensor
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
-from panoless.environment.footprints import Footprints
-from panoless.environment.rays import Rays
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers
-from panoless.geometry.exact import ExactFamily, ExactGeometry, areas_of_pixels
+from panoless.geometry.exact import ExactFamily, SeenByCenters
 from panoless.geometry.height_field.fit import fit_height_field
 from panoless.geometry.height_field.model import (
     HeightField,
     flat_height_field,
     height_field_buffers,
-    height_field_rays,
     visible_reflections,
 )
 from panoless.geometry.surfels.mirror import SurfelMirror
@@ -31,7 +28,7 @@ from shinypartial.core.errors import InputError
 
 
 @dataclass(frozen=True)
-class HeightFieldMirror(ExactGeometry):
+class HeightFieldMirror(SeenByCenters):
     """A mirror that bends: a smooth height over a plane."""
 
     kind: ClassVar[str] = "height_field"
@@ -56,18 +53,10 @@ class HeightFieldMirror(ExactGeometry):
         """Solid pixels whose reflected rays pass the frame."""
         return visible_reflections(self.height_field, view, view.solid).pixels
 
-    def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
-        """The rays of those of the pixels whose reflected rays pass the frame."""
-        return height_field_rays(self.height_field, view, pixels)
-
-    def footprints(self, views: Views, max_pixels: int) -> Footprints | None:
-        """Of the pixels whose reflected rays pass the frame."""
-
-        def seen(view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Int[Tensor, "Q"], Float[Tensor, "Q 3"]]:
-            visible = visible_reflections(self.height_field, view, pixels)
-            return visible.pixels, torch.from_numpy(visible.outgoing).to(view.radiance)
-
-        return areas_of_pixels(views, max_pixels, seen)
+    def seen(self, view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Int[Tensor, "Q"], Float[Tensor, "Q 3"]]:
+        """Those of the pixels whose reflected rays pass the frame."""
+        visible = visible_reflections(self.height_field, view, pixels)
+        return visible.pixels, torch.from_numpy(visible.outgoing).to(view.radiance)
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
         """Coverage by the mirror's edge; depth and normals by intersection."""

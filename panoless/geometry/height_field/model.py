@@ -9,7 +9,6 @@ from torch import Tensor
 
 from panoless.capture.rays import pixel_rays, pose_of, reflect
 from panoless.capture.views import TrainView
-from panoless.environment.rays import Rays
 from panoless.geometry.base import SurfaceBuffers, buffers_from_arrays
 from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.model import Plane
@@ -178,14 +177,6 @@ def visible_reflections(
         chosen,
         plane.surroundings.looked_up(points, outgoing @ height_field.frame),
     )
-
-
-def height_field_rays(height_field: HeightField, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
-    """What pixels of a view observed of the environment."""
-    visible = visible_reflections(height_field, view, pixels)
-    outgoing = torch.from_numpy(visible.outgoing).float().to(view.radiance.device)
-    radiance = view.radiance_at(visible.pixels)
-    return Rays(outgoing, radiance, incoming=view.directions_world(visible.pixels))
 
 
 def height_field_buffers(height_field: HeightField, camera: RasterCamera) -> SurfaceBuffers:

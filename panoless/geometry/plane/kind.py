@@ -10,11 +10,9 @@ from torch import Tensor
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
-from panoless.environment.footprints import Footprints
-from panoless.environment.rays import Rays
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import SOLID_SURFACE_ALPHA, Geometry, Mesh, Proposal, SurfaceBuffers
-from panoless.geometry.exact import ExactFamily, ExactGeometry, areas_of_pixels, looked_up, mirrored_directions
+from panoless.geometry.exact import ExactFamily, SeenByCenters, looked_up, mirrored_directions
 from panoless.geometry.plane.fit import fit_plane
 from panoless.geometry.plane.model import Plane, plane_buffers, unoccluded_share
 from panoless.geometry.surfels.mirror import SurfelMirror
@@ -26,7 +24,7 @@ UNOCCLUDED_SHARE = 0.99
 
 
 @dataclass(frozen=True)
-class PlaneMirror(ExactGeometry):
+class PlaneMirror(SeenByCenters):
     """A flat mirror with a boundary and, perhaps, a frame that stands out before it."""
 
     kind: ClassVar[str] = "plane"
@@ -55,16 +53,8 @@ class PlaneMirror(ExactGeometry):
         share = unoccluded_share(self.plane, view.camera).flatten()[view.solid]
         return view.solid[share > UNOCCLUDED_SHARE]
 
-    def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
-        """The rays of those of the pixels that the plane covers."""
-        pixels, directions = self._seen(view, pixels)
-        return Rays(directions, view.radiance_at(pixels), incoming=view.directions_world(pixels))
-
-    def footprints(self, views: Views, max_pixels: int) -> Footprints | None:
-        """Of the pixels that the plane covers."""
-        return areas_of_pixels(views, max_pixels, self._seen)
-
-    def _seen(self, view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Int[Tensor, "Q"], Float[Tensor, "Q 3"]]:
+    def seen(self, view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Int[Tensor, "Q"], Float[Tensor, "Q 3"]]:
+        """Those of the pixels that the plane covers."""
         buffers = plane_buffers(self.plane, view.camera)
         pixels = pixels[buffers.alpha.flatten()[pixels] > SOLID_SURFACE_ALPHA]
         directions = mirrored_directions(view.camera, pixels, buffers.normals_camera.flatten(1)[:, pixels])
