@@ -295,10 +295,15 @@ def _silhouette(view: TrainView, surface: SurfaceBuffers, options: TrustOptions)
     the share of the pixels well inside the mask that are not covered.
 
     A pixel near the fitted contour has the mask's signed distance less the fitted one; a shift t changes it by n·t.
+    Where both fill the picture there is no contour to compare; where one fills it, or is not in it, all is wrong.
     """
     mask, alpha, shared = view.mask.cpu().numpy(), surface.alpha.cpu().numpy(), overlap(surface.alpha, view.mask)
+    if min(mask.min(), alpha.min()) > MASK_LEVEL:
+        return 0.0, 0.0, shared, 0.0
     if min(mask.max(), alpha.max()) < MASK_LEVEL or max(mask.min(), alpha.min()) > MASK_LEVEL:
-        return float(max(mask.shape)), float(max(mask.shape)), shared, 1.0
+        solid = mask > MASK_LEVEL
+        missed = float((alpha[solid] < MASK_LEVEL).mean()) if solid.any() else 0.0
+        return float(max(mask.shape)), float(max(mask.shape)), shared, missed
     of_mask, of_fit = silhouette_distance_px(view.mask).cpu().numpy(), mask_distance_px(alpha)
     inside = of_mask < -options.missed_inside_px
     missed = float((alpha[inside] < MASK_LEVEL).mean()) if inside.any() else 0.0

@@ -98,6 +98,16 @@ def test_what_the_shape_leaves_bare_is_measured_and_named(views: Views) -> None:
     assert "bare" in verdict.reason
 
 
+def test_a_mirror_that_fills_all_pictures_misses_no_outline() -> None:
+    """Its outline lies outside of them; what a smaller one leaves bare of them is still missed."""
+    wide = plane_of(10 * RECTANGLE)
+    views = reflecting_views(wide, arc(6, 20.0, size=32))
+    assert all(view.mask.min() == 1 for view in views.train)
+    found, bare = (gather_evidence(views, PlaneMirror(each), VISIBILITY, CONFIG) for each in (wide, MIRROR.plane))
+    assert (found.silhouette_px, found.view_shift_px, found.missed) == (0, 0, 0)
+    assert 0.3 < bare.missed < 1
+
+
 def test_turned_cameras_are_measured_and_named(views: Views) -> None:
     """A turn of 1.5° about the horizontal axis, up and down in turn, shifts each silhouette by that angle; a verdict
     says so.
