@@ -72,8 +72,9 @@ def fit_free_form(
     poses of the views where these are unknowns.
 
     Rounds are taken with four fifths of the views as long as the others gain by them, and the last of those once more
-    with all. After the rounds that are always taken, hollows are searched, parts that pixels distrust are mended, and
-    poses are set `free`, under the prior that views state of them.
+    with all, in which outlines count more where photographs agree with them. After the rounds that are always taken,
+    hollows are searched, parts that pixels distrust are mended, and poses are set `free`, under the prior that views
+    state of them.
     """
     kept, held_out = split_held_out(views.train)
     solved = replace(views, train=tuple(kept)) if kept and held_out else views
@@ -105,7 +106,7 @@ def fit_free_form(
             progress.advance(steps=skipped)
         if stage.poses is not None and held_out:
             stage = replace(stage, poses=_joined(stage.poses, found_poses(solved, tested, stage, options)))
-        stage = take_round(views, stage, stage.last, options, progress)
+        stage = take_round(views, stage, stage.last, options, progress, last=True)
     return stage.surface, stage.trust, stage.poses
 
 
@@ -124,13 +125,13 @@ def follow_views(
             glance = replace(
                 settings, steps=options.focal_glance_steps, rays=min(options.focal_glance_rays, settings.rays)
             )
-            seen = take_round(views, stage, glance, options)
+            seen = take_round(views, stage, glance, options, last=True)
             if seen.focal is not None and abs(seen.focal) < options.least_focal_change:
                 return seen
         if longer or stage.focal is not None or not stage.surface.surroundings.is_far:
             settings = replace(settings, steps=options.shared_steps)
             options = replace(options, least_gain=options.least_shared_gain)
-        return take_round(views, stage, settings, options, Progress("fitting on", settings.steps))
+        return take_round(views, stage, settings, options, Progress("fitting on", settings.steps), last=True)
 
 
 def coarse_stage(
@@ -166,19 +167,20 @@ def poses_by_outlines(
     prior of the sizes that turns and shifts were found to have.
     """
     wide, settings = replace(options, outline_scale_px=options.pose_outline_scale_px), options.outline_round
+    glance = replace(wide, outline_points=min(options.pose_glance_points, options.outline_points))
     with torch.no_grad():
-        cost, start, told = math.inf, starts[0], None
+        cost, least, start = math.inf, math.inf, starts[0]
         for each in starts:
-            free = coarse_stage(views, each, [settings], wide, poses=Poses.none(len(views.train)))
-            if told is None or free.cost < told.cost:
-                start, told = each, free
+            free = coarse_stage(views, each, [settings], glance, poses=Poses.none(len(views.train))).cost
+            if free < least:
+                least, start = free, each
             if not always:
-                cost = min(cost, coarse_stage(views, each, [settings], wide).cost)
-            if views_agree and told.cost > options.largest_cost_left * cost:
+                cost = min(cost, coarse_stage(views, each, [settings], glance).cost)
+            if views_agree and least > options.largest_cost_left * cost:
                 return None
-        assert told is not None, "there is a start"
-        if told.cost > options.largest_cost_left * cost:
+        if least > options.largest_cost_left * cost:
             return None
+        told = coarse_stage(views, start, [settings], wide, poses=Poses.none(len(views.train)))
         task, cameras = make_task(views, settings, wide), StatedCameras.of(views)
         stated = task.pose_prior
         for _ in range(options.pose_prior_rounds):
@@ -248,9 +250,15 @@ def distrusted_share(views: Views, stage: FitStage, options: FreeFormOptions) ->
 
 
 def take_round(
-    views: Views, stage: FitStage, settings: FreeFormRound, options: FreeFormOptions, progress: Progress | None = None
+    views: Views,
+    stage: FitStage,
+    settings: FreeFormRound,
+    options: FreeFormOptions,
+    progress: Progress | None = None,
+    *,
+    last: bool = False,
 ) -> FitStage:
-    """A stage after the steps of a round."""
+    """A stage after the steps of a round; in the `last` one outlines count more where photographs agree with them."""
     surface = stage.surface
     if stage.settings is None or stage.settings.cells != settings.cells:
         surface = surface.resampled(settings.cells)
@@ -260,6 +268,8 @@ def take_round(
     solution = Solution.at(
         task, surface, stage.trust, stage.environment, options.first_map_rounds, stage.poses, stage.focal
     )
+    if last and solution.outlines_agree:
+        solution = replace(solution, task=task.outlined(options.agreed_outline_gain))
     solution, damping = take_steps(solution, stage.damping, progress)
     found = replace(
         stage,

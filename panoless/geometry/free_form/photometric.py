@@ -96,6 +96,11 @@ class Task:
         """Weights of squared turns and shifts: the inverse of what the views state."""
         return np.linalg.inv(np.array(self.cameras.covariances))
 
+    def outlined(self, gain: float) -> "Task":
+        """The same with another factor of the outlines' weight."""
+        settings = replace(self.settings, outline_gain=gain)
+        return replace(self, settings=settings, outline_weight=self.outline_weight * gain / self.settings.outline_gain)
+
     def seen_from(self, rays: PixelRays, poses: Poses | None, focal: float | None) -> PixelRays:
         """Rays where their cameras are, through the lens that they have."""
         rays = rays if focal is None else rays.zoomed(focal, self.cameras.rotations[rays.view, 2])
@@ -239,6 +244,19 @@ class Solution:
             self.task.photograph_weight * sigmas**2,
             self.task.options,
         )
+
+    @property
+    def outlines_agree(self) -> bool:
+        """Whether outlines lie within `agreed_outline_px` of their masks' in the median, and within `agreed_pull_px` in
+        the median over views of the median with a sign, which wrong masks move.
+        """
+        view, options = self.task.outlines.view, self.task.options
+        met = self.silhouettes.weights[: len(view)] > 0
+        if not met.any():
+            return False
+        view, apart = view[met], self.silhouettes.residual[: len(view), 0][met]
+        pulled = np.median([np.median(apart[view == each]) for each in np.unique(view)])
+        return bool(np.median(np.abs(apart)) <= options.agreed_outline_px and abs(pulled) <= options.agreed_pull_px)
 
     @cached_property
     def gauge(self) -> Rows:

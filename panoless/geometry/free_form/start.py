@@ -25,7 +25,7 @@ from shinypartial.io.progress import Progress
 @dataclass(frozen=True)
 class FirstSurfaces:
     """What a fit may start from, in one world: the plate whose pixels disagree least, held inside the hull, the hull
-    itself, and the plates that descend.
+    itself, and the plates, which descend as the hull does.
     """
 
     plain: LevelSet
@@ -57,24 +57,24 @@ def first_surfaces(views: Views, config: FitConfig) -> FirstSurfaces:
 
     disagreement = _disagreement(views, options)
     plates = {tension: level_set(completed(known, first, tension, rounds=1)) for tension in options.start_tensions}
-    order = sorted(plates, key=lambda tension: disagreement(plates[tension]))
-    followed = tuple(plates[tension] for tension in order[: options.descent.followed])
-    plain, hull = level_set(completed(known, first, order[0])), level_set(known.surface)
-    return FirstSurfaces(plain, hull, followed, known.hull.left_out == 0)
+    best = min(plates, key=lambda tension: disagreement(plates[tension]))
+    plain, hull = level_set(completed(known, first, best)), level_set(known.surface)
+    return FirstSurfaces(plain, hull, tuple(plates.values()), known.hull.left_out == 0)
 
 
 def started(views: Views, first: FirstSurfaces, options: FreeFormOptions) -> LevelSet:
-    """What the best of the plates descends to, if pixels agree better under it than under the plain surface, both after
-    the first round of the fit. Each plate descends twice at first, held by outlines and not; pixels tell which goes on.
-    Where they agree well under the plain surface, nothing descends.
+    """What the best of the plates, or the hull, descends to, if pixels agree better under it than under the plain
+    surface, both after the first round of the fit. Each descends held by outlines and not; after the first round of
+    that, pixels tell which ways go on to the end. Where they agree well under the plain surface, nothing descends.
     """
     descent, plain = options.descent, first.surface
     if not descent.rounds:
         return plain
     short = replace(options, outline_points=min(descent.outline_points, options.outline_points))
-    rounds = {held: tuple(replace(each, held=held) for each in descent.rounds) for held in (True, False)}
-    tried = descent.rounds[: descent.tried] * (len(first.plates) * len(rounds))
-    steps = [each.steps for each in (*tried, *descent.rounds[descent.tried :], *options.rounds[:1])]
+    starts = [replace(each, surroundings=first.surroundings) for each in (*first.plates, first.hull)]
+    ways = {held: [replace(each, held=held) for each in descent.rounds] for held in (True, False)}
+    most = (len(ways) * len(starts), *[descent.followed] * (len(descent.rounds) - 1))
+    steps = sum(count * each.steps for count, each in zip(most, descent.rounds, strict=True))
     disagreement = _disagreement(views, options)
 
     def taken(surface: LevelSet, rounds: Sequence[FreeFormRound]) -> LevelSet:
@@ -87,13 +87,12 @@ def started(views: Views, first: FirstSurfaces, options: FreeFormOptions) -> Lev
         disagreed = left(plain)
         if disagreed < descent.least_disagreement:
             return plain
-        progress = Progress("looking for a start", sum(steps))
-        plates = [replace(plate, surroundings=first.surroundings) for plate in first.plates]
-        ways = [(held, taken(plate, rounds[held][: descent.tried])) for plate in plates for held in rounds]
-        held, best = min(ways, key=lambda way: disagreement(way[1]))
-        descended = taken(best, rounds[held][descent.tried :])
-        costs = (plain, disagreed), (descended, left(descended, progress))
-        return keep_if_better(costs, lambda each: each[1], descent.least_gain)[0]
+        progress = Progress("looking for a start", steps + descent.followed * options.rounds[0].steps)
+        begun = [(held, taken(start, rounds[:1])) for start in starts for held, rounds in ways.items()]
+        begun.sort(key=lambda way: disagreement(way[1]))
+        ended = [taken(surface, ways[held][1:]) for held, surface in begun[: descent.followed]]
+        best = min(((surface, left(surface, progress)) for surface in ended), key=lambda each: each[1])
+        return keep_if_better(((plain, disagreed), best), lambda each: each[1], descent.least_gain)[0]
 
 
 def _disagreement(views: Views, options: FreeFormOptions) -> Callable[[LevelSet], float]:

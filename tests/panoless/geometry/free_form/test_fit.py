@@ -289,14 +289,15 @@ def with_waves(surface: LevelSet) -> LevelSet:
 
 @pytest.mark.slow
 def test_a_start_that_descended_is_taken_where_pixels_agree_better() -> None:
-    """Not a hull with waves but what the hull leads to; and the hull itself where no gain is enough."""
+    """Not the plain surface with waves but what a plate or the hull leads to; the plain one where no gain is enough."""
     views = body_views(sphere(), 8, 32)
     proposal = FreeFormFamily().propose(views, CONFIG, asked=True)
     assert proposal is not None
     right, one = proposal.shape.surface, FreeFormRound(12, 4, 0.5, 1, 500, 100.0, 1, anchored=True)
-    options = replace(OPTIONS, rounds=(replace(one, anchored=False),), descent=DescentOptions(rounds=(one,), tried=1))
+    options = replace(OPTIONS, rounds=(replace(one, anchored=False),), descent=DescentOptions(rounds=(one,)))
     wrong = with_waves(right)
     assert started(views, FirstSurfaces(wrong, wrong, (right,)), options).cells == one.cells
+    assert started(views, FirstSurfaces(wrong, right, (wrong,)), options).cells == one.cells
     never = replace(options, descent=replace(options.descent, least_gain=1.0))
     assert started(views, FirstSurfaces(right, right, (wrong,)), never).cells == right.cells
 
@@ -307,7 +308,7 @@ def test_nothing_descends_where_pixels_agree_on_the_plain_surface() -> None:
     right = first_surfaces(views, CONFIG).plain
     wrong = with_waves(right)
     one = FreeFormRound(12, 4, 0.5, 1, 500, 100.0, 1, anchored=True)
-    content = DescentOptions(rounds=(one,), tried=1, least_disagreement=np.inf)
+    content = DescentOptions(rounds=(one,), least_disagreement=np.inf)
     options = replace(OPTIONS, rounds=(replace(one, anchored=False),), descent=content)
     assert started(views, FirstSurfaces(wrong, wrong, (right,)), options).coefficients is wrong.coefficients
 
@@ -448,25 +449,29 @@ def test_a_wrong_focal_length_is_found_beside_the_shape() -> None:
     assert np.median(after) < 0.3 * np.median(before)
 
 
-@pytest.mark.slow
 def test_flat_faces_that_no_outline_shows_are_found_by_a_descent() -> None:
-    """The corner of a block faces the cameras: the first surface is wrong by 8° there, and first rounds alone stay."""
+    """The corner of a block faces the cameras. By the median of normals a start that descended is wrong by 1.6°, the
+    plain one by 22°.
+    """
     views = body_views(block(), VIEWS, SIZE_PX)
+    proposal = FreeFormFamily().propose(views, CONFIG, asked=True)
+    assert proposal is not None
 
     def error_deg(options: FreeFormOptions) -> float:
-        return float(np.median(normal_errors_deg(fitted(views, options), block(), views, cameras_around(7, 60)[1::2])))
+        start = started(views, proposal.shape, options)
+        return float(np.median(normal_errors_deg(start, block(), views, cameras_around(7, 60)[1::2])))
 
-    assert error_deg(replace(OPTIONS, descent=DescentOptions())) < 1.0 < 3.0 < error_deg(OPTIONS)
+    assert error_deg(replace(OPTIONS, descent=DescentOptions())) < 3.0 < 12.0 < error_deg(OPTIONS)
 
 
 def test_outlines_hold_faces_that_maps_of_few_texels_would_turn() -> None:
-    """After two rounds of the descent from a rounded plate, by the mean of normals: 2.6° held, 21° by pixels alone."""
+    """After two rounds of the descent from a rounded plate, by the mean of normals: 3.3° held, 17° by pixels alone."""
     body = block(exponent=10.0)
     views = body_views(body, 16, 56)
     config = replace(CONFIG, free_form=replace(OPTIONS, start_tensions=DEFAULTS.start_tensions))
     proposal = FreeFormFamily().propose(views, config, asked=True)
     assert proposal is not None
-    first = proposal.shape.plates[-1]
+    first = proposal.shape.plates[1]
 
     def error_deg(*, held: bool) -> float:
         rounds = [replace(each, held=held) for each in DescentOptions().rounds[:2]]
@@ -557,6 +562,23 @@ def test_outlines_tell_cameras_that_are_turned_by_two_degrees(body: Body) -> Non
     assert start is not None
     assert start.poses is not None
     assert left_deg(start.poses, wrong) < 0.5
+
+
+def test_photographs_agree_with_masks_unless_outlines_lie_to_one_side_of_them(solution: Solution) -> None:
+    """A surface that is larger by 0.05 px is as near to the masks as theirs may be, but not as one that they tell."""
+
+    def apart_px(moved: Solution) -> float:
+        return float(np.median(moved.silhouettes.residual[: len(moved.task.outlines.view)]))
+
+    def larger(cells: float) -> Solution:
+        surface = replace(solution.surface, coefficients=solution.surface.coefficients - cells)
+        return replace(solution, surface=surface)
+
+    cells_a_pixel = 0.01 / (apart_px(larger(0.0)) - apart_px(larger(0.01)))
+    level = apart_px(solution) * cells_a_pixel
+    assert larger(level).outlines_agree
+    for off_px in (-0.2, -0.05, 0.05, 0.2):
+        assert not larger(level + off_px * cells_a_pixel).outlines_agree
 
 
 def test_rays_that_pass_the_box_of_a_surface_cost_as_outliers(ring: tuple[Views, FreeFormMirror]) -> None:
