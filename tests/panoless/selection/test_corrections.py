@@ -148,26 +148,29 @@ def test_outlines_of_the_true_surface_lie_where_masks_were(offset_px: float) -> 
     assert outline_pull_px(views, MIRROR) == pytest.approx(-offset_px, abs=0.1)
 
 
-@pytest.mark.parametrize(("grown_px", "tried"), [(1.0, [-2.0, -1.0]), (-1.0, [-2.0, 1.0]), (0.0, [-2.0])])
-def test_where_proposals_tell_no_offset_masks_move_to_where_outlines_are_pulled(
-    monkeypatch: pytest.MonkeyPatch, grown_px: float, tried: list[float]
+@pytest.mark.parametrize(
+    ("small_px", "tried"),
+    [(2.0, [1, -1, 2, 3]), (-1.0, [1, -1, -2]), (0.0, [1, -1]), (0.6, [1, -1, 2]), (9.0, [1, -1, 2, 3, 4, 5, 6])],
+)
+def test_masks_are_followed_as_long_as_held_out_views_gain(
+    monkeypatch: pytest.MonkeyPatch, small_px: float, tried: list[float]
 ) -> None:
-    """A wrong offset by proposals is refused; then a pixel toward the true outlines is tried, where they are pulled."""
-    views, proposal = (
-        with_masks(reflecting_views(MIRROR.plane, arc(6, size=64)), grown_px),
-        Proposal(MIRROR.plane, 0, 1),
-    )
-    first, moved = Fitted(MIRROR, PosedProposal(proposal)), []
+    """From pixel to pixel, each on from the fit before, up to the largest offset."""
+    first, ways = Fitted(MIRROR, PosedProposal(Proposal(MIRROR.plane, 0, 1))), []
 
-    def earned(_views: Views, _before: Fitted, after: Fitted, _config: FitConfig) -> bool:
-        moved.append(after.corrections.mask_offset_px)
-        return after.corrections.mask_offset_px == pytest.approx(-grown_px)
+    def moved_by(offset_px: float, before: Fitted, *, anew: bool) -> Fitted:
+        ways.append((before.corrections.mask_offset_px, offset_px, anew))
+        return replace(first, corrections=Corrections(offset_px))
 
-    monkeypatch.setattr(mask_offset, "find_mask_offset", lambda *_: -2.0)
-    monkeypatch.setattr(mask_offset, "_offset_is_earned", earned)
-    found = mask_offset.with_moved_masks(FAMILIES["plane"], views, first, CONFIG, lambda _, before, anew: first)
-    assert moved == tried
-    assert found.corrections.mask_offset_px == (-grown_px if grown_px else 0.0)
+    def errors(_views: Views, *fits: object) -> list[np.ndarray]:
+        return [np.full(8, 0.1 + abs(each.corrections.mask_offset_px - small_px)) for each in fits[:2]]
+
+    monkeypatch.setattr(mask_offset, "errors_in_common", errors)
+    views = reflecting_views(MIRROR.plane, arc(3, size=16))
+    found = mask_offset.followed_offset(views, first, moved_by, CONFIG)
+    assert [offset for _, offset, _ in ways] == tried
+    assert all(offset - before in (-1, 1) and not anew for before, offset, anew in ways)
+    assert found == min((0.0, *tried), key=lambda offset: abs(offset - small_px))
 
 
 @pytest.mark.slow
