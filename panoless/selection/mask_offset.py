@@ -82,7 +82,7 @@ def followed_offset(views: Views, fitted: Fitted, moved_by: _MovedFit, config: F
     small leave 0.71 and 0.56 of the error after a step outward, 1.40 and 1.26 after one inward; drum with masks 1 px
     too large 1.11 and 0.74; twist with right ones 1.12 and 1.08.
     """
-    step, best = config.corrections.followed_step_px, fitted
+    step = config.corrections.followed_step_px
 
     def gain_of(offset_px: float, before: Fitted) -> tuple[float, Fitted]:
         """Share of the error that is left, and the fit; as it was where it is not clearly better."""
