@@ -234,7 +234,7 @@ class FreeFormOptions:
     agreed_outline_gain: Positive = 9.0
     """Factor of the outlines' weight in the last round of all, where photographs agree with the masks. After the rounds
     of `fast` it takes normals of chrome-block from 0.162° to 0.137°, of drum from 0.136° to 0.101°, of twist from
-    0.237° to 0.209°, and those of sculpture and pebble by 0.003° and 0.005°; 3 gives half of that."""
+    0.237° to 0.209°, and those of sculpture by 0.003°; 3 gives half of that."""
     agreed_outline_px: Positive = 0.1
     """They agree where the outlines are this near to those of the masks: 0.05 to 0.06 px under right masks, more where
     the shape is wrong…"""
