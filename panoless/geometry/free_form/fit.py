@@ -79,8 +79,9 @@ def fit_free_form(
     kept, held_out = split_held_out(views.train)
     solved = replace(views, train=tuple(kept)) if kept and held_out else views
     tested = replace(views, train=tuple(held_out))
-    every = [*options.rounds, *options.finer, (*options.rounds, *options.finer)[-1]]
-    progress = Progress("fitting a free-form surface", sum(settings.steps for settings in every))
+    steps = [settings.steps for settings in (*options.rounds, *options.finer)]
+    again = max(steps[len(options.rounds) - 1 :])
+    progress = Progress("fitting a free-form surface", sum(steps) + again)
 
     def error(stage: FitStage) -> float:
         return held_out_error(solved, tested, stage, options)
