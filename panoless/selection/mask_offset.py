@@ -1,7 +1,6 @@
 """Masks that are too small or too large by one distance, where held-out views ask for it."""
 
 from dataclasses import replace
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -26,13 +25,6 @@ from panoless.selection.fitted import (
 from panoless.selection.held_out import is_clearly_lower
 
 
-@runtime_checkable
-class _MovedFit(Protocol):
-    """Fits to masks moved outward by so many pixels, on from a fit or anew."""
-
-    def __call__(self, offset_px: float, before: Fitted, *, anew: bool) -> Fitted | None: ...
-
-
 def masks_are_doubted(views: Views, geometry: Geometry, errors: Float[np.ndarray, "V"], config: FitConfig) -> bool:
     """Whether a geometry leaves much unexplained, or photographs pull its outlines off those of the masks; not where
     another kind takes it on.
@@ -53,28 +45,32 @@ def with_moved_masks(source: Family, views: Views, fitted: Fitted, config: FitCo
     Proposals of moved outlines tell the offset of kinds whose proposals are near to their fits. A kind that goes on
     from a fit tells it by that: hulls of flat faces say nothing of it.
     """
-    options, said = config.corrections, fitted.corrections.applied(views, config)
-
-    def moved_by(offset_px: float, before: Fitted, *, anew: bool) -> Fitted | None:
-        corrections = replace(fitted.corrections, mask_offset_px=offset_px)
-        again = refit(corrections.applied(views, config), before, anew=anew)
-        return None if again is None else replace(again, corrections=corrections)
-
-    goes_on = source.finds_poses
-    offset = (
-        followed_offset(views, fitted, moved_by, config) if goes_on else find_mask_offset(source, said, fitted, config)
-    )
-    found = moved_by(offset, fitted, anew=True) if offset else None
+    options, goes_on = config.corrections, source.finds_poses
+    if goes_on:
+        offset = followed_offset(views, fitted, config, refit)
+    else:
+        offset = find_mask_offset(source, fitted.corrections.applied(views, config), fitted, config)
+    found = _moved_by(offset, views, fitted, config, refit, anew=True) if offset else None
     if found is None or not _offset_is_earned(views, fitted, found, config):
         return fitted
     pull = outline_pull_px(found.corrections.applied(views, config), found.geometry)
     if abs(pull) < options.least_pull_px:
         return found
-    nearer = moved_by(found.corrections.mask_offset_px + pull / options.pull_share, found, anew=not goes_on)
+    nearer_px = found.corrections.mask_offset_px + pull / options.pull_share
+    nearer = _moved_by(nearer_px, views, found, config, refit, anew=not goes_on)
     return nearer if nearer is not None and _explains_more(views, found, nearer, config) else found
 
 
-def followed_offset(views: Views, fitted: Fitted, moved_by: _MovedFit, config: FitConfig) -> float:
+def _moved_by(
+    offset_px: float, views: Views, before: Fitted, config: FitConfig, refit: Refit, *, anew: bool
+) -> Fitted | None:
+    """Fitted to masks that are moved outward by so much in all, on from a fit or anew."""
+    corrections = replace(before.corrections, mask_offset_px=offset_px)
+    again = refit(corrections.applied(views, config), before, anew=anew)
+    return None if again is None else replace(again, corrections=corrections)
+
+
+def followed_offset(views: Views, fitted: Fitted, config: FitConfig, refit: Refit) -> float:
     """By how much all masks are too small, in pixels: to where held-out views are clearly better explained as a fit
     goes on from pixel to pixel, outward or inward.
 
@@ -82,21 +78,21 @@ def followed_offset(views: Views, fitted: Fitted, moved_by: _MovedFit, config: F
     small leave 0.71 and 0.56 of the error after a step outward, 1.40 and 1.26 after one inward; drum with masks 1 px
     too large 1.11 and 0.74; twist with right ones 1.12 and 1.08.
     """
-    step = config.corrections.followed_step_px
+    step, largest = config.corrections.followed_step_px, config.corrections.largest_px
 
-    def gain_of(offset_px: float, before: Fitted) -> tuple[float, Fitted]:
+    def followed(offset_px: float, before: Fitted) -> tuple[float, Fitted]:
         """Share of the error that is left, and the fit; as it was where it is not clearly better."""
-        after = moved_by(offset_px, before, anew=False)
+        after = _moved_by(offset_px, views, before, config, refit, anew=False)
         if after is None:
             return 1.0, before
         was, is_now = errors_in_common(views, before, after, config)
         left = float(is_now.mean() / max(was.mean(), 1e-12))
         return (left, after) if is_clearly_lower(is_now, was, config.selection) else (1.0, before)
 
-    best = min((gain_of(each, fitted) for each in (step, -step)), key=lambda each: each[0])[1]
-    direction = np.sign(best.corrections.mask_offset_px)
-    while direction and abs(best.corrections.mask_offset_px) + step <= config.corrections.largest_px:
-        farther = gain_of(best.corrections.mask_offset_px + float(direction) * step, best)[1]
+    _, best = min((followed(each, fitted) for each in (step, -step)), key=lambda each: each[0])
+    onward = float(np.copysign(step, best.corrections.mask_offset_px))
+    while best is not fitted and abs(best.corrections.mask_offset_px) + step <= largest:
+        _, farther = followed(best.corrections.mask_offset_px + onward, best)
         if farther is best:
             break
         best = farther

@@ -65,7 +65,7 @@ class CorrectionOptions:
     pull_share: Positive = 0.17
     """Share of a small offset by which outlines of a fit give way. On vase 0.18, on sculpture 0.16."""
     followed_step_px: Positive = 1.0
-    """By so much masks are moved as these go on. Not tuned."""
+    """By so much masks are moved each time that such a kind goes on. Not tuned."""
     least_pull_px: Positive = 0.02
     """The fit to moved masks stays where its outlines lie nearer to them than this. With masks that are right it is
     0.001 on vase and 0.004 on sculpture."""

@@ -52,8 +52,8 @@ class TrustOptions:
     missed_inside_px: Positive = 4.0
     """Pixels as far inside the masks are asked whether the surface covers them. Not tuned."""
     largest_missed: Positive = 0.03
-    """Share of these that it leaves bare from which it is. On the trial shape Pawn, whose neck comes apart, it is 0.04,
-    and 0 on the development scenes."""
+    """Share of these that it leaves bare from which it is. On the trial shape Pawn, where its neck comes apart, it is
+    0.04, and 0 on the development scenes."""
     least_viewed: Positive = 0.08
     """Share of all directions near those of cameras, up to which a fit is doubted. It leaves Mirror trusted, whose 50
     views have 0.145. At 160 px arcs of 30° have 0.083 on it and on Vase, and cost 13 and 4.6 dB."""

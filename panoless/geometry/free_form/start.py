@@ -73,8 +73,7 @@ def started(views: Views, first: FirstSurfaces, options: FreeFormOptions) -> Lev
     short = replace(options, outline_points=min(descent.outline_points, options.outline_points))
     starts = [replace(each, surroundings=first.surroundings) for each in (*first.plates, first.hull)]
     ways = {held: [replace(each, held=held) for each in descent.rounds] for held in (True, False)}
-    most = (len(ways) * len(starts), *[descent.followed] * (len(descent.rounds) - 1))
-    steps = sum(count * each.steps for count, each in zip(most, descent.rounds, strict=True))
+    begin, *onward = (each.steps for each in (*descent.rounds, options.rounds[0]))
     disagreement = _disagreement(views, options)
 
     def taken(surface: LevelSet, rounds: Sequence[FreeFormRound]) -> LevelSet:
@@ -87,7 +86,7 @@ def started(views: Views, first: FirstSurfaces, options: FreeFormOptions) -> Lev
         disagreed = left(plain)
         if disagreed < descent.least_disagreement:
             return plain
-        progress = Progress("looking for a start", steps + descent.followed * options.rounds[0].steps)
+        progress = Progress("looking for a start", len(starts) * len(ways) * begin + descent.followed * sum(onward))
         begun = [(held, taken(start, rounds[:1])) for start in starts for held, rounds in ways.items()]
         begun.sort(key=lambda way: disagreement(way[1]))
         ended = [taken(surface, ways[held][1:]) for held, surface in begun[: descent.followed]]

@@ -158,18 +158,20 @@ def test_masks_are_followed_as_long_as_held_out_views_gain(
     """From pixel to pixel, each on from the fit before, up to the largest offset."""
     first, ways = Fitted(MIRROR, PosedProposal(Proposal(MIRROR.plane, 0, 1))), []
 
-    def moved_by(offset_px: float, before: Fitted, *, anew: bool) -> Fitted:
-        ways.append((before.corrections.mask_offset_px, offset_px, anew))
-        return replace(first, corrections=Corrections(offset_px))
+    def refit(_views: Views, _before: Fitted, *, anew: bool) -> Fitted:
+        assert not anew
+        return first
 
-    def errors(_views: Views, *fits: object) -> list[np.ndarray]:
-        return [np.full(8, 0.1 + abs(each.corrections.mask_offset_px - small_px)) for each in fits[:2]]
+    def errors(_views: Views, before: Fitted, after: Fitted, _config: FitConfig) -> list[np.ndarray]:
+        offsets = [each.corrections.mask_offset_px for each in (before, after)]
+        ways.append(offsets)
+        return [np.full(8, 0.1 + abs(offset - small_px)) for offset in offsets]
 
     monkeypatch.setattr(mask_offset, "errors_in_common", errors)
     views = reflecting_views(MIRROR.plane, arc(3, size=16))
-    found = mask_offset.followed_offset(views, first, moved_by, CONFIG)
-    assert [offset for _, offset, _ in ways] == tried
-    assert all(offset - before in (-1, 1) and not anew for before, offset, anew in ways)
+    found = mask_offset.followed_offset(views, first, CONFIG, refit)
+    assert [offset for _, offset in ways] == tried
+    assert all(offset - before in (-1, 1) for before, offset in ways)
     assert found == min((0.0, *tried), key=lambda offset: abs(offset - small_px))
 
 
