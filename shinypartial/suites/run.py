@@ -56,12 +56,13 @@ def run_suite(folder: Path, plan: Plan, cores: int, arguments: Sequence[str] = (
 def snakemake_arguments(folder: Path, cores: int, arguments: Sequence[str]) -> list[str]:
     """The command line of Snakemake; cores are those of this machine, unless an executor has machines of its own."""
     words = ["--snakefile", str(SNAKEFILE), "--directory", str(folder.resolve()), "--nolock", "--rerun-incomplete"]
-    words += ["--config", f"folder={folder.resolve()}", "--keep-going", "--rerun-triggers", "mtime"]
+    words += ["--config", f"folder={folder.resolve()}", "--rerun-triggers", "mtime"]
     if not any(word.partition("=")[0] in EXECUTOR for word in arguments):
         words += ["--cores", str(cores)]
     if DRY_RUN.isdisjoint(arguments):
         words += ["--quiet", "all"]
-    return [*words, *arguments]
+    # Targets may follow, which an option that takes several values before them would swallow.
+    return [*words, "--keep-going", *arguments]
 
 
 def forget_failures(folder: Path, plan: Plan) -> None:

@@ -66,10 +66,18 @@ def test_a_job_that_was_stopped_has_not_failed(tmp_path: Path) -> None:
 
 
 def test_arguments_of_snakemake(tmp_path: Path) -> None:
-    assert snakemake_arguments(tmp_path, 2, [])[-4:] == ["--cores", "2", "--quiet", "all"]
+    assert "--cores 2 --quiet all" in " ".join(snakemake_arguments(tmp_path, 2, []))
     words = snakemake_arguments(tmp_path, 2, ["--executor", "slurm", "--jobs", "50"])
     assert "--cores" not in words
     assert words[-4:] == ["--executor", "slurm", "--jobs", "50"]
+
+
+@needs_snakemake
+def test_further_words_may_be_targets(tmp_path: Path) -> None:
+    from snakemake.cli import get_argument_parser
+
+    words = snakemake_arguments(tmp_path, 2, ["done/score/a", "done/score/b"])
+    assert get_argument_parser().parse_args(words).targets == ["done/score/a", "done/score/b"]
 
 
 def test_without_snakemake_the_message_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
