@@ -4,7 +4,15 @@ import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 
-from panoless.kernels.cpu.compilation import PLAIN_LOOPS
+from panoless.kernels.cpu.compilation import INLINED_LANE_CODE, PLAIN_LOOPS
+from panoless.kernels.cpu.simd_memory import fetch_add
+from panoless.kernels.cpu.workers import run_shared
+
+RAYS_PER_CLAIM = 256
+RUN = 8
+"""Steps that are taken, or left out, at once."""
+STEEPEST = 2**0.5
+"""How fast a distance that is interpolated between four others may change with the place."""
 
 
 @njit(**PLAIN_LOOPS)
@@ -84,21 +92,27 @@ def _inside(x, y, polyline):
     return odd
 
 
-@njit(**PLAIN_LOOPS)
 def distance_grid(
     polyline: Float[np.ndarray, "N 2"], lowest: float, cell: float, rows: int, columns: int
 ) -> Float[np.ndarray, "rows columns"]:
     """See `panoless.kernels.revolution`."""
     grid = np.empty((rows, columns))
-    for row in range(rows):
-        for column in range(columns):
-            x, y = column * cell, lowest + row * cell
-            distance, _, _ = polyline_distance(x, y, polyline)
-            grid[row, column] = -distance if _inside(x, y, polyline) else distance
+    run_shared(_distance_grid, polyline, lowest, cell, grid)
     return grid
 
 
 @njit(**PLAIN_LOOPS)
+def _distance_grid(counter, polyline, lowest, cell, grid):
+    while True:
+        row = fetch_add(counter, 1)
+        if row >= len(grid):
+            return
+        for column in range(grid.shape[1]):
+            x, y = column * cell, lowest + row * cell
+            distance, _, _ = polyline_distance(x, y, polyline)
+            grid[row, column] = -distance if _inside(x, y, polyline) else distance
+
+
 def closest_approach(
     origins: Float[np.ndarray, "P 3"],
     directions: Float[np.ndarray, "P 3"],
@@ -112,39 +126,72 @@ def closest_approach(
     count = len(origins)
     where, signed = np.zeros(count), np.zeros(count)
     side, along = np.full(count, -1), np.zeros(count)
-    rows, columns = grid.shape
-    for ray in range(count):
-        o, d = origins[ray], directions[ray]
-        middle, half = _chord(o, d, reach)
-        if half < 0:
-            continue
-        steps = int(4 * half / cell) + 2
-        size = 2 * half / (steps - 1)
-        best, at = np.inf, -1
-        before, here, left, right = np.inf, np.inf, np.inf, np.inf
-        for step in range(steps):
-            t = middle - half + step * size
-            column = np.sqrt((o[0] + t * d[0]) ** 2 + (o[1] + t * d[1]) ** 2) / cell
-            row = (o[2] + t * d[2] - lowest) / cell
-            i, j = int(np.floor(row)), int(np.floor(column))
-            value = np.inf
-            if 0 <= i < rows - 1 and 0 <= j < columns - 1:
-                p, q = row - i, column - j
-                value = (1 - p) * ((1 - q) * grid[i, j] + q * grid[i, j + 1])
-                value += p * ((1 - q) * grid[i + 1, j] + q * grid[i + 1, j + 1])
-            before, here = here, value
-            if at == step - 1:
-                right = value
-            if value < best:
-                best, at, left, right = value, step, before, np.inf
-        if at < 0:
-            continue
-        t = middle - half + at * size
-        if np.isfinite(left) and np.isfinite(right):
-            bend = left - 2 * best + right
-            if bend > 1e-12:
-                t += size * min(max(0.5 * (left - right) / bend, -1.0), 1.0)
-        x, y = np.sqrt((o[0] + t * d[0]) ** 2 + (o[1] + t * d[1]) ** 2), o[2] + t * d[2]
-        distance, side[ray], along[ray] = polyline_distance(x, y, polyline)
-        where[ray], signed[ray] = t, -distance if _inside(x, y, polyline) else distance
+    run_shared(_closest_approach, origins, directions, polyline, grid, lowest, cell, reach, where, signed, side, along)
     return where, signed, side, along
+
+
+@njit(**PLAIN_LOOPS)
+def _closest_approach(counter, origins, directions, polyline, grid, lowest, cell, reach, where, signed, side, along):
+    """All steps of a run are left out if none can be nearer to the body than the nearest middle of a run.
+
+    Of a profile that begins and ends on the axis the signed distance changes by no more than its place does, and its
+    interpolation by no more than √2 times as much.
+    """
+    is_closed = polyline[0, 0] == 0 and polyline[-1, 0] == 0
+    least = np.empty(int(4 * reach / cell) // RUN + 2)
+    while True:
+        begin = fetch_add(counter, RAYS_PER_CLAIM)
+        if begin >= len(origins):
+            return
+        for ray in range(begin, min(begin + RAYS_PER_CLAIM, len(origins))):
+            o, d = origins[ray], directions[ray]
+            middle, half = _chord(o, d, reach)
+            if half < 0:
+                continue
+            steps = int(4 * half / cell) + 2
+            first, size = middle - half, 2 * half / (steps - 1)
+            reached = RUN // 2 * size
+            best, at = np.inf, -1
+            for run in range((steps + RUN - 1) // RUN):
+                step = RUN * run + RUN // 2
+                value, beyond = _interpolated(o, d, first + step * size, grid, lowest, cell)
+                least[run] = value - STEEPEST * reached
+                if (value == np.inf and beyond * cell <= reached) or not is_closed:
+                    least[run] = -np.inf
+                if value < best and step < steps:
+                    best, at = value, step
+            for run in range((steps + RUN - 1) // RUN):
+                if least[run] > best:
+                    continue
+                for step in range(RUN * run, min(RUN * run + RUN, steps)):
+                    value, _ = _interpolated(o, d, first + step * size, grid, lowest, cell)
+                    if value < best or (value == best and step < at):
+                        best, at = value, step
+            if at < 0:
+                continue
+            t, left, right = first + at * size, np.inf, np.inf
+            if at > 0:
+                left, _ = _interpolated(o, d, first + (at - 1) * size, grid, lowest, cell)
+            if at < steps - 1:
+                right, _ = _interpolated(o, d, first + (at + 1) * size, grid, lowest, cell)
+            if np.isfinite(left) and np.isfinite(right):
+                bend = left - 2 * best + right
+                if bend > 1e-12:
+                    t += size * min(max(0.5 * (left - right) / bend, -1.0), 1.0)
+            x, y = np.sqrt((o[0] + t * d[0]) ** 2 + (o[1] + t * d[1]) ** 2), o[2] + t * d[2]
+            distance, side[ray], along[ray] = polyline_distance(x, y, polyline)
+            where[ray], signed[ray] = t, -distance if _inside(x, y, polyline) else distance
+
+
+@njit(**INLINED_LANE_CODE)
+def _interpolated(origin, direction, t, grid, lowest, cell):
+    """A grid's value at a place on a ray, infinite beyond the grid, and how many cells beyond it that is."""
+    rows, columns = grid.shape
+    column = np.sqrt((origin[0] + t * direction[0]) ** 2 + (origin[1] + t * direction[1]) ** 2) / cell
+    row = (origin[2] + t * direction[2] - lowest) / cell
+    i, j = int(np.floor(row)), int(np.floor(column))
+    if not (0 <= i < rows - 1 and 0 <= j < columns - 1):
+        return np.inf, max(column - (columns - 1), -row, row - (rows - 1))
+    p, q = row - i, column - j
+    value = (1 - p) * ((1 - q) * grid[i, j] + q * grid[i, j + 1])
+    return value + p * ((1 - q) * grid[i + 1, j] + q * grid[i + 1, j + 1]), 0.0
