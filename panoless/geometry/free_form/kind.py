@@ -93,11 +93,14 @@ class FreeFormMirror(ExactGeometry):
 
     def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
         """Solid pixels that see the surroundings by way of the surface, but for the outermost ones."""
-        return view.solid[torch.from_numpy(self._sights(view, view.solid)[1]).to(view.solid.device)]
+        _, traces = self._traced(view, view.solid)
+        seeing = self._seeing(view, view.solid, traces.clear[view.solid.cpu().numpy()])
+        return view.solid[torch.from_numpy(seeing).to(view.solid.device)]
 
     def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
         """The rays of those of the pixels that see the surroundings, with the trust of the surface there."""
-        sights, seeing = self._sights(view, pixels)
+        sights = self._sights(view, pixels, 1)
+        seeing = self._seeing(view, pixels, sights.clear)
         chosen = pixels[torch.from_numpy(seeing).to(pixels.device)]
         trust = self.trust.at(self.surface.points(sights.hits.places[seeing]))
         outgoing, trusted = (torch.from_numpy(each).float() for each in (sights.outgoing[seeing, 0], trust))
@@ -105,23 +108,31 @@ class FreeFormMirror(ExactGeometry):
         incoming = view.directions_world(chosen)
         return Rays(outgoing.to(radiance.device), radiance, trusted.to(radiance.device), incoming)
 
-    def _sights(self, view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Sights, Bool[np.ndarray, "P"]]:
-        sights, inner = self._traced(view, pixels, 1), inner_distance_px(view.mask)[pixels.cpu().numpy()]
-        return sights, sights.clear & (inner > self.options.map_inner_px)
+    def _seeing(self, view: TrainView, pixels: Int[Tensor, "P"], clear: Bool[np.ndarray, "P"]) -> Bool[np.ndarray, "P"]:
+        """Which of the pixels that are `clear` lie well inside the mask."""
+        return clear & (inner_distance_px(view.mask)[pixels.cpu().numpy()] > self.options.map_inner_px)
 
-    def _traced(self, view: TrainView, pixels: Int[Tensor, "P"], samples: int) -> Sights:
-        """What pixels of a view see. Each is traced once, because selection, map and verdict ask for the same."""
-        index, surface, known = pixels.cpu().numpy(), self.surface, self._traces.get(view.mask)
+    def _sights(self, view: TrainView, pixels: Int[Tensor, "P"], samples: int) -> Sights:
+        """What pixels of a view see."""
+        rays, traces = self._traced(view, pixels)
+        index = pixels.cpu().numpy()
+        hits = self.surface.hits_at(rays.origins, rays.directions, traces.distance[index])
+        return Sights.along(self.surface, rays, samples, hits, traces.clear[index])
+
+    def _traced(self, view: TrainView, pixels: Int[Tensor, "P"]) -> "tuple[PixelRays, _Traces]":
+        """Rays of pixels of a view, and its traces. Each is traced once, because selection, map and verdict ask for the
+        same.
+        """
+        index, known = pixels.cpu().numpy(), self._traces.get(view.mask)
         if known is None or not known.are_of(view.camera):
             self._traces[view.mask] = known = _Traces.none(view.camera)
         rays, new = PixelRays.centers(view.camera, index), np.isnan(known.distance[index])
         if new.any():
             found = Sights.of(
-                surface, rays.chosen(new), 1, self.options.least_map_cosine, occlusion_test=self.occlusion_test
+                self.surface, rays.chosen(new), 1, self.options.least_map_cosine, occlusion_test=self.occlusion_test
             )
             known.distance[index[new]], known.clear[index[new]] = found.hits.distance, found.clear
-        hits = surface.hits_at(rays.origins, rays.directions, known.distance[index])
-        return Sights.along(surface, rays, samples, hits, known.clear[index])
+        return rays, known
 
     @cached_property
     def _traces(self) -> MutableMapping[Tensor, "_Traces"]:
@@ -132,7 +143,7 @@ class FreeFormMirror(ExactGeometry):
         """Four directions over each of at most `footprints` pixels that are trusted and turn little."""
         found = []
         for view, pixels in at_most_pixels(views, min(max_pixels, self.options.footprints)):
-            sights = self._traced(view, pixels, 4)
+            sights = self._sights(view, pixels, 4)
             trusted = self.trust.at(self.surface.points(sights.hits.places)) > self.options.least_footprint_trust
             kept = sights.clear & trusted & (sights.turn < self.options.widest_footprint_rad)
             directions = torch.from_numpy(sights.outgoing[kept]).float().to(view.radiance.device)

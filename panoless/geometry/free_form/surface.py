@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
 
 from panoless.environment.surroundings import FAR, Surroundings
@@ -210,7 +211,7 @@ def level_set_of(surface: TriangleMesh, cells: int, margin: float) -> LevelSet:
     empty = LevelSet(low, spacing, np.zeros(shape + 3))
     points = empty.points(empty.nodes().reshape(-1, 3))
     tree = cKDTree(vertices, leafsize=LEAF)
-    distance, index = tree.query(points)
+    distance, index = tree.query(points, workers=torch.get_num_threads())
     usual = float(np.median(tree.query(vertices[:: max(len(vertices) // 1000, 1)], k=2)[0][:, 1]))
     values = np.copysign(distance, ((points - vertices[index]) * normals[index]).sum(1))
     parts = label((distance > max(spacing, 2 * usual)).reshape(empty.shape))[0]
@@ -219,7 +220,7 @@ def level_set_of(surface: TriangleMesh, cells: int, margin: float) -> LevelSet:
     reached = np.isin(parts, np.setdiff1d(parts[~inner], 0)).ravel()
     values[reached] = distance[reached]
     near = distance < 4 * usual
-    distance, index = tree.query(points[near], k=NEAREST)
+    distance, index = tree.query(points[near], k=NEAREST, workers=torch.get_num_threads())
     planes = ((points[near, None] - vertices[index]) * normals[index]).sum(2)
     weights = np.exp(-(distance - distance[:, :1]) / usual)
     share = np.clip((distance[:, 0] - 2 * usual) / (2 * usual), 0, 1)
