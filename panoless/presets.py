@@ -160,7 +160,7 @@ PRESETS: dict[str, FitConfig] = {
             rounds=(
                 FreeFormRound(20, 16, 0.30, 1, 20_000, 100.0, 5, outline_gain=9.0),
                 FreeFormRound(28, 64, 0.80, 4, 40_000, 30.0, 8, outline_gain=9.0),
-                FreeFormRound(28, 64, 0.15, 4, 40_000, 30.0, 4),
+                FreeFormRound(28, 64, 0.15, 4, 40_000, 30.0, 4, solver_steps=20),
             ),
             finer=(),
         ),

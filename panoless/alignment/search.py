@@ -45,6 +45,8 @@ def align_proposal(family: Family, views: Views, proposal: Proposal, config: Fit
         return None
     if family.finds_poses:
         return _outlined_proposal(family, views, proposal, config)
+    if options.mode == "auto" and proposal.overlap < options.least_overlap:
+        return None
     outline = family.as_proposed(proposal, config)
     if outline is None:
         return None

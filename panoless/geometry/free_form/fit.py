@@ -382,7 +382,7 @@ def gauss_newton_step(solution: Solution, damping: float, *, still: bool = False
         product,
         -packed(gradient, beside),
         np.concatenate([free.ravel(), *moving]),
-        options.solver_steps,
+        solution.task.settings.solver_steps,
         options.solver_tolerance,
     )
     change = unpacked(found)
