@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from shinypartial.io.records import NonEmpty, NonNegative, Positive
+from shinypartial.io.records import Count, NonEmpty, NonNegative, Positive
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,8 @@ class FootprintMapOptions:
     """Of so many pixels one is held out. Not tuned."""
     least_gain: float = 0.002
     """Share of the error of held-out pixels by which a map of twice the resolution has to lower it. Not tuned."""
+    least_told: Positive = 1.0
+    """Pixels on a texel from which their footprints tell where it starts. Not tuned."""
     pull: float = 0.002
     """Weight ε of the start, in pixels. Not tuned."""
     rounds: int = 4
@@ -38,6 +40,8 @@ class FootprintMapOptions:
     """Share of the largest value from which a texel of the start is saturated."""
     ceiling: float = 4.0
     """Largest radiance of the map, in those of views. Eight changes nothing on Vase and Cola."""
+    coarse_pixels: Count = 200_000
+    """About so many pixels at most tell it. Not tuned."""
     coarse_resolution: int = 8
     """Texels along a face side of what they add."""
     coarse_rounds: int = 2

@@ -17,7 +17,7 @@ from torch.nn.functional import max_pool2d
 
 from panoless.environment.cubemap import by_face, by_texel, resample
 from panoless.environment.fill import texel_neighbors
-from panoless.environment.footprints import Footprints, PixelFootprints
+from panoless.environment.footprints import Footprints, PixelFootprints, thinned
 from panoless.environment.options import DEFAULTS, FootprintMapOptions
 from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
@@ -47,10 +47,16 @@ def sharpest_map(
     options: FootprintMapOptions = DEFAULTS,
 ) -> Float[Tensor, "6 3 L L"]:
     """The map of all pixels: `rays` are their centers, also of those without footprints. The resolutions that it may
-    have go from coarse to fine.
+    have go from coarse to fine. E₀ is solved from them twice: the second time, where footprints tell it, from the map
+    by which resolution and smoothness were chosen. Under that fewer rays look as if they were wrong.
     """
-    chosen = chosen_sharpness(footprints.smooth, resolutions, saturation, options)
-    return deblur_map(footprints, solve_environment(rays, chosen.resolution), saturation, chosen.smoothness, options)
+    chosen, tried = chosen_sharpness(footprints.smooth, resolutions, saturation, options)
+    start = solve_environment(rays, chosen.resolution)
+    told = torch.zeros_like(start[:, :1])
+    for each in footprints.smooth:
+        told += each.spread(each.rays().initial_weight()[:, None], chosen.resolution)
+    start = solve_environment(rays, chosen.resolution, torch.where(told >= options.least_told, tried, start))
+    return deblur_map(footprints, start, saturation, chosen.smoothness, options)
 
 
 def chosen_sharpness(
@@ -58,26 +64,36 @@ def chosen_sharpness(
     resolutions: Sequence[int],
     saturation: Float[Tensor, "3"],
     options: FootprintMapOptions = DEFAULTS,
-) -> Sharpness:
-    """What explains every fifth pixel best by the others. From the coarsest map on, a finer, a smoother and a
-    sharper one are tried as long as one is better, a finer one by the share `least_gain`.
+) -> tuple[Sharpness, Float[Tensor, "6 3 L L"]]:
+    """What explains every fifth pixel best by the others, and the map of these. From the coarsest map on, a finer, a
+    smoother and a sharper one are tried as long as one is better, a finer one by the share `least_gain`.
     """
     trial, size, rung = _Trial(areas, saturation, options), 0, options.middle
-    tried = {(size, rung): trial.error(resolutions[size], options.smoothness[rung])}
+    tried = {(size, rung): trial.made(resolutions[size], options.smoothness[rung])}
     moves = list(MOVES)
     while moves:
         (finer, smoother), *moves = moves
         there = size + finer, rung + smoother
         if there in tried or there[0] >= len(resolutions) or not 0 <= there[1] < len(options.smoothness):
             continue
-        tried[there] = trial.error(resolutions[there[0]], options.smoothness[there[1]])
-        if tried[there] < tried[size, rung] * (1 - finer * options.least_gain):
+        tried[there] = trial.made(resolutions[there[0]], options.smoothness[there[1]])
+        if tried[there].error < tried[size, rung].error * (1 - finer * options.least_gain):
             (size, rung), moves = there, list(MOVES)
-    return Sharpness(resolutions[size], options.smoothness[rung])
+    return Sharpness(resolutions[size], options.smoothness[rung]), tried[size, rung].environment
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """A map of four fifths of the pixels, and how badly it explains the others: the mean of ‖e‖²/(‖e‖² + s²), weighted
+    by trust.
+    """
+
+    environment: Float[Tensor, "6 3 L L"]
+    error: float
 
 
 class _Trial:
-    """Maps of four fifths of the pixels, and how well they explain the others."""
+    """What the pixels say of which some are held out."""
 
     def __init__(
         self, areas: Sequence[PixelFootprints], saturation: Float[Tensor, "3"], options: FootprintMapOptions
@@ -87,8 +103,8 @@ class _Trial:
         self.saturation, self.options = saturation, replace(options, steps=options.trial_steps)
         self._starts: dict[int, Tensor] = {}
 
-    def error(self, resolution: int, smoothness: float) -> float:
-        """Mean of ‖e‖²/(‖e‖² + s²) over the pixels that were held out, weighted by trust."""
+    def made(self, resolution: int, smoothness: float) -> _Tried:
+        """The map of that resolution and smoothness."""
         if resolution not in self._starts:
             self._starts[resolution] = solve_environment([each.rays() for each in self.kept], resolution)
         start = self._starts[resolution]
@@ -99,7 +115,7 @@ class _Trial:
             error = each.seen(environment).minimum(self.saturation.to(environment)) - each.radiance
             summed += float((weight * bounded_error(error, self.options.robust_scale)).sum())
             weights += float(weight.sum())
-        return summed / max(weights, 1e-9)
+        return _Tried(environment, summed / max(weights, 1e-9))
 
 
 def deblur_map(
@@ -121,7 +137,9 @@ def deblur_map(
     lit = torch.stack([(each.radiance >= options.saturated * saturation).any(0) for each in footprints.smooth]).any(0)
     highest = (saturation * torch.where(lit, options.ceiling, 1.0))[:, None, None]
     inner = _eroded(environment >= options.lit * saturation[:, None, None])
-    others = footprints.trace_others() if footprints.trace_others is not None and inner.any() else None
+    others = None
+    if footprints.trace_others is not None and inner.any():
+        others = thinned([footprints.trace_others()], options.coarse_pixels)[0]
     for _ in range(options.rounds):
         if others is not None:
             environment = _brightened(environment, others, inner, saturation, options).minimum(highest)

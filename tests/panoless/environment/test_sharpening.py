@@ -51,9 +51,9 @@ def error(environment: torch.Tensor, waves: float = 6.0) -> float:
 def test_noise_makes_held_out_pixels_ask_for_smoothness() -> None:
     """They take the most that is offered, and not without noise. That map is the nearest to the truth by far."""
     least, most = OPTIONS.smoothness[0], OPTIONS.smoothness[-1]
-    assert chosen_sharpness([photographed(10_000, 0.0)], SIZES[-1:], ONE).smoothness < most
+    assert chosen_sharpness([photographed(10_000, 0.0)], SIZES[-1:], ONE)[0].smoothness < most
     noisy = photographed(10_000, 0.05)
-    assert chosen_sharpness([noisy], SIZES[-1:], ONE).smoothness == most
+    assert chosen_sharpness([noisy], SIZES[-1:], ONE)[0].smoothness == most
     start = solve_environment([noisy.rays()], SIZES[-1])
     errors = [error(deblur_map(Footprints.of([noisy]), start, ONE, each, OPTIONS)) for each in (least, most)]
     assert errors[1] < errors[0] / 2
@@ -62,7 +62,7 @@ def test_noise_makes_held_out_pixels_ask_for_smoothness() -> None:
 def test_a_map_is_as_fine_as_held_out_pixels_want_it() -> None:
     """Noisy pixels of slow waves need few texels, clean ones of fast waves many."""
     slow, fast = photographed(5_000, 0.05, waves=2.0, window=0.0), photographed(20_000, 0.0, waves=20.0)
-    assert chosen_sharpness([slow], SIZES, ONE).resolution == SIZES[0]
+    assert chosen_sharpness([slow], SIZES, ONE)[0].resolution == SIZES[0]
     assert sharpest_map(Footprints.of([fast]), [fast.rays()], SIZES, ONE).shape[-1] == SIZES[-1]
 
 
