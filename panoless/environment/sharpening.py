@@ -66,19 +66,22 @@ def chosen_sharpness(
     options: FootprintMapOptions = DEFAULTS,
 ) -> tuple[Sharpness, Float[Tensor, "6 3 L L"]]:
     """What explains every fifth pixel best by the others, and the map of these. From the coarsest map on, a finer, a
-    smoother and a sharper one are tried as long as one is better, a finer one by the share `least_gain`.
+    smoother and a sharper one are tried as long as one is better, a finer one by the share `least_gain`. One that is as
+    fine as a refused one is not tried again.
     """
     trial, size, rung = _Trial(areas, saturation, options), 0, options.middle
     tried = {(size, rung): trial.made(resolutions[size], options.smoothness[rung])}
-    moves = list(MOVES)
+    moves, sizes = list(MOVES), len(resolutions)
     while moves:
         (finer, smoother), *moves = moves
         there = size + finer, rung + smoother
-        if there in tried or there[0] >= len(resolutions) or not 0 <= there[1] < len(options.smoothness):
+        if there in tried or there[0] >= sizes or not 0 <= there[1] < len(options.smoothness):
             continue
         tried[there] = trial.made(resolutions[there[0]], options.smoothness[there[1]])
         if tried[there].error < tried[size, rung].error * (1 - finer * options.least_gain):
             (size, rung), moves = there, list(MOVES)
+        elif finer:
+            sizes = there[0]
     return Sharpness(resolutions[size], options.smoothness[rung]), tried[size, rung].environment
 
 

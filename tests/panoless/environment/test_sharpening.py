@@ -2,12 +2,13 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 from torch.nn.functional import normalize
 
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.options import FootprintMapOptions
-from panoless.environment.sharpening import _Smoothness, chosen_sharpness, deblur_map, sharpest_map
+from panoless.environment.sharpening import _Smoothness, _Trial, _Tried, chosen_sharpness, deblur_map, sharpest_map
 from panoless.environment.solve import solve_environment
 from panoless.kernels.cubemap import cubemap_directions
 
@@ -64,6 +65,32 @@ def test_a_map_is_as_fine_as_held_out_pixels_want_it() -> None:
     slow, fast = photographed(5_000, 0.05, waves=2.0, window=0.0), photographed(20_000, 0.0, waves=20.0)
     assert chosen_sharpness([slow], SIZES, ONE)[0].resolution == SIZES[0]
     assert sharpest_map(Footprints.of([fast]), [fast.rays()], SIZES, ONE).shape[-1] == SIZES[-1]
+
+
+def test_rays_tell_the_map_where_no_footprint_falls() -> None:
+    """Though what is filled in from the footprints beside it is far from what these rays saw."""
+    areas = photographed(10_000, 0.0)
+    part = areas.directions.mean(1)[:, 0] < 0
+    dark = PixelFootprints(areas.directions[part].contiguous(), 0.1 * torch.ones(int(part.sum()), 3))
+    directions = areas.rays().directions
+    rays = replace(areas.rays(), radiance=torch.where(directions[:, :1] < 0, 0.1, 0.9).expand(-1, 3).contiguous())
+    environment = sharpest_map(Footprints.of([dark]), [rays], SIZES, ONE)
+    beyond = cubemap_directions(environment.shape[-1])[..., 0] > 0.3
+    assert (environment.permute(0, 2, 3, 1)[beyond] - 0.9).abs().max() < 0.02
+
+
+def test_a_refused_resolution_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not even where a sharper map of the coarser one was better."""
+    tried, (_, usual, _) = [], OPTIONS.smoothness
+
+    def made(trial: _Trial, resolution: int, smoothness: float) -> _Tried:
+        tried.append((resolution, smoothness))
+        return _Tried(torch.zeros(6, 3, resolution, resolution), resolution + smoothness)
+
+    monkeypatch.setattr(_Trial, "made", made)
+    chosen, _ = chosen_sharpness([photographed(10, 0.0)], SIZES, ONE)
+    assert (chosen.resolution, chosen.smoothness) == (SIZES[0], OPTIONS.smoothness[0])
+    assert [each for each in tried if each[0] == SIZES[1]] == [(SIZES[1], usual)]
 
 
 def test_edges_stay_under_the_largest_smoothness() -> None:
