@@ -45,13 +45,13 @@ def align_proposal(family: Family, views: Views, proposal: Proposal, config: Fit
         return None
     if family.finds_poses:
         return _outlined_proposal(family, views, proposal, config)
-    if options.mode == "auto" and proposal.overlap < options.least_overlap:
-        return None
     outline = family.as_proposed(proposal, config)
     if outline is None:
         return None
     alignment = Alignment(views, options)
-    if options.mode == "auto" and alignment.left_by_turns(outline) > options.largest_share_left:
+    if options.mode == "auto" and (
+        proposal.overlap < options.least_overlap or alignment.left_by_turns(outline) > options.largest_share_left
+    ):
         return None
     found = poses = Poses.none(len(views.train))
     nearest = proposal

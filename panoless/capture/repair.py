@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from panoless.capture.masks import MASK_LEVEL
@@ -134,16 +134,21 @@ class _Votes:
 
     def _seen(self, index: int, chosen: Bool[np.ndarray, "P"]) -> Image:
         """Pixels that show some of the chosen points, which lie closer than its gaps are closed."""
+        from scipy.ndimage import maximum_filter, minimum_filter
+
         camera, points = self.views.train[index].camera, self.grid.points
         points_camera = in_camera(camera, points[torch.from_numpy(chosen).to(points.device)])
         columns, rows = (each.cpu().numpy() for each in project(camera, points_camera, first_center=0))
         nearest = max(float(points_camera[:, 2].min()), camera.near) if len(points_camera) else math.inf
         gap = max(1, math.ceil(self.grid.spacing * camera.fx / (2 * nearest)))
-        image = np.zeros((camera.height + 2 * gap, camera.width + 2 * gap), np.uint8)
+        image = np.zeros((camera.height + 2 * gap, camera.width + 2 * gap), bool)
         rows, columns = (np.rint(each).astype(int) + gap for each in (rows, columns))
         within = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1])
-        image[rows[within], columns[within]] = 1
-        return _closed(image, 2 * gap + 1)[gap:-gap, gap:-gap]
+        image[rows[within], columns[within]] = True
+        # A closing by a square, one axis at a time.
+        size = 2 * gap + 1
+        closed: np.ndarray = minimum_filter(maximum_filter(image, size, mode="constant"), size, mode="constant")
+        return closed[gap:-gap, gap:-gap]
 
 
 @dataclass(frozen=True)
@@ -179,14 +184,6 @@ class _Contradicted:
                     count += 1
             wide += int(opened.sum())
         return cls(blobs, count, sum(int(blob.sum()) for blob in blobs), wide)
-
-
-def _closed(image: UInt8[np.ndarray, "H W"], size: int) -> Image:
-    """Gaps closed by a square of so many pixels, one axis at a time; beyond the image there is nothing."""
-    from scipy.ndimage import maximum_filter, minimum_filter
-
-    found: np.ndarray = minimum_filter(maximum_filter(image, size, mode="constant"), size, mode="constant") > 0
-    return found
 
 
 def _opened(region: Image, radius: float) -> tuple[Float[np.ndarray, "H W"], Image]:

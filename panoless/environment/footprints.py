@@ -10,13 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from panoless.environment.rays import Rays
+from panoless.environment.rays import Believed, Rays
 from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap
 from panoless.numeric.robust import robust_weight
 
 
 @dataclass(frozen=True)
-class PixelFootprints:
+class PixelFootprints(Believed):
     """K directions over the area of each pixel, and the mean radiance seen there."""
 
     directions: Float[Tensor, "P K 3"]
@@ -41,7 +41,7 @@ class PixelFootprints:
 
     def without(self, stride: int, first: int) -> "PixelFootprints":
         """All of them, but those of `every` are not believed at all."""
-        trust = torch.ones_like(self.radiance[:, 0]) if self.trust is None else self.trust.clone()
+        trust = self.initial_weight()
         trust[first::stride] = 0
         return replace(self, trust=trust)
 

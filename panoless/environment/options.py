@@ -41,15 +41,15 @@ class FootprintMapOptions:
     ceiling: float = 4.0
     """Largest radiance of the map, in those of views. Eight changes nothing on Vase and Cola."""
     coarse_pixels: Count = 200_000
-    """About so many pixels at most tell it. Not tuned."""
+    """About so many pixels at most tell how bright the inside of saturated regions is. Not tuned."""
     coarse_resolution: int = 8
-    """Texels along a face side of what they add."""
+    """Texels along a face side of what is added there."""
     coarse_rounds: int = 2
     """Rounds of it."""
     coarse_steps: int = 6
     """Conjugate-gradient steps of such a round."""
     coarse_pull: float = 0.2
-    """Weight of what they add, in pixels."""
+    """Weight of what is added, in pixels."""
     coarse_scale: float = 1.0
     """Robust scale there: while a lamp is far too dark, pixels that see it in part must keep their votes."""
 

@@ -8,8 +8,19 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 
+class Believed:
+    """What saw radiance and is believed beforehand as far as its trust says."""
+
+    radiance: Float[Tensor, "P 3"]
+    trust: Float[Tensor, "P"] | None
+
+    def initial_weight(self) -> Float[Tensor, "P"]:
+        """The trust, or ones."""
+        return torch.ones_like(self.radiance[:, 0]) if self.trust is None else self.trust.clone()
+
+
 @dataclass(frozen=True)
-class Rays:
+class Rays(Believed):
     """Observations of the environment: unit world directions and the linear radiance seen along them.
 
     `trust` says how far each is believed beforehand, in [0, 1]; None: all alike. `incoming` are the unit world
@@ -20,10 +31,6 @@ class Rays:
     radiance: Float[Tensor, "P 3"]
     trust: Float[Tensor, "P"] | None = None
     incoming: Float[Tensor, "P 3"] | None = None
-
-    def initial_weight(self) -> Float[Tensor, "P"]:
-        """The trust, or ones."""
-        return torch.ones_like(self.radiance[:, 0]) if self.trust is None else self.trust.clone()
 
     def every(self, stride: int, first: int) -> "Rays":
         """Every stride-th ray from the first."""

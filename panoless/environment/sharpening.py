@@ -54,7 +54,7 @@ def sharpest_map(
     start = solve_environment(rays, chosen.resolution)
     told = torch.zeros_like(start[:, :1])
     for each in footprints.smooth:
-        told += each.spread(each.rays().initial_weight()[:, None], chosen.resolution)
+        told += each.spread(each.initial_weight()[:, None], chosen.resolution)
     start = solve_environment(rays, chosen.resolution, torch.where(told >= options.least_told, tried, start))
     return deblur_map(footprints, start, saturation, chosen.smoothness, options)
 
@@ -70,19 +70,20 @@ def chosen_sharpness(
     fine as a refused one is not tried again.
     """
     trial, size, rung = _Trial(areas, saturation, options), 0, options.middle
-    tried = {(size, rung): trial.made(resolutions[size], options.smoothness[rung])}
+    best, tried = trial.made(resolutions[size], options.smoothness[rung]), {(size, rung)}
     moves, sizes = list(MOVES), len(resolutions)
     while moves:
         (finer, smoother), *moves = moves
         there = size + finer, rung + smoother
         if there in tried or there[0] >= sizes or not 0 <= there[1] < len(options.smoothness):
             continue
-        tried[there] = trial.made(resolutions[there[0]], options.smoothness[there[1]])
-        if tried[there].error < tried[size, rung].error * (1 - finer * options.least_gain):
-            (size, rung), moves = there, list(MOVES)
+        tried.add(there)
+        found = trial.made(resolutions[there[0]], options.smoothness[there[1]])
+        if found.error < best.error * (1 - finer * options.least_gain):
+            best, (size, rung), moves = found, there, list(MOVES)
         elif finer:
             sizes = there[0]
-    return Sharpness(resolutions[size], options.smoothness[rung]), tried[size, rung].environment
+    return Sharpness(resolutions[size], options.smoothness[rung]), best.environment
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ class _Trial:
         environment = deblur_map(Footprints(self.kept), start, self.saturation, smoothness, self.options)
         summed, weights = 0.0, 0.0
         for each in self.asked:
-            weight = each.rays().initial_weight()
+            weight = each.initial_weight()
             error = each.seen(environment).minimum(self.saturation.to(environment)) - each.radiance
             summed += float((weight * bounded_error(error, self.options.robust_scale)).sum())
             weights += float(weight.sum())

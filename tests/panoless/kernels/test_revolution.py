@@ -117,6 +117,16 @@ def test_rays_come_nearest_where_the_definition_has_it() -> None:
         assert plain[1][ray] < gaps.min() + cell / 2
 
 
+def test_rays_come_nearest_to_a_profile_that_begins_off_the_axis() -> None:
+    """What is inside then jumps from one height to the next, so no step may be left out."""
+    cell, profile = 0.02, GOBLET[1:]
+    grid = distance_grid(profile, -1.2, cell, 120, 70)
+    arguments = (*unit_rays(3), profile, grid, -1.2, cell, 1.5)
+    fast, plain = (closest_approach(*arguments, backend=name) for name in ("cpu", "reference"))
+    for own, expected in zip(fast, plain, strict=True):
+        np.testing.assert_allclose(own, expected, atol=1e-9)
+
+
 def test_votes_of_slopes_are_those_of_the_definition() -> None:
     generator = np.random.default_rng(4)
     origins = np.concatenate([generator.uniform(-0.3, 0.3, (80, 2)), np.full((80, 1), 2.0)], 1)
