@@ -5,6 +5,11 @@ neighboring texels that pixels see, by conjugate gradients from the map E₀ of 
 E_j‖²/s²) edges of lamps and windows stay, and noise does not. Views are clipped at some largest radiance, c = min(S,
 mean_k E(ω_k)): a saturated pixel has no error while its prediction is saturated too, and light above S is told by
 pixels that see a lamp in part.
+
+A lamp of radiance L saturates each pixel of which it covers more than S/L. Of the pixels over a point of its border,
+1 − S/L are saturated, so a map in which these and the others count alike shows bright lamps too large. A saturated
+pixel that counts as w unsaturated ones sets the border where 1/(1 + w) are saturated, which is right for
+L = (1 + 1/w) S.
 """
 
 from collections.abc import Sequence
@@ -17,11 +22,11 @@ from torch.nn.functional import max_pool2d
 
 from panoless.environment.cubemap import by_face, by_texel, resample
 from panoless.environment.fill import texel_neighbors
-from panoless.environment.footprints import Footprints, PixelFootprints, thinned
-from panoless.environment.options import DEFAULTS, FootprintMapOptions
+from panoless.environment.footprints import Footprints, PixelFootprints, counting_saturated, thinned
+from panoless.environment.options import DEFAULTS, FootprintMapOptions, LampOptions
 from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
-from panoless.kernels.cubemap import cubemap_directions, scatter_cubemap
+from panoless.kernels.cubemap import cubemap_directions, sample_cubemap, scatter_cubemap
 from panoless.numeric.conjugate_gradients import conjugate_gradients
 from panoless.numeric.robust import bounded_error
 
@@ -37,6 +42,8 @@ class Sharpness:
     """Texels along a face side."""
     smoothness: float
     """λ, in pixels."""
+    lamps: LampOptions
+    """How saturated pixels are believed."""
 
 
 def sharpest_map(
@@ -48,15 +55,22 @@ def sharpest_map(
 ) -> Float[Tensor, "6 3 L L"]:
     """The map of all pixels: `rays` are their centers, also of those without footprints. The resolutions that it may
     have go from coarse to fine. E₀ is solved from them twice: the second time, where footprints tell it, from the map
-    by which resolution and smoothness were chosen. Under that fewer rays look as if they were wrong.
+    by which its sharpness was chosen. Under that fewer rays look as if they were wrong.
     """
     chosen, tried = chosen_sharpness(footprints.smooth, resolutions, saturation, options)
-    start = solve_environment(rays, chosen.resolution)
-    told = torch.zeros_like(start[:, :1])
+    told = torch.zeros_like(tried[:, :1])
     for each in footprints.smooth:
         told += each.spread(each.initial_weight()[:, None], chosen.resolution)
-    start = solve_environment(rays, chosen.resolution, torch.where(told >= options.least_told, tried, start))
-    return deblur_map(footprints, start, saturation, chosen.smoothness, options)
+    told = (told >= options.least_told).float()
+    level = options.saturated * saturation
+    believed = [
+        counting_saturated(each, chosen.lamps.saturated_weight, level, sample_cubemap(told, each.directions)[:, 0])
+        for each in rays
+    ]
+    start = solve_environment(believed, chosen.resolution)
+    seen = tried.minimum(saturation.to(tried)[:, None, None])
+    start = solve_environment(believed, chosen.resolution, torch.where(told > 0, seen, start))
+    return deblur_map(footprints, start, saturation, chosen.smoothness, options, chosen.lamps)
 
 
 def chosen_sharpness(
@@ -68,22 +82,29 @@ def chosen_sharpness(
     """What explains every fifth pixel best by the others, and the map of these. From the coarsest map on, a finer, a
     smoother and a sharper one are tried as long as one is better, a finer one by the share `least_gain`. One that is as
     fine as a refused one is not tried again.
+
+    Which kind of lamps there is, unsaturated pixels tell before that: those beside lamps that are shown too large.
+    Saturated ones always prefer larger lamps.
     """
     trial, size, rung = _Trial(areas, saturation, options), 0, options.middle
-    best, tried = trial.made(resolutions[size], options.smoothness[rung]), {(size, rung)}
-    moves, sizes = list(MOVES), len(resolutions)
+    lamps, best = options.soft, trial.made(Sharpness(resolutions[size], options.smoothness[rung], options.soft))
+    if trial.is_saturated:
+        hard = trial.made(Sharpness(resolutions[size], options.smoothness[rung], options.hard))
+        if hard.unsaturated_error < (1 - options.least_hard_gain) * best.unsaturated_error:
+            lamps, best = options.hard, hard
+    tried, moves, sizes = {(size, rung)}, list(MOVES), len(resolutions)
     while moves:
         (finer, smoother), *moves = moves
         there = size + finer, rung + smoother
         if there in tried or there[0] >= sizes or not 0 <= there[1] < len(options.smoothness):
             continue
         tried.add(there)
-        found = trial.made(resolutions[there[0]], options.smoothness[there[1]])
+        found = trial.made(Sharpness(resolutions[there[0]], options.smoothness[there[1]], lamps))
         if found.error < best.error * (1 - finer * options.least_gain):
             best, (size, rung), moves = found, there, list(MOVES)
         elif finer:
             sizes = there[0]
-    return Sharpness(resolutions[size], options.smoothness[rung]), best.environment
+    return Sharpness(resolutions[size], options.smoothness[rung], lamps), best.environment
 
 
 @dataclass(frozen=True)
@@ -94,6 +115,8 @@ class _Tried:
 
     environment: Float[Tensor, "6 3 L L"]
     error: float
+    unsaturated_error: float
+    """Of the unsaturated ones."""
 
 
 class _Trial:
@@ -105,21 +128,31 @@ class _Trial:
         self.kept = [each.without(options.held_out, index % options.held_out) for index, each in enumerate(areas)]
         self.asked = [each.every(options.held_out, index % options.held_out) for index, each in enumerate(areas)]
         self.saturation, self.options = saturation, replace(options, steps=options.trial_steps)
-        self._starts: dict[int, Tensor] = {}
+        self.level = options.saturated * saturation
+        self.is_saturated = any(bool((each.radiance >= self.level.to(each.radiance)).any()) for each in areas)
+        self._starts: dict[tuple[int, LampOptions], Tensor] = {}
 
-    def made(self, resolution: int, smoothness: float) -> _Tried:
-        """The map of that resolution and smoothness."""
-        if resolution not in self._starts:
-            self._starts[resolution] = solve_environment([each.rays() for each in self.kept], resolution)
-        start = self._starts[resolution]
-        environment = deblur_map(Footprints(self.kept), start, self.saturation, smoothness, self.options)
-        summed, weights = 0.0, 0.0
+    def made(self, sharpness: Sharpness) -> _Tried:
+        """The map that is so sharp."""
+        lamps, key = sharpness.lamps, (sharpness.resolution, sharpness.lamps)
+        if key not in self._starts:
+            rays = [counting_saturated(each.rays(), lamps.saturated_weight, self.level) for each in self.kept]
+            self._starts[key] = solve_environment(rays, sharpness.resolution)
+        start, footprints = self._starts[key], Footprints(self.kept)
+        environment = deblur_map(footprints, start, self.saturation, sharpness.smoothness, self.options, lamps)
+        return _Tried(environment, *self._errors(environment))
+
+    def _errors(self, environment: Float[Tensor, "6 3 L L"]) -> tuple[float, float]:
+        """Of all pixels that are asked, and of the unsaturated ones."""
+        summed = torch.zeros(2, 2)
         for each in self.asked:
-            weight = each.initial_weight()
             error = each.seen(environment).minimum(self.saturation.to(environment)) - each.radiance
-            summed += float((weight * bounded_error(error, self.options.robust_scale)).sum())
-            weights += float(weight.sum())
-        return _Tried(environment, summed / max(weights, 1e-9))
+            badly = bounded_error(error, self.options.robust_scale)
+            for part, weight in zip(summed, (1.0, 0.0), strict=True):
+                counted = counting_saturated(each, weight, self.level).initial_weight()
+                part += torch.stack([(counted * badly).sum(), counted.sum()]).cpu()
+        every, unsaturated = (summed[:, 0] / summed[:, 1].clamp(min=1e-9)).tolist()
+        return every, unsaturated
 
 
 def deblur_map(
@@ -128,26 +161,29 @@ def deblur_map(
     saturation: Float[Tensor, "3"],
     smoothness: float,
     options: FootprintMapOptions = DEFAULTS,
+    lamps: LampOptions | None = None,
 ) -> Float[Tensor, "6 3 L L"]:
     """The map E₀ of pixel centers, sharpened; texels that no footprint touches stay. Views are clipped at `saturation`.
 
     It lies between 0 and that, or `ceiling` times that in channels in which pixels are saturated. Before each round,
     pixels that bend the light much, or reflect it often, and so see wide parts of it, tell how bright the inside of
-    saturated regions is, coarsely.
+    saturated regions is, coarsely. `lamps` are soft unless they are given.
     """
     if not footprints.smooth:
         return environment
-    saturation = saturation.to(environment)
-    lit = torch.stack([(each.radiance >= options.saturated * saturation).any(0) for each in footprints.smooth]).any(0)
+    saturation, lamps = saturation.to(environment), lamps or options.soft
+    level = options.saturated * saturation
+    areas = [counting_saturated(each, lamps.saturated_weight, level) for each in footprints.smooth]
+    lit = torch.stack([(each.radiance >= level).any(0) for each in areas]).any(0)
     highest = (saturation * torch.where(lit, options.ceiling, 1.0))[:, None, None]
     inner = _eroded(environment >= options.lit * saturation[:, None, None])
     others = None
     if footprints.trace_others is not None and inner.any():
         others = thinned([footprints.trace_others()], options.coarse_pixels)[0]
-    for _ in range(options.rounds):
+    for scale in lamps.robust_scales:
         if others is not None:
             environment = _brightened(environment, others, inner, saturation, options).minimum(highest)
-        change = _sharpening(environment, footprints.smooth, saturation, smoothness, options)
+        change = _sharpening(environment, areas, saturation, smoothness, replace(options, robust_scale=scale))
         environment = (environment + change).clamp(min=0).minimum(highest)
     return environment
 

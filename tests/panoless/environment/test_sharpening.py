@@ -7,8 +7,16 @@ import torch
 from torch.nn.functional import normalize
 
 from panoless.environment.footprints import Footprints, PixelFootprints
-from panoless.environment.options import FootprintMapOptions
-from panoless.environment.sharpening import _Smoothness, _Trial, _Tried, chosen_sharpness, deblur_map, sharpest_map
+from panoless.environment.options import FootprintMapOptions, LampOptions
+from panoless.environment.sharpening import (
+    Sharpness,
+    _Smoothness,
+    _Trial,
+    _Tried,
+    chosen_sharpness,
+    deblur_map,
+    sharpest_map,
+)
 from panoless.environment.solve import solve_environment
 from panoless.kernels.cubemap import cubemap_directions
 
@@ -83,14 +91,49 @@ def test_a_refused_resolution_is_not_tried_again(monkeypatch: pytest.MonkeyPatch
     """Not even where a sharper map of the coarser one was better."""
     tried, (_, usual, _) = [], OPTIONS.smoothness
 
-    def made(trial: _Trial, resolution: int, smoothness: float) -> _Tried:
+    def made(trial: _Trial, sharpness: Sharpness) -> _Tried:
+        resolution, smoothness = sharpness.resolution, sharpness.smoothness
         tried.append((resolution, smoothness))
-        return _Tried(torch.zeros(6, 3, resolution, resolution), resolution + smoothness)
+        return _Tried(torch.zeros(6, 3, resolution, resolution), resolution + smoothness, 0.0)
 
     monkeypatch.setattr(_Trial, "made", made)
     chosen, _ = chosen_sharpness([photographed(10, 0.0)], SIZES, ONE)
     assert (chosen.resolution, chosen.smoothness) == (SIZES[0], OPTIONS.smoothness[0])
     assert [each for each in tried if each[0] == SIZES[1]] == [(SIZES[1], usual)]
+
+
+def test_bright_lamps_are_not_shown_too_large() -> None:
+    """Of a window thirty times as bright as what saturates, the map has less than half of the error of one in which
+    saturated pixels count like others, and that is lit where it should not be. A window that is little brighter is
+    told from it.
+    """
+    areas = photographed(20_000, 0.0, window=30.0)
+    start = solve_environment([areas.rays()], SIZES[-1])
+    truth = light(cubemap_directions(SIZES[-1]), 6.0, 30.0).permute(0, 3, 1, 2).clamp(0, 1)
+    alike = LampOptions(1.0, OPTIONS.hard.robust_scales)
+    others = deblur_map(Footprints.of([areas]), start, ONE, OPTIONS.smoothness[0], OPTIONS, alike)
+    found = sharpest_map(Footprints.of([areas]), [areas.rays()], SIZES[-1:], ONE)
+    wrong, right = (each.clamp(0, 1) - truth for each in (others, found))
+    assert right.square().mean() < wrong.square().mean() / 2
+    assert wrong.clamp(min=0).square().sum() > 2 * wrong.clamp(max=0).square().sum()
+    dimmer = photographed(20_000, 0.0, window=1.0)
+    lamps = [chosen_sharpness([each], SIZES[-1:], ONE)[0].lamps for each in (areas, dimmer)]
+    assert lamps == [OPTIONS.hard, OPTIONS.soft]
+
+
+def test_saturated_pixels_without_footprints_keep_their_say() -> None:
+    """Three quarters of the rays beyond all footprints are saturated, the others dimmer: that part is bright, though a
+    quarter of the weight would make it dim, which rays get that footprints explain beside hard lamps.
+    """
+    areas = photographed(10_000, 0.0, window=30.0)
+    told = areas.directions.mean(1)[:, 2] < 0
+    below = PixelFootprints(areas.directions[told].contiguous(), areas.radiance[told])
+    rays = areas.rays()
+    bright = (torch.arange(len(told)) % 4 > 0)[:, None].float().expand(-1, 3)
+    mixed = replace(rays, radiance=torch.where(told[:, None], rays.radiance, 0.5 + 0.5 * bright).contiguous())
+    found = sharpest_map(Footprints.of([below]), [mixed], SIZES[:1], ONE)
+    beyond = cubemap_directions(SIZES[0])[..., 2] > 0.4
+    assert float(found.permute(0, 2, 3, 1)[beyond].mean()) > 0.95
 
 
 def test_edges_stay_under_the_largest_smoothness() -> None:
