@@ -27,12 +27,12 @@ class FootprintMapOptions:
 
     soft: LampOptions = LampOptions(0.5, (0.5, 0.35, 0.25, 0.16))
     """Where lamps and windows are little brighter than what saturates: their borders are pixels in between, which wide
-    scales keep. Chosen, as the next, on nine shapes and scenes in six worlds."""
+    scales keep. Chosen, as the next, on nine shapes and scenes of development."""
     hard: LampOptions = LampOptions(0.25, (0.16, 0.16, 0.16, 0.16))
     """Where they are much brighter, and saturate pixels that they hardly touch. Half as much loses small lamps."""
     least_hard_gain: float = 0.02
-    """Share of the error of unsaturated held-out pixels that lamps of the second kind have to lower: 0.04 to 0.32 under
-    studio lights, at most 0 under clouds and the sun."""
+    """Share of the error of unsaturated held-out pixels that hard lamps have to lower: they lower it by 0.04 to 0.32
+    on four of those, and by 0.00 or not at all on the others."""
     robust_scale: float = 0.16
     """Of radiance errors. Chosen by the true maps of Vase and Cola; held-out views would take 0.3."""
     smoothness: NonEmpty[float] = (0.01, 0.05, 0.25)

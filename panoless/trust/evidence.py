@@ -223,12 +223,15 @@ def _seen_areas(views: Views, geometry: Geometry, config: FitConfig) -> list[Pix
 
 
 def _predicting_map(areas: Sequence[PixelFootprints], config: FitConfig) -> Float[Tensor, "6 3 L L"]:
-    """The map of these pixels, as fine as they are dense."""
+    """The map of these pixels, as fine as they are dense. Saturated ones count like others, because they are to be
+    explained as much, and scales are narrow, because many may be wrong.
+    """
     rays = [each.rays() for each in areas]
     environment = solve_environment(rays, min(config.trust.resolution, densest_resolution(rays)))
     options = replace(config.footprint_map, steps=config.footprint_map.trial_steps)
     saturation, smoothness = encoding_of(config).saturation, options.smoothness[options.middle]
-    return deblur_map(Footprints(list(areas)), environment, saturation, smoothness, options)
+    lamps = replace(options.hard, saturated_weight=1.0)
+    return deblur_map(Footprints(list(areas)), environment, saturation, smoothness, options, lamps)
 
 
 @dataclass
