@@ -96,8 +96,7 @@ def counting_saturated(
     batch: Batch, weight: float, level: Float[Tensor, "3"], share: Float[Tensor, "P"] | float = 1.0
 ) -> Batch:
     """The same, but of those that reach a radiance in some channel, a share is believed by so much of what it was."""
-    reached = (batch.radiance >= level.to(batch.radiance)).any(1)
-    return replace(batch, trust=batch.initial_weight() * (1 - reached * share * (1 - weight)))
+    return replace(batch, trust=batch.initial_weight() * (1 - batch.reaches(level) * share * (1 - weight)))
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,8 @@ class FootprintMapOptions:
     """Share of the error of unsaturated held-out pixels that hard lamps have to lower: they lower it by 0.04 to 0.32
     on four of those, and by 0.00 or not at all on the others."""
     robust_scale: float = 0.16
-    """Of radiance errors. Chosen by the true maps of Vase and Cola; held-out views would take 0.3."""
+    """Of errors of held-out pixels, and where the scales of lamps end. Chosen by the true maps of Vase and Cola;
+    held-out views would take 0.3."""
     smoothness: NonEmpty[float] = (0.01, 0.05, 0.25)
     """Weights λ of differences between neighboring texels, in pixels, among which held-out pixels choose, from the
     middle one on. On Sculpture and Vase they take that where pixels have no noise, and the largest where it is 0.02."""

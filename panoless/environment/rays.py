@@ -18,6 +18,10 @@ class Believed:
         """The trust, or ones."""
         return torch.ones_like(self.radiance[:, 0]) if self.trust is None else self.trust.clone()
 
+    def reaches(self, level: Float[Tensor, "3"]) -> Bool[Tensor, "P"]:
+        """Whether each saw that radiance or more in some channel."""
+        return (self.radiance >= level.to(self.radiance)).any(1)
+
 
 @dataclass(frozen=True)
 class Rays(Believed):

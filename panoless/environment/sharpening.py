@@ -86,25 +86,29 @@ def chosen_sharpness(
     Which kind of lamps there is, unsaturated pixels tell before that: those beside lamps that are shown too large.
     Saturated ones always prefer larger lamps.
     """
-    trial, size, rung = _Trial(areas, saturation, options), 0, options.middle
-    lamps, best = options.soft, trial.made(Sharpness(resolutions[size], options.smoothness[rung], options.soft))
+
+    def sharpness(place: tuple[int, int], lamps: LampOptions) -> Sharpness:
+        return Sharpness(resolutions[place[0]], options.smoothness[place[1]], lamps)
+
+    trial, here, lamps = _Trial(areas, saturation, options), (0, options.middle), options.soft
+    best = trial.made(sharpness(here, lamps))
     if trial.is_saturated:
-        hard = trial.made(Sharpness(resolutions[size], options.smoothness[rung], options.hard))
+        hard = trial.made(sharpness(here, options.hard))
         if hard.unsaturated_error < (1 - options.least_hard_gain) * best.unsaturated_error:
             lamps, best = options.hard, hard
-    tried, moves, sizes = {(size, rung)}, list(MOVES), len(resolutions)
+    tried, moves, sizes = {here}, list(MOVES), len(resolutions)
     while moves:
         (finer, smoother), *moves = moves
-        there = size + finer, rung + smoother
+        there = here[0] + finer, here[1] + smoother
         if there in tried or there[0] >= sizes or not 0 <= there[1] < len(options.smoothness):
             continue
         tried.add(there)
-        found = trial.made(Sharpness(resolutions[there[0]], options.smoothness[there[1]], lamps))
+        found = trial.made(sharpness(there, lamps))
         if found.error < best.error * (1 - finer * options.least_gain):
-            best, (size, rung), moves = found, there, list(MOVES)
+            best, here, moves = found, there, list(MOVES)
         elif finer:
             sizes = there[0]
-    return Sharpness(resolutions[size], options.smoothness[rung], lamps), best.environment
+    return sharpness(here, lamps), best.environment
 
 
 @dataclass(frozen=True)
@@ -129,7 +133,7 @@ class _Trial:
         self.asked = [each.every(options.held_out, index % options.held_out) for index, each in enumerate(areas)]
         self.saturation, self.options = saturation, replace(options, steps=options.trial_steps)
         self.level = options.saturated * saturation
-        self.is_saturated = any(bool((each.radiance >= self.level.to(each.radiance)).any()) for each in areas)
+        self.is_saturated = any(bool(each.reaches(self.level).any()) for each in areas)
         self._starts: dict[tuple[int, LampOptions], Tensor] = {}
 
     def made(self, sharpness: Sharpness) -> _Tried:
@@ -148,8 +152,8 @@ class _Trial:
         for each in self.asked:
             error = each.seen(environment).minimum(self.saturation.to(environment)) - each.radiance
             badly = bounded_error(error, self.options.robust_scale)
-            for part, weight in zip(summed, (1.0, 0.0), strict=True):
-                counted = counting_saturated(each, weight, self.level).initial_weight()
+            weight = each.initial_weight()
+            for part, counted in zip(summed, (weight, weight * ~each.reaches(self.level)), strict=True):
                 part += torch.stack([(counted * badly).sum(), counted.sum()]).cpu()
         every, unsaturated = (summed[:, 0] / summed[:, 1].clamp(min=1e-9)).tolist()
         return every, unsaturated
@@ -161,17 +165,17 @@ def deblur_map(
     saturation: Float[Tensor, "3"],
     smoothness: float,
     options: FootprintMapOptions = DEFAULTS,
-    lamps: LampOptions | None = None,
+    lamps: LampOptions = DEFAULTS.soft,
 ) -> Float[Tensor, "6 3 L L"]:
     """The map E₀ of pixel centers, sharpened; texels that no footprint touches stay. Views are clipped at `saturation`.
 
     It lies between 0 and that, or `ceiling` times that in channels in which pixels are saturated. Before each round,
     pixels that bend the light much, or reflect it often, and so see wide parts of it, tell how bright the inside of
-    saturated regions is, coarsely. `lamps` are soft unless they are given.
+    saturated regions is, coarsely.
     """
     if not footprints.smooth:
         return environment
-    saturation, lamps = saturation.to(environment), lamps or options.soft
+    saturation = saturation.to(environment)
     level = options.saturated * saturation
     areas = [counting_saturated(each, lamps.saturated_weight, level) for each in footprints.smooth]
     lit = torch.stack([(each.radiance >= level).any(0) for each in areas]).any(0)
@@ -183,7 +187,7 @@ def deblur_map(
     for scale in lamps.robust_scales:
         if others is not None:
             environment = _brightened(environment, others, inner, saturation, options).minimum(highest)
-        change = _sharpening(environment, areas, saturation, smoothness, replace(options, robust_scale=scale))
+        change = _sharpening(environment, areas, saturation, smoothness, scale, options)
         environment = (environment + change).clamp(min=0).minimum(highest)
     return environment
 
@@ -193,11 +197,12 @@ def _sharpening(
     areas: Sequence[PixelFootprints],
     saturation: Float[Tensor, "3"],
     smoothness: float,
+    scale: float,
     options: FootprintMapOptions,
 ) -> Float[Tensor, "6 3 L L"]:
     """The change of a map that explains pixels best, as they and its differences weigh under that map."""
-    equations = _Equations.at(environment, areas, saturation, options.robust_scale, options.pull, options.saturated)
-    agreeing = _Smoothness.at(environment, equations.total, smoothness, options.robust_scale)
+    equations = _Equations.at(environment, areas, saturation, scale, options.pull, options.saturated)
+    agreeing = _Smoothness.at(environment, equations.total, smoothness, scale)
     return conjugate_gradients(
         lambda image: equations.product(image) + agreeing.product(image),
         torch.zeros_like(environment),
