@@ -79,6 +79,7 @@ def pose_of(camera: RasterCamera) -> tuple[Float[np.ndarray, "3 3"], Float[np.nd
     return matrix[:3, :3], -matrix[:3, :3].T @ matrix[:3, 3]
 
 
-def unit_rays_camera(camera: RasterCamera) -> Float[Tensor, "3 H W"]:
-    """Unit ray directions in the camera frame through pixel centers."""
-    return unit_rays((camera.height, camera.width), (camera.fx, camera.fy), (camera.cx, camera.cy))
+def unit_rays_camera(camera: RasterCamera, device: torch.device | None = None) -> Float[Tensor, "3 H W"]:
+    """Unit ray directions in the camera frame through pixel centers, made on a device."""
+    size, focal, center = (camera.height, camera.width), (camera.fx, camera.fy), (camera.cx, camera.cy)
+    return unit_rays(size, focal, center, device=device)

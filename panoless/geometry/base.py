@@ -44,7 +44,7 @@ class SurfaceBuffers:
 
     def cosines(self, camera: RasterCamera) -> Float[Tensor, "H W"]:
         """cos θ of the angle of incidence at the pixels' centers, in [0, 1]; 1 where `camera` sees no surface."""
-        rays = unit_rays_camera(camera).to(self.alpha.device)
+        rays = unit_rays_camera(camera, self.alpha.device)
         cosines = -(normalize(self.normals_camera, dim=0) * rays).sum(0)
         return torch.where(self.alpha > 0, cosines.clamp(0, 1), 1.0)
 

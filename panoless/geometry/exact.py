@@ -180,7 +180,7 @@ def mirrored_directions(
     camera: RasterCamera, pixels: Int[Tensor, "P"], normals_camera: Float[Tensor, "3 P"]
 ) -> Float[Tensor, "P 3"]:
     """World directions of the rays through pixel centers (flat indices), reflected at normals of any length."""
-    rays = unit_rays_camera(camera).to(normals_camera.device).flatten(1)[:, pixels]
+    rays = unit_rays_camera(camera, normals_camera.device).flatten(1)[:, pixels]
     return reflection_directions_world(normals_camera, rays, camera.world_to_camera[:3, :3].T)
 
 

@@ -90,10 +90,12 @@ def pulled(surfels: Vase, camera: RasterCamera, curved: bool, weights: dict[str,
     return torch.autograd.grad(images, leaves, list(weights.values()), allow_unused=True)
 
 
-def largest_disagreement(surfels: Vase, camera: RasterCamera, device: torch.device) -> float:
-    """Largest difference of any image or gradient from the CPU kernels', over its own largest value.
+def disagreement(surfels: Vase, camera: RasterCamera, device: torch.device) -> str:
+    """Differences of all images and gradients from the CPU kernels', each over its own largest value: the largest, and
+    the share of the numbers that are apart by more than 0.001 of it.
 
-    The median depth is left out: where transmittances lie within rounding of one half, it jumps.
+    A fragment may be left out, and a pixel be finished, on one side of a limit or the other. The median depth is left
+    out: where transmittances lie within rounding of one half, it jumps.
     """
     results = []
     for place in (torch.device("cpu"), device):
@@ -101,9 +103,14 @@ def largest_disagreement(surfels: Vase, camera: RasterCamera, device: torch.devi
         weights = cotangents(camera, place)
         del weights["median_depth"]
         buffers = drawn(here, camera, True)
-        found = [getattr(buffers, name) for name in weights] + list(pulled(here, camera, True, weights))
-        results.append([tensor.detach().double().cpu() for tensor in found if tensor is not None])
-    return max(float((a - b).abs().max() / a.abs().max()) for a, b in zip(*results, strict=True))
+        named = {name: getattr(buffers, name) for name in weights}
+        leaves = [f"gradient of {f.name}" for f in fields(surfels)]
+        named |= dict(zip(leaves, pulled(here, camera, True, weights), strict=True))
+        results.append({name: value.detach().double().cpu() for name, value in named.items() if value is not None})
+    apart = {name: (value - results[1][name]).abs() / value.abs().max() for name, value in results[0].items()}
+    worst = max(apart, key=lambda name: float(apart[name].max()))
+    share = sum(int((each > 1e-3).sum()) for each in apart.values()) / sum(each.numel() for each in apart.values())
+    return f"largest relative difference {float(apart[worst].max()):.1e} ({worst}), above 0.001 in {share:.1e} of all"
 
 
 def time_rasterizer(surfels: Vase, camera: RasterCamera, device: torch.device, curved: bool, what: str) -> Row:
@@ -121,46 +128,66 @@ def time_rasterizer(surfels: Vase, camera: RasterCamera, device: torch.device, c
     return Row(what, camera.width, len(here.means), milliseconds(device, forward), milliseconds(device, step))
 
 
-def time_gsplat(surfels: Vase, camera: RasterCamera, device: torch.device) -> Row | None:
-    """The same surfels, flat, by gsplat: color, depth, normals and distortion; None where it is not installed.
+@dataclass(frozen=True)
+class Gsplat:
+    """The same surfels, flat, by gsplat's `rasterization_2dgs`: color, depth, normals and distortion.
 
     It also makes normals of the depth in torch; its median and accumulated depths are those of the surfels' centers.
     """
-    try:
-        from gsplat import rasterization_2dgs
-    except ImportError:
-        return None
-    here = placed(surfels, device)
-    flat = torch.cat([here.scales, torch.ones_like(here.scales[:, :1])], 1).detach().requires_grad_()
-    leaves = [here.means, here.quats, flat, here.opacities, here.colors]
-    intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]], device=device)
 
-    def images() -> list[Tensor]:
-        colors, alphas, normals, _, distortion, median, _ = rasterization_2dgs(
-            *leaves,
-            camera.world_to_camera.to(device)[None].float(),
-            intrinsics[None],
-            camera.width,
-            camera.height,
-            near_plane=camera.near,
-            far_plane=camera.far,
-            packed=False,
-            render_mode="RGB+D",
-            distloss=True,
-        )
-        return [colors, alphas, normals, distortion, median]
+    leaves: tuple[Tensor, ...]
+    images: Callable[[], list[Tensor]]
 
-    weights = [torch.randn_like(image) for image in images()]
+    @classmethod
+    def of(cls, surfels: Vase, camera: RasterCamera, device: torch.device) -> "Gsplat | None":
+        """None where it is not installed."""
+        try:
+            from gsplat import rasterization_2dgs
+        except ImportError:
+            return None
+        here = placed(surfels, device)
+        flat = torch.cat([here.scales, torch.ones_like(here.scales[:, :1])], 1).detach().requires_grad_()
+        # One camera's colors: with depth it takes them for each camera only.
+        leaves = here.means, here.quats, flat, here.opacities, here.colors.detach()[None].requires_grad_()
+        intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]], device=device)
 
-    def forward() -> None:
+        def images() -> list[Tensor]:
+            colors, alphas, normals, _, distortion, median, _ = rasterization_2dgs(
+                *leaves,
+                camera.world_to_camera.to(device)[None].float(),
+                intrinsics[None],
+                camera.width,
+                camera.height,
+                near_plane=camera.near,
+                far_plane=camera.far,
+                packed=False,
+                render_mode="RGB+D",
+                distloss=True,
+            )
+            return [colors, alphas, normals, distortion, median]
+
+        return cls(leaves, images)
+
+    def disagreement(self, surfels: Vase, camera: RasterCamera, device: torch.device) -> Tensor:
+        """Largest difference of color and alpha from ours in each pixel."""
         with torch.no_grad():
-            images()
+            ours, (colors, alphas, *_) = drawn(placed(surfels, device), camera, False), self.images()
+        theirs = torch.cat([colors[0, ..., :3], alphas[0]], 2)
+        return (theirs - torch.cat([ours.colors, ours.alpha[None]]).permute(1, 2, 0)).abs().amax(2)
 
-    def step() -> None:
-        torch.autograd.grad(images(), leaves, weights, allow_unused=True)
+    def time(self, camera: RasterCamera, device: torch.device) -> Row:
+        """Forward alone, and forward with backward."""
+        weights = [torch.randn_like(image) for image in self.images()]
 
-    times = milliseconds(device, forward), milliseconds(device, step)
-    return Row("gsplat rasterization_2dgs", camera.width, len(here.means), *times)
+        def forward() -> None:
+            with torch.no_grad():
+                self.images()
+
+        def step() -> None:
+            torch.autograd.grad(self.images(), self.leaves, weights, allow_unused=True)
+
+        times = milliseconds(device, forward), milliseconds(device, step)
+        return Row("gsplat rasterization_2dgs", camera.width, len(self.leaves[0]), *times)
 
 
 def time_fit(surfels: Vase, camera: RasterCamera, device: torch.device) -> Row:
@@ -237,22 +264,32 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"{name}, torch {torch.__version__}")
     print("what                            pixels surfels | forward  | with backward")
     rows: list[Row] = []
+
+    def report(*found: Row) -> None:
+        for row in found:
+            forward = "       –" if row.forward_ms is None else f"{row.forward_ms:8.3f}"
+            rate = f"{1e3 / row.step_ms:8.1f}/s"
+            print(
+                f"{row.what:32} {row.pixels:4}² {row.surfels:6} | {forward} | {row.step_ms:8.3f} ms {rate}", flush=True
+            )
+        rows.extend(found)
+
     for pixels, count in CASES[: options.cases]:
         camera = vase_camera(pixels)
         surfels, _, _ = calibrated_vase(count, camera)
+        for curved, what in KINDS:
+            report(time_rasterizer(surfels, camera, device, curved, what))
         if device.type == "cuda":
-            excluded = largest_disagreement(surfels, camera, device)
-            print(f"{pixels} px, {count} surfels: largest relative difference from the CPU kernels {excluded:.1e}")
-        rows += [time_rasterizer(surfels, camera, device, curved, what) for curved, what in KINDS]
-        if device.type == "cuda":
-            rows += sweep(surfels, camera, device) if options.sweep else []
-            peer = time_gsplat(surfels, camera, device)
-            rows += [peer] if peer else []
-        rows.append(time_fit(surfels, camera, device))
-    for row in rows:
-        rate = f"{1e3 / row.step_ms:8.1f}/s"
-        forward = "       –" if row.forward_ms is None else f"{row.forward_ms:8.3f}"
-        print(f"{row.what:32} {row.pixels:4}² {row.surfels:6} | {forward} | {row.step_ms:8.3f} ms {rate}")
+            print(f"GPU and CPU kernels: {disagreement(surfels, camera, device)}", flush=True)
+            report(*(sweep(surfels, camera, device) if options.sweep else []))
+            if peer := Gsplat.of(surfels, camera, device):
+                apart = peer.disagreement(surfels, camera, device)
+                print(
+                    f"gsplat and ours: largest difference of color or alpha {float(apart.max()):.1e}, above 1/255 in "
+                    f"{float((apart > 1 / 255).float().mean()):.2%} of the pixels"
+                )
+                report(peer.time(camera, device))
+        report(time_fit(surfels, camera, device))
     if options.json:
         options.json.write_text(json.dumps({"device": name, "rows": [asdict(row) for row in rows]}, indent=1))
     return 0

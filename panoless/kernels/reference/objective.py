@@ -41,7 +41,7 @@ def _photometric(operators, normals_camera, alpha, albedo, environment, view, te
         return alpha.new_zeros(())
     pixels = torch.nonzero(view.mask.flatten() > view.solid_alpha)[:, 0]
     flat_alpha = alpha.flatten()[pixels]
-    rays = unit_rays(tuple(alpha.shape), (view.fx, view.fy), (view.cx, view.cy), alpha.dtype).to(alpha.device)
+    rays = unit_rays(tuple(alpha.shape), (view.fx, view.fy), (view.cx, view.cy), alpha.dtype, alpha.device)
     directions = reflection_directions_world(
         normals_camera.flatten(1)[:, pixels], rays.flatten(1)[:, pixels], view.camera_to_world_rotation
     )
@@ -55,11 +55,15 @@ def _photometric(operators, normals_camera, alpha, albedo, environment, view, te
 
 
 def unit_rays(
-    size: tuple[int, int], focal: tuple[float, float], center: tuple[float, float], dtype: torch.dtype = torch.float32
+    size: tuple[int, int],
+    focal: tuple[float, float],
+    center: tuple[float, float],
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | None = None,
 ) -> Float[Tensor, "3 H W"]:
     """Unit ray directions in the camera frame through the pixel centers (i + ½, j + ½) of H×W pixels."""
     y, x = (
-        (torch.arange(count, dtype=dtype) + 0.5 - middle) / length
+        (torch.arange(count, dtype=dtype, device=device) + 0.5 - middle) / length
         for count, middle, length in zip(size, reversed(center), reversed(focal), strict=True)
     )
     # A norm over three planes by torch takes fifteen times as long.

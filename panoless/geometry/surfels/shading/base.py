@@ -266,7 +266,7 @@ class SurfacePixels:
         alpha = surface.alpha.flatten()
         pixels = torch.nonzero(alpha.detach() > ALPHA_FLOOR)[:, 0]
         to_world = camera.world_to_camera[:3, :3].T.to(alpha)
-        rays = unit_rays_camera(camera).to(alpha).flatten(1)[:, pixels]
+        rays = unit_rays_camera(camera, alpha.device).to(alpha.dtype).flatten(1)[:, pixels]
         normals = normalize(to_world @ surface.normals_camera.flatten(1)[:, pixels], dim=0, eps=1e-8)
         return cls(pixels, alpha[pixels], normals.T, (to_world @ rays).T)
 

@@ -86,7 +86,7 @@ def seen_at(
     depth: Float[Tensor, "H W"], view: TrainView, neighbor: RasterCamera
 ) -> tuple[Float[Tensor, "P 2"], Float[Tensor, "P"]]:
     """Where another camera sees the surface points of the solid pixels of a view, in pixels, and at what depth."""
-    rays = unit_rays_camera(view.camera).to(depth).flatten(1)[:, view.solid]
+    rays = unit_rays_camera(view.camera, depth.device).to(depth.dtype).flatten(1)[:, view.solid]
     points = rays / rays[2] * depth.flatten()[view.solid]
     between = neighbor.world_to_camera @ torch.linalg.inv(view.camera.world_to_camera)
     moved = between[:3, :3].to(depth) @ points + between[:3, 3:].to(depth)
