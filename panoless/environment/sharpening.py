@@ -54,13 +54,14 @@ def sharpest_map(
     options: FootprintMapOptions = DEFAULTS,
 ) -> Float[Tensor, "6 3 L L"]:
     """The map of all pixels: `rays` are their centers, also of those without footprints. The resolutions that it may
-    have go from coarse to fine. E₀ is solved from them twice: the second time, where footprints tell it, from the map
-    by which its sharpness was chosen. Under that fewer rays look as if they were wrong.
+    have go from coarse to fine; the coarsest has enough pixels a texel to say where footprints tell it. E₀ is solved
+    from them twice: the second time, where they do, from the map by which its sharpness was chosen. Under that fewer
+    rays look as if they were wrong.
     """
     chosen, tried = chosen_sharpness(footprints.smooth, resolutions, saturation, options)
-    told = torch.zeros_like(tried[:, :1])
+    told = tried.new_zeros(6, 1, resolutions[0], resolutions[0])
     for each in footprints.smooth:
-        told += each.spread(each.initial_weight()[:, None], chosen.resolution)
+        told += each.spread(each.initial_weight()[:, None], resolutions[0])
     told = (told >= options.least_told).float()
     level = options.saturated * saturation
     believed = [
@@ -69,7 +70,8 @@ def sharpest_map(
     ]
     start = solve_environment(believed, chosen.resolution)
     seen = tried.minimum(saturation.to(tried)[:, None, None])
-    start = solve_environment(believed, chosen.resolution, torch.where(told > 0, seen, start))
+    told = resample(told, chosen.resolution) > 0.5
+    start = solve_environment(believed, chosen.resolution, torch.where(told, seen, start))
     return deblur_map(footprints, start, saturation, chosen.smoothness, options, chosen.lamps)
 
 
@@ -83,8 +85,9 @@ def chosen_sharpness(
     smoother and a sharper one are tried as long as one is better, a finer one by the share `least_gain`. One that is as
     fine as a refused one is not tried again.
 
-    Which kind of lamps there is, unsaturated pixels tell before that: those beside lamps that are shown too large.
-    Saturated ones always prefer larger lamps.
+    Held-out pixels that are saturated count as they do in the map; at the borders of lamps they prefer blur. Which kind
+    of lamps there is, unsaturated pixels tell before that: those beside lamps that are shown too large. Saturated ones
+    always prefer larger lamps.
     """
 
     def sharpness(place: tuple[int, int], lamps: LampOptions) -> Sharpness:
@@ -114,7 +117,7 @@ def chosen_sharpness(
 @dataclass(frozen=True)
 class _Tried:
     """A map of four fifths of the pixels, and how badly it explains the others: the mean of ‖e‖²/(‖e‖² + s²), weighted
-    by trust.
+    by trust and, of saturated ones, by what they count in the map.
     """
 
     environment: Float[Tensor, "6 3 L L"]
@@ -144,15 +147,15 @@ class _Trial:
             self._starts[key] = solve_environment(rays, sharpness.resolution)
         start, footprints = self._starts[key], Footprints(self.kept)
         environment = deblur_map(footprints, start, self.saturation, sharpness.smoothness, self.options, lamps)
-        return _Tried(environment, *self._errors(environment))
+        return _Tried(environment, *self._errors(environment, lamps))
 
-    def _errors(self, environment: Float[Tensor, "6 3 L L"]) -> tuple[float, float]:
+    def _errors(self, environment: Float[Tensor, "6 3 L L"], lamps: LampOptions) -> tuple[float, float]:
         """Of all pixels that are asked, and of the unsaturated ones."""
         summed = torch.zeros(2, 2)
         for each in self.asked:
             error = each.seen(environment).minimum(self.saturation.to(environment)) - each.radiance
             badly = bounded_error(error, self.options.robust_scale)
-            weight = each.initial_weight()
+            weight = counting_saturated(each, lamps.saturated_weight, self.level).initial_weight()
             for part, counted in zip(summed, (weight, weight * ~each.reaches(self.level)), strict=True):
                 part += torch.stack([(counted * badly).sum(), counted.sum()]).cpu()
         every, unsaturated = (summed[:, 0] / summed[:, 1].clamp(min=1e-9)).tolist()

@@ -8,6 +8,7 @@ from torch.nn.functional import normalize
 
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.options import FootprintMapOptions, LampOptions
+from panoless.environment.rays import Rays
 from panoless.environment.sharpening import (
     Sharpness,
     _Smoothness,
@@ -19,6 +20,7 @@ from panoless.environment.sharpening import (
 )
 from panoless.environment.solve import solve_environment
 from panoless.kernels.cubemap import cubemap_directions
+from panoless.numeric.robust import bounded_error
 
 ONE = torch.ones(3)
 OPTIONS = FootprintMapOptions()
@@ -134,6 +136,35 @@ def test_saturated_pixels_without_footprints_keep_their_say() -> None:
     found = sharpest_map(Footprints.of([below]), [mixed], SIZES[:1], ONE)
     beyond = cubemap_directions(SIZES[0])[..., 2] > 0.4
     assert float(found.permute(0, 2, 3, 1)[beyond].mean()) > 0.95
+
+
+def test_footprints_tell_a_fine_map_although_few_fall_on_a_texel() -> None:
+    """There is one on two texels. Rays without footprints, of which half saw something else, spoil nothing."""
+    areas = photographed(12_000, 0.0, waves=20.0, window=0.0)
+    directions = normalize(torch.randn(36_000, 3, generator=torch.Generator().manual_seed(2)), dim=1)
+    others = Rays(directions, light(directions, 20.0, 0.0))
+    others.radiance[::2] = 0.1
+    resolutions = SIZES[0], 4 * SIZES[0]
+    truth = light(cubemap_directions(resolutions[1]), 20.0, 0.0).permute(0, 3, 1, 2)
+    errors = []
+    for rays in ([areas.rays()], [areas.rays(), others]):
+        found = sharpest_map(Footprints.of([areas]), rays, resolutions, ONE)
+        errors.append(float((found - truth).square().mean()))
+    assert errors[1] < 1.1 * errors[0]
+
+
+def test_held_out_saturated_pixels_count_as_they_do_in_the_map() -> None:
+    """Of a map that is right but for a dark window, they are all of the error."""
+    areas = photographed(10_000, 0.0, window=30.0)
+    trial = _Trial([areas], ONE, OPTIONS)
+    asked = areas.every(OPTIONS.held_out, 0)
+    saturated = asked.reaches(trial.level)
+    dark = light(cubemap_directions(128), 6.0, 0.0).permute(0, 3, 1, 2).contiguous()
+    for lamps in (OPTIONS.soft, OPTIONS.hard):
+        weight = torch.where(saturated, lamps.saturated_weight, 1.0)
+        badly = bounded_error(asked.seen(dark) - asked.radiance, OPTIONS.robust_scale)
+        every, _ = trial._errors(dark, lamps)
+        assert every == pytest.approx(float((weight * badly).sum() / weight.sum()), rel=1e-5)
 
 
 def test_edges_stay_under_the_largest_smoothness() -> None:
