@@ -45,7 +45,7 @@ class FootprintMapOptions:
     least_gain: float = 0.002
     """Share of the error of held-out pixels by which a map of twice the resolution has to lower it. Not tuned."""
     least_told: Positive = 1.0
-    """Pixels on a texel from which their footprints tell where it starts. Not tuned."""
+    """Pixels on a texel of the coarsest map from which their footprints tell where the map starts. Not tuned."""
     pull: float = 0.002
     """Weight ε of the start, in pixels. Not tuned."""
     steps: int = 6

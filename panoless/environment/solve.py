@@ -8,7 +8,7 @@ from torch import Tensor
 
 from panoless.environment.cubemap import resample
 from panoless.environment.fill import fill_unobserved
-from panoless.environment.rays import Rays, joined_rays, normalize_confidence
+from panoless.environment.rays import Rays, grouped, joined_rays, normalize_confidence
 from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap
 from panoless.numeric.conjugate_gradients import conjugate_gradients
 from panoless.numeric.robust import robust_weight
@@ -53,12 +53,7 @@ def solve_environment(
 
 def _merge(rays: Sequence[Rays]) -> list[Rays]:
     """The same rays in batches of about a million: a lookup of ten thousand costs six times as much a ray."""
-    groups: list[list[Rays]] = [[]]
-    for batch in rays:
-        if sum(len(part.directions) for part in groups[-1]) >= MERGED_RAYS:
-            groups.append([])
-        groups[-1].append(batch)
-    return [joined_rays(group) for group in groups if group]
+    return [joined_rays(group) for group in grouped(rays, MERGED_RAYS)]
 
 
 def _right_side(

@@ -8,6 +8,7 @@ from jaxtyping import Int
 
 from panoless.capture.views import TrainView, Views
 from panoless.environment.footprints import Footprints, PixelFootprints
+from panoless.environment.rays import grouped
 from panoless.geometry.revolution.model import SurfaceOfRevolution
 from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
 from panoless.geometry.revolution.pixels import PixelBundles
@@ -27,7 +28,7 @@ def pixel_footprints(
 ) -> Footprints:
     """Footprints of all pixels of evenly chosen views that are reflected up to `max_bounces` times."""
     stride = -(-views.num_solid // options.map.pixels)
-    chosen, batch = views.train[:: max(stride, 1)], options.map.batch_views
+    chosen = views.train[:: max(stride, 1)]
     found, others = [], []
     for view in chosen:
         places = view.solid.cpu().numpy()
@@ -39,9 +40,9 @@ def pixel_footprints(
         directions = torch.stack(list(at.within(OFFSETS)), 1).to(view.radiance.device)
         found.append(PixelFootprints(directions, view.radiance_at(pixels)))
         others.append(places[~smooth])
-    joined = [PixelFootprints.joined(found[first : first + batch]) for first in range(0, len(found), batch)]
-    smooth_batches = [areas for areas in joined if len(areas.radiance)]
-    return Footprints(smooth_batches, lambda: _trace(chosen, surface, others, options))
+    seen = [areas for areas in found if len(areas.radiance)]
+    joined = [PixelFootprints.joined(group) for group in grouped(seen, options.map.batch_pixels)]
+    return Footprints(joined, lambda: _trace(chosen, surface, others, options))
 
 
 def _trace(

@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 from panoless.config import EnvironmentConfig
 from panoless.environment.cubemap import initial_environment, look_up, resample
 from panoless.environment.fill import fill_unobserved, texel_neighbors
-from panoless.environment.rays import Rays
+from panoless.environment.rays import Rays, grouped
 from panoless.environment.solve import solve_environment
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap
 
@@ -67,6 +67,16 @@ def test_the_order_and_grouping_of_rays_do_not_matter() -> None:
     rays = with_outliers(random_rays(5_000), 0.1)
     pieces = [Rays(rays.directions[part], rays.radiance[part]) for part in (slice(3000, None), slice(0, 3000))]
     torch.testing.assert_close(solve_environment(pieces, 8), solve_environment([rays], 8), rtol=0, atol=1e-4)
+
+
+def test_groups_are_as_large_as_asked_and_no_larger_than_that_needs() -> None:
+    """They keep all batches in their order; without the last batch a group is too small."""
+    batches = [random_rays(count, count) for count in (3, 4, 1, 0, 9, 2)]
+    groups = grouped(batches, 5)
+    assert [each for group in groups for each in group] == batches
+    sizes = [[len(each.radiance) for each in group] for group in groups]
+    assert all(sum(group) >= 5 > sum(group[:-1]) for group in sizes[:-1])
+    assert grouped([], 5) == []
 
 
 def test_without_rays_the_map_is_finite() -> None:
