@@ -86,6 +86,16 @@ class PixelFootprints(Believed):
 Batch = TypeVar("Batch", Rays, PixelFootprints)
 
 
+def grouped(batches: Sequence[Batch], size: int) -> list[list[Batch]]:
+    """Batches in a row together until they have so many rays or pixels; the last group may have fewer."""
+    groups: list[list[Batch]] = []
+    for batch in batches:
+        if not groups or sum(len(each.radiance) for each in groups[-1]) >= size:
+            groups.append([])
+        groups[-1].append(batch)
+    return groups
+
+
 def thinned(batches: Sequence[Batch], most: float) -> list[Batch]:
     """About `most` of the rays or pixels at most: every k-th, beginning elsewhere in each batch."""
     stride = max(1, math.ceil(sum(len(batch.radiance) for batch in batches) / most))

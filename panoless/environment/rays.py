@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -45,19 +44,6 @@ class Rays(Believed):
         """Those of the rays."""
         trust, incoming = (None if each is None else each[part] for each in (self.trust, self.incoming))
         return Rays(self.directions[part], self.radiance[part], trust, incoming)
-
-
-Batch = TypeVar("Batch", bound=Believed)
-
-
-def grouped(batches: Sequence[Batch], size: int) -> list[list[Batch]]:
-    """Batches in a row together until they have so many rays or pixels; the last group may have fewer."""
-    groups: list[list[Batch]] = []
-    for batch in batches:
-        if not groups or sum(len(each.radiance) for each in groups[-1]) >= size:
-            groups.append([])
-        groups[-1].append(batch)
-    return groups
 
 
 def joined_rays(parts: Sequence[Rays]) -> Rays:

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from panoless.environment.cubemap import resample
 from panoless.environment.fill import fill_unobserved
-from panoless.environment.rays import Rays, grouped, joined_rays, normalize_confidence
+from panoless.environment.footprints import grouped
+from panoless.environment.rays import Rays, joined_rays, normalize_confidence
 from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap
 from panoless.numeric.conjugate_gradients import conjugate_gradients
 from panoless.numeric.robust import robust_weight
@@ -19,6 +20,7 @@ REFINING_SCALES = (0.08, 0.05)
 START_WEIGHT = 1.0
 """Pull of a texel to its splat, in rays."""
 MERGED_RAYS = 1_000_000
+"""About so many rays make a batch: a lookup of ten thousand costs six times as much a ray."""
 
 
 def solve_environment(
@@ -32,7 +34,7 @@ def solve_environment(
     equations. From a `start`, a map of the same rays at any resolution, only the last scales are needed. The map lies
     between 0 and the brightest ray, or 1 where that is more.
     """
-    rays = _merge(normalize_confidence(rays))
+    rays = [joined_rays(group) for group in grouped(normalize_confidence(rays), MERGED_RAYS)]
     weights = [batch.initial_weight() for batch in rays]
     device = rays[0].directions.device if rays else None
     environment = torch.zeros(6, 3, resolution, resolution, device=device)
@@ -49,11 +51,6 @@ def solve_environment(
         environment = _sharpen(splat, right_side, total, rays, weights)
     brightest = max([1.0, *(float(batch.radiance.max()) for batch in rays if batch.radiance.numel())])
     return environment.clamp(0, brightest)
-
-
-def _merge(rays: Sequence[Rays]) -> list[Rays]:
-    """The same rays in batches of about a million: a lookup of ten thousand costs six times as much a ray."""
-    return [joined_rays(group) for group in grouped(rays, MERGED_RAYS)]
 
 
 def _right_side(

@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Int
 
 from panoless.capture.views import TrainView, Views
-from panoless.environment.footprints import Footprints, PixelFootprints
-from panoless.environment.rays import grouped
+from panoless.environment.footprints import Footprints, PixelFootprints, grouped
 from panoless.geometry.revolution.model import SurfaceOfRevolution
 from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
 from panoless.geometry.revolution.pixels import PixelBundles

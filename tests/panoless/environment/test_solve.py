@@ -9,7 +9,8 @@ from torch.nn.functional import normalize
 from panoless.config import EnvironmentConfig
 from panoless.environment.cubemap import initial_environment, look_up, resample
 from panoless.environment.fill import fill_unobserved, texel_neighbors
-from panoless.environment.rays import Rays, grouped
+from panoless.environment.footprints import grouped
+from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap
 

@@ -11,7 +11,6 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from panoless.capture.rays import unit_rays_camera
 from panoless.capture.views import TrainView
 from panoless.geometry.surfels.model import ShadedSurfels
 from panoless.geometry.surfels.rendering import ALPHA_FLOOR
@@ -86,7 +85,7 @@ def seen_at(
     depth: Float[Tensor, "H W"], view: TrainView, neighbor: RasterCamera
 ) -> tuple[Float[Tensor, "P 2"], Float[Tensor, "P"]]:
     """Where another camera sees the surface points of the solid pixels of a view, in pixels, and at what depth."""
-    rays = unit_rays_camera(view.camera, depth.device).to(depth.dtype).flatten(1)[:, view.solid]
+    rays = view.rays_camera.to(depth).flatten(1)[:, view.solid]
     points = rays / rays[2] * depth.flatten()[view.solid]
     between = neighbor.world_to_camera @ torch.linalg.inv(view.camera.world_to_camera)
     moved = between[:3, :3].to(depth) @ points + between[:3, 3:].to(depth)
