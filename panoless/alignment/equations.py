@@ -18,10 +18,10 @@ from torch import Tensor
 
 from panoless.alignment.options import PoseOptions
 from panoless.capture.masks import MASK_LEVEL
-from panoless.capture.rays import camera_rays, pose_of, reflect
+from panoless.capture.rays import camera_rays, pose_of
 from panoless.capture.silhouettes import BORDER_PX
 from panoless.capture.views import TrainView
-from panoless.environment.nearness import light_and_slopes
+from panoless.environment.mirrored import MirroredRays
 from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import SOLID_SURFACE_ALPHA, SurfaceBuffers
 from panoless.kernels.rasterize import RasterCamera
@@ -101,7 +101,7 @@ def light_rows(
     """E(r) − c of those of the pixels (flat indices) around which the surface is smooth.
 
     r = d − 2 (d·n) n changes by the turn of the ray d, δd = ω × d, and by the normal that comes to the pixel,
-    δn = −∇n δq: δr = δd − 2 (n·δd + d·δn) n − 2 (d·n) δn.
+    δn = −∇n δq.
     """
     camera = view.camera
     rotation, _ = pose_of(camera)
@@ -117,15 +117,11 @@ def light_rows(
     by_normal = -np.einsum("pac,pai->pci", by_place, motion)
     by_ray = np.zeros_like(by_normal)
     by_ray[:, :, :3] = np.cross(d[:, None], np.eye(3))
-    along = np.einsum("pc,pci->pi", n, by_ray) + np.einsum("pc,pci->pi", d, by_normal)
-    facing = (d * n).sum(1)[:, None, None]
-    turned = by_ray - 2 * n[:, :, None] * along[:, None] - 2 * facing * by_normal
-    mirrored, points = reflect(d, n), pose_of(camera)[1] + rays * depth[:, None] @ rotation
-    outgoing = surroundings.looked_up(points, mirrored)
-    shown, slopes = light_and_slopes(environment, outgoing)
-    slopes = surroundings.slopes_by_mirrored(slopes, points, mirrored)
-    seen = view.radiance_at(torch.from_numpy(pixels)).cpu().numpy()
-    return PoseRows(shown - seen, np.einsum("pkc,pci->pki", slopes, turned), outgoing)
+    seen = MirroredRays(d, n, pose_of(camera)[1] + rays * depth[:, None] @ rotation, surroundings)
+    slopes = seen.slopes(environment)
+    rows = np.matmul(seen.by_ray(slopes), by_ray) + np.matmul(seen.by_normal(slopes), by_normal)
+    residual = seen.light(environment) - view.radiance_at(torch.from_numpy(pixels)).cpu().numpy()
+    return PoseRows(residual, rows, seen.looked_up)
 
 
 def _normals(

@@ -19,8 +19,8 @@ from torch import Tensor
 
 from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.capture.zoom import farther
-from panoless.environment.cubemap import beyond_texels, texels_of
-from panoless.environment.nearness import light_and_slopes
+from panoless.environment.following import FollowingMap
+from panoless.environment.mirrored import radiance_of, slopes_of
 from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry
@@ -52,17 +52,15 @@ def focal_pull(views: Views, geometry: Geometry, rays: int, resolution: int, rob
     """
     directions, turns, radiance = (np.concatenate(parts) for parts in zip(*_seen(views, geometry, rays), strict=True))
     seen = Rays(torch.from_numpy(directions).float(), torch.from_numpy(radiance).float())
-    shown, slopes = light_and_slopes(solve_environment([seen], resolution), directions)
-    residual, rows = shown - radiance, np.matmul(slopes, turns[..., None])[..., 0]
+    environment = solve_environment([seen], resolution)
+    residual = radiance_of(environment, directions) - radiance
     weights = robust_weight(residual, robust_scale) * robust_weight(turns, WIDEST_TURN)
-    texels = texels_of(directions, resolution)
-    left = beyond_texels(rows, weights, texels)
-    gradient, curvature = (float((weights[:, None] * left * each).sum()) for each in (residual, left))
-    votes = float(weights.sum())
-    taken_over = int(texels.max(initial=-1)) + 1
-    counted = 3 * max(votes - taken_over, votes * LEAST_COUNTED, 1.0)
+    following = FollowingMap.of(directions, weights, resolution)
+    gradient, matrix = following.equations(np.matmul(slopes_of(environment, directions), turns[..., None]), residual)
+    curvature, votes = max(float(matrix[0, 0]), 1e-12), float(weights.sum())
+    counted = 3 * max(votes - following.count, votes * LEAST_COUNTED, 1.0)
     variance = float((weights[:, None] * residual**2).sum()) / counted
-    return FocalPull(-gradient / max(curvature, 1e-12), (variance / max(curvature, 1e-12)) ** 0.5)
+    return FocalPull(-float(gradient[0]) / curvature, (variance / curvature) ** 0.5)
 
 
 def _seen(views: Views, geometry: Geometry, rays: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:

@@ -1,7 +1,5 @@
 """The cubemap: its start, look-up and resampling."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -10,9 +8,6 @@ from torch import Tensor
 from panoless.config import EnvironmentConfig
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap
 from shinypartial.core.sphere import directions_to_cube
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
 
 LEAST_GRAY = 1e-6
 """Of a map that starts through the sigmoid, so that its logits are finite."""
@@ -57,26 +52,3 @@ def flat_texels(directions: Float[np.ndarray, "*P 3"], resolution: int) -> Int[n
     face, st = directions_to_cube(directions)
     column, row = np.moveaxis(np.clip((st + 1) * resolution / 2, 0, resolution - 1).astype(np.int64), -1, 0)
     return (face * resolution + row) * resolution + column
-
-
-def texels_of(directions: Float[np.ndarray, "P 3"], resolution: int) -> Int[np.ndarray, "P"]:
-    """Which of the texels that are seen each direction falls into, numbered from zero."""
-    return np.unique(flat_texels(directions, resolution), return_inverse=True)[1].reshape(-1)
-
-
-def gather_texels(weights: Float[np.ndarray, "P"], texels: Int[np.ndarray, "P"]) -> "csr_matrix":
-    """G with ‖G v‖² = Σ (Σ w v)²/Σ w, sums over a texel: what a map that follows takes over of Σ w v²."""
-    from scipy.sparse import csr_matrix
-
-    total = np.maximum(np.bincount(texels, weights), 1e-12)
-    entries = weights / np.sqrt(total)[texels], (texels, np.arange(len(texels)))
-    return csr_matrix(entries, (len(total), len(texels)))
-
-
-def beyond_texels(
-    values: Float[np.ndarray, "P K"], weights: Float[np.ndarray, "P"], texels: Int[np.ndarray, "P"]
-) -> Float[np.ndarray, "P K"]:
-    """(1 − Π) v: what is left of each column when the weighted mean over a texel takes over all that it can."""
-    total = np.maximum(np.bincount(texels, weights), 1e-12)
-    means = np.stack([np.bincount(texels, weights * column) / total for column in values.T], 1)
-    return values - means[texels]

@@ -1,7 +1,7 @@
 """Exposure and white balance of each view, against the others, by what it shows of the directions that they all see."""
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.encoding import SATURATED
-from panoless.environment.cubemap import texels_of
+from panoless.environment.following import FollowingMap
 from panoless.environment.rays import Rays
 from panoless.numeric.robust import robust_weight
 
@@ -34,55 +34,37 @@ def exposure_gains(
     of all log g from which the texels are eliminated: views that have few directions in common hold on to gains that a
     map has followed. Saturated pixels have no say; a view that shares no texel with others keeps the mean.
     """
-    from scipy import sparse
-
     count = len(views)
     of_view = np.repeat(np.arange(count), [len(rays.radiance) for rays in views])
     radiance = torch.cat([rays.radiance for rays in views]).double().cpu().numpy()
     trust = torch.cat([rays.initial_weight() for rays in views]).double().cpu().numpy()
     clear = radiance < SATURATED * saturation.cpu().numpy()
-    texel = texels_of(torch.cat([rays.directions for rays in views]).double().cpu().numpy(), resolution)
-    gather = sparse.csr_matrix((np.ones(len(texel)), (texel, np.arange(len(texel)))))
+    directions = torch.cat([rays.directions for rays in views]).double().cpu().numpy()
     gains = np.ones((count, 3))
     for group in groups:
-        of_group = _gains(
-            radiance[:, group], trust * clear[:, group].all(1), of_view, texel, gather, count, scale, rounds
-        )
-        gains[:, group] = of_group[:, None]
+        following = FollowingMap.of(directions, trust * clear[:, group].all(1), resolution)
+        gains[:, group] = _gains(radiance[:, group], following, of_view, count, scale, rounds)[:, None]
     return gains
 
 
 def _gains(
     radiance: Float[np.ndarray, "P C"],
-    trust: Float[np.ndarray, "P"],
+    following: FollowingMap,
     of_view: Int[np.ndarray, "P"],
-    texel: Int[np.ndarray, "P"],
-    gather: Any,
     count: int,
     scale: float,
     rounds: int,
 ) -> Float[np.ndarray, "V"]:
-    """One gain a view, for colors of one or more channels; `gather` sums points of a texel."""
-    from scipy import sparse
-
-    log_gains, weight = np.zeros(count), trust
+    """One gain a view, for colors of one or more channels: of w (c − g E)², c/g counts w g² times."""
+    log_gains, trust, weight = np.zeros(count), following.weights, following.weights
     for _ in range(rounds + 1):
         gain = np.exp(log_gains)[of_view]
-        squares = np.maximum(gather @ (weight * gain**2), 1e-12)
-        light = (gather @ ((weight * gain)[:, None] * radiance) / squares[:, None])[texel]
-        shown = gain[:, None] * light
-        residual = radiance - shown
-        weight = trust * robust_weight(residual, scale)
-        matrix = np.diag(np.bincount(of_view, weight * (shown**2).sum(1), count))
-        gradient = np.bincount(of_view, weight * (shown * residual).sum(1), count)
-        among = np.sqrt(np.maximum(gather @ (weight * gain**2), 1e-12))
-        for channel in range(radiance.shape[1]):
-            shared = sparse.csr_matrix(
-                (weight * shown[:, channel] * gain / among[texel], (texel, of_view)), (len(among), count)
-            )
-            asked = gather @ (weight * gain * residual[:, channel]) / among
-            matrix -= (shared.T @ shared).toarray()
-            gradient -= shared.T @ asked
+        asked = radiance / gain[:, None]
+        left = replace(following, weights=weight * gain**2).beyond(asked)
+        weight = trust * robust_weight(gain[:, None] * left, scale)
+        gradient, matrix = replace(following, weights=weight * gain**2).sparse_equations(
+            (asked - left)[:, :, None], of_view[:, None], count, left
+        )
         log_gains = log_gains + np.linalg.pinv(matrix, rcond=1e-6, hermitian=True) @ gradient
         log_gains -= log_gains.mean()
     return np.exp(log_gains)

@@ -10,14 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
-from panoless.environment.cubemap import beyond_texels, texels_of
+from panoless.environment.following import FollowingMap
+from panoless.environment.mirrored import radiance_of, slopes_of
 from panoless.environment.options import SurroundingsOptions
 from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
 from panoless.environment.surroundings import Surroundings
-from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.gauss_newton import damped_step
 from panoless.numeric.robust import bounded_error, robust_weight
 
@@ -50,18 +49,11 @@ class Linearized:
     ) -> "Linearized":
         """With the map solved there."""
         rays = seen.rays(surroundings)
-        environment = solve_environment([rays], resolution)
-        shown, slopes = light_and_slopes(environment, rays.directions.numpy().astype(np.float64))
-        residual = shown - seen.radiance
-        weights = robust_weight(residual, options.robust_scale)
-        rows = surroundings.rows(slopes, seen.points, seen.directions)
-        texels = texels_of(rays.directions.numpy().astype(np.float64), resolution)
-        count = rows.shape[2]
-        gradient, matrix = np.zeros(count), np.zeros((count, count))
-        for channel in range(3):
-            left = beyond_texels(rows[:, channel], weights, texels)
-            gradient += left.T @ (weights * residual[:, channel])
-            matrix += left.T @ (weights[:, None] * left)
+        directions, environment = rays.directions.numpy().astype(np.float64), solve_environment([rays], resolution)
+        residual = radiance_of(environment, directions) - seen.radiance
+        rows = surroundings.rows(slopes_of(environment, directions), seen.points, seen.directions)
+        following = FollowingMap.of(directions, robust_weight(residual, options.robust_scale), resolution)
+        gradient, matrix = following.equations(rows, residual)
         cost = options.robust_scale**2 * float(bounded_error(residual, options.robust_scale).sum()) / 2
         return cls(cost, gradient, matrix)
 
@@ -80,24 +72,3 @@ def found_surroundings(seen: LeavingRays, start: Surroundings, options: Surround
         step = Linearized.at(seen, start, resolution, options).step(options.least_share)
         start = start.after(options.stretch * step)
     return start
-
-
-def light_and_slopes(
-    environment: Float[Tensor, "6 3 L L"], directions: Float[np.ndarray, "P 3"]
-) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3 3"]]:
-    """E(r) of unit directions, and its slopes across r (channel, axis): differences over a texel."""
-    step = np.pi / 4 / environment.shape[-1]
-    least = np.eye(3)[np.abs(directions).argmin(1)]
-    first = np.cross(directions, least)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    tangents = first, np.cross(directions, first)
-
-    def look_up(where: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
-        found: np.ndarray = sample_cubemap(environment, torch.from_numpy(where).to(environment)).cpu().numpy()
-        return found.astype(np.float64)
-
-    slopes = np.zeros((len(directions), 3, 3))
-    for tangent in tangents:
-        change = (look_up(directions + step * tangent) - look_up(directions - step * tangent)) / (2 * step)
-        slopes += change[:, :, None] * tangent[:, None]
-    return look_up(directions), slopes

@@ -44,9 +44,7 @@ def fit_height_field(
             for _ in range(settings.steps):
                 observed = observe(views, height_field, settings.rays, options)
                 environment = solve_environment([observed.rays], settings.resolution)
-                photographs = Photographs.at(
-                    height_field, observed, environment, settings.robust_scale, options.radiance_sigma
-                )
+                photographs = Photographs.at(height_field, observed, environment, settings.robust_scale, options)
                 height_field = step_height_field(
                     contours, height_field, options.contour_scale_px, options.bending, options, photographs
                 )

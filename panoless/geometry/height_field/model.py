@@ -44,6 +44,14 @@ class HeightFieldHits:
         normals = np.concatenate([-self.slopes, np.ones((len(self.slopes), 1))], 1)
         return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
+    def normals_by_slopes(self, frame: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "P 3 2"]:
+        """Derivatives of the unit normals, in the axes whose rotation into those of the plane is `frame`: with N the
+        normal and n its unit vector, (1 − n nᵀ) ∂N/‖N‖.
+        """
+        normals, length = self.normals, np.sqrt(1 + (self.slopes**2).sum(1))[:, None, None]
+        across = -np.eye(3)[:, :2] + normals[:, :, None] * normals[:, None, :2]
+        return np.einsum("ji,pja->pia", frame, across / length)
+
 
 @dataclass(frozen=True)
 class HeightField:

@@ -1,32 +1,24 @@
 """Heights of a bent mirror by what it mirrors: Gauss–Newton against the photographs, with the map eliminated.
 
 At a fixed ray d, in the axes of the plane, a height δ moves the hit by δ/(d_z − ∇h·d) along the ray, so the slope that
-is seen there changes by ∇δ + (D²h d) δ/(d_z − ∇h·d). Tilting a mirror and turning the map after it changes little, so
-a step at a fixed map would get nowhere: each texel takes the mean of what its rays ask for, and only the rest moves
-the mirror (variable projection, Golub and Pereyra 1973).
+is seen there changes by ∇δ + (D²h d) δ/(d_z − ∇h·d). The map follows in each step (see `environment.following`).
 """
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from panoless.capture.rays import reflect
 from panoless.capture.views import Views, concatenated, every_kth_pixel
-from panoless.environment.cubemap import gather_texels, texels_of
+from panoless.environment.following import FollowingMap
+from panoless.environment.mirrored import MirroredRays
 from panoless.environment.rays import Rays
 from panoless.geometry.height_field.model import HeightField, HeightFieldHits, visible_reflections
 from panoless.geometry.height_field.options import HeightFieldOptions
-from panoless.kernels.cubemap import sample_cubemap
-from panoless.numeric.gauss_newton import jacobian_of_rows, normal_equations
 from panoless.numeric.robust import robust_weight
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
 
 
 @dataclass(frozen=True)
@@ -39,6 +31,17 @@ class Observations:
     directions: Float[np.ndarray, "P 3"]
     hits: HeightFieldHits
     rays: Rays
+
+    @cached_property
+    def radiance(self) -> Float[np.ndarray, "P 3"]:
+        """What was seen along the rays."""
+        return self.rays.radiance.cpu().numpy()
+
+    def mirrored_by(self, height_field: HeightField, hits: HeightFieldHits) -> MirroredRays:
+        """The rays where they meet a height field."""
+        points = self.origins + np.where(hits.met, hits.distance, 0.0)[:, None] * self.directions
+        directions = self.directions / np.linalg.norm(self.directions, axis=1, keepdims=True)
+        return MirroredRays(directions, hits.normals @ height_field.frame, points, height_field.plane.surroundings)
 
 
 def observe(
@@ -68,8 +71,7 @@ class Photographs:
     observed: Observations
     environment: Float[Tensor, "6 3 L L"]
     residual: Float[np.ndarray, "P 3"]
-    weights: Float[np.ndarray, "P"]
-    texel: Int[np.ndarray, "P"]
+    following: FollowingMap
 
     @classmethod
     def at(
@@ -78,14 +80,14 @@ class Photographs:
         observed: Observations,
         environment: Float[Tensor, "6 3 L L"],
         robust_scale: float,
-        radiance_sigma: float,
+        options: HeightFieldOptions = HeightFieldOptions(),
     ) -> "Photographs":
         """Weights (1 + ‖r‖²/s²)⁻²/σ² and texels of observations at the height field that they were made with."""
-        radiance = observed.rays.radiance.cpu().numpy()
-        residual = _look_up(environment, height_field, observed, observed.hits) - radiance
-        weights = robust_weight(residual, robust_scale) / radiance_sigma**2
-        texel = texels_of(observed.rays.directions.cpu().numpy().astype(np.float64), environment.shape[-1])
-        return cls(height_field, observed, environment, residual, weights, texel)
+        residual = observed.mirrored_by(height_field, observed.hits).light(environment) - observed.radiance
+        weights = robust_weight(residual, robust_scale) / options.radiance_sigma**2
+        directions = observed.rays.directions.cpu().numpy().astype(np.float64)
+        following = FollowingMap.of(directions, weights, environment.shape[-1])
+        return cls(height_field, observed, environment, residual, following)
 
     def equations(self) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
         """Gradient and Gauss–Newton matrix of the cost over the coefficients.
@@ -93,9 +95,8 @@ class Photographs:
         Zero when there are no rays, as where a high frame is mirrored everywhere.
         """
         height_field, hits, count = self.height_field, self.observed.hits, self.height_field.coefficients.size
-        gradient, matrix = np.zeros(count), np.zeros((count, count))
-        if not len(self.weights):
-            return gradient, matrix
+        if not len(self.residual):
+            return np.zeros(count), np.zeros((count, count))
         directions = self.observed.directions @ height_field.frame.T
         index, basis = height_field.basis(hits.places)
         _, _, _, h_uu, h_uv, h_vv = (basis * height_field.coefficients.ravel()[index]).sum(2)
@@ -103,52 +104,15 @@ class Photographs:
         slide = np.stack([h_uu, h_uv, h_uv, h_vv]).reshape(2, 2, -1)
         slide = np.einsum("abp,pb->ap", slide, directions[:, :2]) / rate
         slopes = basis[1:3] + slide[:, :, None] * basis[0]
-        by_slope, gather = self._radiance_by_slope(), self.gather
-        for channel, residual in enumerate(self.residual.T):
-            values = by_slope[0, :, channel, None] * slopes[0] + by_slope[1, :, channel, None] * slopes[1]
-            jacobian = jacobian_of_rows(values, index, count)
-            by_rays, of_rays = normal_equations(jacobian, residual, self.weights)
-            mean = (gather @ jacobian).toarray()
-            gradient += by_rays - mean.T @ (gather @ residual)
-            matrix += of_rays - mean.T @ mean
-        return gradient, matrix
+        mirrored = self.observed.mirrored_by(height_field, hits)
+        by_slope = mirrored.light_by_turns(self.environment, hits.normals_by_slopes(height_field.frame))
+        rows = np.matmul(by_slope, slopes.transpose(1, 0, 2))
+        return self.following.sparse_equations(rows, index, count, self.residual)
 
     def cost(self, candidate: HeightField) -> float:
         """The cost of another height field near to this one; a ray that misses it has a residual of 1."""
-        residual = self.residual
-        if candidate is not self.height_field:
-            hits = candidate.hits(self.observed.origins, self.observed.directions)
-            shown = _look_up(self.environment, candidate, self.observed, hits)
-            residual = np.where(hits.met[:, None], shown - self.observed.rays.radiance.cpu().numpy(), 1.0)
-        explained = self.gather @ residual
-        return float((self.weights @ residual**2).sum() - (explained**2).sum()) / 2
-
-    @cached_property
-    def gather(self) -> "csr_matrix":
-        """What the map takes over (see `gather_texels`)."""
-        return gather_texels(self.weights, self.texel)
-
-    def _radiance_by_slope(self) -> Float[np.ndarray, "2 P 3"]:
-        """Derivatives of what is seen by the slopes along u and v: differences over a texel."""
-        step, hits = np.pi / 2 / self.environment.shape[-1] / 2, self.observed.hits
-
-        def shifted(shift: Float[np.ndarray, "2"]) -> Float[np.ndarray, "P 3"]:
-            turned = HeightFieldHits(hits.distance, hits.places, hits.slopes + shift)
-            return _look_up(self.environment, self.height_field, self.observed, turned)
-
-        return np.stack([(shifted(step * axis) - shifted(-step * axis)) / (2 * step) for axis in np.eye(2)])
-
-
-def _look_up(
-    environment: Float[Tensor, "6 3 L L"],
-    height_field: HeightField,
-    observed: Observations,
-    hits: HeightFieldHits,
-) -> Float[np.ndarray, "P 3"]:
-    mirrored = reflect(observed.directions, hits.normals @ height_field.frame)
-    surroundings = height_field.plane.surroundings
-    if not surroundings.is_far:
-        mirrored /= np.linalg.norm(mirrored, axis=1, keepdims=True)
-        distance = np.where(hits.met, hits.distance, 0.0)[:, None]
-        mirrored = surroundings.looked_up(observed.origins + distance * observed.directions, mirrored)
-    return sample_cubemap(environment, torch.from_numpy(mirrored).to(environment)).cpu().numpy().astype(np.float64)
+        if candidate is self.height_field:
+            return self.following.cost(self.residual)
+        hits = candidate.hits(self.observed.origins, self.observed.directions)
+        shown = self.observed.mirrored_by(candidate, hits).light(self.environment)
+        return self.following.cost(np.where(hits.met[:, None], shown - self.observed.radiance, 1.0))

@@ -18,12 +18,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from panoless.capture.rays import reflect
 from panoless.capture.views import Views, every_kth_pixel
+from panoless.environment.mirrored import MirroredRays
 from panoless.environment.solve import solve_environment
 from panoless.geometry.revolution.model import Hits, ReflectionPaths, SurfaceOfRevolution, revolution_rays
 from panoless.geometry.revolution.options import DEFAULTS, PhotometricOptions, Round
-from panoless.geometry.revolution.pixels import PixelBundles, look_up
+from panoless.geometry.revolution.pixels import PixelBundles
 from panoless.geometry.revolution.profile import ProfileSplines, apply_step
 from panoless.geometry.revolution.silhouette import (
     ContourRays,
@@ -96,7 +96,7 @@ def photometric_equations(
     once = np.flatnonzero((found.paths.bounces == 1) & np.repeat(found.whole, each))
     motion = normal_motion(pixels.directions[once], found.paths.first.of(once), surface, splines, pixel, options)
     rows, ray, columns = (
-        motion.radiance_by_parameters(environment, surface),
+        motion.radiance_by_parameters(environment),
         once[motion.kept],
         parameter_columns(motion.index),
     )
@@ -112,46 +112,21 @@ def photometric_equations(
 
 @dataclass(frozen=True)
 class NormalMotion:
-    """How normals turn, at fixed rays, with the axis' four numbers and the four splines that act at each hit.
-
-    For the rays that see the surface well enough, in the frame of the axis; turns are those along τ and along e_φ.
+    """How normals turn along τ and e_φ, at fixed rays, with the axis' four numbers and the four splines that act at
+    each hit, for the rays that see the surface well enough.
     """
 
     kept: Bool[np.ndarray, "P"]
     """Which of all rays these are."""
-    rays: Float[np.ndarray, "Q 3"]
-    normals: Float[np.ndarray, "Q 3"]
-    points: Float[np.ndarray, "Q 3"]
-    """In the normalized frame."""
-    along_profile: Float[np.ndarray, "Q 3"]
-    along_azimuth: Float[np.ndarray, "Q 3"]
-    turn_profile: Float[np.ndarray, "Q 8"]
-    turn_azimuth: Float[np.ndarray, "Q 8"]
+    mirrored: MirroredRays
+    along: Float[np.ndarray, "Q 3 2"]
+    """τ and e_φ."""
+    turns: Float[np.ndarray, "Q 2 8"]
     index: Int[np.ndarray, "Q 4"]
 
-    def look_up(
-        self,
-        environment: Float[Tensor, "6 3 L L"],
-        surface: SurfaceOfRevolution,
-        normals: Float[np.ndarray, "Q 3"],
-    ) -> Float[np.ndarray, "Q 3"]:
-        """What rays see of a map by other normals, which need not be unit."""
-        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        mirrored = reflect(self.rays, normals) @ surface.frame
-        return look_up(environment, surface.surroundings.looked_up(self.points, mirrored))
-
-    def radiance_by_parameters(
-        self, environment: Float[Tensor, "6 3 L L"], surface: SurfaceOfRevolution
-    ) -> Float[np.ndarray, "Q 3 8"]:
-        """Derivatives of what rays see, by differences over a texel."""
-        step = np.pi / 2 / environment.shape[-1] / 2
-
-        def derivative(way: Float[np.ndarray, "Q 3"]) -> Float[np.ndarray, "Q 3"]:
-            ahead, behind = (self.look_up(environment, surface, self.normals + s * way) for s in (step, -step))
-            return (ahead - behind) / (2 * step)
-
-        by_profile, by_azimuth = derivative(self.along_profile), derivative(self.along_azimuth)
-        return by_profile[:, :, None] * self.turn_profile[:, None] + by_azimuth[:, :, None] * self.turn_azimuth[:, None]
+    def radiance_by_parameters(self, environment: Float[Tensor, "6 3 L L"]) -> Float[np.ndarray, "Q 3 8"]:
+        """Derivatives of what rays see."""
+        return np.matmul(self.mirrored.light_by_turns(environment, self.along), self.turns)
 
 
 def normal_motion(
@@ -186,15 +161,14 @@ def normal_motion(
     spline_profile = -slopes + values * (bend * slide_profile / facing)[:, None]
     spline_azimuth = values * (around * slide_azimuth / facing)[:, None]
     axis_profile, axis_azimuth = _axis_turns(points, normals, profile_direction, azimuth, rays, facing, bend, around)
+    turn_profile = np.concatenate([axis_profile, spline_profile], 1)
+    turn_azimuth = np.concatenate([axis_azimuth, spline_azimuth], 1)
+    chosen = hits.of(kept)
     return NormalMotion(
         kept=kept,
-        rays=rays,
-        normals=normals,
-        points=hits.points[kept],
-        along_profile=profile_direction,
-        along_azimuth=azimuth,
-        turn_profile=np.concatenate([axis_profile, spline_profile], 1),
-        turn_azimuth=np.concatenate([axis_azimuth, spline_azimuth], 1),
+        mirrored=MirroredRays(rays @ surface.frame, chosen.normals, chosen.points, surface.surroundings),
+        along=np.stack([profile_direction @ surface.frame, azimuth @ surface.frame], 2),
+        turns=np.stack([turn_profile, turn_azimuth], 1),
         index=index,
     )
 

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from panoless.capture.rays import pixel_rays
 from panoless.capture.views import TrainView, Views, concatenated, every_kth_pixel
+from panoless.environment.mirrored import radiance_of
 from panoless.geometry.revolution.model import ReflectionPaths, SurfaceOfRevolution, trace_reflections
-from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.robust import bounded_error
 from shinypartial.core.conventions import PIXEL_CENTER
 
@@ -67,7 +67,7 @@ class PixelBundles:
         """What each pixel shows of a map; rays that miss or have not left are black."""
         left = paths.bounces > 0
         light = np.zeros((len(left), 3))
-        light[left] = look_up(environment, paths.directions[left])
+        light[left] = radiance_of(environment, paths.directions[left])
         return light.reshape(-1, self.rays_per_pixel, 3).mean(1)
 
     def shown(
@@ -82,12 +82,6 @@ class PixelBundles:
         """Mean of ‖e‖²/(‖e‖² + s²) over pixels; 1 if there are none."""
         found = bounded_error(self.shown(surface, environment, max_bounces) - self.radiance, scale)
         return float(found.mean()) if len(found) else 1.0
-
-
-def look_up(environment: Float[Tensor, "6 3 L L"], directions: Float[np.ndarray, "R 3"]) -> Float[np.ndarray, "R 3"]:
-    """Radiance of a map in unit directions."""
-    where = torch.from_numpy(directions).float().to(environment.device)
-    return sample_cubemap(environment, where).cpu().numpy().astype(np.float64)
 
 
 def evenly(views: Views, count: int) -> list[tuple[TrainView, Int[np.ndarray, "_"]]]:

@@ -76,7 +76,7 @@ def test_contours_alone_recover_the_plane_of_the_frame_and_the_height_of_the_edg
 
 
 def photographs_at(height_field: HeightField, observed: Observations, environment: torch.Tensor) -> Photographs:
-    return Photographs.at(height_field, observed, environment, ALL_VOTE, OPTIONS.radiance_sigma)
+    return Photographs.at(height_field, observed, environment, ALL_VOTE)
 
 
 def texel_map(resolution: int) -> torch.Tensor:
