@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from panoless.environment.rays import Believed, Rays
-from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap
+from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap, weigh_cubemap
 from panoless.numeric.robust import robust_weight
 
 
@@ -72,6 +72,10 @@ class PixelFootprints(Believed):
     def spread(self, values: Float[Tensor, "P C"], resolution: int) -> Float[Tensor, "6 C L L"]:
         """The adjoint of `seen`."""
         return scatter_cubemap(values, self.directions, resolution)
+
+    def weighed(self, environment: Float[Tensor, "6 C L L"], weights: Float[Tensor, "P W"]) -> Float[Tensor, "6 C L L"]:
+        """What is `seen`, times weights of all channels or of each, `spread`."""
+        return weigh_cubemap(environment, self.directions, weights)
 
     def weights(
         self, seen: Float[Tensor, "P 3"], saturation: Float[Tensor, "3"], scale: float, saturated: float

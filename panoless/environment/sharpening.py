@@ -250,7 +250,7 @@ class _Equations:
         """The matrix times a change."""
         found = self.pull * image
         for each, weight in zip(self.areas, self.weights, strict=True):
-            found += each.spread(each.seen(image) * weight, image.shape[-1])
+            found += each.weighed(image, weight)
         return found
 
 

@@ -10,7 +10,7 @@ from panoless.environment.cubemap import resample
 from panoless.environment.fill import fill_unobserved
 from panoless.environment.footprints import grouped
 from panoless.environment.rays import Rays, joined_rays, normalize_confidence
-from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap
+from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap, weigh_cubemap
 from panoless.numeric.conjugate_gradients import conjugate_gradients
 from panoless.numeric.robust import robust_weight
 
@@ -45,8 +45,7 @@ def solve_environment(
             for batch, weight in zip(rays, weights, strict=True):
                 error = sample_cubemap(environment, batch.directions) - batch.radiance
                 weight.copy_(batch.initial_weight() * robust_weight(error, scale))
-        total = _normal_product(torch.ones_like(environment[:, :1]), rays, weights)
-        right_side = _right_side(rays, weights, environment)
+        right_side, total = _right_side(rays, weights, environment)
         splat = fill_unobserved(right_side / total.clamp(min=1e-9), total[:, 0])
         environment = _sharpen(splat, right_side, total, rays, weights)
     brightest = max([1.0, *(float(batch.radiance.max()) for batch in rays if batch.radiance.numel())])
@@ -55,12 +54,13 @@ def solve_environment(
 
 def _right_side(
     rays: Sequence[Rays], weights: Sequence[Tensor], environment: Float[Tensor, "6 3 L L"]
-) -> Float[Tensor, "6 3 L L"]:
-    """Eᵀ(w c), of the size and on the device of a map."""
-    result = torch.zeros_like(environment)
+) -> tuple[Float[Tensor, "6 3 L L"], Float[Tensor, "6 1 L L"]]:
+    """Eᵀ(w c) and Eᵀw, of the size and on the device of a map."""
+    both = torch.cat([torch.zeros_like(environment), torch.zeros_like(environment[:, :1])], 1)
     for batch, weight in zip(rays, weights, strict=True):
-        result += scatter_cubemap(batch.radiance * weight[:, None], batch.directions, environment.shape[-1])
-    return result
+        values = torch.cat([batch.radiance, torch.ones_like(batch.radiance[:, :1])], 1) * weight[:, None]
+        both += scatter_cubemap(values, batch.directions, environment.shape[-1])
+    return both[:, :3], both[:, 3:]
 
 
 def _normal_product(
@@ -69,8 +69,7 @@ def _normal_product(
     """EᵀWE applied to a map: look up, weigh, scatter."""
     result = torch.zeros_like(environment)
     for batch, weight in zip(rays, weights, strict=True):
-        weighted = sample_cubemap(environment, batch.directions) * weight[:, None]
-        result += scatter_cubemap(weighted, batch.directions, environment.shape[-1])
+        result += weigh_cubemap(environment, batch.directions, weight[:, None])
     return result
 
 

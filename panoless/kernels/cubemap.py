@@ -88,6 +88,34 @@ def scatter_cubemap(
     return scatter(values, directions, resolution)
 
 
+@torch.no_grad()
+def weigh_cubemap(
+    cubemap: Float[Tensor, "6 C L L"],
+    directions: Float[Tensor, "P *K 3"],
+    weights: Float[Tensor, "P W"],
+    *,
+    backend: Backend = "auto",
+) -> Float[Tensor, "6 C L L"]:
+    """AᵀWA E, with A the lookup of `sample_cubemap` and W the weights, of all channels or of each: the product of the
+    normal equations of a cubemap.
+
+    It is `scatter_cubemap(weights · sample_cubemap(E, d), d, L)`, and carries no gradient. Raises as those do.
+    """
+    _check_cubemap(cubemap)
+    _check_directions(directions)
+    if weights.ndim != 2 or len(weights) != len(directions) or weights.shape[1] not in (1, cubemap.shape[1]):
+        raise ValueError(
+            f"expected weights (P, 1) or (P, {cubemap.shape[1]}), one row for each of the {len(directions)} "
+            f"directions; found {tuple(weights.shape)}."
+        )
+    if choose_backend(backend, cubemap=cubemap, directions=directions, weights=weights) == "cpu":
+        from panoless.kernels.cpu.cubemap import weigh_cubemap as weigh
+
+        return weigh(cubemap, directions, weights)
+    seen = sample_cubemap(cubemap, directions, backend=backend)
+    return scatter_cubemap(weights * seen, directions, cubemap.shape[-1], backend=backend)
+
+
 def cubemap_directions(
     resolution: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> Float[Tensor, "6 L L 3"]:

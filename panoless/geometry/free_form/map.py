@@ -1,5 +1,6 @@
 """The map that a fit works with: weighted least squares of pixels as means of a few rays, from the one before."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -11,10 +12,8 @@ from panoless.numeric.conjugate_gradients import conjugate_gradients
 
 def splatted_map(pixels: PixelFootprints, weights: Float[Tensor, "P"], resolution: int) -> Float[Tensor, "6 3 L L"]:
     """Each texel the mean of what fell on it, gaps filled."""
-    total = pixels.spread(weights[:, None], resolution)
-    return fill_unobserved(
-        pixels.spread(weights[:, None] * pixels.radiance, resolution) / total.clamp(min=1e-9), total[:, 0]
-    )
+    light, total = _splat(pixels, weights, resolution)
+    return fill_unobserved(light / total.clamp(min=1e-9), total[:, 0])
 
 
 def smoothed_map(
@@ -33,9 +32,18 @@ def smoothed_map(
         return by_face(4 * texels - texels[around].sum(0), resolution)
 
     def product(image: Tensor) -> Tensor:
-        return pixels.spread(pixels.seen(image) * weights[:, None], resolution) + smoothness * differences(image)
+        return pixels.weighed(image, weights[:, None]) + smoothness * differences(image)
 
-    diagonal = pixels.spread(weights[:, None], resolution) + 4 * smoothness
-    residual = pixels.spread(pixels.radiance * weights[:, None], resolution) - product(environment)
-    found = conjugate_gradients(product, environment, residual, 1 / diagonal, steps)
+    light, total = _splat(pixels, weights, resolution)
+    diagonal = total + 4 * smoothness
+    found = conjugate_gradients(product, environment, light - product(environment), 1 / diagonal, steps)
     return found.clamp(min=0)
+
+
+def _splat(
+    pixels: PixelFootprints, weights: Float[Tensor, "P"], resolution: int
+) -> tuple[Float[Tensor, "6 3 L L"], Float[Tensor, "6 1 L L"]]:
+    """Sums of what fell on each texel: weighted light, and weights."""
+    values = torch.cat([pixels.radiance, torch.ones_like(pixels.radiance[:, :1])], 1) * weights[:, None]
+    both = pixels.spread(values, resolution)
+    return both[:, :3], both[:, 3:]

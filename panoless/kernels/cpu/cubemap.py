@@ -1,14 +1,14 @@
-"""Seamless cubemap lookup and its adjoint in Numba.
+"""Seamless cubemap lookup, its adjoint and the product of both in Numba.
 
-The faces are first copied, with their ring of neighboring texels, into a padded texture whose channels lie
-together, so that a ray touches two short runs of memory and never asks where a face ends. The adjoint goes the
-same way back: fixed shares of the rays add to padded buffers of their own, which are then summed and folded onto the
-faces in a fixed order, so the result depends neither on the scheduling of threads nor on their number.
+The faces are first copied, with their ring of neighboring texels, into a padded texture of which four channels lie
+together, so that a ray touches two short runs of memory and never asks where a face ends, and the four texels around it
+are one value of sixteen lanes. The adjoint goes the same way back: fixed shares of the rays add to padded buffers of
+their own, which are then summed and folded onto the faces in a fixed order, so the result depends neither on the
+scheduling of threads nor on their number.
 
-Rays go in blocks: all of a block are projected first, without a branch, then each is interpolated. What the ray loops
-touch is passed flat, because LLVM vectorizes steps of a constant 3 but guesses wrong about the row length of a
-matrix (22 times slower, measured); and the channels are passed as an `unrolled` tuple, because its length is a
-constant to the compiler.
+Rays go in blocks: all of a block are projected first, without a branch, then each is interpolated or deposited. What
+the projection touches is passed flat, because LLVM vectorizes steps of a constant 3 but guesses wrong about the row
+length of a matrix (22 times slower, measured).
 """
 
 from functools import lru_cache
@@ -20,13 +20,23 @@ from jaxtyping import Float
 from numba import njit
 from torch import Tensor
 
-from panoless.kernels.cpu.compilation import VECTORIZED_LOOPS
-from panoless.kernels.cpu.simd_memory import fetch_add
+from panoless.kernels.cpu.compilation import LANE_CODE, VECTORIZED_LOOPS
+from panoless.kernels.cpu.simd import lanes
+from panoless.kernels.cpu.simd_memory import (
+    add_cell,
+    cell_weights,
+    fetch_add,
+    load_cell,
+    load_color,
+    store_color,
+)
 from panoless.kernels.cpu.workers import run_shared
 from panoless.kernels.reference.cubemap import SHORTEST_DIRECTION, cubemap_padding
 
 f32 = np.float32
 SHORTEST, LARGEST = f32(SHORTEST_DIRECTION), np.finfo(np.float32).max
+TOGETHER = 4
+"""Channels of a texel that lie side by side; those that a cubemap has not are zero."""
 RAYS_PER_BLOCK = 512
 LINES_PER_CLAIM = 16
 MOST_SHARES = 4
@@ -38,15 +48,9 @@ class SampleCubemap(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, cubemap, directions):
-        _, channels, resolution, _ = cubemap.shape
-        padding = cubemap_padding(resolution, torch.device("cpu"))
-        texture = cubemap.new_empty(6, resolution + 2, resolution + 2, channels)
-        faces = cubemap.detach().contiguous().numpy()
-        run_shared(_pad, faces, padding.sources.numpy(), padding.corners.numpy(), texture.numpy())
-        directions = directions.detach().contiguous()
-        values = directions.new_empty(len(directions), channels)
-        rays = _flat(directions), _flat(values)
-        run_shared(_sample, _flat(texture), resolution, *rays, _samples(directions), (0,) * channels)
+        texture, directions = _padded(cubemap), directions.detach().contiguous()
+        values = directions.new_empty(len(directions), cubemap.shape[1])
+        run_shared(_sample, texture.numpy(), _flat(directions), values.numpy(), _samples(directions))
         ctx.save_for_backward(texture, directions)
         return values
 
@@ -57,14 +61,12 @@ class SampleCubemap(torch.autograd.Function):
         grad_values = grad_values.contiguous()
         grad_cubemap = grad_directions = None
         if ctx.needs_input_grad[0]:
-            grad_cubemap = scatter_cubemap(grad_values, directions, texture.shape[1] - 2)
+            grad_cubemap = scatter_cubemap(grad_values, directions, texture.shape[2] - 2)
         if ctx.needs_input_grad[1]:
             grad_directions = torch.empty_like(directions)
-            _, padded, _, channels = texture.shape
             samples = _samples(directions)
             each = grad_values if samples == 1 else (grad_values / samples).repeat_interleave(samples, 0)
-            rays = _flat(directions), _flat(each), _flat(grad_directions)
-            run_shared(_pull_to_directions, _flat(texture), padded - 2, *rays, (0,) * channels)
+            run_shared(_pull_to_directions, texture.numpy(), _flat(directions), each.numpy(), _flat(grad_directions))
         return grad_cubemap, grad_directions
 
 
@@ -72,14 +74,45 @@ def scatter_cubemap(
     values: Float[Tensor, "P C"], directions: Float[Tensor, "P *K 3"], resolution: int
 ) -> Float[Tensor, "6 C L L"]:
     """The adjoint of `SampleCubemap` in its first argument."""
-    channels, samples = values.shape[1], _samples(directions)
+    buffers = _scatter_buffers(directions, resolution, values.shape[1])
+    run_shared(_scatter, values.detach().contiguous().numpy(), _flat(directions), buffers, _samples(directions))
+    return _collected(buffers, values.shape[1])
+
+
+def weigh_cubemap(
+    cubemap: Float[Tensor, "6 C L L"], directions: Float[Tensor, "P *K 3"], weights: Float[Tensor, "P W"]
+) -> Float[Tensor, "6 C L L"]:
+    """What is looked up, times weights, scattered: both ways while a block of rays is at hand."""
+    texture, channels = _padded(cubemap), cubemap.shape[1]
+    buffers = _scatter_buffers(directions, cubemap.shape[2], channels)
+    weights = weights.detach().expand(-1, channels).contiguous()
+    run_shared(_weigh, texture.numpy(), weights.numpy(), _flat(directions), buffers, _samples(directions))
+    return _collected(buffers, channels)
+
+
+def _padded(cubemap: Float[Tensor, "6 C L L"]) -> Float[Tensor, "groups 6 padded padded 4"]:
+    _, channels, resolution, _ = cubemap.shape
     padding = cubemap_padding(resolution, torch.device("cpu"))
+    texture = cubemap.new_empty(_groups(channels), 6, resolution + 2, resolution + 2, TOGETHER)
+    faces = cubemap.detach().contiguous().numpy()
+    run_shared(_pad, faces, padding.sources.numpy(), padding.corners.numpy(), texture.numpy())
+    return texture
+
+
+def _scatter_buffers(
+    directions: Float[Tensor, "P *K 3"], resolution: int, channels: int
+) -> Float[np.ndarray, "shares groups 6 padded padded 4"]:
     # Clearing and adding up one more buffer must cost less than the work it takes from the others.
-    useful = max(1, 4 * samples * len(directions) // (6 * resolution**2))
-    buffers = _scatter_buffers(min(MOST_SHARES, useful), resolution, channels, get_ident())
-    flat_buffers = buffers.reshape(len(buffers), -1)
-    run_shared(_scatter, _flat(values), _flat(directions), flat_buffers, resolution, samples, (0,) * channels)
-    cubemap = values.new_empty(6, channels, resolution, resolution)
+    useful = max(1, 4 * _samples(directions) * len(directions) // (6 * resolution**2))
+    return _kept_buffers(min(MOST_SHARES, useful), resolution, _groups(channels), get_ident())
+
+
+def _collected(
+    buffers: Float[np.ndarray, "shares groups 6 padded padded 4"], channels: int
+) -> Float[Tensor, "6 C L L"]:
+    resolution = buffers.shape[3] - 2
+    padding = cubemap_padding(resolution, torch.device("cpu"))
+    cubemap = torch.empty(6, channels, resolution, resolution)
     run_shared(_add_up, buffers, cubemap.numpy())
     _fold_rings(buffers, padding.sources.numpy(), padding.corners.numpy(), cubemap.numpy())
     return cubemap
@@ -90,39 +123,56 @@ def _samples(directions: Float[Tensor, "P *K 3"]) -> int:
     return directions.shape[1] if directions.ndim == 3 else 1
 
 
+def _groups(channels: int) -> int:
+    return -(-channels // TOGETHER)
+
+
 def _flat(tensor: Tensor) -> Float[np.ndarray, "N"]:
     return tensor.detach().contiguous().numpy().reshape(-1)
 
 
 @lru_cache(maxsize=4)
-def _scatter_buffers(
-    count: int, resolution: int, channels: int, owner: int
-) -> Float[np.ndarray, "buffers 6 padded padded C"]:
+def _kept_buffers(
+    shares: int, resolution: int, groups: int, owner: int
+) -> Float[np.ndarray, "shares groups 6 padded padded 4"]:
     """Scratch of one Python thread (`owner`) that every scatter of this shape clears and uses again."""
-    return np.empty((count, 6, resolution + 2, resolution + 2, channels), f32)
+    return np.empty((shares, groups, 6, resolution + 2, resolution + 2, TOGETHER), f32)
 
 
 @njit(**VECTORIZED_LOOPS)
 def _pad(counter, cubemap, sources, corners, texture):
     """Copy the faces, channels last, with their ring of neighbors."""
-    _, channels, resolution, _ = cubemap.shape
-    last = resolution + 1
+    resolution = cubemap.shape[3]
+    last, rows, nothing = resolution + 1, 6 * (resolution + 2), np.zeros(resolution, np.float32)
     while True:
         first = fetch_add(counter, LINES_PER_CLAIM)
-        if first >= 6 * (resolution + 2):
+        if first >= rows * len(texture):
             return
-        for line in range(first, min(first + LINES_PER_CLAIM, 6 * (resolution + 2))):
-            face, row = line // (resolution + 2), line % (resolution + 2)
-            out = texture[face, row]
+        for line in range(first, min(first + LINES_PER_CLAIM, rows * len(texture))):
+            group, face, row = line // rows, line % rows // (resolution + 2), line % (resolution + 2)
+            out, faces = texture[group, face, row], cubemap[face, TOGETHER * group : TOGETHER * (group + 1)]
             if 0 < row < last:
-                for channel in range(channels):
-                    texels = cubemap[face, channel, row - 1]
-                    for i in range(resolution):
-                        out[i + 1, channel] = texels[i]
+                _interleave(
+                    faces[0, row - 1],
+                    faces[1, row - 1] if len(faces) > 1 else nothing,
+                    faces[2, row - 1] if len(faces) > 2 else nothing,
+                    faces[3, row - 1] if len(faces) > 3 else nothing,
+                    out[1:last].reshape(-1),
+                )
             for column in range(0, resolution + 2, last if 0 < row < last else 1):
-                source = sources[face, row, column]
-                for channel in range(channels):
-                    out[column, channel] = _extended_texel(cubemap, corners, source, channel)
+                out[column] = f32(0)
+                for lane in range(len(faces)):
+                    channel = TOGETHER * group + lane
+                    out[column, lane] = _extended_texel(cubemap, corners, sources[face, row, column], channel)
+
+
+@njit(**VECTORIZED_LOOPS)
+def _interleave(first, second, third, fourth, out):
+    for i in range(first.size):
+        out[TOGETHER * i] = first[i]
+        out[TOGETHER * i + 1] = second[i]
+        out[TOGETHER * i + 2] = third[i]
+        out[TOGETHER * i + 3] = fourth[i]
 
 
 @njit(**VECTORIZED_LOOPS)
@@ -166,128 +216,158 @@ def _locate(directions, resolution, cells, rights, downs, present):
 
 
 @njit(**VECTORIZED_LOOPS)
-def _sample(counter, texture, resolution, directions, values, samples, unrolled):
+def _sample(counter, texture, directions, values, samples):
     """Means over so many directions each."""
-    count, channels, block = directions.size // 3 // samples, len(unrolled), max(RAYS_PER_BLOCK // samples, 1)
+    stride, count, block = texture.shape[2], len(values), max(RAYS_PER_BLOCK // samples, 1)
     cells, places = np.empty(block * samples, np.int32), np.empty((3, block * samples), np.float32)
+    colors = np.empty(TOGETHER * block, np.float32)
     while True:
         begin = fetch_add(counter, block)
         if begin >= count:
             return
         end = min(begin + block, count)
         share = directions[3 * samples * begin : 3 * samples * end]
-        _locate(share, resolution, cells, places[0], places[1], places[2])
-        out = values[channels * begin : channels * end]
-        if samples == 1:
-            _interpolate(texture, resolution + 2, cells, places, out, unrolled)
-        else:
-            _interpolate_means(texture, resolution + 2, cells, places, out, samples, unrolled)
+        _locate(share, stride - 2, cells, places[0], places[1], places[2])
+        for group in range(len(texture)):
+            _interpolate(texture[group], stride, cells, places, samples, end - begin, colors)
+            _give(colors, group, values[begin:end])
 
 
-@njit(**VECTORIZED_LOOPS)
-def _interpolate(texture, stride, cells, places, values, unrolled):
-    channels = len(unrolled)
-    for i in range(values.size // channels):
-        right, down = places[0, i], places[1, i]
-        left, up = places[2, i] - right, f32(1) - down
-        a = np.int64(cells[i]) * channels
-        b, c = a + channels, a + stride * channels
-        d = c + channels
-        for k in range(channels):
-            upper = left * texture[a + k] + right * texture[b + k]
-            lower = left * texture[c + k] + right * texture[d + k]
-            values[channels * i + k] = up * upper + down * lower
-
-
-@njit(**VECTORIZED_LOOPS)
-def _interpolate_means(texture, stride, cells, places, values, samples, unrolled):
-    channels, share = len(unrolled), f32(1) / f32(samples)
-    values[:] = f32(0)
-    for pixel in range(values.size // channels):
+@njit(**LANE_CODE)
+def _interpolate(texture, stride, cells, places, samples, pixels, colors):
+    """Four channels of each pixel, from a group's texture."""
+    share = f32(1) / f32(samples)
+    for pixel in range(pixels):
+        total = lanes(f32(0))
         for i in range(samples * pixel, samples * (pixel + 1)):
             right, down = places[0, i], places[1, i] * share
             left, up = places[2, i] - right, share - down
-            a = np.int64(cells[i]) * channels
-            b, c = a + channels, a + stride * channels
-            d = c + channels
-            for k in range(channels):
-                upper = left * texture[a + k] + right * texture[b + k]
-                lower = left * texture[c + k] + right * texture[d + k]
-                values[channels * pixel + k] += up * upper + down * lower
+            upper = TOGETHER * np.int64(cells[i])
+            weights = cell_weights(up * left, up * right, down * left, down * right)
+            total += load_cell(texture, upper, upper + TOGETHER * stride) * weights
+        store_color(colors, TOGETHER * pixel, total)
+
+
+@njit(**LANE_CODE)
+def _deposit(colors, stride, cells, places, samples, pixels, buffer):
+    """Add four channels of each pixel to the texels of a group's buffer."""
+    share = f32(1) / f32(samples)
+    for pixel in range(pixels):
+        color = load_color(colors, TOGETHER * pixel)
+        for i in range(samples * pixel, samples * (pixel + 1)):
+            right, down = places[0, i], places[1, i] * share
+            left, up = places[2, i] - right, share - down
+            upper = TOGETHER * np.int64(cells[i])
+            weights = cell_weights(up * left, up * right, down * left, down * right)
+            add_cell(buffer, upper, upper + TOGETHER * stride, color * weights)
 
 
 @njit(**VECTORIZED_LOOPS)
-def _scatter(counter, values, directions, buffers, resolution, samples, unrolled):
+def _give(colors, group, values):
+    """Write the channels of a group to where all of a pixel lie together."""
+    first = TOGETHER * group
+    for lane in range(min(values.shape[1] - first, TOGETHER)):
+        for pixel in range(len(values)):
+            values[pixel, first + lane] = colors[TOGETHER * pixel + lane]
+
+
+@njit(**VECTORIZED_LOOPS)
+def _take(values, group, colors):
+    """The way back; channels that are not there are zero."""
+    first = TOGETHER * group
+    used = min(values.shape[1] - first, TOGETHER)
+    for lane in range(TOGETHER):
+        for pixel in range(len(values)):
+            colors[TOGETHER * pixel + lane] = values[pixel, first + lane] if lane < used else f32(0)
+
+
+@njit(**VECTORIZED_LOOPS)
+def _scatter(counter, values, directions, buffers, samples):
     """Clear each padded buffer and add its share of the rays to it: the same share whichever thread comes to it."""
-    count, channels, block = directions.size // 3 // samples, len(unrolled), max(RAYS_PER_BLOCK // samples, 1)
-    shares = len(buffers)
+    shares, groups, _, stride, _, _ = buffers.shape
+    count, block = len(values), max(RAYS_PER_BLOCK // samples, 1)
     cells, places = np.empty(block * samples, np.int32), np.empty((3, block * samples), np.float32)
+    colors = np.empty(TOGETHER * block, np.float32)
     while True:
         task = fetch_add(counter, 1)
         if task >= shares:
             return
-        buffer = buffers[task]
-        buffer[:] = f32(0)
+        buffers[task] = f32(0)
         last = (task + 1) * count // shares
         for begin in range(task * count // shares, last, block):
             end = min(begin + block, last)
             share = directions[3 * samples * begin : 3 * samples * end]
-            _locate(share, resolution, cells, places[0], places[1], places[2])
-            _deposit(
-                values[channels * begin : channels * end], resolution + 2, cells, places, buffer, samples, unrolled
-            )
+            _locate(share, stride - 2, cells, places[0], places[1], places[2])
+            for group in range(groups):
+                _take(values[begin:end], group, colors)
+                _deposit(colors, stride, cells, places, samples, end - begin, buffers[task, group])
 
 
 @njit(**VECTORIZED_LOOPS)
-def _deposit(values, stride, cells, places, buffer, samples, unrolled):
-    channels, share = len(unrolled), f32(1) / f32(samples)
-    for pixel in range(values.size // channels):
-        for i in range(samples * pixel, samples * (pixel + 1)):
-            right, down = places[0, i], places[1, i] * share
-            left, up = places[2, i] - right, share - down
-            a = np.int64(cells[i]) * channels
-            b, c = a + channels, a + stride * channels
-            d = c + channels
-            for k in range(channels):
-                value = values[channels * pixel + k]
-                buffer[a + k] += up * left * value
-                buffer[b + k] += up * right * value
-                buffer[c + k] += down * left * value
-                buffer[d + k] += down * right * value
+def _weigh(counter, texture, weights, directions, buffers, samples):
+    """`_scatter` of what `_sample` gives, times weights."""
+    shares, groups, _, stride, _, _ = buffers.shape
+    count, block = len(weights), max(RAYS_PER_BLOCK // samples, 1)
+    cells, places = np.empty(block * samples, np.int32), np.empty((3, block * samples), np.float32)
+    colors, factors = np.empty(TOGETHER * block, np.float32), np.empty(TOGETHER * block, np.float32)
+    while True:
+        task = fetch_add(counter, 1)
+        if task >= shares:
+            return
+        buffers[task] = f32(0)
+        last = (task + 1) * count // shares
+        for begin in range(task * count // shares, last, block):
+            end = min(begin + block, last)
+            share = directions[3 * samples * begin : 3 * samples * end]
+            _locate(share, stride - 2, cells, places[0], places[1], places[2])
+            for group in range(groups):
+                _interpolate(texture[group], stride, cells, places, samples, end - begin, colors)
+                _take(weights[begin:end], group, factors)
+                for i in range(TOGETHER * (end - begin)):
+                    colors[i] *= factors[i]
+                _deposit(colors, stride, cells, places, samples, end - begin, buffers[task, group])
 
 
 @njit(**VECTORIZED_LOOPS)
 def _add_up(counter, buffers, cubemap):
     """Sum the inner parts of the buffers, in their order, channels first."""
-    count, _, padded, _, channels = buffers.shape
-    resolution = padded - 2
+    _, channels, resolution, _ = cubemap.shape
+    total = np.empty(TOGETHER * resolution, np.float32)
     while True:
         first = fetch_add(counter, LINES_PER_CLAIM)
         if first >= 6 * resolution:
             return
         for line in range(first, min(first + LINES_PER_CLAIM, 6 * resolution)):
             face, row = line // resolution, line % resolution
-            for channel in range(channels):
-                out = cubemap[face, channel, row]
-                for i in range(resolution):
-                    total = f32(0)
-                    for buffer in range(count):
-                        total += buffers[buffer, face, row + 1, i + 1, channel]
-                    out[i] = total
+            for group in range(buffers.shape[1]):
+                total[:] = f32(0)
+                for share in range(len(buffers)):
+                    _add(buffers[share, group, face, row + 1].reshape(-1), total)
+                for lane in range(min(channels - TOGETHER * group, TOGETHER)):
+                    out = cubemap[face, TOGETHER * group + lane, row]
+                    for i in range(resolution):
+                        out[i] = total[TOGETHER * i + lane]
+
+
+@njit(**VECTORIZED_LOOPS)
+def _add(line, total):
+    """Add the inner part of a padded line."""
+    for i in range(total.size):
+        total[i] += line[i + TOGETHER]
 
 
 @njit(**VECTORIZED_LOOPS)
 def _fold_rings(buffers, sources, corners, cubemap):
     """Add what was deposited in the ring around each face to the texels that it shows."""
-    count, _, padded, _, channels = buffers.shape
+    channels, padded = cubemap.shape[1], buffers.shape[3]
     for face in range(6):
         for row in range(padded):
             for column in range(0, padded, padded - 1 if 0 < row < padded - 1 else 1):
                 source = sources[face, row, column]
                 for channel in range(channels):
                     total = f32(0)
-                    for buffer in range(count):
-                        total += buffers[buffer, face, row, column, channel]
+                    for share in range(len(buffers)):
+                        total += buffers[share, channel // TOGETHER, face, row, column, channel % TOGETHER]
                     _add_to_extended_texel(cubemap, corners, source, channel, total)
 
 
@@ -303,39 +383,41 @@ def _add_to_extended_texel(cubemap, corners, source, channel, value):
 
 
 @njit(**VECTORIZED_LOOPS)
-def _pull_to_directions(counter, texture, resolution, directions, grad_values, grad_directions, unrolled):
+def _pull_to_directions(counter, texture, directions, grad_values, grad_directions):
     """Derivative of the interpolation by the place in the cell, then of the central projection by the direction."""
-    rays, channels = directions.size // 3, len(unrolled)
+    stride, rays = texture.shape[2], len(grad_values)
     cells, places = np.empty(RAYS_PER_BLOCK, np.int32), np.empty((3, RAYS_PER_BLOCK), np.float32)
+    colors, pulls = np.empty(TOGETHER * RAYS_PER_BLOCK, np.float32), np.empty((2, RAYS_PER_BLOCK), np.float32)
     while True:
         begin = fetch_add(counter, RAYS_PER_BLOCK)
         if begin >= rays:
             return
         end = min(begin + RAYS_PER_BLOCK, rays)
         share = directions[3 * begin : 3 * end]
-        _locate(share, resolution, cells, places[0], places[1], places[2])
-        _pull_to_places(
-            texture, resolution + 2, cells, places, grad_values[channels * begin : channels * end], unrolled
-        )
-        _pull_through_projection(share, resolution, places[0], places[1], grad_directions[3 * begin : 3 * end])
+        _locate(share, stride - 2, cells, places[0], places[1], places[2])
+        pulls[:] = f32(0)
+        for group in range(len(texture)):
+            _take(grad_values[begin:end], group, colors)
+            _pull_to_places(texture[group].reshape(-1), stride, cells, places, colors, pulls[:, : end - begin])
+        _pull_through_projection(share, stride - 2, pulls[0], pulls[1], grad_directions[3 * begin : 3 * end])
 
 
 @njit(**VECTORIZED_LOOPS)
-def _pull_to_places(texture, stride, cells, places, grad_values, unrolled):
-    """Replace each ray's place in its cell by the derivatives of the loss by it."""
-    channels = len(unrolled)
-    for i in range(grad_values.size // channels):
+def _pull_to_places(texture, stride, cells, places, colors, pulls):
+    """Add the derivatives of the loss by each ray's place in its cell."""
+    for i in range(pulls.shape[1]):
         right, down = places[0, i], places[1, i]
         left, up = f32(1) - right, f32(1) - down
-        a = np.int64(cells[i]) * channels
-        b, c = a + channels, a + stride * channels
-        d = c + channels
+        a = TOGETHER * np.int64(cells[i])
+        b, c = a + TOGETHER, a + TOGETHER * stride
+        d = c + TOGETHER
         by_right, by_down = f32(0), f32(0)
-        for k in range(channels):
-            grad = grad_values[channels * i + k]
+        for k in range(TOGETHER):
+            grad = colors[TOGETHER * i + k]
             by_right += grad * (up * (texture[b + k] - texture[a + k]) + down * (texture[d + k] - texture[c + k]))
             by_down += grad * (left * (texture[c + k] - texture[a + k]) + right * (texture[d + k] - texture[b + k]))
-        places[0, i], places[1, i] = by_right, by_down
+        pulls[0, i] += by_right
+        pulls[1, i] += by_down
 
 
 @njit(**VECTORIZED_LOOPS)

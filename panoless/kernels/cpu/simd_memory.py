@@ -19,6 +19,7 @@ from panoless.kernels.cpu.simd import (
 )
 
 _ROW = ir.VectorType(FLOAT, 4)
+_PAIR = ir.VectorType(FLOAT, 8)
 _WORD = ir.IntType(16)
 
 
@@ -107,6 +108,83 @@ def add_color(typingctx, array, offset, weight, red, green, blue):
         return context.get_dummy_value()
 
     return types.void(array, types.intp, *[types.float32] * 4), build
+
+
+@intrinsic
+def load_cell(typingctx, array, upper, lower):
+    """Load eight consecutive float32 of a C-contiguous array from flat index `upper`, and eight from `lower`: the four
+    texels, of four channels each, around a place.
+    """
+
+    def build(context, builder, sig, args):
+        pointers = (_element_pointer(context, builder, sig.args[0], args[0], place) for place in args[1:])
+        rows = [builder.load(builder.bitcast(pointer, _PAIR.as_pointer()), align=4, typ=_PAIR) for pointer in pointers]
+        return builder.shuffle_vector(*rows, constant_vector(range(LANES), INT32))
+
+    return lanes_type(array, types.intp, types.intp), build
+
+
+@intrinsic
+def add_cell(typingctx, array, upper, lower, value):
+    """Add to what `load_cell` loads, a texel after the other: a load that only overlaps the store before it would wait
+    for that.
+    """
+
+    def build(context, builder, sig, args):
+        for texel in range(4):
+            place = builder.add(args[1 + texel // 2], ir.Constant(args[1].type, 4 * (texel % 2)))
+            pointer = builder.bitcast(
+                _element_pointer(context, builder, sig.args[0], args[0], place), _ROW.as_pointer()
+            )
+            own = constant_vector(range(4 * texel, 4 * texel + 4), INT32)
+            share = builder.shuffle_vector(args[3], args[3], own)
+            total = builder.fadd(builder.load(pointer, align=4, typ=_ROW), share, flags=("contract",))
+            builder.store(total, pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.intp, lanes_type), build
+
+
+@intrinsic
+def cell_weights(typingctx, upper_left, upper_right, lower_left, lower_right):
+    """Weights of four texels, each repeated for their four channels."""
+
+    def build(context, builder, sig, args):
+        row = ir.Constant(_ROW, ir.Undefined)
+        for texel, weight in enumerate(args):
+            row = builder.insert_element(row, weight, ir.Constant(INT32, texel))
+        return builder.shuffle_vector(row, row, constant_vector([lane // 4 for lane in range(LANES)], INT32))
+
+    return lanes_type(*[types.float32] * 4), build
+
+
+@intrinsic
+def load_color(typingctx, array, offset):
+    """Load four consecutive float32 of a C-contiguous array, repeated for four texels."""
+
+    def build(context, builder, sig, args):
+        pointer = builder.bitcast(_element_pointer(context, builder, sig.args[0], *args), _ROW.as_pointer())
+        row = builder.load(pointer, align=4, typ=_ROW)
+        return builder.shuffle_vector(row, row, constant_vector([lane % 4 for lane in range(LANES)], INT32))
+
+    return lanes_type(array, types.intp), build
+
+
+@intrinsic
+def store_color(typingctx, array, offset, value):
+    """Store the sum over four texels of their four channels, from flat index `offset` on."""
+
+    def build(context, builder, sig, args):
+        value, flags = args[2], ("contract", "reassoc", "nsz")
+        texels = [
+            builder.shuffle_vector(value, value, constant_vector(range(4 * k, 4 * k + 4), INT32)) for k in range(4)
+        ]
+        upper, lower = (builder.fadd(*texels[k : k + 2], flags=flags) for k in (0, 2))
+        pointer = builder.bitcast(_element_pointer(context, builder, sig.args[0], *args[:2]), _ROW.as_pointer())
+        builder.store(builder.fadd(upper, lower, flags=flags), pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, lanes_type), build
 
 
 def _row_mask(builder, mask, row):

@@ -12,6 +12,7 @@ from panoless.kernels.cubemap import (
     cubemap_solid_angles,
     sample_cubemap,
     scatter_cubemap,
+    weigh_cubemap,
 )
 from panoless.kernels.reference.cubemap import project_to_face
 
@@ -57,6 +58,20 @@ def test_scatter_is_the_adjoint_of_the_lookup(backend, dtype, tolerance, resolut
     looked_up = sample_cubemap(cubemap, directions, backend=backend).double() * weights.double()
     scattered = scatter_cubemap(weights, directions, resolution, backend=backend).double() * cubemap.double()
     assert abs(looked_up.sum() - scattered.sum()) < tolerance * looked_up.abs().sum()
+
+
+@every_implementation
+@pytest.mark.parametrize("channels", [1, 3, 4, 6])
+@pytest.mark.parametrize("weighted", [1, None])
+def test_a_weighed_cubemap_is_looked_up_times_weights_and_scattered(backend, dtype, tolerance, channels, weighted):
+    """In float64 by the definitions; three directions each, and more channels than lie together in the kernel."""
+    cubemap, generator = random_cubemap(5, dtype, channels), torch.Generator().manual_seed(2)
+    directions = torch.randn(1500, 3, 3, generator=generator, dtype=torch.float64).to(dtype)
+    weights = torch.rand(1500, weighted or channels, generator=generator, dtype=torch.float64).to(dtype)
+    exact = sample_cubemap(cubemap.double(), directions.double(), backend="reference") * weights.double()
+    expected = scatter_cubemap(exact, directions.double(), 5, backend="reference")
+    found = weigh_cubemap(cubemap, directions, weights, backend=backend)
+    torch.testing.assert_close(found.double(), expected, atol=50 * tolerance, rtol=0)
 
 
 @every_implementation
