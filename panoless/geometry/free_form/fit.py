@@ -66,7 +66,12 @@ class Change:
 
 
 def fit_free_form(
-    views: Views, start: LevelSet, options: FreeFormOptions = DEFAULTS, *, free_poses: bool = False
+    views: Views,
+    start: LevelSet,
+    options: FreeFormOptions = DEFAULTS,
+    *,
+    lids: Sequence[LevelSet] = (),
+    free_poses: bool = False,
 ) -> tuple[LevelSet, Trust, Poses | None]:
     """The surface that explains photographs and outlines best, no finer than held-out views want it, its trust, and the
     poses of the views where these are unknowns.
@@ -74,7 +79,7 @@ def fit_free_form(
     Rounds are taken with four fifths of the views as long as the others gain by them, and the last of those once more
     with all, in which outlines count more where photographs agree with them. After the rounds that are always taken,
     hollows are searched, parts that pixels distrust are mended, and poses are set `free`, under the prior that views
-    state of them.
+    state of them. Hollows are searched under the start, and if there is none, under the `lids`, other first surfaces.
     """
     kept, held_out = split_held_out(views.train)
     solved = replace(views, train=tuple(kept)) if kept and held_out else views
@@ -91,8 +96,11 @@ def fit_free_form(
 
     with torch.no_grad():
         stage = coarse_stage(solved, start, options.rounds, options, progress)
-        search = options.concave.search
-        hollowed = concave_start(solved, start, stage.surface, options.concave) if search else None
+        hollowed = None
+        for lid in (start, *lids) if options.concave.search else ():
+            hollowed = concave_start(solved, lid, stage.surface, options.concave)
+            if hollowed is not None:
+                break
         if hollowed is not None:
             deeper = coarse_stage(solved, hollowed, options.concave.rounds, options)
             stage = better(stage, deeper, options.concave.least_held_out_gain) if held_out else deeper

@@ -262,14 +262,18 @@ def _mirror(surface: LevelSet, trust: Trust, poses: Poses | None, config: FitCon
 
 
 def _fitted(views: Views, first: FirstSurfaces, told: ToldPoses | None, config: FitConfig) -> FreeFormMirror:
-    """From first surfaces on. Poses that are free under covariances that outlines `told` leave the world where it is
-    said to be: these say little of what all cameras share.
+    """From first surfaces on. A start that has descended may have bent a lid until pixels agree a little: then hollows
+    are looked for under the plain surface.
+
+    Poses that are free under covariances that outlines `told` leave the world where it is said to be: these say little
+    of what all cameras share.
     """
     options, start = config.free_form, started(views, first, config.free_form)
+    lids = () if np.array_equal(start.coefficients, first.plain.coefficients) else (first.surface,)
     if told is None:
-        return _mirror(*fit_free_form(views, start, options), config)
+        return _mirror(*fit_free_form(views, start, options, lids=lids), config)
     surface, trust, poses = fit_free_form(
-        with_pose_covariances(views, told.covariances), start, options, free_poses=True
+        with_pose_covariances(views, told.covariances), start, options, lids=lids, free_poses=True
     )
     assert poses is not None, "poses were free"
     common, poses = poses.without_common(StatedCameras.of(views), told.prior)

@@ -7,6 +7,7 @@ import pytest
 
 from panoless.capture.views import Views
 from panoless.config import FitConfig
+from panoless.geometry.free_form import fit
 from panoless.geometry.free_form.concave import concave_start, unexplained_parts, unexplained_patches
 from panoless.geometry.free_form.fit import fit_free_form
 from panoless.geometry.free_form.hollows import Chart, Hollow, Relief, smooth_maximum
@@ -222,6 +223,24 @@ def test_photographs_of_one_color_tell_no_hollow(dish: tuple[Body, Views]) -> No
 def test_a_surface_that_no_pixel_meets_has_no_hollow(dish: tuple[Body, Views]) -> None:
     far = level_set_of(Body(lambda x: np.linalg.norm(x - [0, 0, 9.0], axis=1)), dish[1])
     assert concave_start(dish[1], far, far, OPTIONS) is None
+
+
+def test_hollows_are_looked_for_under_lids_where_the_start_has_none(
+    dish: tuple[Body, Views], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One after the other, until there is one."""
+    start, lid, other = (level_set_of(ellipsoid(), dish[1], 20) for _ in range(3))
+    asked = []
+
+    def looked_for(views: Views, surface: LevelSet, settled: LevelSet, options: ConcaveOptions) -> LevelSet | None:
+        asked.append(surface)
+        return None if surface is start else surface
+
+    monkeypatch.setattr(fit, "concave_start", looked_for)
+    rounds = (replace(DEFAULTS.rounds[0], rays=2000, steps=1),)
+    short = replace(DEFAULTS, rounds=rounds, finer=(), mending=(), concave=ConcaveOptions(rounds=rounds))
+    fit_free_form(dish[1], start, short, lids=(lid, other))
+    assert [each is known for each, known in zip(asked, (start, lid), strict=True)] == [True, True]
 
 
 @pytest.mark.slow
