@@ -186,7 +186,7 @@ def deblur_map(
     inner = _eroded(environment >= options.lit * saturation[:, None, None])
     others = None
     if footprints.trace_others is not None and inner.any():
-        others = thinned([footprints.trace_others()], options.coarse_pixels)[0]
+        others = PixelFootprints.joined(thinned(footprints.trace_others(), options.coarse_pixels))
     for scale in lamps.robust_scales:
         if others is not None:
             environment = _brightened(environment, others, inner, saturation, options).minimum(highest)

@@ -1,6 +1,7 @@
 """The environment as a cubemap, by robust least squares of rays."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -34,7 +35,7 @@ def solve_environment(
     equations. From a `start`, a map of the same rays at any resolution, only the last scales are needed. The map lies
     between 0 and the brightest ray, or 1 where that is more.
     """
-    rays = [joined_rays(group) for group in grouped(normalize_confidence(rays), MERGED_RAYS)]
+    rays = merged(normalize_confidence(rays))
     weights = [batch.initial_weight() for batch in rays]
     device = rays[0].directions.device if rays else None
     environment = torch.zeros(6, 3, resolution, resolution, device=device)
@@ -50,6 +51,14 @@ def solve_environment(
         environment = _sharpen(splat, right_side, total, rays, weights)
     brightest = max([1.0, *(float(batch.radiance.max()) for batch in rays if batch.radiance.numel())])
     return environment.clamp(0, brightest)
+
+
+def merged(rays: Iterable[Rays]) -> list[Rays]:
+    """The rays in batches of about a million, without where they came from, which a map does not ask for. Those that
+    come one by one need memory once.
+    """
+    groups = grouped((replace(batch, incoming=None) for batch in rays), MERGED_RAYS)
+    return [group[0] if len(group) == 1 else joined_rays(group) for group in groups]
 
 
 def _right_side(

@@ -17,7 +17,7 @@ from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays, normalize_confidence
 from panoless.environment.resolution import RESOLUTIONS, densest_resolution
 from panoless.environment.sharpening import sharpest_map
-from panoless.environment.solve import solve_environment
+from panoless.environment.solve import merged, solve_environment
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import (
     Geometry,
@@ -65,7 +65,7 @@ class ExactGeometry:
         It starts from nothing, because a coarse start would reject what is finer. Footprints are means of radiance, so
         they take no part where radiance is encoded.
         """
-        rays = normalize_confidence(list(observe_views(views, cast(Geometry, self), config.environment.rays)))
+        rays = normalize_confidence(merged(observe_views(views, cast(Geometry, self), config.environment.rays)))
         resolution, encoding = config.environment.solve_resolution, encoding_of(config)
         footprints = None if encoding.high_dynamic_range else self.footprints(views, config.environment.rays)
         if footprints is None or not footprints.smooth:

@@ -10,7 +10,7 @@ from pathlib import Path
 from panoless.geometry.base import Geometry, Training
 from panoless.reconstruct.snapshots import SnapshotSchedule, snapshot_folders
 from panoless.reconstruct.state import FitState, save_state
-from shinypartial.io.memory import peak_memory_bytes
+from shinypartial.io.memory import peak_memory_bytes, release_free_memory
 from shinypartial.prediction.format import SNAPSHOTS
 
 CHECKPOINT_INTERVAL_S = 20.0
@@ -61,9 +61,10 @@ def note_peak_memory(state: FitState) -> None:
 
 @contextmanager
 def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Add the time that a block takes to its stage."""
+    """Add the time that a block takes to its stage, and give back the memory that it no longer needs."""
     start = time.monotonic()
     try:
         yield
     finally:
+        release_free_memory()
         seconds[stage] = seconds.get(stage, 0.0) + time.monotonic() - start

@@ -141,15 +141,16 @@ class FreeFormMirror(ExactGeometry):
 
     def footprints(self, views: Views, max_pixels: int) -> Footprints | None:
         """Four directions over each of at most `footprints` pixels that are trusted and turn little."""
-        found = []
-        for view, pixels in at_most_pixels(views, min(max_pixels, self.options.footprints)):
-            sights = self._sights(view, pixels, 4)
-            trusted = self.trust.at(self.surface.points(sights.hits.places)) > self.options.least_footprint_trust
-            kept = sights.clear & trusted & (sights.turn < self.options.widest_footprint_rad)
-            directions = torch.from_numpy(sights.outgoing[kept]).float().to(view.radiance.device)
-            chosen = pixels[torch.from_numpy(kept).to(pixels.device)]
-            found.append(PixelFootprints(directions, view.radiance_at(chosen)))
-        return Footprints.of(found)
+        chosen = at_most_pixels(views, min(max_pixels, self.options.footprints))
+        return Footprints.of(self._footprints(*each) for each in chosen)
+
+    def _footprints(self, view: TrainView, pixels: Int[Tensor, "P"]) -> PixelFootprints:
+        """Those of the pixels of one view."""
+        sights = self._sights(view, pixels, 4)
+        trusted = self.trust.at(self.surface.points(sights.hits.places)) > self.options.least_footprint_trust
+        kept = sights.clear & trusted & (sights.turn < self.options.widest_footprint_rad)
+        directions = torch.from_numpy(sights.outgoing[kept]).float().to(view.radiance.device)
+        return PixelFootprints(directions, view.radiance_at(pixels[torch.from_numpy(kept).to(pixels.device)]))
 
     def shade(
         self,

@@ -1,13 +1,13 @@
 """The footprints of pixels on a surface of revolution: from neighboring pixels, or traced where these disagree."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Int
 
 from panoless.capture.views import TrainView, Views
-from panoless.environment.footprints import Footprints, PixelFootprints, grouped
+from panoless.environment.footprints import Footprints, PixelFootprints, batched
 from panoless.geometry.revolution.model import SurfaceOfRevolution
 from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
 from panoless.geometry.revolution.pixels import PixelBundles
@@ -28,20 +28,21 @@ def pixel_footprints(
     """Footprints of all pixels of evenly chosen views that are reflected up to `max_bounces` times."""
     stride = -(-views.num_solid // options.map.pixels)
     chosen = views.train[:: max(stride, 1)]
-    found, others = [], []
-    for view in chosen:
-        places = view.solid.cpu().numpy()
-        bend = options.rendering.largest_bend
-        at, smooth = smooth_pixels(
-            surface, view.camera, places, bend, max_bounces=max_bounces, occlusion_test=occlusion_test
-        )
-        pixels = view.solid[torch.from_numpy(smooth).to(view.solid.device)]
-        directions = torch.stack(list(at.within(OFFSETS)), 1).to(view.radiance.device)
-        found.append(PixelFootprints(directions, view.radiance_at(pixels)))
-        others.append(places[~smooth])
-    seen = [areas for areas in found if len(areas.radiance)]
-    joined = [PixelFootprints.joined(group) for group in grouped(seen, options.map.batch_pixels)]
-    return Footprints(joined, lambda: _trace(chosen, surface, others, options))
+    others = list[Int[np.ndarray, "_"]]()
+
+    def seen() -> Iterator[PixelFootprints]:
+        for view in chosen:
+            places = view.solid.cpu().numpy()
+            bend = options.rendering.largest_bend
+            at, smooth = smooth_pixels(
+                surface, view.camera, places, bend, max_bounces=max_bounces, occlusion_test=occlusion_test
+            )
+            others.append(places[~smooth])
+            pixels = view.solid[torch.from_numpy(smooth).to(view.solid.device)]
+            directions = torch.stack(list(at.within(OFFSETS)), 1).to(view.radiance.device)
+            yield PixelFootprints(directions, view.radiance_at(pixels))
+
+    return Footprints(batched(seen()), lambda: [_trace(chosen, surface, others, options)])
 
 
 def _trace(

@@ -248,9 +248,6 @@ class MapOptions:
     """A pixel that spans a wider angle says little about any texel: confidence 1/(1 + a/t) with t its square."""
     pixels: int = 3_500_000
     """Most pixels with a footprint."""
-    batch_pixels: int = 500_000
-    """Views make a batch until it has so many, which bounds memory. Each costs time for every texel of the map: with
-    batches of four views of 160 px, the map of Vase takes 1.3 times as long."""
     traced: int = 60_000
     """Pixels without a smooth footprint that tell how bright saturated regions are."""
 

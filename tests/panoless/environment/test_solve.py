@@ -73,11 +73,11 @@ def test_the_order_and_grouping_of_rays_do_not_matter() -> None:
 def test_groups_are_as_large_as_asked_and_no_larger_than_that_needs() -> None:
     """They keep all batches in their order; without the last batch a group is too small."""
     batches = [random_rays(count, count) for count in (3, 4, 1, 0, 9, 2)]
-    groups = grouped(batches, 5)
+    groups = list(grouped(batches, 5))
     assert [each for group in groups for each in group] == batches
     sizes = [[len(each.radiance) for each in group] for group in groups]
     assert all(sum(group) >= 5 > sum(group[:-1]) for group in sizes[:-1])
-    assert grouped([], 5) == []
+    assert not list(grouped([], 5))
 
 
 def test_without_rays_the_map_is_finite() -> None:

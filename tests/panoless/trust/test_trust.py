@@ -217,7 +217,7 @@ class BlurringMirror(PlaneMirror):
     """A flat mirror every other pixel of which is a mean over eleven degrees each way."""
 
     def footprints(self, views: Views, max_pixels: int) -> Footprints:
-        return Footprints([blurred_pixels(view) for view in views.train], lambda: blurred_pixels(views.train[0]))
+        return Footprints([blurred_pixels(view) for view in views.train], lambda: [blurred_pixels(views.train[0])])
 
 
 def blurred_pixels(view: TrainView) -> PixelFootprints:
