@@ -15,7 +15,7 @@ from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap, weigh_cube
 from panoless.numeric.robust import robust_weight
 
 BATCH_PIXELS = 500_000
-"""Views make a batch until it has so many, which bounds memory. Each costs time for every texel of the map: with
+"""Views make a batch until it has so many, which bounds memory. Each batch costs time for every texel of the map: with
 batches of four views of 160 px, that of Vase takes 1.3 times as long."""
 
 
@@ -119,7 +119,7 @@ def counting_saturated(
     return replace(batch, trust=batch.initial_weight() * (1 - batch.reaches(level) * share * (1 - weight)))
 
 
-def batched(parts: "Iterable[PixelFootprints]") -> list[PixelFootprints]:
+def batched(parts: Iterable[PixelFootprints]) -> list[PixelFootprints]:
     """The pixels in batches; parts that come one by one need memory once."""
     groups = grouped((part for part in parts if len(part.radiance)), BATCH_PIXELS)
     return [PixelFootprints.joined(group) for group in groups]
