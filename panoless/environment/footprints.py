@@ -112,6 +112,12 @@ def thinned(batches: Sequence[Batch], most: float) -> list[Batch]:
     return [batch.every(stride, index % stride) for index, batch in enumerate(batches)]
 
 
+def splat(batch: Rays | PixelFootprints, weights: Float[Tensor, "P"], resolution: int) -> Float[Tensor, "6 4 L L"]:
+    """Sums of what fell on each texel: weighted light, and weights."""
+    values = torch.cat([batch.radiance, torch.ones_like(batch.radiance[:, :1])], 1) * weights[:, None]
+    return scatter_cubemap(values, batch.directions, resolution)
+
+
 def counting_saturated(
     batch: Batch, weight: float, level: Float[Tensor, "3"], share: Float[Tensor, "P"] | float = 1.0
 ) -> Batch:

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from panoless.environment.cubemap import resample
 from panoless.environment.fill import fill_unobserved
-from panoless.environment.footprints import grouped
+from panoless.environment.footprints import grouped, splat
 from panoless.environment.rays import Rays, joined_rays, normalize_confidence
-from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap, weigh_cubemap
+from panoless.kernels.cubemap import sample_cubemap, weigh_cubemap
 from panoless.numeric.conjugate_gradients import conjugate_gradients
 from panoless.numeric.robust import robust_weight
 
@@ -67,8 +67,7 @@ def _right_side(
     """Eᵀ(w c) and Eᵀw, of the size and on the device of a map."""
     both = torch.cat([torch.zeros_like(environment), torch.zeros_like(environment[:, :1])], 1)
     for batch, weight in zip(rays, weights, strict=True):
-        values = torch.cat([batch.radiance, torch.ones_like(batch.radiance[:, :1])], 1) * weight[:, None]
-        both += scatter_cubemap(values, batch.directions, environment.shape[-1])
+        both += splat(batch, weight, environment.shape[-1])
     return both[:, :3], both[:, 3:]
 
 

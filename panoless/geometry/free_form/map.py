@@ -1,18 +1,17 @@
 """The map that a fit works with: weighted least squares of pixels as means of a few rays, from the one before."""
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from panoless.environment.cubemap import by_face, by_texel
 from panoless.environment.fill import fill_unobserved, texel_neighbors
-from panoless.environment.footprints import PixelFootprints
+from panoless.environment.footprints import PixelFootprints, splat
 from panoless.numeric.conjugate_gradients import conjugate_gradients
 
 
 def splatted_map(pixels: PixelFootprints, weights: Float[Tensor, "P"], resolution: int) -> Float[Tensor, "6 3 L L"]:
     """Each texel the mean of what fell on it, gaps filled."""
-    light, total = _splat(pixels, weights, resolution)
+    light, total = splat(pixels, weights, resolution).split((3, 1), 1)
     return fill_unobserved(light / total.clamp(min=1e-9), total[:, 0])
 
 
@@ -34,16 +33,7 @@ def smoothed_map(
     def product(image: Tensor) -> Tensor:
         return pixels.weighed(image, weights[:, None]) + smoothness * differences(image)
 
-    light, total = _splat(pixels, weights, resolution)
+    light, total = splat(pixels, weights, resolution).split((3, 1), 1)
     diagonal = total + 4 * smoothness
     found = conjugate_gradients(product, environment, light - product(environment), 1 / diagonal, steps)
     return found.clamp(min=0)
-
-
-def _splat(
-    pixels: PixelFootprints, weights: Float[Tensor, "P"], resolution: int
-) -> tuple[Float[Tensor, "6 3 L L"], Float[Tensor, "6 1 L L"]]:
-    """Sums of what fell on each texel: weighted light, and weights."""
-    values = torch.cat([pixels.radiance, torch.ones_like(pixels.radiance[:, :1])], 1) * weights[:, None]
-    both = pixels.spread(values, resolution)
-    return both[:, :3], both[:, 3:]

@@ -74,20 +74,34 @@ def scatter_cubemap(
     values: Float[Tensor, "P C"], directions: Float[Tensor, "P *K 3"], resolution: int
 ) -> Float[Tensor, "6 C L L"]:
     """The adjoint of `SampleCubemap` in its first argument."""
-    buffers = _scatter_buffers(directions, resolution, values.shape[1])
-    run_shared(_scatter, values.detach().contiguous().numpy(), _flat(directions), buffers, _samples(directions))
-    return _collected(buffers, values.shape[1])
+    nothing = values.new_empty(0, 6, resolution + 2, resolution + 2, TOGETHER)
+    return _scattered(nothing, values.detach().contiguous(), directions, resolution)
 
 
 def weigh_cubemap(
     cubemap: Float[Tensor, "6 C L L"], directions: Float[Tensor, "P *K 3"], weights: Float[Tensor, "P W"]
 ) -> Float[Tensor, "6 C L L"]:
     """What is looked up, times weights, scattered: both ways while a block of rays is at hand."""
-    texture, channels = _padded(cubemap), cubemap.shape[1]
-    buffers = _scatter_buffers(directions, cubemap.shape[2], channels)
-    weights = weights.detach().expand(-1, channels).contiguous()
-    run_shared(_weigh, texture.numpy(), weights.numpy(), _flat(directions), buffers, _samples(directions))
-    return _collected(buffers, channels)
+    weights = weights.detach().expand(-1, cubemap.shape[1]).contiguous()
+    return _scattered(_padded(cubemap), weights, directions, cubemap.shape[2])
+
+
+def _scattered(
+    texture: Float[Tensor, "groups 6 padded padded 4"],
+    values: Float[Tensor, "P C"],
+    directions: Float[Tensor, "P *K 3"],
+    resolution: int,
+) -> Float[Tensor, "6 C L L"]:
+    channels, samples = values.shape[1], _samples(directions)
+    padding = cubemap_padding(resolution, torch.device("cpu"))
+    # Clearing and adding up one more buffer must cost less than the work it takes from the others.
+    useful = max(1, 4 * samples * len(directions) // (6 * resolution**2))
+    buffers = _scatter_buffers(min(MOST_SHARES, useful), resolution, _groups(channels), get_ident())
+    run_shared(_scatter, texture.numpy(), values.numpy(), _flat(directions), buffers, samples)
+    cubemap = values.new_empty(6, channels, resolution, resolution)
+    run_shared(_add_up, buffers, cubemap.numpy())
+    _fold_rings(buffers, padding.sources.numpy(), padding.corners.numpy(), cubemap.numpy())
+    return cubemap
 
 
 def _padded(cubemap: Float[Tensor, "6 C L L"]) -> Float[Tensor, "groups 6 padded padded 4"]:
@@ -97,25 +111,6 @@ def _padded(cubemap: Float[Tensor, "6 C L L"]) -> Float[Tensor, "groups 6 padded
     faces = cubemap.detach().contiguous().numpy()
     run_shared(_pad, faces, padding.sources.numpy(), padding.corners.numpy(), texture.numpy())
     return texture
-
-
-def _scatter_buffers(
-    directions: Float[Tensor, "P *K 3"], resolution: int, channels: int
-) -> Float[np.ndarray, "shares groups 6 padded padded 4"]:
-    # Clearing and adding up one more buffer must cost less than the work it takes from the others.
-    useful = max(1, 4 * _samples(directions) * len(directions) // (6 * resolution**2))
-    return _kept_buffers(min(MOST_SHARES, useful), resolution, _groups(channels), get_ident())
-
-
-def _collected(
-    buffers: Float[np.ndarray, "shares groups 6 padded padded 4"], channels: int
-) -> Float[Tensor, "6 C L L"]:
-    resolution = buffers.shape[3] - 2
-    padding = cubemap_padding(resolution, torch.device("cpu"))
-    cubemap = torch.empty(6, channels, resolution, resolution)
-    run_shared(_add_up, buffers, cubemap.numpy())
-    _fold_rings(buffers, padding.sources.numpy(), padding.corners.numpy(), cubemap.numpy())
-    return cubemap
 
 
 def _samples(directions: Float[Tensor, "P *K 3"]) -> int:
@@ -132,7 +127,7 @@ def _flat(tensor: Tensor) -> Float[np.ndarray, "N"]:
 
 
 @lru_cache(maxsize=4)
-def _kept_buffers(
+def _scatter_buffers(
     shares: int, resolution: int, groups: int, owner: int
 ) -> Float[np.ndarray, "shares groups 6 padded padded 4"]:
     """Scratch of one Python thread (`owner`) that every scatter of this shape clears and uses again."""
@@ -282,12 +277,15 @@ def _take(values, group, colors):
 
 
 @njit(**VECTORIZED_LOOPS)
-def _scatter(counter, values, directions, buffers, samples):
-    """Clear each padded buffer and add its share of the rays to it: the same share whichever thread comes to it."""
+def _scatter(counter, texture, values, directions, buffers, samples):
+    """Clear each padded buffer and add its share of the rays to it: the same share whichever thread comes to it.
+
+    Values are added, or where the texture has groups, values times what `_sample` gives.
+    """
     shares, groups, _, stride, _, _ = buffers.shape
     count, block = len(values), max(RAYS_PER_BLOCK // samples, 1)
     cells, places = np.empty(block * samples, np.int32), np.empty((3, block * samples), np.float32)
-    colors = np.empty(TOGETHER * block, np.float32)
+    colors, seen = np.empty(TOGETHER * block, np.float32), np.empty(TOGETHER * block, np.float32)
     while True:
         task = fetch_add(counter, 1)
         if task >= shares:
@@ -300,31 +298,10 @@ def _scatter(counter, values, directions, buffers, samples):
             _locate(share, stride - 2, cells, places[0], places[1], places[2])
             for group in range(groups):
                 _take(values[begin:end], group, colors)
-                _deposit(colors, stride, cells, places, samples, end - begin, buffers[task, group])
-
-
-@njit(**VECTORIZED_LOOPS)
-def _weigh(counter, texture, weights, directions, buffers, samples):
-    """`_scatter` of what `_sample` gives, times weights."""
-    shares, groups, _, stride, _, _ = buffers.shape
-    count, block = len(weights), max(RAYS_PER_BLOCK // samples, 1)
-    cells, places = np.empty(block * samples, np.int32), np.empty((3, block * samples), np.float32)
-    colors, factors = np.empty(TOGETHER * block, np.float32), np.empty(TOGETHER * block, np.float32)
-    while True:
-        task = fetch_add(counter, 1)
-        if task >= shares:
-            return
-        buffers[task] = f32(0)
-        last = (task + 1) * count // shares
-        for begin in range(task * count // shares, last, block):
-            end = min(begin + block, last)
-            share = directions[3 * samples * begin : 3 * samples * end]
-            _locate(share, stride - 2, cells, places[0], places[1], places[2])
-            for group in range(groups):
-                _interpolate(texture[group], stride, cells, places, samples, end - begin, colors)
-                _take(weights[begin:end], group, factors)
-                for i in range(TOGETHER * (end - begin)):
-                    colors[i] *= factors[i]
+                if len(texture):
+                    _interpolate(texture[group], stride, cells, places, samples, end - begin, seen)
+                    for i in range(TOGETHER * (end - begin)):
+                        colors[i] *= seen[i]
                 _deposit(colors, stride, cells, places, samples, end - begin, buffers[task, group])
 
 
