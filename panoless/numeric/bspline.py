@@ -34,3 +34,11 @@ def cubic_bsplines_at(
     """
     cell = np.clip(np.floor(place), 0, np.maximum(np.asarray(count) - 4, 0)).astype(np.int64)
     return cell, cubic_bspline_basis(place - cell, derivatives)
+
+
+def with_halved_knots(coefficients: Float[np.ndarray, "N ..."]) -> Float[np.ndarray, "M ..."]:
+    """The 2N − 3 coefficients of the same spline with twice as many knots, along the first axis."""
+    finer = np.empty((2 * len(coefficients) - 3, *coefficients.shape[1:]))
+    finer[0::2] = (coefficients[:-1] + coefficients[1:]) / 2
+    finer[1::2] = (coefficients[:-2] + 6 * coefficients[1:-1] + coefficients[2:]) / 8
+    return finer

@@ -26,15 +26,17 @@ from shinypartial.core.errors import InputError
 ANY = "auto"
 LEAST = "leaves much unexplained, and nothing explains more"
 BENT = "a bend explains more than near surroundings do"
+OTHER = "another kind is preferred"
 
 
 def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefly) -> tuple[Geometry, Selection]:
     """The geometry of the scene and the evidence for it; of surfels it is the start.
 
     Candidates are examined from the simplest on. One is refused when it misses the silhouettes, or when surfels that
-    start on it explain held-out views clearly better. One that leaves too much unexplained waits until those after it
-    are refused, too. Surfels explain what is left; of the candidates that explained the silhouettes they start on the
-    one from which they explained held-out views best. `config.model` overrides.
+    start on it explain held-out views clearly better. One that leaves more than right ones do is taken unless one after
+    it leaves much less. One that leaves too much waits until all others are refused. Surfels explain what is left; of
+    the candidates that explained the silhouettes they start on the one from which they explained held-out views best.
+    `config.model` overrides.
     Raises InputError when a kind is asked for and can't be proposed, and when views along one line show no kind that
     these tell.
     """
@@ -44,25 +46,29 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
     if views.object_frame.depth_is_open:
         families = [family for family in families if not family.needs_depth]
     table, refused = list[Candidate](), dict[str, list[PosedProposal]]()
-    fitted = list[tuple[Candidate, Geometry]]()
+    fitted, doubted = list[tuple[Candidate, Geometry]](), list[tuple[Candidate, Geometry]]()
     for family in families:
         source = _source(family)
         proposals = refused.get(source.kind, []) if family.refines else _proposals(source, views, config, asked=False)
         candidate, geometry = _examine(family, proposals, views, config, trial)
         table.append(candidate)
-        refused[family.kind] = [each for each in proposals if _is_near(each, config)]
+        refused[family.kind] = [each for each in proposals if _is_near(each, config, bent=True)]
         if geometry is not None:
             if candidate.verdict == Verdict.CHOSEN:
-                if not _bends_rather(family, geometry, proposals, candidate.corrections.applied(views, config), config):
-                    return geometry, Selection(family.kind, tuple(table))
-                table[-1] = replace(candidate, verdict=Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason=BENT)
-                continue
+                if _bends_rather(family, geometry, proposals, candidate.corrections.applied(views, config), config):
+                    table[-1] = replace(candidate, verdict=Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason=BENT)
+                    continue
+                doubted.append((candidate, geometry))
+                if error_of(doubted[-1]) > config.selection.doubted_error:
+                    continue
+                break
             fitted.append((candidate, geometry))
+    if doubted:
+        return _chosen(*much_less_unexplained(doubted, config), table)
     waiting = least_unexplained(fitted, config)
     if waiting is not None:
         candidate, geometry = waiting
-        others = (each for each in table if each.kind != candidate.kind)
-        return geometry, Selection(candidate.kind, (*others, replace(candidate, verdict=Verdict.CHOSEN, reason=LEAST)))
+        return _chosen(replace(candidate, verdict=Verdict.CHOSEN, reason=LEAST), geometry, table)
     if views.object_frame.depth_is_open:
         raise _along_one_line()
     start, corrections = None, NO_CORRECTIONS
@@ -75,23 +81,47 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
     return geometry, Selection(last.kind, tuple(table))
 
 
+def _chosen(candidate: Candidate, geometry: Geometry, table: Sequence[Candidate]) -> tuple[Geometry, Selection]:
+    """The geometry, and the evidence with what was chosen last; what else might have been is refused."""
+    others = (
+        replace(each, verdict=Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason=OTHER)
+        if each.verdict == Verdict.CHOSEN
+        else each
+        for each in table
+        if each.kind != candidate.kind
+    )
+    return geometry, Selection(candidate.kind, (*others, candidate))
+
+
+def error_of(each: tuple[Candidate, Geometry]) -> float:
+    """The held-out error; zero where it was not measured."""
+    return each[0].held_out_error or 0.0
+
+
+def much_less_unexplained(
+    fitted: Sequence[tuple[Candidate, Geometry]], config: FitConfig
+) -> tuple[Candidate, Geometry]:
+    """The simplest, unless one after it leaves a share of its error only."""
+    chosen = fitted[0]
+    for each in fitted[1:]:
+        if error_of(each) < config.selection.doubted_share * error_of(chosen):
+            chosen = each
+    return chosen
+
+
 def least_unexplained(
     fitted: Sequence[tuple[Candidate, Geometry]], config: FitConfig
 ) -> tuple[Candidate, Geometry] | None:
     """Of what was refused only because it leaves too much unexplained, the simplest that nothing else explains clearly
     more than, surfels included; None where they do.
     """
-
-    def error(each: tuple[Candidate, Geometry]) -> float:
-        return each[0].held_out_error or 0.0
-
     waiting = [each for each in fitted if each[0].verdict == Verdict.LEFT_TOO_MUCH and not is_refined(each[0].kind)]
     if not waiting:
         return None
-    enough = min(map(error, waiting)) / (1 - config.selection.least_gain)
+    enough = min(map(error_of, waiting)) / (1 - config.selection.least_gain)
     surfels = min(candidate.surfels_error for candidate, _ in fitted if candidate.surfels_error is not None)
-    simplest = next(each for each in waiting if error(each) <= enough)
-    return None if surfels < (1 - config.selection.least_gain) * error(simplest) else simplest
+    simplest = next(each for each in waiting if error_of(each) <= enough)
+    return None if surfels < (1 - config.selection.least_gain) * error_of(simplest) else simplest
 
 
 def _source(family: Family) -> Family:
@@ -108,10 +138,13 @@ def _proposals(source: Family, views: Views, config: FitConfig, *, asked: bool) 
     return [PosedProposal(proposal)] if aligned is None else [aligned, PosedProposal(proposal)]
 
 
-def _is_near(start: PosedProposal, config: FitConfig) -> bool:
-    """Whether a proposal explains the silhouettes."""
+def _is_near(start: PosedProposal, config: FitConfig, *, bent: bool) -> bool:
+    """Whether a proposal explains the silhouettes, or would where a kind that refines it bends its edge."""
     options, proposal = config.selection, start.proposal
-    return proposal.silhouette_px <= options.largest_silhouette_px and proposal.overlap >= options.least_overlap
+    farther = options.bent_edge if bent else 1.0
+    return proposal.silhouette_px <= farther * options.largest_silhouette_px and 1 - proposal.overlap <= farther * (
+        1 - options.least_overlap
+    )
 
 
 def _best_fit(
@@ -121,7 +154,8 @@ def _best_fit(
     source = _source(family)
 
     def near(proposals: Sequence[PosedProposal]) -> list[PosedProposal]:
-        return list(proposals) if asked else [each for each in proposals if _is_near(each, config)]
+        bent = family.refines is not None
+        return list(proposals) if asked else [each for each in proposals if _is_near(each, config, bent=bent)]
 
     def refit(views: Views, before: Fitted, *, anew: bool) -> Fitted | None:
         poses = before.geometry.poses
@@ -200,7 +234,7 @@ def _bends_rather(
         return False
     far = replace(config, surroundings=replace(config.surroundings, mode="off"))
     for other in FAMILIES.values():
-        near = [each for each in proposals if _is_near(each, config)]
+        near = [each for each in proposals if _is_near(each, config, bent=True)]
         fitted = _first_fit(other, near, views, far) if other.refines == family.kind else None
         if fitted is not None and explains_clearly_more(views, fitted.geometry, geometry, config):
             return True

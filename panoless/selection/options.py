@@ -14,9 +14,16 @@ class SelectionOptions:
     """A candidate's silhouette lies at most this far from the masks' contours: median over views of the median."""
     least_overlap: Share = 0.98
     """Its silhouette and the masks share at least this part of their union: median over views."""
+    bent_edge: Positive = 2.0
+    """What a kind refines may be farther from the masks by this factor: its edge bends, too. Not tuned."""
     largest_error: NonNegative = 0.3
     """A candidate that leaves more of the held-out views unexplained is refused even if surfels do no better, unless no
     later kind explains more. Right ones leave a twentieth."""
+    doubted_error: NonNegative = 0.15
+    """Where a candidate leaves more, those after it are asked, too. Right ones of development scenes leave up to
+    0.143."""
+    doubted_share: Share = 0.5
+    """One of those is preferred where it leaves less than this share of that. Not tuned."""
     explained_error: Share = 0.03
     """A candidate that no other kind takes on, and that leaves less of the held-out views unexplained, is chosen
     without asking surfels. On sculpture and on other shapes of trial these leave 0.04 and more."""

@@ -72,6 +72,14 @@ def cut_bowl() -> Vessel:
     return Vessel([floor, np.stack([radius, height], 1)], [])
 
 
+def deep_cup() -> Vessel:
+    """An open wall without thickness, as deep as it is wide: cameras see the sky in it by way of its walls only."""
+    height = np.linspace(-0.6, 0.6, 160)
+    radius = 0.5 + 0.06 * height + 0.04 * np.sin(4 * height)
+    floor = np.linspace([0.0, -0.6], [radius[0], -0.6], 3)
+    return Vessel([floor, np.stack([radius, height], 1)], [])
+
+
 def dished_jar() -> Vessel:
     """A closed jar whose top is a shallow dish below its lip."""
     height = np.linspace(-0.7, 0.6, 160)

@@ -1,4 +1,6 @@
-"""A bent mirror from photographs: edge and frame by silhouettes, then all heights by what is mirrored."""
+"""A bent mirror from photographs: edge and frame by silhouettes, then all heights by what is mirrored, on a grid as
+fine as held-out views ask for.
+"""
 
 from dataclasses import replace
 
@@ -7,15 +9,16 @@ import torch
 from jaxtyping import Float
 
 from panoless.capture.silhouettes import MaskContours, mask_contours
-from panoless.capture.views import Views
+from panoless.capture.views import Views, split_held_out
 from panoless.environment.solve import solve_environment
 from panoless.geometry.height_field.model import HeightField, flat_height_field
-from panoless.geometry.height_field.options import HeightFieldOptions
+from panoless.geometry.height_field.options import HeightFieldOptions, HeightFieldRound
 from panoless.geometry.height_field.photometric import Photographs, observe
 from panoless.geometry.height_field.silhouette import edge_equations, edge_residuals
 from panoless.geometry.plane.model import Plane
 from panoless.geometry.plane.silhouette import apply_plane_step
-from panoless.numeric.gauss_newton import accept_step, damped_step
+from panoless.numeric.gauss_newton import accept_step, damped_step, keep_if_better
+from panoless.numeric.robust import bounded_error
 from shinypartial.io.progress import Progress
 
 
@@ -29,27 +32,69 @@ def fit_height_field(
 
     The silhouettes alone give the plane of a frame that stands out, and the heights along the mirror's edge. From there
     on a step asks silhouettes and photographs together; the map is solved anew before each, and eliminated in it.
-    One that was `fitted` to almost the same views goes on in the last round.
+    One that was `fitted` to almost the same views goes on in the last round, on its grid.
     """
-    contours = mask_contours(views)
-    contours = contours.every(max(1, len(contours.view) // options.max_points))
-    height_field, rounds = fitted, options.rounds[-1:]
-    if height_field is None:
-        height_field, rounds = flat_height_field(plane, options.cells), options.rounds
-        for scale_px in options.edge_scales_px:
-            height_field = step_height_field(contours, height_field, scale_px, options.edge_bending, options)
-    progress = Progress("fitting a bent mirror", sum(settings.steps for settings in rounds))
     with torch.no_grad():
-        for settings in rounds:
-            for _ in range(settings.steps):
-                observed = observe(views, height_field, settings.rays, options)
-                environment = solve_environment([observed.rays], settings.resolution)
-                photographs = Photographs.at(height_field, observed, environment, settings.robust_scale, options)
-                height_field = step_height_field(
-                    contours, height_field, options.contour_scale_px, options.bending, options, photographs
-                )
-                progress.advance()
+        if fitted is not None:
+            return _refine(views, fitted, options.rounds[-1], options)
+        contours, height_field = _contours(views, options), flat_height_field(plane, options.cells)
+        for scale_px in options.edge_scales_px:
+            height_field = step_height_field(contours, height_field, scale_px, options.edge_bending, options)[0]
+        progress = Progress("fitting a bent mirror", len(options.rounds) + 1)
+        for each in options.rounds:
+            height_field = _refine(views, height_field, each, options)
+            progress.advance()
+        height_field = _refine_grid(views, height_field, options)
+        progress.advance()
     return height_field
+
+
+def _refine_grid(views: Views, height_field: HeightField, options: HeightFieldOptions) -> HeightField:
+    """The height field on finer grids, as long as held-out views gain by them.
+
+    What is there already was fitted to all views, so a finer grid has to gain a little more than that.
+    """
+    kept, held_out = (replace(views, train=tuple(part)) for part in split_held_out(views.train))
+    last = options.rounds[-1]
+
+    def error(each: HeightField) -> float:
+        environment = solve_environment([observe(kept, each, last.rays, options).rays], last.resolution)
+        judged = observe(held_out, each, last.rays, options)
+        shown = judged.mirrored_by(each, judged.hits).light(environment)
+        return float(bounded_error(shown - judged.radiance, last.robust_scale).mean()) if len(shown) else 1.0
+
+    for _ in range(options.halvings):
+        finer = height_field.with_halved_cells()
+        candidate = _refine(kept, finer, replace(last, steps=options.judged_steps), options)
+        if keep_if_better((height_field, candidate), error) is height_field:
+            return height_field
+        height_field = _refine(views, candidate, last, options)
+    return height_field
+
+
+def _refine(
+    views: Views, height_field: HeightField, each: HeightFieldRound, options: HeightFieldOptions
+) -> HeightField:
+    """The height field after the steps of one round, as long as they lower the cost."""
+    contours = _contours(views, options)
+    for _ in range(each.steps):
+        observed = observe(views, height_field, each.rays, options)
+        environment = solve_environment([observed.rays], each.resolution)
+        tell_tilt = each is options.rounds[-1]
+        photographs = Photographs.at(
+            height_field, observed, environment, each.robust_scale, options, tell_tilt=tell_tilt
+        )
+        height_field, fall = step_height_field(
+            contours, height_field, options.contour_scale_px, options.bending, options, photographs
+        )
+        if fall < options.least_fall:
+            break
+    return height_field
+
+
+def _contours(views: Views, options: HeightFieldOptions) -> MaskContours:
+    contours = mask_contours(views)
+    return contours.every(max(1, len(contours.view) // options.max_points))
 
 
 def step_height_field(
@@ -59,11 +104,12 @@ def step_height_field(
     bending: float,
     options: HeightFieldOptions,
     photographs: Photographs | None = None,
-) -> HeightField:
+) -> tuple[HeightField, float]:
     """One Gauss–Newton step of plane, boundary and heights that does not raise the cost
 
     s²/2σ² Σ e²/(e² + s²) + ½ λ cᵀ B c, plus that of the photographs, with e the distances of contours in pixels, s
-    their robust scale, c the coefficients, B the bending energy and λ a share of their mean diagonal.
+    their robust scale, c the coefficients, B the bending energy and λ a share of their mean diagonal. And the share of
+    the cost by which it fell.
     """
     residuals = edge_residuals(contours, height_field, options)
     scale, precision = residuals.scale(scale_px, options.contours), options.contour_sigma_px**-2
@@ -77,13 +123,17 @@ def step_height_field(
     gradient[first:] += energy @ height_field.coefficients.ravel()
     matrix[first:, first:] += energy
 
+    costs = list[float]()
+
     def cost(candidate: HeightField) -> float:
         coefficients = candidate.coefficients.ravel()
         contour_cost = edge_residuals(contours, candidate, options).cost(scale, residuals.counted)
         total = precision * scale**2 * contour_cost / 2 + coefficients @ energy @ coefficients / 2
-        return float(total if photographs is None else total + photographs.cost(candidate))
+        costs.append(float(total if photographs is None else total + photographs.cost(candidate)))
+        return costs[-1]
 
-    return accept_step(height_field, damped_step(gradient, matrix), apply_height_field_step, cost)
+    moved = accept_step(height_field, damped_step(gradient, matrix), apply_height_field_step, cost)
+    return moved, 0.0 if moved is height_field else 1 - costs[-1] / costs[0]
 
 
 def apply_height_field_step(height_field: HeightField, step: Float[np.ndarray, "D"]) -> HeightField:

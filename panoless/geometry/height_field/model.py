@@ -1,6 +1,6 @@
 """A mirror that bends: a plane with a boundary and a smooth height over it, and what a camera sees of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.model import Plane
 from panoless.kernels.height_field import first_hits
 from panoless.kernels.rasterize import RasterCamera
-from panoless.numeric.bspline import cubic_bsplines_at
+from panoless.numeric.bspline import cubic_bsplines_at, with_halved_knots
 from panoless.numeric.polygon import depth_inside, projected_coverage
 
 ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
@@ -97,6 +97,11 @@ class HeightField:
         index, weights = self.basis(places, derivatives)
         return (weights * self.coefficients.ravel()[index]).sum(2)
 
+    def with_halved_cells(self) -> "HeightField":
+        """The same surface with twice as many cells along either side."""
+        finer = with_halved_knots(with_halved_knots(self.coefficients).T).T
+        return replace(self, spacing=self.spacing / 2, coefficients=finer)
+
     def quadrilaterals(self) -> tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, "F 4"]]:
         """Points in the normalized frame, over a grid of the boundary's box, and the faces within the boundary."""
         low, high = self.plane.boundary.min(0), self.plane.boundary.max(0)
@@ -124,6 +129,11 @@ class HeightField:
         )
         whole = np.concatenate(differences)
         return whole.T @ whole
+
+    def tilts(self) -> Float[np.ndarray, "D 3"]:
+        """An orthonormal basis of the coefficients whose height is linear: a shift and the tilts of the whole."""
+        places = np.stack(np.meshgrid(*map(np.arange, self.coefficients.shape), indexing="ij"), -1).reshape(-1, 2)
+        return np.linalg.qr(np.concatenate([np.ones((len(places), 1)), places], 1))[0]
 
     def hits(self, origins: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"]) -> HeightFieldHits:
         """Where rays meet the front of the height field, also beside its boundary."""

@@ -2,6 +2,9 @@
 
 At a fixed ray d, in the axes of the plane, a height δ moves the hit by δ/(d_z − ∇h·d) along the ray, so the slope that
 is seen there changes by ∇δ + (D²h d) δ/(d_z − ∇h·d). The map follows in each step (see `environment.following`).
+
+How far the map can follow a tilt of the whole mirror depends on its texels: coarse ones hold against it, and where they
+do tells nothing. So under coarse maps photographs have no say on that.
 """
 
 from dataclasses import dataclass
@@ -72,6 +75,8 @@ class Photographs:
     environment: Float[Tensor, "6 3 L L"]
     residual: Float[np.ndarray, "P 3"]
     following: FollowingMap
+    tell_tilt: bool = True
+    """Whether they have a say on the tilt of the whole."""
 
     @classmethod
     def at(
@@ -81,16 +86,18 @@ class Photographs:
         environment: Float[Tensor, "6 3 L L"],
         robust_scale: float,
         options: HeightFieldOptions = HeightFieldOptions(),
+        *,
+        tell_tilt: bool = True,
     ) -> "Photographs":
         """Weights (1 + ‖r‖²/s²)⁻²/σ² and texels of observations at the height field that they were made with."""
         residual = observed.mirrored_by(height_field, observed.hits).light(environment) - observed.radiance
         weights = robust_weight(residual, robust_scale) / options.radiance_sigma**2
         directions = observed.rays.directions.cpu().numpy().astype(np.float64)
         following = FollowingMap.of(directions, weights, environment.shape[-1])
-        return cls(height_field, observed, environment, residual, following)
+        return cls(height_field, observed, environment, residual, following, tell_tilt)
 
     def equations(self) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
-        """Gradient and Gauss–Newton matrix of the cost over the coefficients.
+        """Gradient and Gauss–Newton matrix of the cost over the coefficients, or over what they are beside tilts.
 
         Zero when there are no rays, as where a high frame is mirrored everywhere.
         """
@@ -107,7 +114,12 @@ class Photographs:
         mirrored = self.observed.mirrored_by(height_field, hits)
         by_slope = mirrored.light_by_turns(self.environment, hits.normals_by_slopes(height_field.frame))
         rows = np.matmul(by_slope, slopes.transpose(1, 0, 2))
-        return self.following.sparse_equations(rows, index, count, self.residual)
+        gradient, matrix = self.following.sparse_equations(rows, index, count, self.residual)
+        if self.tell_tilt:
+            return gradient, matrix
+        tilts = height_field.tilts()
+        left = matrix - tilts @ (tilts.T @ matrix)
+        return gradient - tilts @ (tilts.T @ gradient), left - (left @ tilts) @ tilts.T
 
     def cost(self, candidate: HeightField) -> float:
         """The cost of another height field near to this one; a ray that misses it has a residual of 1."""

@@ -24,6 +24,7 @@ from panoless.geometry.revolution.photometric import refine_round, solve_map
 from panoless.geometry.revolution.pixels import CENTER, PixelBundles, evenly
 from panoless.geometry.revolution.profile import resample_profile
 from panoless.geometry.revolution.silhouette import (
+    EXTENTS,
     ContourRays,
     axis_starts,
     contour_cost,
@@ -53,15 +54,15 @@ class RevolutionProposal:
 def propose_revolution(views: Views, options: RevolutionOptions = DEFAULTS) -> RevolutionProposal | None:
     """Axis and outer profile that explain the masks best; None when none comes near.
 
-    What may be a stem below the body, or a cone that silhouettes leave beyond its lip, is believed only where the body
-    without it misses the masks.
+    What may be a stem below the body, or a cone that silhouettes leave beyond its lip, and then what lies beyond a
+    narrow place, is believed only where the body without it misses the masks.
     """
     rays = contour_rays(views, options.silhouette)
     if len(np.unique(rays.view)) < options.silhouette.least_views:
         return None
     best, starts = None, axis_starts(views, options.silhouette)
-    for stem in (False, True):
-        found = _propose(views, rays, starts, options, stem)
+    for extent in range(EXTENTS):
+        found = _propose(views, rays, starts, options, extent)
         if found is not None and (best is None or np.median(found.iou) > np.median(best.iou)):
             best = found
         if best is not None and np.median(best.iou) >= options.silhouette.believed_overlap:
@@ -70,17 +71,17 @@ def propose_revolution(views: Views, options: RevolutionOptions = DEFAULTS) -> R
 
 
 def _propose(
-    views: Views, rays: ContourRays, starts: list[SurfaceOfRevolution], options: RevolutionOptions, stem: bool
+    views: Views, rays: ContourRays, starts: list[SurfaceOfRevolution], options: RevolutionOptions, extent: int
 ) -> RevolutionProposal | None:
     own = options.silhouette
-    start = fit_outer(rays, starts, stem=stem)
+    start = fit_outer(rays, starts, extent)
     if start is None:
         return None
     residuals = silhouette_residuals(rays.at_most(own.start_points), start, rays.pixel)
     if contour_cost(residuals, own.judged_scale_px) > own.largest_start_cost:
         return None
     base, lid = (_count(end) for end in end_pixels(views, start, options.mouth.pixels))
-    surface = refine_outer(rays, start if lid >= base else start.turned_over(), stem=stem)
+    surface = refine_outer(rays, start if lid >= base else start.turned_over(), extent)
     if surface is None:
         return None
     found = silhouette_residuals(rays, surface, rays.pixel)
@@ -131,11 +132,12 @@ class _Refinement:
         """All of them, in order."""
         fine = self.options.photometric.fine
         progress = Progress("fitting a surface of revolution", 5 + len(fine))
-        surface, environment = self.open_mouth()
+        surface, environment = self.open_mouth(), None
         progress.advance()
         for each in fine:
             surface, environment = self.refine_by_centers(surface, each, environment)
             progress.advance()
+        assert environment is not None, "there is a fine round"
         mapped = None
         for refine in (self.refine_areas, self.refine_interior, self.refine_floor, self.refine_lip):
             if surface is not mapped:
@@ -159,8 +161,11 @@ class _Refinement:
     def _error(self, pixels: PixelBundles, surface: SurfaceOfRevolution, environment: Tensor) -> float:
         return pixels.error(surface, environment, self.options.rendering.max_bounces, self.options.judged_scale)
 
-    def open_mouth(self) -> tuple[SurfaceOfRevolution, Tensor]:
-        """The outside after coarse rounds with what is inside its lid, or inside its base if that is unclear; a map."""
+    def open_mouth(self) -> SurfaceOfRevolution:
+        """The outside after coarse rounds with what is inside its lid, or inside its base if that is unclear.
+
+        Every candidate is judged under a map of its own: that of a wide bowl's flat lid says nothing of its inside.
+        """
         own = self.options.mouth
         base, lid = (_count(end) for end in end_pixels(self.views, self.start, own.pixels))
         starts = [self.start, self.start.turned_over()] if base > own.unclear_share * lid else [self.start]
@@ -170,13 +175,28 @@ class _Refinement:
             environment = None
             for each in self.options.photometric.coarse:
                 surface, environment = self.refine_by_centers(surface, each, environment)
-            assert environment is not None
-            thin = open_at_lip(self.contours, surface, self.options.lip) if own.thin_walls else None
-            for candidate in (thin, search_interior(self.kept, surface, environment, self.pixel, own)):
-                if candidate is not None:
-                    surface = self.keep_if_better(surface, candidate, seen, environment)
-            opened.append((self._error(seen, surface, environment), surface, environment))
-        return min(opened, key=lambda each: each[0])[1:]
+            best = self._mapped(surface)
+            if own.thin_walls and (thin := open_at_lip(self.contours, surface, self.options.lip)) is not None:
+                best = self._keep_mapped(best, self._mapped(thin), seen)
+            thick = search_interior(self.kept, surface, best[1], self.pixel, own)
+            best = self._keep_mapped(best, self._mapped(thick), seen)
+            opened.append((self._error(seen, *best), best[0]))
+        return min(opened, key=lambda each: each[0])[1]
+
+    def _mapped(self, surface: SurfaceOfRevolution) -> tuple[SurfaceOfRevolution, Tensor]:
+        """A surface and its own map of the views that are not held out, from nothing, since others' leave traces; with
+        rays that are mirrored often, since some directions are seen by way of the walls only.
+        """
+        rays, resolution = self.options.photometric.map_rays, self.options.photometric.coarse[-1].resolution
+        return surface, solve_map(self.kept, surface, rays, resolution, max_bounces=self.options.max_bounces)
+
+    def _keep_mapped(
+        self,
+        best: tuple[SurfaceOfRevolution, Tensor],
+        candidate: tuple[SurfaceOfRevolution, Tensor],
+        seen: PixelBundles,
+    ) -> tuple[SurfaceOfRevolution, Tensor]:
+        return keep_if_better((best, candidate), lambda each: self._error(seen, *each), self.options.least_gain)
 
     def _held_out_ends(self, closed: SurfaceOfRevolution) -> PixelBundles:
         base, lid = end_pixels(self.held_out, closed, self.options.mouth.judged_pixels)

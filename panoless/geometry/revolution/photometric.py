@@ -40,11 +40,17 @@ from panoless.numeric.robust import bounded_error, robust_weight
 
 
 def solve_map(
-    views: Views, surface: SurfaceOfRevolution, rays: int, resolution: int, start: Tensor | None = None
+    views: Views,
+    surface: SurfaceOfRevolution,
+    rays: int,
+    resolution: int,
+    start: Tensor | None = None,
+    max_bounces: int = 1,
 ) -> Float[Tensor, "6 3 L L"]:
-    """The closed-form map for a surface of revolution, from about that many rays."""
+    """The closed-form map for a surface of revolution, from about that many rays that leave it in time."""
     chosen = every_kth_pixel(views, rays)
-    return solve_environment([revolution_rays(surface, *each)[0] for each in chosen], resolution, start)
+    traced = (revolution_rays(surface, *each, max_bounces=max_bounces)[0] for each in chosen)
+    return solve_environment(list(traced), resolution, start)
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,8 @@ from shinypartial.core.conventions import PIXEL_CENTER
 REACH = 1.5
 TALLEST = 1.05
 """The normalized object lies in the unit ball; rays are followed a little beyond."""
+EXTENTS = 3
+"""How far from its widest place a body may be taken to reach, in so many ways."""
 
 
 @dataclass(frozen=True)
@@ -106,10 +108,10 @@ def _bare(origin: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"]) -> Surfa
 
 
 def outer_surface(
-    rays: ContourRays, start: SurfaceOfRevolution, cell: float, *, stem: bool = False
+    rays: ContourRays, start: SurfaceOfRevolution, cell: float, extent: int = 0
 ) -> SurfaceOfRevolution | None:
-    """The envelope around an axis, closed flat at both ends, with what may be a `stem` or a cone or without; None where
-    there is none.
+    """The envelope around an axis, closed flat at both ends, with so many of the parts that may belong to it (see
+    `_ends`); None where there is none.
     """
     origins, directions = in_axis_frame(rays, start)
     cells = int(2 * TALLEST / cell)
@@ -118,7 +120,7 @@ def outer_surface(
     radius = np.where(np.isfinite(smallest), smallest, 0.0)
     heights = -TALLEST + (np.arange(cells) + 0.5) * cell
     ends = _ends(origins, heights, radius, cell, rays.options)
-    for lowest, highest in reversed(ends) if stem else ends:
+    for lowest, highest in [*ends[extent:], *reversed(ends[:extent])]:
         if highest - lowest >= rays.options.least_cells:
             outer = np.stack([radius, heights], 1)[lowest : highest + 1]
             profile = closed_profile(outer)
@@ -133,32 +135,44 @@ def _ends(
     cell: float,
     options: SilhouetteOptions,
 ) -> list[tuple[int, int]]:
-    """Cells between which silhouettes tell the profile: beyond, it closes as fast as the most level view allows.
+    """Cells between which silhouettes tell the profile: beyond, it closes as fast as the most level view allows. One to
+    three pairs, the nearest first.
 
-    The widest cell belongs to the object, unless few rays pass the heights beyond its ends. The last cell outward is
-    blunt and less steep than that. A pair before it, where it differs, also leaves out what any cell inward falls to as
-    steeply: a cone that silhouettes leave beyond a lip, or a stem.
+    The widest cell belongs to the object, unless few rays pass the heights beyond its ends. The first pair ends before
+    anything that falls as steeply: a cone that silhouettes leave beyond a lip, or a stem. The second ends where the
+    profile does, in a tip or bluntly. The third goes on beyond tips: around an axis that is a little off, the stem
+    between a goblet's cup and its foot is one.
     """
     middle = np.abs(heights) < options.widest_within
     widest = int(np.argmax(np.where(middle, radius, 0.0)))
     across = np.hypot(origins[:, 0], origins[:, 1]) + float(radius[widest])
-    ends, cut = [], []
+    pairs = []
     for outward in (-1, 1):
         elevation = np.arctan2(outward * (origins[:, 2] - heights[widest]), across).min()
         steepest = 1 / np.tan(max(elevation, 0.0) + options.grazing_rad)
-        index = widest
-        while 0 < index < len(radius) - 1 and radius[index] > options.tip_cells * cell:
-            index += outward
-        while abs(index - widest) > 2:
-            rise = (radius[index - 2 * outward] - radius[index]) / (2 * cell)
-            if radius[index] > options.blunt_cells * cell and rise < steepest:
-                break
-            index -= outward
-        inward = np.arange(widest, index, outward)
-        steep = radius[inward] - radius[index] > steepest * cell * np.abs(inward - index)
-        ends.append(index)
-        cut.append(int(inward[np.argmax(steep)]) if steep.any() else index)
-    return [(ends[0], ends[1])] if cut == ends else [(cut[0], cut[1]), (ends[0], ends[1])]
+        outer = np.arange(widest, len(radius) if outward > 0 else -1, outward)
+        outer = outer[np.abs(heights[outer]) < 1]
+        wide = radius[outer] > options.tip_cells * cell
+        tips = [outer[len(wide) - 1 if wide.all() else wide.argmin()], outer[np.flatnonzero(wide).max(initial=0)]]
+        end, beyond = (_blunt_end(radius, widest, int(tip), steepest, cell, options) for tip in tips)
+        inward = np.arange(widest, end, outward)
+        steep = radius[inward] - radius[end] > steepest * cell * np.abs(inward - end)
+        pairs.append((int(inward[np.argmax(steep)]) if steep.any() else end, end, beyond))
+    return list(dict.fromkeys(zip(*pairs, strict=True)))
+
+
+def _blunt_end(
+    radius: Float[np.ndarray, "C"], widest: int, tip: int, steepest: float, cell: float, options: SilhouetteOptions
+) -> int:
+    """The last cell on the way from the widest to a tip that is wide, and where the profile is less steep than that."""
+    outward = 1 if tip > widest else -1
+    index = tip
+    while abs(index - widest) > 2:
+        rise = (radius[index - 2 * outward] - radius[index]) / (2 * cell)
+        if radius[index] > options.blunt_cells * cell and rise < steepest:
+            break
+        index -= outward
+    return index
 
 
 def in_axis_frame(
@@ -255,16 +269,14 @@ def contour_step(
     )
 
 
-def fit_outer(
-    rays: ContourRays, starts: Sequence[SurfaceOfRevolution], *, stem: bool = False
-) -> SurfaceOfRevolution | None:
+def fit_outer(rays: ContourRays, starts: Sequence[SurfaceOfRevolution], extent: int = 0) -> SurfaceOfRevolution | None:
     """Axis and outer profile of the best of several starts, coarse to fine; None when no start has an envelope."""
     options = rays.options
     sparse = rays.at_most(options.start_points)
     cell = options.start_cell_px * rays.pixel
     best, least = None, np.inf
     for start in starts:
-        surface = _refine(sparse, start, cell, options.start_scales_px, stem)
+        surface = _refine(sparse, start, cell, options.start_scales_px, extent)
         if surface is not None:
             cost = contour_cost(silhouette_residuals(sparse, surface, cell), options.judged_scale_px)
             if cost < least:
@@ -272,16 +284,16 @@ def fit_outer(
     return best
 
 
-def refine_outer(rays: ContourRays, start: SurfaceOfRevolution, *, stem: bool = False) -> SurfaceOfRevolution | None:
+def refine_outer(rays: ContourRays, start: SurfaceOfRevolution, extent: int = 0) -> SurfaceOfRevolution | None:
     """Axis and profile at a pixel's spacing."""
-    return _refine(rays.at_most(rays.options.points), start, rays.pixel, rays.options.scales_px, stem)
+    return _refine(rays.at_most(rays.options.points), start, rays.pixel, rays.options.scales_px, extent)
 
 
 def _refine(
-    rays: ContourRays, start: SurfaceOfRevolution, cell: float, scales_px: Sequence[float], stem: bool
+    rays: ContourRays, start: SurfaceOfRevolution, cell: float, scales_px: Sequence[float], extent: int
 ) -> SurfaceOfRevolution | None:
     """The envelope around an axis after steps at those scales; None when there is none."""
-    surface = outer_surface(rays, start, cell, stem=stem)
+    surface = outer_surface(rays, start, cell, extent)
     if surface is None:
         return None
     for scale in scales_px:

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.interpolate import BSpline
 
-from panoless.numeric.bspline import cubic_bspline, cubic_bspline_basis, cubic_bsplines_at
+from panoless.numeric.bspline import cubic_bspline, cubic_bspline_basis, cubic_bsplines_at, with_halved_knots
 
 COUNT = 9
 PLACES = np.random.default_rng(0).uniform(0, COUNT - 3, 200)
@@ -43,3 +43,11 @@ def test_the_last_knot_belongs_to_the_last_cell_and_counts_may_differ() -> None:
     first, basis = cubic_bsplines_at(np.array([6.0, 6.0, 1.0]), np.array([9, 12, 4]))
     assert first.tolist() == [5, 6, 0]
     np.testing.assert_allclose(basis[0], [[0, 1 / 6, 4 / 6, 1 / 6], [1 / 6, 4 / 6, 1 / 6, 0], [0, 1 / 6, 4 / 6, 1 / 6]])
+
+
+def test_a_spline_with_halved_knots_is_the_same() -> None:
+    coefficients = np.random.default_rng(2).normal(size=(COUNT, 2))
+    finer = with_halved_knots(coefficients)
+    assert finer.shape == (2 * COUNT - 3, 2)
+    same = [BSpline(np.arange(-3.0, len(each) + 1), each, 3) for each in (coefficients, finer)]
+    np.testing.assert_allclose(same[1](2 * PLACES), same[0](PLACES), atol=1e-12)

@@ -17,7 +17,7 @@ from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.reconstruct.fit import begin, fit
 from panoless.reconstruct.snapshots import SnapshotSchedule
 from panoless.selection.candidates import Candidate, Selection, Verdict
-from panoless.selection.choose import choose_geometry, least_unexplained
+from panoless.selection.choose import choose_geometry, least_unexplained, much_less_unexplained
 from panoless.selection.options import CorrectionOptions
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
@@ -185,6 +185,24 @@ def test_what_leaves_too_much_waits_for_kinds_that_explain_more() -> None:
     assert kept(plane, bend, left("free_form", 0.32, 0.5)) == "free_form"
     assert kept(plane, bend, left("free_form", 0.32, 0.2)) is None
     assert kept(plane, left("free_form", 0.2, 0.1, Verdict.REFUSED_BY_HELD_OUT_VIEWS)) is None
+
+
+def test_what_is_doubted_stays_unless_another_leaves_much_less() -> None:
+    """The simplest is compared with all after it, and a simple one that leaves half of its error replaces it."""
+
+    def chosen(*errors: float) -> int:
+        geometry = PlaneMirror(plane_of(RECTANGLE))
+        fitted = [
+            (Candidate(str(number), Verdict.CHOSEN, "", None, None, error, 0.5), geometry)
+            for number, error in enumerate(errors)
+        ]
+        return int(much_less_unexplained(fitted, CONFIG)[0].kind)
+
+    assert chosen(0.2) == 0
+    assert chosen(0.2, 0.11) == 0
+    assert chosen(0.2, 0.09) == 1
+    assert chosen(0.2, 0.09, 0.05) == 1
+    assert chosen(0.2, 0.11, 0.05) == 2
 
 
 def test_surfels_that_cover_nothing_do_not_beat_the_plane() -> None:

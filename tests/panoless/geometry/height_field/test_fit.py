@@ -10,7 +10,7 @@ from panoless.capture.silhouettes import mask_contours
 from panoless.capture.views import Views
 from panoless.geometry.height_field.fit import apply_height_field_step, fit_height_field, step_height_field
 from panoless.geometry.height_field.model import HeightField, flat_height_field, visible_reflections
-from panoless.geometry.height_field.options import HeightFieldOptions
+from panoless.geometry.height_field.options import HeightFieldOptions, HeightFieldRound
 from panoless.geometry.height_field.photometric import Observations, Photographs, observe
 from panoless.geometry.height_field.silhouette import edge_jacobian, edge_residuals
 from panoless.geometry.plane.silhouette import apply_plane_step
@@ -67,7 +67,7 @@ def test_contours_alone_recover_the_plane_of_the_frame_and_the_height_of_the_edg
     """At 96 px a contour tells a tenth of the degree that was put in, and a tenth of the bumps."""
     contours, height_field = mask_contours(views), flat_height_field(TILTED, 4)
     for scale in OPTIONS.edge_scales_px:
-        height_field = step_height_field(contours, height_field, scale, OPTIONS.edge_bending, OPTIONS)
+        height_field, _ = step_height_field(contours, height_field, scale, OPTIONS.edge_bending, OPTIONS)
     assert np.degrees(np.arccos(height_field.plane.normal @ PLANE.normal)) < 0.15
     middles = (PLANE.boundary + np.roll(PLANE.boundary, -1, 0)) / 2
     found = height_field.heights(middles)[0] + height_field.plane.offset
@@ -149,6 +149,29 @@ def test_a_bent_and_tilted_mirror_is_recovered(truth: HeightField) -> None:
     )
 
 
+def test_a_tilt_that_photographs_do_not_tell_changes_nothing_for_them(truth: HeightField, views: Views) -> None:
+    """Neither gradient nor matrix has anything along coefficients of a linear height; the rest is as it was."""
+    photographs = photographs_at(truth, observe(views, truth, 10_000), texel_map(32))
+    gradient, matrix = photographs.equations()
+    without, left = replace(photographs, tell_tilt=False).equations()
+    rows, columns = truth.coefficients.shape
+    linear = np.add.outer(3.0 * np.arange(rows), -2.0 * np.arange(columns) + 0.5).ravel()
+    assert abs(linear @ without) < 1e-9 * np.linalg.norm(linear) * np.linalg.norm(gradient)
+    assert np.linalg.norm(left @ linear) < 1e-9 * np.linalg.norm(linear) * np.linalg.norm(matrix)
+    bump = np.random.default_rng(6).normal(size=truth.coefficients.size)
+    bump -= truth.tilts() @ (truth.tilts().T @ bump)
+    np.testing.assert_allclose([bump @ without, bump @ left @ bump], [bump @ gradient, bump @ matrix @ bump])
+
+
+def test_bumps_too_short_for_the_grid_are_recovered_on_a_finer_one() -> None:
+    """Held-out views ask for halved cells, and for none where the mirror is flat."""
+    options = replace(OPTIONS, cells=5, rounds=(HeightFieldRound(64, 0.3, 20_000, 4),))
+    for height, cells in ((0.0, 5), (0.004, 10)):
+        truth = bumpy(PLANE, height, cells=10)
+        found = fit_height_field(height_field_views(truth, arc(12, size=48)), PLANE, options)
+        assert found.spacing == pytest.approx(flat_height_field(PLANE, cells).spacing, rel=0.02)
+
+
 def test_photographs_of_nothing_but_the_frame_say_nothing(views: Views) -> None:
     """A frame so high that every mirrored ray meets it: outlines alone decide, and the height field is finite."""
     walled = flat_height_field(replace(PLANE, frame_height=1e3), 4)
@@ -167,7 +190,8 @@ def test_no_step_raises_the_cost_of_the_photographs(truth: HeightField, views: V
     contours, options = mask_contours(views), replace(OPTIONS, contour_sigma_px=1e6)
     for start in (replace(truth, coefficients=1.5 * truth.coefficients), truth):
         photographs = photographs_at(start, observe(views, start, 20_000), texel_map(32))
-        moved = step_height_field(contours, start, 1.0, 0.0, options, photographs)
+        moved, fall = step_height_field(contours, start, 1.0, 0.0, options, photographs)
+        assert fall == pytest.approx(1 - photographs.cost(moved) / photographs.cost(start), abs=1e-4)
         assert photographs.cost(moved) <= photographs.cost(start) * (1 + 1e-6)
         if start is not truth:
             assert photographs.cost(moved) < photographs.cost(start) / 2

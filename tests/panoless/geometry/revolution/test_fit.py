@@ -15,7 +15,7 @@ from panoless.geometry.revolution.fit import propose_revolution, refine_revoluti
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_rays
 from panoless.geometry.revolution.options import DEFAULTS
 from panoless.kernels.cubemap import sample_cubemap
-from tests.support.traced_vessel import Photographs, Vessel, cut_bowl, dished_jar, photograph, stripes
+from tests.support.traced_vessel import Photographs, Vessel, cut_bowl, deep_cup, dished_jar, photograph, stripes
 
 SIZE, VIEWS = 72, 14
 UPRIGHT, UPSIDE_DOWN = np.eye(3), np.diag([1.0, -1.0, -1.0])
@@ -89,6 +89,13 @@ def test_a_closed_vessel_is_found_with_the_dish_in_its_lid() -> None:
     assert np.median(errors) < 0.2
     assert errors.mean() < 1.5
     assert map_error(photographs, surface, UPRIGHT) < 0.03
+
+
+def test_a_deep_cup_is_open_though_no_ray_leaves_it_at_once() -> None:
+    """What is inside is judged by rays that are mirrored often."""
+    photographs, surface = fitted(deep_cup, False)
+    assert surface.is_open
+    assert np.median(normal_errors_deg(photographs, surface)) < 0.5
 
 
 def assert_equivariant(surface: SurfaceOfRevolution, errors: np.ndarray, turn: np.ndarray) -> None:

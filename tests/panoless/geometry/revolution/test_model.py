@@ -17,7 +17,7 @@ from panoless.geometry.revolution.photometric import Photometry, photometric_equ
 from panoless.geometry.revolution.pixels import CENTER, PixelBundles, evenly
 from panoless.geometry.revolution.placement import surfels_on_revolution
 from panoless.geometry.revolution.profile import ProfileSplines, apply_step, resample_profile
-from panoless.geometry.revolution.silhouette import contour_rays, silhouette_residuals
+from panoless.geometry.revolution.silhouette import EXTENTS, contour_rays, outer_surface, silhouette_residuals
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.kernels.reference.rasterize import rotation_matrices
 from tests.support.mirror_revolution import TILTED, around, funnel, goblet, rays_of, revolution_views
@@ -238,6 +238,23 @@ def test_a_search_rises_above_the_end_of_the_outlines() -> None:
     seen = inner[inner[:, 0] > 0.1][::-1]
     expected = np.interp(seen[:, 0], truth.profile[: body.lip - 1 : -1, 0], truth.profile[: body.lip - 1 : -1, 1])
     assert float(np.median(np.abs(seen[:, 1] - expected))) < 0.02
+
+
+def test_outlines_go_on_beyond_a_thin_stem() -> None:
+    """A cup on a stem that is three pixels thick, and a foot, around an axis that is turned by 6°."""
+    height = np.linspace(-0.8, 0.8, 300)
+    cup = 0.45 * np.sqrt(np.clip(1 - ((height - 0.45) / 0.4) ** 2, 0, 1))
+    foot = 0.4 * np.exp(-((height + 0.8) ** 2) / 0.02)
+    outer = np.stack([np.maximum(np.maximum(cup, foot), 0.03), height], 1)
+    body = replace(goblet(), profile=np.concatenate([[[0.0, -0.8]], outer, [[0.0, 0.8]]]), lip=len(outer))
+    rays = contour_rays(revolution_views(body, around(12)))
+    tilted = body.axis + np.tan(np.radians(6)) * body.frame[0]
+    start = replace(body, axis=tilted / np.linalg.norm(tilted))
+    found = [outer_surface(rays, start, 0.04, extent) for extent in range(EXTENTS)]
+    reach = [np.ptp(each.profile[:, 1]) for each in found if each is not None]
+    assert len(reach) == EXTENTS
+    assert reach[0] < 1.2
+    assert reach[-1] > 1.5
 
 
 def test_closed_contours_touch_the_true_body() -> None:
