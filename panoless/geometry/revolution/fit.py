@@ -107,7 +107,7 @@ def refine_revolution(
     refinements for which pixels are found: areas of pixels, the interior anew, the floor and the lip.
     """
     with torch.no_grad():
-        return _Refinement(views, start, options).run()
+        return Refinement(views, start, options).run()
 
 
 def follow_views(
@@ -115,10 +115,10 @@ def follow_views(
 ) -> SurfaceOfRevolution:
     """A fitted surface after one more round on single rays, to views that changed a little."""
     with torch.no_grad():
-        return _Refinement(views, fitted, options).refine_by_centers(fitted, options.photometric.fine[-1], None)[0]
+        return Refinement(views, fitted, options).refine_by_centers(fitted, options.photometric.fine[-1], None)[0]
 
 
-class _Refinement:
+class Refinement:
     """The data of a fit, and its steps."""
 
     def __init__(self, views: Views, start: SurfaceOfRevolution, options: RevolutionOptions) -> None:

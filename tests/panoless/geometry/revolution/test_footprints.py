@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from panoless.capture.views import Views
-from panoless.geometry.revolution.fit import _Refinement
+from panoless.geometry.revolution.fit import Refinement
 from panoless.geometry.revolution.footprints import informative_pixels
 from panoless.geometry.revolution.model import SurfaceOfRevolution
 from panoless.geometry.revolution.options import DEFAULTS
@@ -70,7 +70,7 @@ COARSE = replace(
 def refine_areas(views: Views, start: SurfaceOfRevolution) -> SurfaceOfRevolution:
     """What held-out views leave of the refinement by areas."""
     with torch.no_grad():
-        fit = _Refinement(views, start, COARSE)
+        fit = Refinement(views, start, COARSE)
         return fit.refine_areas(start, solve_map(views, start, 1_000_000, 64))
 
 
