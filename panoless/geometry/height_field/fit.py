@@ -56,6 +56,8 @@ def _refine_grid(views: Views, height_field: HeightField, options: HeightFieldOp
     """
     kept, held_out = (replace(views, train=tuple(part)) for part in split_held_out(views.train))
     last = options.rounds[-1]
+    if not held_out.train:
+        return height_field
 
     def error(each: HeightField) -> float:
         environment = solve_environment([observe(kept, each, last.rays, options).rays], last.resolution)
@@ -80,7 +82,7 @@ def _refine(
     for _ in range(each.steps):
         observed = observe(views, height_field, each.rays, options)
         environment = solve_environment([observed.rays], each.resolution)
-        tell_tilt = each is options.rounds[-1]
+        tell_tilt = each.resolution >= options.rounds[-1].resolution
         photographs = Photographs.at(
             height_field, observed, environment, each.robust_scale, options, tell_tilt=tell_tilt
         )

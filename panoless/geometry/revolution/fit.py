@@ -132,7 +132,7 @@ class Refinement:
         """All of them, in order."""
         fine = self.options.photometric.fine
         progress = Progress("fitting a surface of revolution", 5 + len(fine))
-        surface, environment = self.open_mouth(), None
+        surface, environment = self.open_mouth()
         progress.advance()
         for each in fine:
             surface, environment = self.refine_by_centers(surface, each, environment)
@@ -161,8 +161,9 @@ class Refinement:
     def _error(self, pixels: PixelBundles, surface: SurfaceOfRevolution, environment: Tensor) -> float:
         return pixels.error(surface, environment, self.options.rendering.max_bounces, self.options.judged_scale)
 
-    def open_mouth(self) -> SurfaceOfRevolution:
-        """The outside after coarse rounds with what is inside its lid, or inside its base if that is unclear.
+    def open_mouth(self) -> tuple[SurfaceOfRevolution, Tensor | None]:
+        """The outside after coarse rounds with what is inside its lid, or inside its base if that is unclear; and the
+        map of these rounds, unless a thin wall is seen within, which shows more.
 
         Every candidate is judged under a map of its own: that of a wide bowl's flat lid says nothing of its inside.
         """
@@ -175,13 +176,16 @@ class Refinement:
             environment = None
             for each in self.options.photometric.coarse:
                 surface, environment = self.refine_by_centers(surface, each, environment)
-            best = self._mapped(surface)
+            assert environment is not None, "there is a coarse round"
+            best, known = self._mapped(surface), environment
             if own.thin_walls and (thin := open_at_lip(self.contours, surface, self.options.lip)) is not None:
                 best = self._keep_mapped(best, self._mapped(thin), seen)
-            thick = search_interior(self.kept, surface, best[1], self.pixel, own)
+                if best[0] is thin:
+                    environment, known = None, best[1]
+            thick = search_interior(self.kept, surface, known, self.pixel, own)
             best = self._keep_mapped(best, self._mapped(thick), seen)
-            opened.append((self._error(seen, *best), best[0]))
-        return min(opened, key=lambda each: each[0])[1]
+            opened.append((self._error(seen, *best), best[0], environment))
+        return min(opened, key=lambda each: each[0])[1:]
 
     def _mapped(self, surface: SurfaceOfRevolution) -> tuple[SurfaceOfRevolution, Tensor]:
         """A surface and its own map of the views that are not held out, from nothing, since others' leave traces; with

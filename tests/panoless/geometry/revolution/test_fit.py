@@ -98,7 +98,7 @@ def test_a_deep_cup_is_open_though_no_ray_leaves_it_at_once() -> None:
     assert proposal is not None
     photometric = replace(DEFAULTS.photometric, map_rays=100_000)
     with torch.no_grad():
-        opened = Refinement(views, proposal.surface, replace(DEFAULTS, photometric=photometric)).open_mouth()
+        opened, _ = Refinement(views, proposal.surface, replace(DEFAULTS, photometric=photometric)).open_mouth()
     assert opened.is_open
 
 
