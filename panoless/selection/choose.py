@@ -46,25 +46,27 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
     if views.object_frame.depth_is_open:
         families = [family for family in families if not family.needs_depth]
     table, refused = list[Candidate](), dict[str, list[PosedProposal]]()
-    fitted, doubted = list[tuple[Candidate, Geometry]](), list[tuple[Candidate, Geometry]]()
+    fitted = list[tuple[Candidate, Geometry]]()
     for family in families:
         source = _source(family)
         proposals = refused.get(source.kind, []) if family.refines else _proposals(source, views, config, asked=False)
         candidate, geometry = _examine(family, proposals, views, config, trial)
         table.append(candidate)
         refused[family.kind] = [each for each in proposals if _is_near(each, config, bent=True)]
-        if geometry is not None:
-            if candidate.verdict == Verdict.CHOSEN:
-                if _bends_rather(family, geometry, proposals, candidate.corrections.applied(views, config), config):
-                    table[-1] = replace(candidate, verdict=Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason=BENT)
-                    continue
-                doubted.append((candidate, geometry))
-                if error_of(doubted[-1]) > config.selection.doubted_error:
-                    continue
-                break
-            fitted.append((candidate, geometry))
-    if doubted:
-        return _chosen(*much_less_unexplained(doubted, config), table)
+        if geometry is None:
+            continue
+        explains = candidate.verdict == Verdict.CHOSEN
+        if explains and _bends_rather(
+            family, geometry, proposals, candidate.corrections.applied(views, config), config
+        ):
+            table[-1] = replace(candidate, verdict=Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason=BENT)
+            continue
+        fitted.append((candidate, geometry))
+        if explains and error_of(fitted[-1]) <= config.selection.doubted_error:
+            break
+    chosen = [each for each in fitted if each[0].verdict == Verdict.CHOSEN]
+    if chosen:
+        return _chosen(*much_less_unexplained(chosen, config), table)
     waiting = least_unexplained(fitted, config)
     if waiting is not None:
         candidate, geometry = waiting
@@ -142,9 +144,8 @@ def _is_near(start: PosedProposal, config: FitConfig, *, bent: bool) -> bool:
     """Whether a proposal explains the silhouettes, or would where a kind that refines it bends its edge."""
     options, proposal = config.selection, start.proposal
     farther = options.bent_edge if bent else 1.0
-    return proposal.silhouette_px <= farther * options.largest_silhouette_px and 1 - proposal.overlap <= farther * (
-        1 - options.least_overlap
-    )
+    outside, missed = farther * options.largest_silhouette_px, farther * (1 - options.least_overlap)
+    return proposal.silhouette_px <= outside and 1 - proposal.overlap <= missed
 
 
 def _best_fit(

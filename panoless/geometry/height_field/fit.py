@@ -35,21 +35,24 @@ def fit_height_field(
     One that was `fitted` to almost the same views goes on in the last round, on its grid.
     """
     with torch.no_grad():
+        contours = _contours(views, options)
         if fitted is not None:
-            return _refine(views, fitted, options.rounds[-1], options)
-        contours, height_field = _contours(views, options), flat_height_field(plane, options.cells)
+            return _refine(views, contours, fitted, options.rounds[-1], options)
+        height_field = flat_height_field(plane, options.cells)
         for scale_px in options.edge_scales_px:
             height_field = step_height_field(contours, height_field, scale_px, options.edge_bending, options)[0]
         progress = Progress("fitting a bent mirror", len(options.rounds) + 1)
         for each in options.rounds:
-            height_field = _refine(views, height_field, each, options)
+            height_field = _refine(views, contours, height_field, each, options)
             progress.advance()
-        height_field = _refine_grid(views, height_field, options)
+        height_field = _refine_grid(views, contours, height_field, options)
         progress.advance()
     return height_field
 
 
-def _refine_grid(views: Views, height_field: HeightField, options: HeightFieldOptions) -> HeightField:
+def _refine_grid(
+    views: Views, contours: MaskContours, height_field: HeightField, options: HeightFieldOptions
+) -> HeightField:
     """The height field on finer grids, as long as held-out views gain by them.
 
     What is there already was fitted to all views, so a finer grid has to gain a little more than that.
@@ -61,24 +64,27 @@ def _refine_grid(views: Views, height_field: HeightField, options: HeightFieldOp
 
     def error(each: HeightField) -> float:
         environment = solve_environment([observe(kept, each, last.rays, options).rays], last.resolution)
-        judged = observe(held_out, each, last.rays, options)
-        shown = judged.mirrored_by(each, judged.hits).light(environment)
-        return float(bounded_error(shown - judged.radiance, last.robust_scale).mean()) if len(shown) else 1.0
+        observed = observe(held_out, each, last.rays, options)
+        shown = observed.mirrored_by(each, observed.hits).light(environment)
+        return float(bounded_error(shown - observed.radiance, last.robust_scale).mean()) if len(shown) else 1.0
 
+    judged, of_kept = replace(last, steps=options.judged_steps), _contours(kept, options)
     for _ in range(options.halvings):
-        finer = height_field.with_halved_cells()
-        candidate = _refine(kept, finer, replace(last, steps=options.judged_steps), options)
+        candidate = _refine(kept, of_kept, height_field.with_halved_cells(), judged, options)
         if keep_if_better((height_field, candidate), error) is height_field:
             return height_field
-        height_field = _refine(views, candidate, last, options)
+        height_field = _refine(views, contours, candidate, last, options)
     return height_field
 
 
 def _refine(
-    views: Views, height_field: HeightField, each: HeightFieldRound, options: HeightFieldOptions
+    views: Views,
+    contours: MaskContours,
+    height_field: HeightField,
+    each: HeightFieldRound,
+    options: HeightFieldOptions,
 ) -> HeightField:
     """The height field after the steps of one round, as long as they lower the cost."""
-    contours = _contours(views, options)
     for _ in range(each.steps):
         observed = observe(views, height_field, each.rays, options)
         environment = solve_environment([observed.rays], each.resolution)

@@ -118,6 +118,15 @@ def follow_views(
         return Refinement(views, fitted, options).refine_by_centers(fitted, options.photometric.fine[-1], None)[0]
 
 
+@dataclass(frozen=True)
+class _Judged:
+    """A surface, a map of its own, and the error of held-out pixels under both."""
+
+    surface: SurfaceOfRevolution
+    environment: Float[Tensor, "6 3 L L"]
+    error: float
+
+
 class Refinement:
     """The data of a fit, and its steps."""
 
@@ -177,30 +186,26 @@ class Refinement:
             for each in self.options.photometric.coarse:
                 surface, environment = self.refine_by_centers(surface, each, environment)
             assert environment is not None, "there is a coarse round"
-            best, known = self._mapped(surface), environment
+            best, known = self._judged(surface, seen), environment
             if own.thin_walls and (thin := open_at_lip(self.contours, surface, self.options.lip)) is not None:
-                best = self._keep_mapped(best, self._mapped(thin), seen)
-                if best[0] is thin:
-                    environment, known = None, best[1]
+                best = self._better(best, self._judged(thin, seen))
+                if best.surface is thin:
+                    environment, known = None, best.environment
             thick = search_interior(self.kept, surface, known, self.pixel, own)
-            best = self._keep_mapped(best, self._mapped(thick), seen)
-            opened.append((self._error(seen, *best), best[0], environment))
+            best = self._better(best, self._judged(thick, seen))
+            opened.append((best.error, best.surface, environment))
         return min(opened, key=lambda each: each[0])[1:]
 
-    def _mapped(self, surface: SurfaceOfRevolution) -> tuple[SurfaceOfRevolution, Tensor]:
-        """A surface and its own map of the views that are not held out, from nothing, since others' leave traces; with
-        rays that are mirrored often, since some directions are seen by way of the walls only.
+    def _judged(self, surface: SurfaceOfRevolution, seen: PixelBundles) -> _Judged:
+        """A surface under its own map of the views that are not held out, from nothing, since others' leave traces;
+        with rays that are mirrored often, since some directions are seen by way of the walls only.
         """
         rays, resolution = self.options.photometric.map_rays, self.options.photometric.coarse[-1].resolution
-        return surface, solve_map(self.kept, surface, rays, resolution, max_bounces=self.options.max_bounces)
+        environment = solve_map(self.kept, surface, rays, resolution, max_bounces=self.options.max_bounces)
+        return _Judged(surface, environment, self._error(seen, surface, environment))
 
-    def _keep_mapped(
-        self,
-        best: tuple[SurfaceOfRevolution, Tensor],
-        candidate: tuple[SurfaceOfRevolution, Tensor],
-        seen: PixelBundles,
-    ) -> tuple[SurfaceOfRevolution, Tensor]:
-        return keep_if_better((best, candidate), lambda each: self._error(seen, *each), self.options.least_gain)
+    def _better(self, best: _Judged, candidate: _Judged) -> _Judged:
+        return keep_if_better((best, candidate), lambda each: each.error, self.options.least_gain)
 
     def _held_out_ends(self, closed: SurfaceOfRevolution) -> PixelBundles:
         base, lid = end_pixels(self.held_out, closed, self.options.mouth.judged_pixels)

@@ -49,8 +49,8 @@ def solve_map(
 ) -> Float[Tensor, "6 3 L L"]:
     """The closed-form map for a surface of revolution, from about that many rays that leave it in time."""
     chosen = every_kth_pixel(views, rays)
-    traced = (revolution_rays(surface, *each, max_bounces=max_bounces)[0] for each in chosen)
-    return solve_environment(list(traced), resolution, start)
+    traced = [revolution_rays(surface, *each, max_bounces=max_bounces)[0] for each in chosen]
+    return solve_environment(traced, resolution, start)
 
 
 @dataclass(frozen=True)
