@@ -90,6 +90,16 @@ def dished_jar() -> Vessel:
     return Vessel([floor, np.stack([radius, height], 1)], [dish])
 
 
+def plate() -> Vessel:
+    """A plate with a wide brim and a flat middle, without a wall that outlines show: its inside slopes by up to 30°."""
+    outer = np.stack([np.linspace(0.5, 0.9, 80), 0.22 * np.linspace(0, 1, 80) ** 2 - 0.2], 1)
+    floor = np.linspace([0.0, -0.2], [0.5, -0.2], 3)
+    x = np.linspace(1.0, 0.0, 120)
+    inner = np.stack([0.9 * x, 0.02 - 0.14 / (1 + np.exp((0.9 * x - 0.55) / 0.05))], 1)
+    inner[0, 1] = outer[-1, 1]
+    return Vessel([floor, outer], [inner])
+
+
 def cameras_around(count: int, elevations_deg: tuple[float, ...]) -> list[Float[np.ndarray, "4 4"]]:
     """Poses on an arc of 200° at elevations in turn."""
     poses = []

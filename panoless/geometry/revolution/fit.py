@@ -4,7 +4,9 @@ Every profile goes through the same steps. Which end is open and what is inside,
 held-out views: every fifth view takes no part in what it judges.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 import torch
@@ -19,7 +21,7 @@ from panoless.geometry.revolution.footprints import has_edges, informative_pixel
 from panoless.geometry.revolution.interior import end_pixels, search_interior
 from panoless.geometry.revolution.lip import clear_of_lip, lip_pixels, open_at_lip, place_lip, refine_lip
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_buffers
-from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions, Round
+from panoless.geometry.revolution.options import DEFAULTS, PhotometricOptions, RevolutionOptions, Round
 from panoless.geometry.revolution.photometric import refine_round, solve_map
 from panoless.geometry.revolution.pixels import CENTER, PixelBundles, evenly
 from panoless.geometry.revolution.profile import resample_profile
@@ -125,6 +127,8 @@ class _Judged:
     surface: SurfaceOfRevolution
     environment: Float[Tensor, "6 3 L L"]
     error: float
+    keeps_outside: bool = True
+    """Whether the map of the outside goes on with it."""
 
 
 class Refinement:
@@ -178,6 +182,7 @@ class Refinement:
         """
         own = self.options.mouth
         base, lid = (_count(end) for end in end_pixels(self.views, self.start, own.pixels))
+        every = _count(evenly(self.views, own.pixels))
         starts = [self.start, self.start.turned_over()] if base > own.unclear_share * lid else [self.start]
         seen = self._held_out_ends(self.start)
         opened = []
@@ -186,36 +191,69 @@ class Refinement:
             for each in self.options.photometric.coarse:
                 surface, environment = self.refine_by_centers(surface, each, environment)
             assert environment is not None, "there is a coarse round"
-            best, known = self._judged(surface, seen), environment
-            if own.thin_walls and (thin := open_at_lip(self.contours, surface, self.options.lip)) is not None:
-                best = self._better(best, self._judged(thin, seen))
-                if best.surface is thin:
-                    environment, known = None, best.environment
-            thick = search_interior(self.kept, surface, known, self.pixel, own)
-            best = self._better(best, self._judged(thick, seen))
-            opened.append((best.error, best.surface, environment))
-        return min(opened, key=lambda each: each[0])[1:]
+            flat = self._judged(surface, seen)
+            within = list(self._walls(surface, environment, flat, seen))
+            best = self._best(flat, *within)
+            if best.error * (base + lid) > own.settled_share * every:
+                near = [each for each in within if each.error < own.descending * best.error]
+                best = self._best(best, *(self._descended(each, seen) for each in near))
+            opened.append((best, environment if best.keeps_outside else None))
+        best, environment = min(opened, key=lambda each: each[0].error)
+        return best.surface, environment
 
-    def _judged(self, surface: SurfaceOfRevolution, seen: PixelBundles) -> _Judged:
+    def _walls(
+        self, closed: SurfaceOfRevolution, environment: Tensor, flat: _Judged, seen: PixelBundles
+    ) -> Iterator[_Judged]:
+        """What may be inside: a wall without thickness, and interiors that are searched under the map of the outside,
+        and under that of such a wall if it explains more than the flat lid.
+        """
+        own, maps = self.options.mouth, [environment]
+        if own.thin_walls and (opened := open_at_lip(self.contours, closed, self.options.lip)) is not None:
+            thin = self._judged(opened, seen, keeps_outside=False)
+            yield thin
+            if self._best(flat, thin) is thin:
+                maps.append(thin.environment)
+        for known in maps:
+            searched = search_interior(self.kept, closed, known, self.pixel, own)
+            yield self._judged(searched, seen, keeps_outside=known is environment)
+
+    def _descended(self, start: _Judged, seen: PixelBundles) -> _Judged:
+        """A surface after steps under maps so coarse that its inside may be wrong by many degrees."""
+        surface, own = start.surface, self.options.mouth
+        photometric = replace(self.options.photometric, pixels=own.descent_pixels, map_rays=own.descent_rays)
+        for each in own.descent:
+            surface, _ = self.refine_by_centers(surface, each, None, photometric)
+        return self._judged(surface, seen, keeps_outside=False)
+
+    def _judged(self, surface: SurfaceOfRevolution, seen: PixelBundles, *, keeps_outside: bool = True) -> _Judged:
         """A surface under its own map of the views that are not held out, from nothing, since others' leave traces;
         with rays that are mirrored often, since some directions are seen by way of the walls only.
         """
         rays, resolution = self.options.photometric.map_rays, self.options.photometric.coarse[-1].resolution
         environment = solve_map(self.kept, surface, rays, resolution, max_bounces=self.options.max_bounces)
-        return _Judged(surface, environment, self._error(seen, surface, environment))
+        return _Judged(surface, environment, self._error(seen, surface, environment), keeps_outside)
 
-    def _better(self, best: _Judged, candidate: _Judged) -> _Judged:
-        return keep_if_better((best, candidate), lambda each: each.error, self.options.least_gain)
+    def _best(self, *candidates: _Judged) -> _Judged:
+        """The last that is clearly better than the best before it."""
+
+        def better(best: _Judged, candidate: _Judged) -> _Judged:
+            return keep_if_better((best, candidate), lambda each: each.error, self.options.least_gain)
+
+        return reduce(better, candidates)
 
     def _held_out_ends(self, closed: SurfaceOfRevolution) -> PixelBundles:
         base, lid = end_pixels(self.held_out, closed, self.options.mouth.judged_pixels)
         return PixelBundles.of([*base, *lid], CENTER)
 
     def refine_by_centers(
-        self, surface: SurfaceOfRevolution, each: Round, environment: Tensor | None
+        self,
+        surface: SurfaceOfRevolution,
+        each: Round,
+        environment: Tensor | None,
+        options: PhotometricOptions | None = None,
     ) -> tuple[SurfaceOfRevolution, Tensor]:
         """The surface after one round on single rays, and the map before it."""
-        own, lip = self.options.photometric, self.options.lip
+        own, lip = options or self.options.photometric, self.options.lip
         views = clear_of_lip(self.views, surface, lip)
         environment = solve_map(views, surface, own.map_rays, each.resolution, environment)
         surface = refine_round(

@@ -137,6 +137,23 @@ class MouthOptions:
     """Cost of a cell and slope that no pixel sees: worse than a fair one, better than a wrong one."""
     reach: int = 3
     """Cells that an edge of the path spans at most."""
+    settled_share: float = 0.05
+    """Share of all pixels that the ends may leave unexplained, the held-out error times the share that sees them. Where
+    it is more, candidates descend by steps under coarse maps…"""
+    descending: float = 1.25
+    """…whose error is within so many times the least. Chosen on a plate and a bowl with thick walls, whose right
+    inside is the best at first, too."""
+    descent: tuple[Round, ...] = (
+        Round(8, 0.5, 6.0, 4),
+        Round(16, 0.5, 4.0, 4),
+        Round(32, 0.4, 3.0, 4),
+        Round(64, 0.3, 2.0, 4),
+    )
+    """Rounds of that descent."""
+    descent_pixels: int = 30_000
+    """Pixels of its steps."""
+    descent_rays: int = 150_000
+    """Rays of its maps."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from panoless.geometry.revolution.fit import Refinement, propose_revolution, ref
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_rays
 from panoless.geometry.revolution.options import DEFAULTS
 from panoless.kernels.cubemap import sample_cubemap
-from tests.support.traced_vessel import Photographs, Vessel, cut_bowl, deep_cup, dished_jar, photograph, stripes
+from tests.support.traced_vessel import Photographs, Vessel, cut_bowl, deep_cup, dished_jar, photograph, plate, stripes
 
 SIZE, VIEWS = 72, 14
 UPRIGHT, UPSIDE_DOWN = np.eye(3), np.diag([1.0, -1.0, -1.0])
@@ -100,6 +100,19 @@ def test_a_deep_cup_is_open_though_no_ray_leaves_it_at_once() -> None:
     with torch.no_grad():
         opened, _ = Refinement(views, proposal.surface, replace(DEFAULTS, photometric=photometric)).open_mouth()
     assert opened.is_open
+
+
+def test_the_inside_of_a_plate_is_found_by_steps_under_coarse_maps() -> None:
+    """No outline shows it. Measured: 1.0° in the median; 19° without these steps."""
+    photographs = photograph(plate(), VIEWS, 96, elevations_deg=(20.0, 35.0, 50.0, 60.0))
+    proposal = propose_revolution(photographs.views)
+    assert proposal is not None
+    photometric = replace(DEFAULTS.photometric, map_rays=60_000, pixels=20_000)
+    mouth = replace(DEFAULTS.mouth, descent_rays=60_000, descent_pixels=15_000)
+    options = replace(DEFAULTS, photometric=photometric, mouth=mouth)
+    with torch.no_grad():
+        opened, _ = Refinement(photographs.views, proposal.surface, options).open_mouth()
+    assert np.median(normal_errors_deg(photographs, opened)) < 2
 
 
 def assert_equivariant(surface: SurfaceOfRevolution, errors: np.ndarray, turn: np.ndarray) -> None:
