@@ -78,15 +78,16 @@ def fit_free_form(
 
     Rounds are taken with four fifths of the views as long as the others gain by them, and the last of those once more
     with all, in which outlines count more where photographs agree with them. After the rounds that are always taken,
-    hollows are searched, parts that pixels distrust are mended, and poses are set `free`, under the prior that views
-    state of them. Hollows are searched under the start, and if there is none, under the `lids`, other first surfaces.
+    hollows are searched, parts that pixels distrust are mended, details are looked for where much is left, and poses
+    are set `free`, under the prior that views state of them. Hollows are searched under the start, and if there is
+    none, under the `lids`, other first surfaces.
     """
     kept, held_out = split_held_out(views.train)
     solved = replace(views, train=tuple(kept)) if kept and held_out else views
     tested = replace(views, train=tuple(held_out))
-    steps = [settings.steps for settings in (*options.rounds, *options.finer)]
-    again = max(steps[len(options.rounds) - 1 :])
-    progress = Progress("fitting a free-form surface", sum(steps) + again)
+    rounds = *options.rounds, *options.finer
+    again = max(settings.steps for settings in (options.rounds[-1], *options.finer, *options.detailing[-1:]))
+    progress = Progress("fitting a free-form surface", sum(settings.steps for settings in rounds) + again)
 
     def error(stage: FitStage) -> float:
         return held_out_error(solved, tested, stage, options)
@@ -96,7 +97,7 @@ def fit_free_form(
 
     with torch.no_grad():
         stage = coarse_stage(solved, start, options.rounds, options, progress)
-        hollowed = None
+        begun, hollowed = start, None
         for lid in (start, *lids) if options.concave.search else ():
             hollowed = concave_start(solved, lid, stage.surface, options.concave)
             if hollowed is not None:
@@ -104,8 +105,11 @@ def fit_free_form(
         if hollowed is not None:
             deeper = coarse_stage(solved, hollowed, options.concave.rounds, options)
             stage = better(stage, deeper, options.concave.least_held_out_gain) if held_out else deeper
+            begun = hollowed if stage is deeper else start
         if held_out:
             stage = keep_if_better(mended_stages(solved, stage, options), error, options.least_mending_gain)
+            if options.detailing and not free_poses and error(stage) > options.detailed_error:
+                stage = better(stage, _detailed_stage(solved, begun, options), options.least_detailing_gain)
         if free_poses:
             stage = take_round(solved, replace(stage, poses=Poses.none(len(solved.train))), stage.last, options)
         if held_out:
@@ -126,7 +130,7 @@ def follow_views(
     focal length among the unknowns. A few steps by fewer pixels tell whether that asks for more of them, or for as many
     without where `longer`.
     """
-    rounds = [*options.rounds, *options.finer]
+    rounds = [*options.detailing, *options.rounds, *options.finer]
     last = next((each for each in reversed(rounds) if each.cells == fitted.surface.cells), rounds[-1])
     stage, settings = replace(fitted, settings=last), last
     with torch.no_grad():
@@ -156,6 +160,12 @@ def coarse_stage(
     for settings in rounds:
         stage = take_round(views, stage, settings, options, progress)
     return stage
+
+
+def _detailed_stage(views: Views, start: LevelSet, options: FreeFormOptions) -> FitStage:
+    """What fine grids under coarse maps lead to from a first surface."""
+    progress = Progress("looking for details", sum(each.steps for each in options.detailing))
+    return coarse_stage(views, start, options.detailing, options, progress)
 
 
 def poses_by_outlines(
@@ -226,9 +236,11 @@ def found_poses(solved: Views, views: Views, stage: FitStage, options: FreeFormO
 
 
 def _stages(views: Views, stage: FitStage, options: FreeFormOptions, progress: Progress) -> Iterator[FitStage]:
-    """A stage, and those after each of the finer rounds."""
+    """A stage, and those after each of the rounds that are finer."""
     yield stage
     for settings in options.finer:
+        if settings.cells < stage.last.cells:
+            continue
         stage = take_round(views, stage, settings, options, progress)
         yield stage
 

@@ -160,6 +160,32 @@ def test_parts_that_pixels_distrust_are_mended(dented: tuple[Body, Views, FitSta
     assert distrusted_share(views, mended, FEW_PIXELS) < distrusted_share(views, stage, FEW_PIXELS) / 3
 
 
+def test_waves_narrower_than_the_first_cells_are_found_under_coarse_maps() -> None:
+    """Their normals turn by 15° and more. Measured: 0.3° in the median; 8.3° without the rounds that look for them."""
+    body, cameras = wavy_ball(0.03, 9.0), cameras_around(16, 64)
+    short = tuple(replace(settings, rays=8_000, steps=4) for settings in DEFAULTS.detailing[:6:2])
+    options = replace(FEW_PIXELS, mending=(), detailing=(*short, replace(DEFAULTS.detailing[5], rays=8_000, steps=4)))
+    views = body_views(body, len(cameras), 64)
+    assert np.median(normal_errors_deg(fitted(views, options), body, views, cameras[::5])) < 0.6
+
+
+def test_rounds_that_look_for_details_are_refused_where_held_out_views_gain_nothing() -> None:
+    """On a ball that is explained already, and no finer round takes their cells away again."""
+    views, details = body_views(sphere(), 10, 40), FreeFormRound(24, 4, 0.8, 1, 2_000, 30.0, 1)
+    coarse = replace(FEW_PIXELS, rounds=(replace(COARSE, steps=2),), mending=(), detailing=(), detailed_error=-1.0)
+    start = started(views, first_surfaces(views, replace(CONFIG, free_form=coarse)), coarse)
+    alone, refused, taken = (
+        fit_free_form(views, start, each)[0]
+        for each in (
+            coarse,
+            replace(coarse, detailing=(details,)),
+            replace(coarse, detailing=(details,), least_detailing_gain=-99.0, finer=(replace(details, cells=22),)),
+        )
+    )
+    np.testing.assert_array_equal(refused.coefficients, alone.coefficients)
+    assert (alone.cells, taken.cells) == (COARSE.cells, details.cells)
+
+
 def test_what_pixels_trust_is_not_mended(dented: tuple[Body, Views, FitStage]) -> None:
     _, views, stage = dented
     trusted = replace(stage, trust=full_trust(stage.surface, FEW_PIXELS.trust_cells))
