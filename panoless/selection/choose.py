@@ -18,7 +18,7 @@ from panoless.geometry.base import Family, Geometry, Proposal, usable_views
 from panoless.geometry.registry import FAMILIES
 from panoless.selection.candidates import Candidate, Selection, Verdict
 from panoless.selection.corrections import with_corrections
-from panoless.selection.fitted import Fitted, is_refined
+from panoless.selection.fitted import Fitted, is_refined, missed_share
 from panoless.selection.held_out import Trial, held_out_errors, is_clearly_lower, train_briefly
 from panoless.selection.surroundings import brought_near, explains_clearly_more, proposed_surroundings
 from shinypartial.core.errors import InputError
@@ -66,7 +66,7 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
             break
     chosen = [each for each in fitted if each[0].verdict == Verdict.CHOSEN]
     if chosen:
-        return _chosen(*much_less_unexplained(chosen, config), table)
+        return _chosen(*much_less_unexplained(chosen, views, config), table)
     waiting = least_unexplained(fitted, config)
     if waiting is not None:
         candidate, geometry = waiting
@@ -101,14 +101,24 @@ def error_of(each: tuple[Candidate, Geometry]) -> float:
 
 
 def much_less_unexplained(
-    fitted: Sequence[tuple[Candidate, Geometry]], config: FitConfig
+    fitted: Sequence[tuple[Candidate, Geometry]], views: Views, config: FitConfig
 ) -> tuple[Candidate, Geometry]:
-    """The simplest, unless one after it leaves a share of its error only."""
+    """The simplest, unless one after it leaves a share of its error only, what it misses of the object included."""
     chosen = fitted[0]
     for each in fitted[1:]:
-        if error_of(each) < config.selection.doubted_share * error_of(chosen):
+        enough = config.selection.doubted_share * error_of(chosen)
+        if error_of(each) < enough and _with_missed(each, views, config) < enough:
             chosen = each
     return chosen
+
+
+def _with_missed(each: tuple[Candidate, Geometry], views: Views, config: FitConfig) -> float:
+    """The held-out error with pixels unexplained that lie well inside the masks and off the geometry: a surface with a
+    hole in it explains the rest.
+    """
+    candidate, geometry = each
+    missed = missed_share(candidate.corrections.applied(views, config), geometry, config.corrections.largest_px)
+    return missed + (1 - missed) * error_of(each)
 
 
 def least_unexplained(

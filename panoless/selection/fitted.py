@@ -79,6 +79,21 @@ def outline_distance_px(views: Views, geometry: Geometry) -> float:
     return float(np.median(found)) if found else 0.0
 
 
+def pixels_inside(mask: Float[Tensor, "H W"], depth_px: float) -> Int[Tensor, "P"]:
+    """Flat indices of the pixels that lie deeper inside a mask."""
+    return torch.nonzero(silhouette_distance_px(mask).flatten() < -depth_px)[:, 0]
+
+
+def missed_share(views: Views, geometry: Geometry, depth_px: float) -> float:
+    """Share of the pixels so deep inside the masks of a few views where a geometry is not; 0 where there are none."""
+    train, missed, number = geometry.corrected(views).train, 0, 0
+    for view in train[:: -(-len(train) // PULLED_VIEWS)]:
+        inside = pixels_inside(view.mask, depth_px)
+        missed += int((geometry.buffers(view.camera).alpha.flatten()[inside.cpu()] < 0.5).sum())
+        number += len(inside)
+    return missed / max(number, 1)
+
+
 def with_solid(views: Views, pixels: Sequence[Int[Tensor, "_"]]) -> Views:
     """Views of which those pixels count."""
     chosen = zip(views.train, pixels, strict=True)

@@ -3,9 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-import torch
-from jaxtyping import Float, Int
-from torch import Tensor
+from jaxtyping import Float
 
 from panoless.capture.corrections import Corrections
 from panoless.capture.silhouettes import silhouette_distance_px
@@ -20,6 +18,7 @@ from panoless.selection.fitted import (
     errors_in_common,
     held_out_errors,
     outline_pull_px,
+    pixels_inside,
     with_solid,
 )
 from panoless.selection.held_out import is_clearly_lower
@@ -106,7 +105,7 @@ def find_mask_offset(source: Family, views: Views, fitted: Fitted, config: FitCo
     far outside show no object. The least of a parabola through the best offset and its neighbors.
     """
     options, poses = config.corrections, fitted.geometry.poses
-    inner = [_pixels_inside(view.mask, options.largest_px) for view in views.train]
+    inner = [pixels_inside(view.mask, options.largest_px) for view in views.train]
     depth = float(np.median([-float(silhouette_distance_px(view.mask).min()) for view in views.train]))
 
     def disagreement(offset: float) -> float:
@@ -129,11 +128,6 @@ def find_mask_offset(source: Family, views: Views, fitted: Fitted, config: FitCo
     if not np.isfinite([before, least, after]).all():
         return best
     return best + step / 2 * (before - after) / max(before - 2 * least + after, 1e-12)
-
-
-def _pixels_inside(mask: Float[Tensor, "H W"], depth_px: float) -> Int[Tensor, "P"]:
-    """Flat indices of the pixels that lie deeper inside a mask."""
-    return torch.nonzero(silhouette_distance_px(mask).flatten() < -depth_px)[:, 0]
 
 
 def _offset_is_earned(views: Views, before: Fitted, after: Fitted, config: FitConfig) -> bool:

@@ -50,6 +50,7 @@ def coarse_config() -> FitConfig:
             config.free_form,
             rounds=(coarsest, replace(coarsest, resolution=32, robust_scale=0.2, steps=4)),
             finer=(),
+            detailing=(),
             concave=replace(config.free_form.concave, search=False),
             descent=replace(config.free_form.descent, rounds=()),
             start_tensions=config.free_form.start_tensions[::2],
@@ -190,19 +191,22 @@ def test_what_leaves_too_much_waits_for_kinds_that_explain_more() -> None:
 def test_what_is_doubted_stays_unless_another_leaves_much_less() -> None:
     """The simplest is compared with all after it, and a simple one that leaves half of its error replaces it."""
 
-    def chosen(*errors: float) -> int:
-        geometry = PlaneMirror(plane_of(RECTANGLE))
+    views, whole = framed(0.0), PlaneMirror(plane_of(RECTANGLE))
+    half = PlaneMirror(plane_of(RECTANGLE * [0.5, 1.0]))
+
+    def chosen(*errors: float, geometry: Geometry = whole) -> int:
         fitted = [
             (Candidate(str(number), Verdict.CHOSEN, "", None, None, error, 0.5), geometry)
             for number, error in enumerate(errors)
         ]
-        return int(much_less_unexplained(fitted, CONFIG)[0].kind)
+        return int(much_less_unexplained(fitted, views, CONFIG)[0].kind)
 
     assert chosen(0.2) == 0
     assert chosen(0.2, 0.11) == 0
     assert chosen(0.2, 0.09) == 1
     assert chosen(0.2, 0.09, 0.05) == 1
     assert chosen(0.2, 0.11, 0.05) == 2
+    assert chosen(0.2, 0.05, geometry=half) == 0, "what misses half of the object explains no more"
 
 
 def test_surfels_that_cover_nothing_do_not_beat_the_plane() -> None:

@@ -238,7 +238,7 @@ def test_hollows_are_looked_for_under_lids_where_the_start_has_none(
 
     monkeypatch.setattr(fit, "concave_start", looked_for)
     rounds = (replace(DEFAULTS.rounds[0], rays=2000, steps=1),)
-    short = replace(DEFAULTS, rounds=rounds, finer=(), mending=(), concave=ConcaveOptions(rounds=rounds))
+    short = replace(DEFAULTS, rounds=rounds, finer=(), mending=(), detailing=(), concave=ConcaveOptions(rounds=rounds))
     fit_free_form(dish[1], start, short, lids=(lid, other))
     assert [each is known for each, known in zip(asked, (start, lid), strict=True)] == [True, True]
 

@@ -57,6 +57,7 @@ from tests.support.mirror_body import (
 OPTIONS = FreeFormOptions(
     rounds=tuple(replace(settings, rays=settings.rays // 2) for settings in DEFAULTS.rounds),
     finer=(),
+    detailing=(),
     concave=ConcaveOptions(search=False),
     descent=DescentOptions(rounds=()),
     start_tensions=DEFAULTS.start_tensions[::2],
