@@ -27,7 +27,7 @@ from shinypartial.suites.stability.axes import BY_NAME, Axis
 
 FOLDER = Path("build/other-shapes")
 NUMBERS = Path("docs/results/other-shapes.json")
-WORLD = "world.exr"
+WORLD, BLEND = "world.exr", "monkey.blend"
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,15 @@ class Trial:
         kind = f'kind = "studiolight"\nname = "{self.world}"'
         if self.ground != 1:
             kind = f'kind = "file"\npath = "{WORLD}"\nlicense = "CC0-1.0"\nsource = "{self.world} of Blender"'
+        shown = f"""kind = "assembly"
+
+[[object.parts]]
+stretch = {list(self.stretch)}
+turn_deg = {list(self.turn_deg)}
+shape = {{ {self.shape} }}
+{parts}"""
+        if self.shape == MONKEY:
+            shown = f'kind = "blend"\npath = "{BLEND}"\nobject = "{MONKEY}"\n'
         return f"""format = 1
 name = "{name}"
 title = "Trial shape {name}"
@@ -64,13 +73,7 @@ license = "CC0-1.0"
 split = "development"
 
 [object]
-kind = "assembly"
-
-[[object.parts]]
-stretch = {list(self.stretch)}
-turn_deg = {list(self.turn_deg)}
-shape = {{ {self.shape} }}
-{parts}
+{shown}
 [world]
 {kind}
 strength = {self.strength}
@@ -84,12 +87,28 @@ elevation_deg = {list(self.elevation_deg)}
 """
 
     def write(self, path: Path, name: str) -> None:
-        """The recipe, and beside it the world that it names where Blender brings along none such."""
+        """The recipe, and beside it the world or the mesh that it names where recipes know none such."""
         write_text(path, self.recipe(name))
         if self.ground != 1:
             radiance = read_exr_rgb(studio_light(self.world))
             radiance[len(radiance) // 2 :] *= self.ground
             write_exr_rgb(path.parent / WORLD, radiance)
+        if self.shape == MONKEY:
+            write_monkey(path.parent / BLEND)
+
+
+def write_monkey(path: Path) -> None:
+    """Blender's monkey, 1.6 across and subdivided four times."""
+    import bpy
+
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.mesh.primitive_monkey_add(size=1.6)
+    bpy.context.object.name = MONKEY
+    modifier = bpy.context.object.modifiers.new("subdivision", "SUBSURF")
+    modifier.levels = modifier.render_levels = 4
+    bpy.ops.object.modifier_apply(modifier=modifier.name)
+    bpy.ops.object.shade_smooth()
+    bpy.ops.wm.save_as_mainfile(filepath=str(path.resolve()))
 
 
 BENT = "[[-0.8, 0.0, 0.25, 0.5, 2.0], [-0.45, 0.0, -0.05, 0.55, 2.0], [0.0, 0.0, -0.18, 0.6, 2.0], \
@@ -100,6 +119,10 @@ SPOUT = """shape = { kind = "tube", path = [[-0.5, 0.0, -0.3], [-0.8, 0.0, -0.05
 [-1.08, 0.0, 0.5]], radii = [0.22, 0.16, 0.11, 0.1] }"""
 SPOUT_END = """shape = { kind = "sphere", radius = 0.1 }
 offset = [-1.08, 0.0, 0.5]"""
+EAR = """shape = { kind = "tube", path = [[0.5, 0.0, 0.35], [0.75, 0.0, 0.4], [0.92, 0.0, 0.15], [0.88, 0.0, -0.15], \
+[0.7, 0.0, -0.35], [0.5, 0.0, -0.4]], radii = [0.07, 0.07, 0.07, 0.07, 0.07, 0.07] }"""
+MONKEY = "Suzanne"
+"""Blender's own head, of a file that is written beside the recipe, in place of a shape of recipes."""
 BUST = "[[0.0, 0.1, 0.4, 0.55, 1.4], [0.02, -0.08, 0.0, 0.42, 1.0], [0.0, -0.52, 0.14, 0.2, 0.7], \
 [0.0, 0.1, -0.5, 0.4, 1.1], [0.5, 0.12, -0.8, 0.4, 1.0], [-0.5, 0.08, -0.8, 0.4, 1.0], [0.0, 0.1, -0.85, 0.4, 0.6], \
 [0.23, -0.55, 0.33, 0.2, -1.6], [-0.21, -0.55, 0.34, 0.2, -1.6], [0.0, -0.6, -0.18, 0.17, -1.2], \
@@ -315,6 +338,50 @@ TRIALS = {
         100.0,
         60.0,
         (-5.0, 50.0),
+    ),
+    "plate": Trial(
+        'kind = "surface_of_revolution", profile = [[0.0, -0.1], [0.5, -0.1], [0.56, -0.06], [0.62, -0.03], \
+[0.98, 0.12], [1.0, 0.15], [0.97, 0.16], [0.6, 0.03], [0.54, -0.01], [0.45, -0.03], [0.0, -0.03]]',
+        (0.0, 0.0, 0.0),
+        "interior",
+        "zigzag",
+        3.8,
+        60.0,
+        60.0,
+        (20.0, 65.0),
+    ),
+    "basin": Trial(
+        'kind = "surface_of_revolution", profile = [[0.0, -0.5], [0.4, -0.5], [0.48, -0.4], [0.8, -0.1], [1.0, 0.3], \
+[1.02, 0.36], [0.98, 0.4], [0.92, 0.34], [0.7, 0.0], [0.4, -0.25], [0.0, -0.32]]',
+        (0.0, 0.0, 0.0),
+        "sunset",
+        "arc",
+        3.6,
+        20.0,
+        60.0,
+        (0.0, 55.0),
+    ),
+    "mug": Trial(
+        'kind = "surface_of_revolution", profile = [[0.0, -0.6], [0.42, -0.6], [0.5, -0.55], [0.53, -0.45], \
+[0.55, 0.5], [0.54, 0.58], [0.5, 0.6], [0.45, 0.57], [0.43, 0.45], [0.41, -0.35], [0.36, -0.45], [0.0, -0.47]]',
+        (0.0, 0.0, 0.0),
+        "city",
+        "arc",
+        3.5,
+        -70.0,
+        60.0,
+        (0.0, 50.0),
+        more=(EAR,),
+    ),
+    "monkey": Trial(
+        MONKEY,
+        (0.0, 0.0, 0.0),
+        "city",
+        "plus",
+        2.75,
+        -90.0,
+        50.0,
+        (-15.0, 45.0),
     ),
     "goblet": Trial(
         'kind = "surface_of_revolution", profile = [[0.0, -0.85], [0.45, -0.85], [0.42, -0.8], [0.15, -0.73], \
