@@ -158,5 +158,6 @@ def test_a_map_brighter_than_rays_can_show_agrees_with_them() -> None:
     brighter = environment + torch.rand(environment.shape, generator=torch.Generator().manual_seed(2))
     ended, bright = (agreement([clipped], each, torch.ones(3)) for each in (environment, brighter))
     for name in vars(ended):
-        assert torch.equal(getattr(bright, name), getattr(ended, name))
+        # The four weights of a look-up add up to one but for rounding, which differs between processors.
+        torch.testing.assert_close(getattr(bright, name), getattr(ended, name), atol=1e-6, rtol=0)
     assert float(agreement([clipped], brighter).disagreement.max()) > 0.1
