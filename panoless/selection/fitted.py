@@ -13,7 +13,7 @@ from panoless.alignment.equations import PoseRows, outline_rows
 from panoless.alignment.search import PosedProposal
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
 from panoless.capture.silhouettes import silhouette_distance_px
-from panoless.capture.views import Views, at_most_pixels
+from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.geometry.base import Geometry, usable_views
 from panoless.geometry.registry import FAMILIES
@@ -41,7 +41,7 @@ class Refit(Protocol):
 
 
 PULLED_VIEWS = 8
-"""From so many views at most the pull of photographs on outlines is told."""
+"""From so many views at most it is told how photographs pull outlines, and what a geometry misses."""
 
 
 def is_refined(kind: str) -> bool:
@@ -54,10 +54,14 @@ def another_takes_on(geometry: Geometry, errors: Float[np.ndarray, "V"], config:
     return bool(is_refined(geometry.kind) and errors.mean() > config.selection.largest_error)
 
 
+def _few(views: Views) -> tuple[TrainView, ...]:
+    """Some of the views, evenly."""
+    return views.train[:: -(-len(views.train) // PULLED_VIEWS)]
+
+
 def _outlines(views: Views, geometry: Geometry) -> Iterator[PoseRows]:
     """Of a geometry against the masks of a few views that see it."""
-    train = geometry.corrected(views).train
-    for view in train[:: -(-len(train) // PULLED_VIEWS)]:
+    for view in _few(geometry.corrected(views)):
         distance = silhouette_distance_px(view.mask).cpu().numpy().astype(np.float64)
         rows = outline_rows(view, distance, geometry.buffers(view.camera))
         if len(rows.residual):
@@ -86,8 +90,8 @@ def pixels_inside(mask: Float[Tensor, "H W"], depth_px: float) -> Int[Tensor, "P
 
 def missed_share(views: Views, geometry: Geometry, depth_px: float) -> float:
     """Share of the pixels so deep inside the masks of a few views where a geometry is not; 0 where there are none."""
-    train, missed, number = geometry.corrected(views).train, 0, 0
-    for view in train[:: -(-len(train) // PULLED_VIEWS)]:
+    missed, number = 0, 0
+    for view in _few(geometry.corrected(views)):
         inside = pixels_inside(view.mask, depth_px)
         missed += int((geometry.buffers(view.camera).alpha.flatten()[inside.cpu()] < 0.5).sum())
         number += len(inside)

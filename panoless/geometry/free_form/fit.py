@@ -1,13 +1,14 @@
 """A free-form surface from silhouettes and photographs: accepted Gauss–Newton steps, from coarse to fine."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, MutableMapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.utils.weak import WeakIdKeyDictionary
 
 from panoless.capture.poses import Poses, StatedCameras, with_pose_covariances
 from panoless.capture.views import Views, split_held_out
@@ -89,8 +90,12 @@ def fit_free_form(
     again = max(settings.steps for settings in (options.rounds[-1], *options.finer, *options.detailing[-1:]))
     progress = Progress("fitting a free-form surface", sum(settings.steps for settings in rounds) + again)
 
+    known: MutableMapping[FitStage, float] = WeakIdKeyDictionary()
+
     def error(stage: FitStage) -> float:
-        return held_out_error(solved, tested, stage, options)
+        if stage not in known:
+            known[stage] = held_out_error(solved, tested, stage, options)
+        return known[stage]
 
     def better(stage: FitStage, other: FitStage, least_gain: float) -> FitStage:
         return keep_if_better((stage, other), error, least_gain)
@@ -238,9 +243,7 @@ def found_poses(solved: Views, views: Views, stage: FitStage, options: FreeFormO
 def _stages(views: Views, stage: FitStage, options: FreeFormOptions, progress: Progress) -> Iterator[FitStage]:
     """A stage, and those after each of the rounds that are finer."""
     yield stage
-    for settings in options.finer:
-        if settings.cells < stage.last.cells:
-            continue
+    for settings in [each for each in options.finer if each.cells >= stage.last.cells]:
         stage = take_round(views, stage, settings, options, progress)
         yield stage
 

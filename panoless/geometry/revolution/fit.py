@@ -127,8 +127,8 @@ class _Judged:
     surface: SurfaceOfRevolution
     environment: Float[Tensor, "6 3 L L"]
     error: float
-    keeps_outside: bool = True
-    """Whether the map of the outside goes on with it."""
+    going_on: Float[Tensor, "6 3 L L"] | None = None
+    """The map that the next round starts from; None: from nothing."""
 
 
 class Refinement:
@@ -176,7 +176,7 @@ class Refinement:
 
     def open_mouth(self) -> tuple[SurfaceOfRevolution, Tensor | None]:
         """The outside after coarse rounds with what is inside its lid, or inside its base if that is unclear; and the
-        map of these rounds, unless a thin wall is seen within, which shows more.
+        map of these rounds, unless what is inside shows more: a thin wall, or what its map or a descent led to.
 
         Every candidate is judged under a map of its own: that of a wide bowl's flat lid says nothing of its inside.
         """
@@ -191,15 +191,15 @@ class Refinement:
             for each in self.options.photometric.coarse:
                 surface, environment = self.refine_by_centers(surface, each, environment)
             assert environment is not None, "there is a coarse round"
-            flat = self._judged(surface, seen)
+            flat = self._judged(surface, seen, environment)
             within = list(self._walls(surface, environment, flat, seen))
             best = self._best(flat, *within)
             if best.error * (base + lid) > own.settled_share * every:
                 near = [each for each in within if each.error < own.descending * best.error]
                 best = self._best(best, *(self._descended(each, seen) for each in near))
-            opened.append((best, environment if best.keeps_outside else None))
-        best, environment = min(opened, key=lambda each: each[0].error)
-        return best.surface, environment
+            opened.append(best)
+        best = min(opened, key=lambda each: each.error)
+        return best.surface, best.going_on
 
     def _walls(
         self, closed: SurfaceOfRevolution, environment: Tensor, flat: _Judged, seen: PixelBundles
@@ -209,13 +209,13 @@ class Refinement:
         """
         own, maps = self.options.mouth, [environment]
         if own.thin_walls and (opened := open_at_lip(self.contours, closed, self.options.lip)) is not None:
-            thin = self._judged(opened, seen, keeps_outside=False)
+            thin = self._judged(opened, seen)
             yield thin
             if self._best(flat, thin) is thin:
                 maps.append(thin.environment)
         for known in maps:
             searched = search_interior(self.kept, closed, known, self.pixel, own)
-            yield self._judged(searched, seen, keeps_outside=known is environment)
+            yield self._judged(searched, seen, environment if known is environment else None)
 
     def _descended(self, start: _Judged, seen: PixelBundles) -> _Judged:
         """A surface after steps under maps so coarse that its inside may be wrong by many degrees."""
@@ -223,15 +223,15 @@ class Refinement:
         photometric = replace(self.options.photometric, pixels=own.descent_pixels, map_rays=own.descent_rays)
         for each in own.descent:
             surface, _ = self.refine_by_centers(surface, each, None, photometric)
-        return self._judged(surface, seen, keeps_outside=False)
+        return self._judged(surface, seen)
 
-    def _judged(self, surface: SurfaceOfRevolution, seen: PixelBundles, *, keeps_outside: bool = True) -> _Judged:
+    def _judged(self, surface: SurfaceOfRevolution, seen: PixelBundles, going_on: Tensor | None = None) -> _Judged:
         """A surface under its own map of the views that are not held out, from nothing, since others' leave traces;
         with rays that are mirrored often, since some directions are seen by way of the walls only.
         """
         rays, resolution = self.options.photometric.map_rays, self.options.photometric.coarse[-1].resolution
         environment = solve_map(self.kept, surface, rays, resolution, max_bounces=self.options.max_bounces)
-        return _Judged(surface, environment, self._error(seen, surface, environment), keeps_outside)
+        return _Judged(surface, environment, self._error(seen, surface, environment), going_on)
 
     def _best(self, *candidates: _Judged) -> _Judged:
         """The last that is clearly better than the best before it."""
