@@ -152,9 +152,14 @@ class DescentOptions:
     outline_points: int = 4000
     """Most outline points of all views."""
     least_disagreement: NonNegative = 0.15
-    """Of pixels under the plain surface, after the first round of the fit, from which anything descends: below it they
-    agree well enough. It is 0.10, 0.12 and 0.14 on sculpture, chrome-block and ellipsoid, where nothing is gained, and
-    0.17 to 0.60 on die, horseshoe, twist, drum, jug, crate and bust, which start better by it."""
+    """Of pixels under the plain surface, after the first round of the fit, from which all first surfaces descend; below
+    it the plain one does. It is 0.10, 0.12 and 0.14 on sculpture, chrome-block and ellipsoid, and 0.17 to 0.60 on die,
+    horseshoe, twist, drum, jug, crate and bust, where others may start better."""
+    judged_pixels: int = 40_000
+    """Of all views, by which what descended is compared…"""
+    judged_resolution: int = 24
+    """…with directions in so many cells along a face side: finer than those that choose the ways, as surfaces that end
+    well and badly differ by little then."""
     least_gain: float = 0.02
     """Share of the disagreement, after the first round of the fit, by which what descended has to lower it."""
 
@@ -232,7 +237,9 @@ class FreeFormOptions:
     chrome-block over a dark ground the normals of the start are wrong by 9.6°, 6.5°, 3.0° and 4.5° in the median, and
     by 9.1°, 3.8°, 0.5° and 1.1° after the first rounds; sculpture ends within 0.02° from all of them."""
     start_pixels: int = 8000
-    """Of all views, by which they choose."""
+    """Of all views, by which they choose…"""
+    start_resolution: int = 12
+    """…with directions compared in so many cells along a face side."""
     descent: DescentOptions = DescentOptions()
     """How the start comes near where its steps from there lead to the true surface."""
     margin: float = 0.175

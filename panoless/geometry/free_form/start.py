@@ -55,7 +55,7 @@ def first_surfaces(views: Views, config: FitConfig) -> FirstSurfaces:
     def level_set(mesh: TriangleMesh) -> LevelSet:
         return level_set_of(mesh, options.start_cells, options.margin)
 
-    disagreement = _disagreement(views, options)
+    disagreement = _disagreement(views, options, options.start_pixels, options.start_resolution)
     plates = {tension: level_set(completed(known, first, tension, rounds=1)) for tension in options.start_tensions}
     best = min(plates, key=lambda tension: disagreement(plates[tension]))
     plain, hull = level_set(completed(known, first, best)), level_set(known.surface)
@@ -63,40 +63,45 @@ def first_surfaces(views: Views, config: FitConfig) -> FirstSurfaces:
 
 
 def started(views: Views, first: FirstSurfaces, options: FreeFormOptions) -> LevelSet:
-    """What the best of the plates, or the hull, descends to, if pixels agree better under it than under the plain
-    surface, both after the first round of the fit. Each descends held by outlines and not; after the first round of
-    that, pixels tell which ways go on to the end. Where they agree well under the plain surface, nothing descends.
+    """What a first surface descends to, if pixels agree better under that than under the plain surface, both after the
+    first round of the fit.
+
+    Where they agree well enough under the plain surface, it alone descends, held by outlines. Elsewhere each plate and
+    the hull do, held and not; after the first round of that, pixels tell which ways go on to the end.
     """
     descent, plain = options.descent, first.surface
     if not descent.rounds:
         return plain
     short = replace(options, outline_points=min(descent.outline_points, options.outline_points))
-    starts = [replace(each, surroundings=first.surroundings) for each in (*first.plates, first.hull)]
     ways = {held: [replace(each, held=held) for each in descent.rounds] for held in (True, False)}
     begin, *onward = (each.steps for each in (*descent.rounds, options.rounds[0]))
-    disagreement = _disagreement(views, options)
+    disagreement = _disagreement(views, options, options.start_pixels, options.start_resolution)
+    judged = _disagreement(views, options, descent.judged_pixels, descent.judged_resolution)
 
-    def taken(surface: LevelSet, rounds: Sequence[FreeFormRound]) -> LevelSet:
+    def taken(surface: LevelSet, rounds: Sequence[FreeFormRound], progress: Progress) -> LevelSet:
         return coarse_stage(views, surface, rounds, short, progress).surface
 
-    def left(surface: LevelSet, progress: Progress | None = None) -> float:
-        return disagreement(coarse_stage(views, surface, options.rounds[:1], options, progress).surface)
+    def settled(surface: LevelSet, progress: Progress | None = None) -> LevelSet:
+        return coarse_stage(views, surface, options.rounds[:1], options, progress).surface
 
     with torch.no_grad():
-        disagreed = left(plain)
-        if disagreed < descent.least_disagreement:
-            return plain
-        progress = Progress("looking for a start", len(starts) * len(ways) * begin + descent.followed * sum(onward))
-        begun = [(held, taken(start, rounds[:1])) for start in starts for held, rounds in ways.items()]
-        begun.sort(key=lambda way: disagreement(way[1]))
-        ended = [taken(surface, ways[held][1:]) for held, surface in begun[: descent.followed]]
-        best = min(((surface, left(surface, progress)) for surface in ended), key=lambda each: each[1])
-        return keep_if_better(((plain, disagreed), best), lambda each: each[1], descent.least_gain)[0]
+        known = settled(plain)
+        if disagreement(known) < descent.least_disagreement:
+            progress = Progress("looking for a start", begin + sum(onward))
+            ended = [taken(plain, ways[True], progress)]
+        else:
+            starts = [replace(each, surroundings=first.surroundings) for each in (*first.plates, first.hull)]
+            progress = Progress("looking for a start", len(starts) * len(ways) * begin + descent.followed * sum(onward))
+            begun = [(held, taken(each, rounds[:1], progress)) for each in starts for held, rounds in ways.items()]
+            begun.sort(key=lambda way: disagreement(way[1]))
+            ended = [taken(surface, ways[held][1:], progress) for held, surface in begun[: descent.followed]]
+        best = min(((each, judged(settled(each, progress))) for each in ended), key=lambda each: each[1])
+        return keep_if_better(((plain, judged(known)), best), lambda each: each[1], descent.least_gain)[0]
 
 
-def _disagreement(views: Views, options: FreeFormOptions) -> Callable[[LevelSet], float]:
-    """How badly pixels of all views agree under a surface."""
-    pixels = solid_pixels(views, options.start_pixels)
-    inner = pixels.inner_px > options.inner_px
-    scored = Scored(pixels.rays.chosen(inner), pixels.radiance[inner], options.concave)
-    return lambda surface: scored(surface, options.concave.resolutions[-1]) if inner.any() else 1.0
+def _disagreement(views: Views, options: FreeFormOptions, pixels: int, resolution: int) -> Callable[[LevelSet], float]:
+    """How badly about so many pixels of all views agree under a surface, compared in cells of that resolution."""
+    chosen = solid_pixels(views, pixels)
+    inner = chosen.inner_px > options.inner_px
+    scored = Scored(chosen.rays.chosen(inner), chosen.radiance[inner], options.concave)
+    return lambda surface: scored(surface, resolution) if inner.any() else 1.0
