@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from panoless.environment.rays import Believed, Rays
-from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap, weigh_cubemap
+from panoless.kernels.cubemap import apply_gram, lookup_gram, sample_cubemap, scatter_cubemap, weigh_cubemap
 from panoless.numeric.robust import robust_weight
 
 BATCH_PIXELS = 500_000
@@ -77,9 +77,16 @@ class PixelFootprints(Believed):
         """The adjoint of `seen`."""
         return scatter_cubemap(values, self.directions, resolution)
 
-    def weighed(self, environment: Float[Tensor, "6 C L L"], weights: Float[Tensor, "P W"]) -> Float[Tensor, "6 C L L"]:
-        """What is `seen`, times weights of all channels or of each, `spread`."""
-        return weigh_cubemap(environment, self.directions, weights)
+    def normal_product(
+        self, weights: Float[Tensor, "P W"], resolution: int
+    ) -> Callable[[Float[Tensor, "6 C L L"]], Float[Tensor, "6 C L L"]]:
+        """What is `seen` of a map, times weights of all channels or of each, `spread`: as a function of the map, for a
+        face of so many texels. It asks no pixel again where each has one direction and one weight.
+        """
+        if self.directions.shape[1] == weights.shape[1] == 1:
+            gram = lookup_gram(self.directions[:, 0], weights[:, 0], resolution)
+            return lambda environment: apply_gram(gram, environment)
+        return lambda environment: weigh_cubemap(environment, self.directions, weights)
 
     def weights(
         self, seen: Float[Tensor, "P 3"], saturation: Float[Tensor, "3"], scale: float, saturated: float

@@ -12,7 +12,7 @@ pixel that counts as w unsaturated ones sets the border where 1/(1 + w) are satu
 L = (1 + 1/w) S.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -219,8 +219,7 @@ def _sharpening(
 class _Equations:
     """Normal equations of a change of the map: AᵀWA + ε and AᵀW (c − A E)."""
 
-    areas: Sequence[PixelFootprints]
-    weights: Sequence[Float[Tensor, "_ 3"]]
+    products: Sequence[Callable[[Float[Tensor, "6 3 L L"]], Float[Tensor, "6 3 L L"]]]
     right_side: Float[Tensor, "6 3 L L"]
     total: Float[Tensor, "6 3 L L"]
     """The weight that lies on each texel."""
@@ -238,19 +237,20 @@ class _Equations:
     ) -> "_Equations":
         """Weighed by what is seen of a map."""
         resolution = environment.shape[-1]
-        weights, residual, total = [], torch.zeros_like(environment), torch.zeros_like(environment)
+        products, residual, total = [], torch.zeros_like(environment), torch.zeros_like(environment)
         for each in areas:
             seen = each.seen(environment)
-            weights.append(each.weights(seen, saturation, scale, saturated))
-            residual += each.spread((each.radiance - seen) * weights[-1], resolution)
-            total += each.spread(weights[-1], resolution)
-        return cls(areas, weights, residual, total, pull)
+            weights = each.weights(seen, saturation, scale, saturated)
+            products.append(each.normal_product(weights, resolution))
+            residual += each.spread((each.radiance - seen) * weights, resolution)
+            total += each.spread(weights, resolution)
+        return cls(products, residual, total, pull)
 
     def product(self, image: Float[Tensor, "6 3 L L"]) -> Float[Tensor, "6 3 L L"]:
         """The matrix times a change."""
         found = self.pull * image
-        for each, weight in zip(self.areas, self.weights, strict=True):
-            found += each.weighed(image, weight)
+        for product in self.products:
+            found += product(image)
         return found
 
 

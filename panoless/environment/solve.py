@@ -11,7 +11,7 @@ from panoless.environment.cubemap import resample
 from panoless.environment.fill import fill_unobserved
 from panoless.environment.footprints import grouped, splat
 from panoless.environment.rays import Rays, joined_rays, normalize_confidence
-from panoless.kernels.cubemap import sample_cubemap, weigh_cubemap
+from panoless.kernels.cubemap import apply_gram, lookup_gram, sample_cubemap
 from panoless.numeric.conjugate_gradients import conjugate_gradients
 from panoless.numeric.robust import robust_weight
 
@@ -71,16 +71,6 @@ def _right_side(
     return both[:, :3], both[:, 3:]
 
 
-def _normal_product(
-    environment: Float[Tensor, "6 C L L"], rays: Sequence[Rays], weights: Sequence[Tensor]
-) -> Float[Tensor, "6 C L L"]:
-    """EᵀWE applied to a map: look up, weigh, scatter."""
-    result = torch.zeros_like(environment)
-    for batch, weight in zip(rays, weights, strict=True):
-        result += weigh_cubemap(environment, batch.directions, weight[:, None])
-    return result
-
-
 def _sharpen(
     start: Float[Tensor, "6 3 L L"],
     right_side: Float[Tensor, "6 3 L L"],
@@ -89,9 +79,13 @@ def _sharpen(
     weights: Sequence[Tensor],
 ) -> Float[Tensor, "6 3 L L"]:
     """A few preconditioned conjugate-gradient steps; a unit-weight pull to the start keeps thin texels stable."""
+    resolution = start.shape[-1]
+    gram = start.new_zeros(6, resolution + 2, resolution + 2, 5)
+    for batch, weight in zip(rays, weights, strict=True):
+        gram += lookup_gram(batch.directions, weight, resolution)
     return conjugate_gradients(
-        lambda image: _normal_product(image, rays, weights) + START_WEIGHT * image,
+        lambda image: apply_gram(gram, image) + START_WEIGHT * image,
         start,
-        right_side - _normal_product(start, rays, weights),
+        right_side - apply_gram(gram, start),
         1 / (total + START_WEIGHT),
     )

@@ -116,6 +116,46 @@ def weigh_cubemap(
     return scatter_cubemap(weights * seen, directions, cubemap.shape[-1], backend=backend)
 
 
+@torch.no_grad()
+def lookup_gram(
+    directions: Float[Tensor, "P 3"], weights: Float[Tensor, "P"], resolution: int, *, backend: Backend = "auto"
+) -> Float[Tensor, "6 padded padded 5"]:
+    """AᵀWA of the lookups of `sample_cubemap` in one direction a value, for products that cost nothing for a ray.
+
+    The four texels that a lookup reads are neighbors on a padded face. So of each padded texel the matrix has five
+    numbers: Σ w a², and Σ w a b with the neighbors b to the right, below, below to the right and below to the left.
+    Those of directions that look nowhere are zero. Carries no gradient. Raises as `scatter_cubemap` does.
+    """
+    _check_directions(directions)
+    _check_resolution(resolution)
+    if directions.ndim != 2 or weights.shape != directions.shape[:1]:
+        raise ValueError(
+            f"expected one direction (P, 3) and one weight (P) a ray; found {tuple(directions.shape)} and "
+            f"{tuple(weights.shape)}."
+        )
+    if choose_backend(backend, directions=directions, weights=weights) == "cpu":
+        from panoless.kernels.cpu.cubemap_gram import lookup_gram as gram_of
+
+        return gram_of(directions, weights, resolution)
+    return reference.lookup_gram(directions, weights, resolution)
+
+
+@torch.no_grad()
+def apply_gram(
+    gram: Float[Tensor, "6 padded padded 5"], cubemap: Float[Tensor, "6 C L L"], *, backend: Backend = "auto"
+) -> Float[Tensor, "6 C L L"]:
+    """The matrix of `lookup_gram` times a cubemap: what `weigh_cubemap` gives for the same rays, but for rounding."""
+    _check_cubemap(cubemap)
+    padded = cubemap.shape[-1] + 2
+    if gram.shape != (6, padded, padded, 5):
+        raise ValueError(f"expected a matrix of shape {(6, padded, padded, 5)} for this cubemap; found {gram.shape}.")
+    if choose_backend(backend, gram=gram, cubemap=cubemap) == "cpu":
+        from panoless.kernels.cpu.cubemap_gram import apply_gram as apply
+
+        return apply(gram, cubemap)
+    return reference.apply_gram(gram, cubemap)
+
+
 def cubemap_directions(
     resolution: int, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> Float[Tensor, "6 L L 3"]:

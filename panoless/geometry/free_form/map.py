@@ -24,6 +24,7 @@ def smoothed_map(
 ) -> Float[Tensor, "6 3 L L"]:
     """min_E Σ w ‖mean_k E(ω_k) − c‖² + λ Σ ‖E_i − E_j‖² over neighboring texels: a few steps from a map on."""
     resolution = environment.shape[-1]
+    of_pixels = pixels.normal_product(weights[:, None], resolution)
     around = texel_neighbors(resolution).to(environment.device)
 
     def differences(image: Tensor) -> Tensor:
@@ -31,7 +32,7 @@ def smoothed_map(
         return by_face(4 * texels - texels[around].sum(0), resolution)
 
     def product(image: Tensor) -> Tensor:
-        return pixels.weighed(image, weights[:, None]) + smoothness * differences(image)
+        return of_pixels(image) + smoothness * differences(image)
 
     light, total = splat(pixels, weights, resolution).split((3, 1), 1)
     diagonal = total + 4 * smoothness

@@ -48,9 +48,9 @@ class SampleCubemap(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, cubemap, directions):
-        texture, directions = _padded(cubemap), directions.detach().contiguous()
+        texture, directions = padded_texture(cubemap), directions.detach().contiguous()
         values = directions.new_empty(len(directions), cubemap.shape[1])
-        run_shared(_sample, texture.numpy(), _flat(directions), values.numpy(), _samples(directions))
+        run_shared(_sample, texture.numpy(), flat(directions), values.numpy(), _samples(directions))
         ctx.save_for_backward(texture, directions)
         return values
 
@@ -66,7 +66,7 @@ class SampleCubemap(torch.autograd.Function):
             grad_directions = torch.empty_like(directions)
             samples = _samples(directions)
             each = grad_values if samples == 1 else (grad_values / samples).repeat_interleave(samples, 0)
-            run_shared(_pull_to_directions, texture.numpy(), _flat(directions), each.numpy(), _flat(grad_directions))
+            run_shared(_pull_to_directions, texture.numpy(), flat(directions), each.numpy(), flat(grad_directions))
         return grad_cubemap, grad_directions
 
 
@@ -83,7 +83,7 @@ def weigh_cubemap(
 ) -> Float[Tensor, "6 C L L"]:
     """What is looked up, times weights, scattered: both ways while a block of rays is at hand."""
     weights = weights.detach().expand(-1, cubemap.shape[1]).contiguous()
-    return _scattered(_padded(cubemap), weights, directions, cubemap.shape[2])
+    return _scattered(padded_texture(cubemap), weights, directions, cubemap.shape[2])
 
 
 def _scattered(
@@ -93,18 +93,25 @@ def _scattered(
     resolution: int,
 ) -> Float[Tensor, "6 C L L"]:
     channels, samples = values.shape[1], _samples(directions)
-    padding = cubemap_padding(resolution, torch.device("cpu"))
     # Clearing and adding up one more buffer must cost less than the work it takes from the others.
     useful = max(1, 4 * samples * len(directions) // (6 * resolution**2))
     buffers = _scatter_buffers(min(MOST_SHARES, useful), resolution, _groups(channels), get_ident())
-    run_shared(_scatter, texture.numpy(), values.numpy(), _flat(directions), buffers, samples)
-    cubemap = values.new_empty(6, channels, resolution, resolution)
+    run_shared(_scatter, texture.numpy(), values.numpy(), flat(directions), buffers, samples)
+    return folded(buffers, channels)
+
+
+def folded(buffers: Float[np.ndarray, "shares groups 6 padded padded 4"], channels: int) -> Float[Tensor, "6 C L L"]:
+    """The sum of padded faces, with their rings added to the texels that these show."""
+    resolution = buffers.shape[3] - 2
+    padding = cubemap_padding(resolution, torch.device("cpu"))
+    cubemap = torch.empty(6, channels, resolution, resolution)
     run_shared(_add_up, buffers, cubemap.numpy())
     _fold_rings(buffers, padding.sources.numpy(), padding.corners.numpy(), cubemap.numpy())
     return cubemap
 
 
-def _padded(cubemap: Float[Tensor, "6 C L L"]) -> Float[Tensor, "groups 6 padded padded 4"]:
+def padded_texture(cubemap: Float[Tensor, "6 C L L"]) -> Float[Tensor, "groups 6 padded padded 4"]:
+    """The faces with their rings, four channels together."""
     _, channels, resolution, _ = cubemap.shape
     padding = cubemap_padding(resolution, torch.device("cpu"))
     texture = cubemap.new_empty(_groups(channels), 6, resolution + 2, resolution + 2, TOGETHER)
@@ -122,7 +129,8 @@ def _groups(channels: int) -> int:
     return -(-channels // TOGETHER)
 
 
-def _flat(tensor: Tensor) -> Float[np.ndarray, "N"]:
+def flat(tensor: Tensor) -> Float[np.ndarray, "N"]:
+    """A tensor as one row."""
     return tensor.detach().contiguous().numpy().reshape(-1)
 
 
@@ -182,7 +190,7 @@ def _extended_texel(cubemap, corners, source, channel):
 
 
 @njit(**VECTORIZED_LOOPS)
-def _locate(directions, resolution, cells, rights, downs, present):
+def locate(directions, resolution, cells, rights, downs, present):
     """Upper left of the four texels around each ray, position between them, and 1, or 0 if it looks nowhere."""
     half = f32(0.5) * f32(resolution)
     middle = half + f32(0.5)
@@ -222,7 +230,7 @@ def _sample(counter, texture, directions, values, samples):
             return
         end = min(begin + block, count)
         share = directions[3 * samples * begin : 3 * samples * end]
-        _locate(share, stride - 2, cells, places[0], places[1], places[2])
+        locate(share, stride - 2, cells, places[0], places[1], places[2])
         for group in range(len(texture)):
             _interpolate(texture[group], stride, cells, places, samples, end - begin, colors)
             _give(colors, group, values[begin:end])
@@ -295,7 +303,7 @@ def _scatter(counter, texture, values, directions, buffers, samples):
         for begin in range(task * count // shares, last, block):
             end = min(begin + block, last)
             share = directions[3 * samples * begin : 3 * samples * end]
-            _locate(share, stride - 2, cells, places[0], places[1], places[2])
+            locate(share, stride - 2, cells, places[0], places[1], places[2])
             for group in range(groups):
                 _take(values[begin:end], group, colors)
                 if len(texture):
@@ -371,7 +379,7 @@ def _pull_to_directions(counter, texture, directions, grad_values, grad_directio
             return
         end = min(begin + RAYS_PER_BLOCK, rays)
         share = directions[3 * begin : 3 * end]
-        _locate(share, stride - 2, cells, places[0], places[1], places[2])
+        locate(share, stride - 2, cells, places[0], places[1], places[2])
         pulls[:] = f32(0)
         for group in range(len(texture)):
             _take(grad_values[begin:end], group, colors)
@@ -399,7 +407,7 @@ def _pull_to_places(texture, stride, cells, places, colors, pulls):
 
 @njit(**VECTORIZED_LOOPS)
 def _pull_through_projection(directions, resolution, by_rights, by_downs, grad_directions):
-    """With s = s_c/|m|: ∂/∂s_c = ∂/∂s / |m| and ∂/∂m = −sign(m)·(s·∂/∂s + t·∂/∂t) / |m|; see `_locate`."""
+    """With s = s_c/|m|: ∂/∂s_c = ∂/∂s / |m| and ∂/∂m = −sign(m)·(s·∂/∂s + t·∂/∂t) / |m|; see `locate`."""
     half = f32(0.5) * f32(resolution)
     for i in range(directions.size // 3):
         x, y, z = directions[3 * i], directions[3 * i + 1], directions[3 * i + 2]

@@ -121,6 +121,37 @@ def fold_padding(padded: Float[Tensor, "N C"], resolution: int) -> Float[Tensor,
     return texels.reshape(6, resolution, resolution, channels).movedim(-1, 1).contiguous()
 
 
+PAIRS = ((0, 0, 0), (1, 1, 0), (2, 2, 0), (3, 3, 0), (0, 1, 1), (2, 3, 1), (0, 2, 2), (1, 3, 2), (0, 3, 3), (1, 2, 4))
+"""Two of the four taps of a lookup each, the earlier first, and which neighbor of the one the other is."""
+NEIGHBORS = ((0, 0), (0, 1), (1, 0), (1, 1), (1, -1))
+"""Rows and columns from a padded texel to those that lookups read with it and that come no earlier."""
+
+
+def lookup_gram(
+    directions: Float[Tensor, "P 3"], weights: Float[Tensor, "P"], resolution: int
+) -> Float[Tensor, "6 padded padded 5"]:
+    """Definition of `panoless.kernels.cubemap.lookup_gram`."""
+    (taps, shares), padded = bilinear_taps(directions, resolution), resolution + 2
+    gram = weights.new_zeros(5, 6 * padded**2)
+    for one, other, neighbor in PAIRS:
+        gram[neighbor].index_add_(0, taps[:, one], weights * shares[:, one] * shares[:, other])
+    return gram.T.reshape(6, padded, padded, 5).contiguous()
+
+
+def apply_gram(gram: Float[Tensor, "6 padded padded 5"], cubemap: Float[Tensor, "6 C L L"]) -> Float[Tensor, "6 C L L"]:
+    """Definition of `panoless.kernels.cubemap.apply_gram`."""
+    channels, padded = cubemap.shape[1], gram.shape[1]
+    texels = padded_texels(cubemap).reshape(6, padded, padded, channels)
+    result = gram[..., :1] * texels
+    for neighbor, (down, right) in enumerate(NEIGHBORS[1:], 1):
+        here = slice(0, padded - down), slice(max(-right, 0), padded - max(right, 0))
+        there = slice(down, padded), slice(max(right, 0), padded - max(-right, 0))
+        shared = gram[:, *here, neighbor, None]
+        result[:, *here] += shared * texels[:, *there]
+        result[:, *there] += shared * texels[:, *here]
+    return fold_padding(result.reshape(-1, channels), padded - 2)
+
+
 def bilinear_taps(directions: Float[Tensor, "P 3"], resolution: int) -> tuple[Int[Tensor, "P 4"], Float[Tensor, "P 4"]]:
     """Flat indices into the padded faces of the four texels around each direction, and their weights.
 

@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from panoless.kernels.cubemap import (
+    apply_gram,
     cubemap_directions,
     cubemap_solid_angles,
+    lookup_gram,
     sample_cubemap,
     scatter_cubemap,
     weigh_cubemap,
@@ -72,6 +74,41 @@ def test_a_weighed_cubemap_is_looked_up_times_weights_and_scattered(backend, dty
     expected = scatter_cubemap(exact, directions.double(), 5, backend="reference")
     found = weigh_cubemap(cubemap, directions, weights, backend=backend)
     torch.testing.assert_close(found.double(), expected, atol=50 * tolerance, rtol=0)
+
+
+@every_implementation
+@pytest.mark.parametrize("resolution", RESOLUTIONS)
+@pytest.mark.parametrize("channels", [1, 3, 6])
+def test_the_matrix_of_lookups_weighs_a_cubemap(backend, dtype, tolerance, resolution, channels):
+    """As looking up, weighing and scattering by the definitions in float64 does; on edges and corners, too."""
+    cubemap, directions = random_cubemap(resolution, dtype, channels), hard_directions(dtype)
+    directions = torch.cat([directions, directions.new_zeros(1, 3), directions.new_full((1, 3), math.nan)])
+    weights = torch.rand(len(directions), generator=torch.Generator().manual_seed(2), dtype=torch.float64).to(dtype)
+    exact = sample_cubemap(cubemap.double(), directions.double(), backend="reference") * weights.double()[:, None]
+    expected = scatter_cubemap(exact, directions.double(), resolution, backend="reference")
+    gram = lookup_gram(directions, weights, resolution, backend=backend)
+    found = apply_gram(gram, cubemap, backend=backend)
+    torch.testing.assert_close(found.double(), expected, atol=tolerance * float(expected.abs().max()), rtol=0)
+
+
+@every_implementation
+def test_matrices_of_lookups_add_up(backend, dtype, tolerance):
+    """That of all rays is the sum of those of two parts, many rays a texel each, so that shares have rays of both."""
+    directions = torch.randn(3000, 3, generator=torch.Generator().manual_seed(5)).to(dtype)
+    weights = torch.rand(3000, generator=torch.Generator().manual_seed(2)).to(dtype)
+    parts = [
+        lookup_gram(directions[part], weights[part], 4, backend=backend) for part in (slice(700), slice(700, None))
+    ]
+    found = lookup_gram(directions, weights, 4, backend=backend)
+    torch.testing.assert_close(found, parts[0] + parts[1], atol=20 * tolerance, rtol=0)
+    assert torch.equal(found, lookup_gram(directions, weights, 4, backend=backend))
+
+
+def test_the_matrix_of_lookups_refuses_what_does_not_match():
+    with pytest.raises(ValueError, match="one direction"):
+        unwrap(lookup_gram)(torch.zeros(2, 4, 3), torch.zeros(2), 4)
+    with pytest.raises(ValueError, match="for this cubemap"):
+        unwrap(apply_gram)(torch.zeros(6, 6, 6, 5), torch.zeros(6, 3, 5, 5))
 
 
 @every_implementation
