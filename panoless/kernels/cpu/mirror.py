@@ -97,7 +97,7 @@ class ShadingNumbers(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """Where rays meet the cubemap; see `panoless.kernels.cpu.cubemap._locate`."""
+    """Where rays meet the cubemap; see `panoless.kernels.cpu.cubemap.locate`."""
 
     usable: Any
     on_x: Any

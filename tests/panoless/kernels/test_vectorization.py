@@ -20,7 +20,7 @@ LOOPS = {
     image._normals_send: (ROWS, *CAMERA, PLANES, int64, PLANES, int64),
     image._normals_gather: (PLANES, int64, LINE),
     # Rays are passed flat: as a matrix, their loop is vectorized too, but for a wrongly guessed row length.
-    cubemap._locate: (LINE, int64, int32[::1], LINE, LINE, LINE),
+    cubemap.locate: (LINE, int64, int32[::1], LINE, LINE, LINE),
     cubemap._pull_through_projection: (LINE, int64, LINE, LINE, LINE),
 }
 
