@@ -93,11 +93,17 @@ def _scattered(
     resolution: int,
 ) -> Float[Tensor, "6 C L L"]:
     channels, samples = values.shape[1], _samples(directions)
-    # Clearing and adding up one more buffer must cost less than the work it takes from the others.
-    useful = max(1, 4 * samples * len(directions) // (6 * resolution**2))
-    buffers = _scatter_buffers(min(MOST_SHARES, useful), resolution, _groups(channels), get_ident())
+    shares = useful_shares(4 * samples * len(directions), resolution)
+    buffers = _scatter_buffers(shares, resolution, _groups(channels), get_ident())
     run_shared(_scatter, texture.numpy(), values.numpy(), flat(directions), buffers, samples)
     return folded(buffers, channels)
+
+
+def useful_shares(additions: int, resolution: int) -> int:
+    """Of work worth so many additions of a color to a texel. Clearing and adding up one more buffer must cost less than
+    what it takes from the others.
+    """
+    return min(MOST_SHARES, max(1, additions // (6 * resolution**2)))
 
 
 def folded(buffers: Float[np.ndarray, "shares groups 6 padded padded 4"], channels: int) -> Float[Tensor, "6 C L L"]:

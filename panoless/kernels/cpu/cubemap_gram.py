@@ -13,13 +13,13 @@ from torch import Tensor
 from panoless.kernels.cpu.compilation import VECTORIZED_LOOPS
 from panoless.kernels.cpu.cubemap import (
     LINES_PER_CLAIM,
-    MOST_SHARES,
     RAYS_PER_BLOCK,
     TOGETHER,
     flat,
     folded,
     locate,
     padded_texture,
+    useful_shares,
 )
 from panoless.kernels.cpu.simd_memory import fetch_add
 from panoless.kernels.cpu.workers import run_shared
@@ -31,8 +31,7 @@ def lookup_gram(
     directions: Float[Tensor, "P 3"], weights: Float[Tensor, "P"], resolution: int
 ) -> Float[Tensor, "6 padded padded 5"]:
     """Definition of `panoless.kernels.cubemap.lookup_gram`."""
-    # Clearing and adding up one more buffer must cost less than the work it takes from the others.
-    shares = min(MOST_SHARES, max(1, len(directions) // (6 * resolution**2)))
+    shares = useful_shares(len(directions), resolution)
     buffers = np.empty((shares, 6, resolution + 2, resolution + 2, NUMBERS), np.float32)
     run_shared(_gather, flat(directions), flat(weights), buffers.reshape(shares, -1), resolution)
     return torch.from_numpy(buffers[0] if shares == 1 else buffers.sum(0))
@@ -82,56 +81,28 @@ def _gather(counter, directions, weights, buffers, resolution):
 @njit(**VECTORIZED_LOOPS)
 def _apply(counter, gram, texture, result, stride):
     """Lines of padded texels, each a sum over itself and its eight neighbors."""
-    groups, count = len(texture), gram.size // NUMBERS
-    lines = groups * 6 * stride
+    lines = len(texture) * 6 * stride
     while True:
         first = fetch_add(counter, LINES_PER_CLAIM)
         if first >= lines:
             return
         for line in range(first, min(first + LINES_PER_CLAIM, lines)):
             group, begin = line // (6 * stride), line % (6 * stride) * stride
-            inner = begin >= 2 * stride and begin + 3 * stride <= count
-            if inner:
-                _apply_line(gram, texture[group], result[group], begin, stride)
-            else:
-                _apply_outer_line(gram, texture[group], result[group], begin, stride)
+            _apply_line(gram, texture[group], result[group], begin, stride)
 
 
 @njit(**VECTORIZED_LOOPS)
 def _apply_line(gram, texels, result, begin, stride):
-    """A line with lines before and after it."""
-    for i in range(begin, begin + stride):
-        above, cell, up, here, down = (
-            NUMBERS * (i - stride),
-            NUMBERS * i,
-            TOGETHER * (i - stride),
-            TOGETHER * i,
-            TOGETHER * (i + stride),
-        )
-        for lane in range(TOGETHER):
-            result[here + lane] = (
-                gram[cell] * texels[here + lane]
-                + gram[cell + 1] * texels[here + TOGETHER + lane]
-                + gram[cell - NUMBERS + 1] * texels[here - TOGETHER + lane]
-                + gram[cell + 2] * texels[down + lane]
-                + gram[above + 2] * texels[up + lane]
-                + gram[cell + 3] * texels[down + TOGETHER + lane]
-                + gram[above - NUMBERS + 3] * texels[up - TOGETHER + lane]
-                + gram[cell + 4] * texels[down - TOGETHER + lane]
-                + gram[above + NUMBERS + 4] * texels[up + TOGETHER + lane]
-            )
-
-
-@njit(**VECTORIZED_LOOPS)
-def _apply_outer_line(gram, texels, result, begin, stride):
-    """A line that may be the first or last, or lie beside these."""
+    """One line; before the first texel comes the last."""
     count = gram.size // NUMBERS
     for i in range(begin, begin + stride):
+        out = result[TOGETHER * i : TOGETHER * (i + 1)]
         for lane in range(TOGETHER):
-            total = gram[NUMBERS * i] * texels[TOGETHER * i + lane]
-            for neighbor, step in ((1, 1), (2, stride), (3, stride + 1), (4, stride - 1)):
-                if i + step < count:
-                    total += gram[NUMBERS * i + neighbor] * texels[TOGETHER * (i + step) + lane]
-                if i >= step:
-                    total += gram[NUMBERS * (i - step) + neighbor] * texels[TOGETHER * (i - step) + lane]
-            result[TOGETHER * i + lane] = total
+            out[lane] = gram[NUMBERS * i] * texels[TOGETHER * i + lane]
+        for neighbor, step in ((1, 1), (2, stride), (3, stride + 1), (4, stride - 1)):
+            after = i + step if i + step < count else i + step - count
+            before = i - step if i >= step else i - step + count
+            to_after, to_before = gram[NUMBERS * i + neighbor], gram[NUMBERS * before + neighbor]
+            for lane in range(TOGETHER):
+                out[lane] += to_after * texels[TOGETHER * after + lane]
+                out[lane] += to_before * texels[TOGETHER * before + lane]
