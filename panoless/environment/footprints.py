@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from panoless.environment.cubemap import flat_texels
 from panoless.environment.rays import Believed, Rays
 from panoless.kernels.cubemap import apply_gram, lookup_gram, sample_cubemap, scatter_cubemap, weigh_cubemap
 from panoless.numeric.robust import robust_weight
@@ -39,7 +40,10 @@ class PixelFootprints(Believed):
 
     def every(self, stride: int, first: int) -> "PixelFootprints":
         """Every stride-th pixel from the first."""
-        part = slice(first, None, stride)
+        return self.kept(slice(first, None, stride))
+
+    def kept(self, part: slice | Bool[Tensor, "P"]) -> "PixelFootprints":
+        """Those of the pixels."""
         trust = None if self.trust is None else self.trust[part]
         return PixelFootprints(self.directions[part].contiguous(), self.radiance[part].contiguous(), trust)
 
@@ -117,6 +121,22 @@ def thinned(batches: Sequence[Batch], most: float) -> list[Batch]:
     """About `most` of the rays or pixels at most: every k-th, beginning elsewhere in each batch."""
     stride = max(1, math.ceil(sum(len(batch.radiance) for batch in batches) / most))
     return [batch.every(stride, index % stride) for index, batch in enumerate(batches)]
+
+
+def in_patches(batches: Sequence[PixelFootprints], most: int, side: int) -> list[PixelFootprints]:
+    """About so many of the pixels at most: all those that look at patches of the sky, side² a face of a cubemap, which
+    are chosen at random. As many fall on a texel there as of all pixels.
+    """
+    share = most / max(sum(len(batch.radiance) for batch in batches), 1)
+    if share >= 1:
+        return list(batches)
+    number = 6 * side**2
+    order = torch.randperm(number, generator=torch.Generator().manual_seed(0))
+    parts = []
+    for batch in batches:
+        patch = torch.from_numpy(flat_texels(batch.rays().directions.cpu().numpy(), side))
+        parts.append(batch.kept((order[patch] < share * number).to(batch.radiance.device)))
+    return parts
 
 
 def splat(batch: Rays | PixelFootprints, weights: Float[Tensor, "P"], resolution: int) -> Float[Tensor, "6 4 L L"]:

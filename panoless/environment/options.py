@@ -52,6 +52,10 @@ class FootprintMapOptions:
     """Conjugate-gradient steps of a round."""
     trial_steps: int = 2
     """The same in maps that only choose resolution and smoothness: on seven shapes they choose as six do."""
+    trial_pixels: Count = 500_000
+    """From about so many pixels at most these maps are made: those that look at some patches of the sky."""
+    trial_patches: Count = 8
+    """Patches along a face side, of which some are chosen. Not tuned."""
     saturated: float = 0.998
     """Share of the largest value from which a pixel is saturated."""
     lit: float = 0.95

@@ -22,7 +22,7 @@ from torch.nn.functional import max_pool2d
 
 from panoless.environment.cubemap import by_face, by_texel, resample
 from panoless.environment.fill import texel_neighbors
-from panoless.environment.footprints import Footprints, PixelFootprints, counting_saturated, thinned
+from panoless.environment.footprints import Footprints, PixelFootprints, counting_saturated, in_patches, thinned
 from panoless.environment.options import DEFAULTS, FootprintMapOptions, LampOptions
 from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
@@ -55,11 +55,11 @@ def sharpest_map(
 ) -> Float[Tensor, "6 3 L L"]:
     """The map of all pixels: `rays` are their centers, also of those without footprints. The resolutions that it may
     have go from coarse to fine; the coarsest has enough pixels a texel to say where footprints tell it. E₀ is solved
-    from them twice: the second time, where they do, from the map by which its sharpness was chosen. Under that fewer
-    rays look as if they were wrong.
+    from them twice: the second time, where they do, from a map of footprints. Under that fewer rays look as if they
+    were wrong.
     """
-    chosen, tried = chosen_sharpness(footprints.smooth, resolutions, saturation, options)
-    told = tried.new_zeros(6, 1, resolutions[0], resolutions[0])
+    chosen = chosen_sharpness(footprints.smooth, resolutions, saturation, options)
+    told = footprints.smooth[0].radiance.new_zeros(6, 1, resolutions[0], resolutions[0])
     for each in footprints.smooth:
         told += each.spread(each.initial_weight()[:, None], resolutions[0])
     told = (told >= options.least_told).float()
@@ -68,8 +68,9 @@ def sharpest_map(
         counting_saturated(each, chosen.lamps.saturated_weight, level, sample_cubemap(told, each.directions)[:, 0])
         for each in rays
     ]
-    start = solve_environment(believed, chosen.resolution)
-    seen = tried.minimum(saturation.to(tried)[:, None, None])
+    start, quick = solve_environment(believed, chosen.resolution), replace(options, steps=options.trial_steps)
+    seen = deblur_map(Footprints(footprints.smooth), start, saturation, chosen.smoothness, quick, chosen.lamps)
+    seen = seen.minimum(saturation.to(seen)[:, None, None])
     told = resample(told, chosen.resolution) > 0.5
     start = solve_environment(believed, chosen.resolution, torch.where(told, seen, start))
     return deblur_map(footprints, start, saturation, chosen.smoothness, options, chosen.lamps)
@@ -80,8 +81,8 @@ def chosen_sharpness(
     resolutions: Sequence[int],
     saturation: Float[Tensor, "3"],
     options: FootprintMapOptions = DEFAULTS,
-) -> tuple[Sharpness, Float[Tensor, "6 3 L L"]]:
-    """What explains every fifth pixel best by the others, and the map of these. From the coarsest map on, a finer, a
+) -> Sharpness:
+    """What explains every fifth pixel best by the others. From the coarsest map on, a finer, a
     smoother and a sharper one are tried as long as one is better, a finer one by the share `least_gain`. One that is as
     fine as a refused one is not tried again.
 
@@ -111,27 +112,27 @@ def chosen_sharpness(
             best, here, moves = found, there, list(MOVES)
         elif finer:
             sizes = there[0]
-    return sharpness(here, lamps), best.environment
+    return sharpness(here, lamps)
 
 
 @dataclass(frozen=True)
 class _Tried:
-    """A map of four fifths of the pixels, and how badly it explains the others: the mean of ‖e‖²/(‖e‖² + s²), weighted
-    by trust and, of saturated ones, by what they count in the map.
+    """How badly a map of four fifths of the pixels explains the others: the mean of ‖e‖²/(‖e‖² + s²), weighted by trust
+    and, of saturated ones, by what they count in the map.
     """
 
-    environment: Float[Tensor, "6 3 L L"]
     error: float
     unsaturated_error: float
     """Of the unsaturated ones."""
 
 
 class _Trial:
-    """What the pixels say of which some are held out."""
+    """What the pixels in some patches of the sky say, of which some are held out."""
 
     def __init__(
         self, areas: Sequence[PixelFootprints], saturation: Float[Tensor, "3"], options: FootprintMapOptions
     ) -> None:
+        areas = in_patches(areas, options.trial_pixels, options.trial_patches)
         self.kept = [each.without(options.held_out, index % options.held_out) for index, each in enumerate(areas)]
         self.asked = [each.every(options.held_out, index % options.held_out) for index, each in enumerate(areas)]
         self.saturation, self.options = saturation, replace(options, steps=options.trial_steps)
@@ -140,14 +141,14 @@ class _Trial:
         self._starts: dict[tuple[int, LampOptions], Tensor] = {}
 
     def made(self, sharpness: Sharpness) -> _Tried:
-        """The map that is so sharp."""
+        """Of the map that is so sharp."""
         lamps, key = sharpness.lamps, (sharpness.resolution, sharpness.lamps)
         if key not in self._starts:
             rays = [counting_saturated(each.rays(), lamps.saturated_weight, self.level) for each in self.kept]
             self._starts[key] = solve_environment(rays, sharpness.resolution)
         start, footprints = self._starts[key], Footprints(self.kept)
         environment = deblur_map(footprints, start, self.saturation, sharpness.smoothness, self.options, lamps)
-        return _Tried(environment, *self._errors(environment, lamps))
+        return _Tried(*self._errors(environment, lamps))
 
     def _errors(self, environment: Float[Tensor, "6 3 L L"], lamps: LampOptions) -> tuple[float, float]:
         """Of all pixels that are asked, and of the unsaturated ones."""

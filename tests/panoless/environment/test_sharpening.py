@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from panoless.environment.footprints import Footprints, PixelFootprints
+from panoless.environment.footprints import Footprints, PixelFootprints, in_patches, splat
 from panoless.environment.options import FootprintMapOptions, LampOptions
 from panoless.environment.rays import Rays
 from panoless.environment.sharpening import (
@@ -62,9 +62,9 @@ def error(environment: torch.Tensor, waves: float = 6.0) -> float:
 def test_noise_makes_held_out_pixels_ask_for_smoothness() -> None:
     """They take the most that is offered, and not without noise. That map is the nearest to the truth by far."""
     least, most = OPTIONS.smoothness[0], OPTIONS.smoothness[-1]
-    assert chosen_sharpness([photographed(10_000, 0.0)], SIZES[-1:], ONE)[0].smoothness < most
+    assert chosen_sharpness([photographed(10_000, 0.0)], SIZES[-1:], ONE).smoothness < most
     noisy = photographed(10_000, 0.05)
-    assert chosen_sharpness([noisy], SIZES[-1:], ONE)[0].smoothness == most
+    assert chosen_sharpness([noisy], SIZES[-1:], ONE).smoothness == most
     start = solve_environment([noisy.rays()], SIZES[-1])
     errors = [error(deblur_map(Footprints.of([noisy]), start, ONE, each, OPTIONS)) for each in (least, most)]
     assert errors[1] < errors[0] / 2
@@ -73,7 +73,7 @@ def test_noise_makes_held_out_pixels_ask_for_smoothness() -> None:
 def test_a_map_is_as_fine_as_held_out_pixels_want_it() -> None:
     """Noisy pixels of slow waves need few texels, clean ones of fast waves many."""
     slow, fast = photographed(5_000, 0.05, waves=2.0, window=0.0), photographed(20_000, 0.0, waves=20.0)
-    assert chosen_sharpness([slow], SIZES, ONE)[0].resolution == SIZES[0]
+    assert chosen_sharpness([slow], SIZES, ONE).resolution == SIZES[0]
     assert sharpest_map(Footprints.of([fast]), [fast.rays()], SIZES, ONE).shape[-1] == SIZES[-1]
 
 
@@ -96,10 +96,10 @@ def test_a_refused_resolution_is_not_tried_again(monkeypatch: pytest.MonkeyPatch
     def made(trial: _Trial, sharpness: Sharpness) -> _Tried:
         resolution, smoothness = sharpness.resolution, sharpness.smoothness
         tried.append((resolution, smoothness))
-        return _Tried(torch.zeros(6, 3, resolution, resolution), resolution + smoothness, 0.0)
+        return _Tried(resolution + smoothness, 0.0)
 
     monkeypatch.setattr(_Trial, "made", made)
-    chosen, _ = chosen_sharpness([photographed(10, 0.0)], SIZES, ONE)
+    chosen = chosen_sharpness([photographed(10, 0.0)], SIZES, ONE)
     assert (chosen.resolution, chosen.smoothness) == (SIZES[0], OPTIONS.smoothness[0])
     assert [each for each in tried if each[0] == SIZES[1]] == [(SIZES[1], usual)]
 
@@ -119,7 +119,7 @@ def test_bright_lamps_are_not_shown_too_large() -> None:
     assert right.square().mean() < wrong.square().mean() / 2
     assert wrong.clamp(min=0).square().sum() > 2 * wrong.clamp(max=0).square().sum()
     dimmer = photographed(20_000, 0.0, window=1.0)
-    lamps = [chosen_sharpness([each], SIZES[-1:], ONE)[0].lamps for each in (areas, dimmer)]
+    lamps = [chosen_sharpness([each], SIZES[-1:], ONE).lamps for each in (areas, dimmer)]
     assert lamps == [OPTIONS.hard, OPTIONS.soft]
 
 
@@ -216,3 +216,25 @@ def test_a_held_out_pixel_has_no_say() -> None:
         for each in (areas.radiance, other)
     ]
     assert torch.equal(*maps)
+
+
+def test_patches_of_the_sky_are_as_dense_as_the_whole() -> None:
+    """A fifth of the pixels: on a texel fall all of them or none, but for those beside borders of patches. No more
+    pixels than are asked for stay as they are.
+    """
+    areas = [photographed(30_000, 0.0), photographed(10_000, 0.0)]
+    parts = in_patches(areas, 8_000, 4)
+    assert sum(len(each.radiance) for each in parts) == pytest.approx(8_000, rel=0.2)
+    whole, part = (sum(splat(e.rays(), e.initial_weight(), 40)[:, 3] for e in batches) for batches in (areas, parts))
+    share = part / whole.clamp(min=1e-9)
+    assert ((share < 1e-3) | (share > 1 - 1e-3)).float().mean() > 0.6
+    assert in_patches(areas, 40_000, 4) == areas
+
+
+def test_patches_choose_the_sharpness_of_the_whole() -> None:
+    """Noise asks for smoothness, slow waves for few texels and fast ones for many, by a quarter of the pixels, too."""
+    options = replace(OPTIONS, trial_pixels=10_000)
+    cases = [(0.05, 2.0, 0.0), (0.0, 20.0, 0.3), (0.05, 6.0, 0.3), (0.0, 6.0, 30.0)]
+    for noise, waves, window in cases:
+        areas = photographed(40_000, noise, waves, window)
+        assert chosen_sharpness([areas], SIZES, ONE, options) == chosen_sharpness([areas], SIZES, ONE)
