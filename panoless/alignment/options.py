@@ -35,6 +35,9 @@ class PoseOptions:
     """No turns are looked for where a shape overlaps less with the masks: mirror and vase do by 0.86 and 0.83 with
     turns of 2°, and a plane by 0.70 with sculpture.
     """
+    trial_views: Count = 16
+    """So many views tell first, where there are at least twice as many, whether turns bring a shape near to the masks.
+    Not tuned."""
     silhouette_rounds: Count = 5
     """Most rounds of turns and shape by silhouettes alone. Not tuned."""
     least_fall: Share = 0.2

@@ -146,8 +146,20 @@ def _proposals(source: Family, views: Views, config: FitConfig, *, asked: bool) 
     proposal = source.propose(views, config, asked=asked)
     if proposal is None:
         return []
-    aligned = align_proposal(source, views, proposal, config)
+    worthwhile = asked or _few_come_near(source, views, proposal, config)
+    aligned = align_proposal(source, views, proposal, config) if worthwhile else None
     return [PosedProposal(proposal)] if aligned is None else [aligned, PosedProposal(proposal)]
+
+
+def _few_come_near(source: Family, views: Views, proposal: Proposal, config: FitConfig) -> bool:
+    """Whether turns of a few of many cameras bring a proposal so near to the masks that it is fitted. Turns of all take
+    as much longer as there are more, and a wrong kind stays far from the masks.
+    """
+    stride = len(views.train) // config.poses.trial_views
+    if stride < 2 or config.poses.mode != "auto" or source.finds_poses:
+        return True
+    few = align_proposal(source, replace(views, train=views.train[::stride]), proposal, config)
+    return few is not None and _is_near(few, config, bent=True)
 
 
 def _is_near(start: PosedProposal, config: FitConfig, *, bent: bool) -> bool:

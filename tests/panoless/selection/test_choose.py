@@ -7,20 +7,26 @@ import numpy as np
 import pytest
 import torch
 
+from panoless.alignment.options import PoseOptions
+from panoless.alignment.search import PosedProposal, align_proposal
 from panoless.capture.poses import Poses
 from panoless.capture.views import Views
 from panoless.config import FitConfig
-from panoless.geometry.base import Geometry, usable_views
+from panoless.geometry.base import Family, Geometry, Proposal, usable_views
 from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.plane.model import Plane, unoccluded_share
+from panoless.geometry.revolution.kind import RevolutionFamily
 from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.reconstruct.fit import begin, fit
 from panoless.reconstruct.snapshots import SnapshotSchedule
+from panoless.selection import choose
 from panoless.selection.candidates import Candidate, Selection, Verdict
 from panoless.selection.choose import choose_geometry, least_unexplained, much_less_unexplained
 from panoless.selection.options import CorrectionOptions
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
+from tests.panoless.alignment.test_search import goblet_views, wrong_turns
+from tests.support.mirror_body import body_views, ellipsoid
 from tests.support.mirror_plane import NORMAL, RECTANGLE, arc, make_plane_dataset, plane_of, reflecting_views
 from tests.support.mirror_revolution import around, goblet, pillar_views, revolution_views
 from tests.support.mirror_sphere import tiny_config
@@ -232,6 +238,31 @@ def test_a_box_is_refused_by_its_silhouettes() -> None:
     assert plane.verdict == Verdict.NOT_PROPOSED or plane.silhouette_px > 0.5 or plane.overlap < 0.98
     assert selection.sentence.startswith("free_form (leaves next to nothing unexplained;")
     assert selection.candidates[-1].surfels_error is None
+
+
+@pytest.mark.parametrize(
+    ("views", "asked"),
+    [
+        (wrong_turns(goblet_views()).moved(goblet_views()), [6, 12]),
+        (wrong_turns(body_views(ellipsoid(), 14, 64)).moved(body_views(ellipsoid(), 14, 64)), [7]),
+    ],
+)
+def test_few_cameras_tell_whether_turns_are_worthwhile(
+    monkeypatch: pytest.MonkeyPatch, views: Views, asked: list[int]
+) -> None:
+    """All of a goblet are turned back, as a few come near to its masks; of an ellipsoid, which is no surface of
+    revolution, only those few are asked.
+    """
+    numbers = []
+
+    def align(family: Family, views: Views, proposal: Proposal, config: FitConfig) -> PosedProposal | None:
+        numbers.append(len(views.train))
+        return align_proposal(family, views, proposal, config)
+
+    monkeypatch.setattr(choose, "align_proposal", align)
+    config = replace(FitConfig(), poses=PoseOptions(trial_views=6))
+    assert len(choose._proposals(RevolutionFamily(), views, config, asked=False)) == len(asked)
+    assert numbers == asked
 
 
 def test_a_fit_remembers_why_it_took_its_kind() -> None:
