@@ -27,7 +27,7 @@ demo: $(VENV)/.installed-demo
 
 capture-demo: $(VENV)/.installed-capture
 	$(BIN)/shinypartial film --scene chrome-ball-board --resolution 320 --frames 24 --test 6 --samples 8 --output films/demo
-	$(BIN)/panoless capture films/demo/film.mp4 --output datasets/film-demo --board A4 --masks films/demo/masks
+	$(BIN)/panoless capture films/demo --output datasets/film-demo
 	$(BIN)/shinypartial align datasets/film-demo --truth films/demo/truth --output datasets/film-demo-aligned
 	$(BIN)/panoless fit datasets/film-demo-aligned --preset fast --output predictions/film-demo
 	$(BIN)/shinypartial evaluate predictions/film-demo --dataset films/demo/truth

@@ -187,12 +187,14 @@ class Capture:
     """Dataset folder to write."""
     colmap: Path | None = None
     """Folder of a COLMAP model, text or binary, for these photographs; found where it is SOURCE/sparse/0."""
-    board: Literal["A4", "Letter", "A3"] | None = None
-    """The board of `panoless board` that lies under the object, by its paper."""
+    board: Literal["A4", "Letter", "A3", "none"] | None = None
+    """The board of `panoless board` that lies under the object, by its paper; when not given, it is known by its
+    markers, where neither a COLMAP model nor a transforms.json is there."""
     square_mm: float | None = None
     """Side of a square of the board as measured on the print, in millimeters."""
     masks: Path | None = None
-    """Folder of masks by the names of the photographs, white on the object."""
+    """Folder of masks by the names of the photographs, white on the object; found where it is SOURCE/masks or beside a
+    video, and has a mask for each of them."""
     segmenter: Path | None = None
     """Without masks: an ONNX model that tells the object from its surroundings; docs/how-to/capture.md says what it is
     given and has to return."""
@@ -262,7 +264,7 @@ class PrintBoard:
         board = BOARDS[self.paper]
         write_board(board, self.output)
         print(f"Print {self.output} at 100 % and measure: five squares are {5 * board.square_mm:g} mm.")
-        print(f"Then: panoless capture FOLDER --output DATASET --board {self.paper}")
+        print("Then: panoless capture FOLDER --output DATASET")
 
 
 def _preset_of(arguments: list[str]) -> str:

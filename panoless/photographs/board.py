@@ -1,6 +1,6 @@
 """A ChArUco board under the object: to print, and as the measure of cameras."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from panoless.photographs.lens import Lens, opencv
 from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import PosedView, Poses, as_rows, with_covariances
 from panoless.photographs.video import luminance
-from shinypartial.core.board import CELLS_OF_MARKER, CELLS_OF_SQUARE, MM, Board
+from shinypartial.core.board import BOARDS, CELLS_OF_MARKER, CELLS_OF_SQUARE, MM, Board
 from shinypartial.core.errors import InputError
 from shinypartial.io.files import atomic_write, write_text
 from shinypartial.io.images import read_png
@@ -95,6 +95,23 @@ def _write_pdf(board: Board, path: Path) -> None:
     file += f"xref\n0 {count}\n0000000000 65535 f \n{places}{trailer}"
     with atomic_write(path) as temporary:
         temporary.write_bytes(file.encode("ascii"))
+
+
+def recognized_board(frames: Frames, folder: Path, options: CaptureOptions) -> Board | None:
+    """The board of which most corners are seen, if half of some frames show enough of them; None: there is none.
+
+    A4 has all markers of Letter in the same places, and one row more, so a board on Letter is found as one on A4: its
+    world is the same.
+    """
+    photographs = frames.photographs
+    some = replace(frames, photographs=photographs[:: -(-len(photographs) // options.board_frames)])
+    best, most = None, 0
+    for board in BOARDS.values():
+        seen = [len(each.corners) for each in find_board(board, some, folder)]
+        enough = [count for count in seen if count >= options.least_corners]
+        if 2 * len(enough) >= len(some.photographs) and sum(enough) > most:
+            best, most = board, sum(enough)
+    return best
 
 
 def find_board(board: Board, frames: Frames, folder: Path) -> list[Sighting]:

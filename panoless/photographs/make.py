@@ -2,15 +2,16 @@
 
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
-from panoless.photographs.board import poses_from_board
+from panoless.photographs.board import poses_from_board, recognized_board
 from panoless.photographs.frames import Frames, block_means, make_frames, source_files
 from panoless.photographs.hull import nearest_point
-from panoless.photographs.masks import Hint, Masks, find_masks, given_mask, overlaps_of
+from panoless.photographs.masks import Hint, Masks, find_masks, given_mask, masks_beside, overlaps_of
 from panoless.photographs.models import find_model, find_transforms, read_colmap, read_transforms
 from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import PosedView, Poses, without_the_rest
@@ -41,7 +42,8 @@ class Request:
     """A folder of photographs, or a video."""
     output: Path
     colmap: Path | None = None
-    board: Paper | None = None
+    board: Paper | Literal["none"] | None = None
+    """By its paper; None: looked for, where no other program says where the cameras were."""
     square_mm: float | None = None
     """As measured on the print; None for what was meant to be printed."""
     masks: Path | None = None
@@ -126,22 +128,25 @@ def _frames(request: Request, files: list[Path], pictures: Path, work: Path) -> 
     return stage(work, "frames", given, Frames, work_on)
 
 
-def _board(request: Request) -> Board | None:
-    if request.board is None:
-        return None
-    drawn = BOARDS[request.board]
-    return Board(drawn.columns, drawn.rows, drawn.paper_mm, request.square_mm or drawn.square_mm)
+def _board(request: Request, drawn: Board | None) -> Board | None:
+    """As it was printed."""
+    return drawn and replace(drawn, square_mm=request.square_mm or drawn.square_mm)
 
 
 def _poses(request: Request, frames: Frames, pictures: Path, work: Path) -> tuple[Poses, dict[str, Path]]:
     """Poses, and the masks that come with the source, in the size of the frames: by `--masks` or by transforms.json."""
-    board = _board(request)
-    model = request.colmap or (None if board else find_model(request.source))
-    transforms = None if board or model else find_transforms(request.source)
+    drawn = None if request.board is None or request.board == "none" else BOARDS[request.board]
+    model = request.colmap or (None if drawn else find_model(request.source))
+    transforms = None if drawn or model else find_transforms(request.source)
+    if not (request.board or model or transforms):
+        drawn = recognized_board(frames, pictures, request.options)
+    board = _board(request, drawn)
     named: dict[str, Path] = {}
     read = None
-    if request.masks:
-        named = {one.name: given_mask(request.masks, one.name) for one in frames.photographs}
+    names = [one.name for one in frames.photographs]
+    folder = request.masks or (None if request.hints or transforms else masks_beside(request.source, names))
+    if folder:
+        named = {name: given_mask(folder, name) for name in names}
     elif transforms:
         read, named = read_transforms(transforms, frames)
     if request.segmenter:

@@ -122,10 +122,20 @@ def overlaps_of(views: Sequence[tuple[Camera, Float[np.ndarray, "_ _"]]], option
     return found
 
 
+def masks_beside(source: Path, names: Sequence[str]) -> Path | None:
+    """The folder `masks` in a folder of photographs or beside it, or beside a video, if it has one for each of them."""
+    places = (folder / "masks" for folder in (source, source.parent))
+    return next((place for place in places if all(_mask_of(place, name) for name in names)), None)
+
+
+def _mask_of(folder: Path, name: str) -> Path | None:
+    ends = (".png", ".png.png", ".jpg.png", "_mask.png", "_alpha.png", ".jpg", ".jpeg")
+    return next((path for end in ends if (path := folder / f"{name}{end}").is_file()), None)
+
+
 def given_mask(folder: Path, name: str) -> Path:
     """The file of a mask, by the name of its photograph; InputError where there is none."""
-    ends = (".png", ".png.png", ".jpg.png", "_mask.png", "_alpha.png", ".jpg", ".jpeg")
-    found = next((path for end in ends if (path := folder / f"{name}{end}").is_file()), None)
+    found = _mask_of(folder, name)
     if found is None:
         raise InputError(
             expected=f"a mask for {name} in {folder}, such as {name}.png",

@@ -30,6 +30,8 @@ class CaptureOptions:
     least_change: Share = 0.25
     """By which share of that contrast the border must change. It changes by 1.6 in a film of *sculpture* in a room, 0.6
     where all borders show a patterned ground; before a camera that stands still by its noise."""
+    board_frames: Count = 8
+    """Frames in which a board is looked for that nobody named: half of them must show it. Not tuned."""
     least_corners: Annotated[int, Meta(ge=6)] = 8
     """Corners of the board that a frame must show; a pose needs four, and more make it certain."""
     corner_blurs_px: tuple[NonNegative, ...] = (1.5, 0.7, 0.7)

@@ -8,14 +8,20 @@ import cv2
 import numpy as np
 import pytest
 
-from panoless.photographs.board import BOARD_TO_WORLD, drawn_by_opencv, poses_from_board, write_board
+from panoless.photographs.board import (
+    BOARD_TO_WORLD,
+    drawn_by_opencv,
+    poses_from_board,
+    recognized_board,
+    write_board,
+)
 from panoless.photographs.corners import corners_of, locate_corners
 from panoless.photographs.frames import Frames, Photograph
 from panoless.photographs.lens import Lens
 from panoless.photographs.options import CaptureOptions
 from panoless.photographs.video import luminance
-from shinypartial.core.board import BOARDS
-from shinypartial.core.camera import project
+from shinypartial.core.board import BOARDS, Board
+from shinypartial.core.camera import Camera, project
 from shinypartial.core.errors import InputError
 from shinypartial.io.images import read_png, write_png
 from tests.support.photographed_planes import arc, photograph
@@ -81,19 +87,36 @@ def test_another_kind_of_file_is_refused(tmp_path: Path) -> None:
         write_board(BOARD, tmp_path / "board.png")
 
 
-@pytest.fixture(scope="module")
-def photographed(tmp_path_factory: pytest.TempPathFactory):
-    """A folder of photographs of the board, their frames, and the cameras that took them."""
-    folder = tmp_path_factory.mktemp("board")
-    picture = np.where(np.kron(BOARD.cells(), np.ones((CELL_PX, CELL_PX), bool)), 20, 235).astype(np.uint8)
-    (width, height), corners = BOARD.size_m, BOARD.corners_world()
-    cameras = arc(9, DISTANCE_M, SIZE, 900.0, (width / 2, -height / 2, 0.0))
+def photographs_of(board: Board, folder: Path, distance_m: float) -> tuple[Frames, list[Camera]]:
+    """Nine photographs of a board in a folder, and the cameras that took them."""
+    picture = np.where(np.kron(board.cells(), np.ones((CELL_PX, CELL_PX), bool)), 20, 235).astype(np.uint8)
+    (width, height), corners = board.size_m, board.corners_world()
+    cameras = arc(9, distance_m, SIZE, 900.0, (width / 2, -height / 2, 0.0))
     frames = []
     for index, camera in enumerate(cameras):
         path = folder / f"board_{index}.png"
         write_png(path, np.repeat(photograph(camera, [(picture, corners)])[..., None], 3, 2))
         frames.append(Photograph(path.stem, path, *SIZE, 1, *SIZE, blur=0.0, brightness=0.5))
-    return folder, Frames(tuple(frames)), cameras
+    return Frames(tuple(frames)), cameras
+
+
+@pytest.fixture(scope="module")
+def photographed(tmp_path_factory: pytest.TempPathFactory):
+    """A folder of photographs of the board on A4, their frames, and the cameras that took them."""
+    folder = tmp_path_factory.mktemp("board")
+    return folder, *photographs_of(BOARD, folder, DISTANCE_M)
+
+
+@pytest.mark.parametrize(("paper", "found"), [("A4", "A4"), ("Letter", "A4"), ("A3", "A3")])
+def test_a_board_is_known_by_its_markers(paper: str, found: str, tmp_path: Path) -> None:
+    """Letter is A4 without its last row, so both define one world. Where most frames show none, there is none."""
+    frames, _ = photographs_of(BOARDS[paper], tmp_path, 0.9)
+    options = CaptureOptions(board_frames=3)
+    assert recognized_board(frames, tmp_path, options) == BOARDS[found]
+    gray = np.full((*SIZE[::-1], 3), 90, np.uint8)
+    for one in frames.photographs[:6]:
+        write_png(tmp_path / f"{one.name}.png", gray)
+    assert recognized_board(frames, tmp_path, options) is None
 
 
 def test_cameras_are_found_from_the_board(photographed) -> None:

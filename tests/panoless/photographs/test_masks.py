@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from panoless.photographs.hull import carve, nearest_point, outline, overlap
-from panoless.photographs.masks import Hint, find_masks, moved_mask, overlaps_of, read_clicks
+from panoless.photographs.masks import Hint, find_masks, masks_beside, moved_mask, overlaps_of, read_clicks
 from panoless.photographs.options import CaptureOptions
 from shinypartial.core.camera import Camera, ray_directions_world
 from shinypartial.core.errors import InputError
@@ -167,3 +167,13 @@ def test_clicks_that_tell_nothing_are_refused(tmp_path: Path, content: object, m
     write_json(tmp_path / "clicks.json", content)
     with pytest.raises(InputError, match=message):
         find_masks({"p_0": CAMERAS[0]}, tmp_path, read_clicks(tmp_path / "clicks.json"), OPTIONS)
+
+
+def test_masks_beside_photographs_or_a_video_are_found_where_all_are_there(tmp_path: Path) -> None:
+    masks, names = tmp_path / "masks", ["a", "b"]
+    masks.mkdir()
+    (masks / "a.png").touch()
+    assert masks_beside(tmp_path / "film.mp4", names) is None
+    (masks / "b_mask.png").touch()
+    for source in (tmp_path, tmp_path / "frames", tmp_path / "film.mp4"):
+        assert masks_beside(source, names) == masks
