@@ -89,6 +89,8 @@ def followed_offset(views: Views, fitted: Fitted, config: FitConfig, refit: Refi
         return (left, after) if is_clearly_lower(is_now, was, config.selection) else (1.0, before)
 
     _, best = min((followed(each, fitted) for each in (step, -step)), key=lambda each: each[0])
+    if best is not fitted and not _explains_more_than_staying(views, fitted, best, config, refit):
+        return 0.0
     onward = float(np.copysign(step, best.corrections.mask_offset_px))
     while best is not fitted and abs(best.corrections.mask_offset_px) + step <= largest:
         _, farther = followed(best.corrections.mask_offset_px + onward, best)
@@ -96,6 +98,17 @@ def followed_offset(views: Views, fitted: Fitted, config: FitConfig, refit: Refi
             break
         best = farther
     return best.corrections.mask_offset_px
+
+
+def _explains_more_than_staying(views: Views, fitted: Fitted, moved: Fitted, config: FitConfig, refit: Refit) -> bool:
+    """Whether held-out views are clearly better explained than by a fit that goes on as long under masks as they were:
+    one that has not settled explains more under any.
+    """
+    stayed = _moved_by(fitted.corrections.mask_offset_px, views, fitted, config, refit, anew=False)
+    if stayed is None:
+        return True
+    errors = errors_in_common(views, stayed, moved, config)
+    return is_clearly_lower(errors[1], errors[0], config.selection)
 
 
 def find_mask_offset(source: Family, views: Views, fitted: Fitted, config: FitConfig) -> float:

@@ -1,5 +1,6 @@
 """What photographs get wrong is found by what a geometry explains of them, and only where there is something wrong."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -156,23 +157,51 @@ def test_masks_are_followed_as_long_as_held_out_views_gain(
     monkeypatch: pytest.MonkeyPatch, small_px: float, tried: list[float]
 ) -> None:
     """From pixel to pixel, each on from the fit before, up to the largest offset."""
-    first, ways = Fitted(MIRROR, PosedProposal(Proposal(MIRROR.plane, 0, 1))), []
-
-    def refit(_views: Views, _before: Fitted, *, anew: bool) -> Fitted:
-        assert not anew
-        return first
-
-    def errors(_views: Views, before: Fitted, after: Fitted, _config: FitConfig) -> list[np.ndarray]:
-        offsets = [each.corrections.mask_offset_px for each in (before, after)]
-        ways.append(offsets)
-        return [np.full(8, 0.1 + abs(offset - small_px)) for offset in offsets]
-
-    monkeypatch.setattr(mask_offset, "errors_in_common", errors)
-    views = reflecting_views(MIRROR.plane, arc(3, size=16))
-    found = mask_offset.followed_offset(views, first, CONFIG, refit)
-    assert [offset for _, offset in ways] == tried
-    assert all(offset - before in (-1, 1) for before, offset in ways)
+    ways = Followed(monkeypatch, lambda offset, _: 0.1 + abs(offset - small_px))
+    found = ways.offset()
+    assert [after for _, after in dict.fromkeys(ways.compared)] == tried
+    assert all(after - before in (-1, 1) for before, after in ways.compared)
     assert found == min((0.0, *tried), key=lambda offset: abs(offset - small_px))
+
+
+@pytest.mark.parametrize(("by_step", "by_masks", "found"), [(0.3, 0.0, 0.0), (0.0, 0.1, -1.0)])
+def test_a_fit_that_has_not_settled_moves_no_masks(
+    monkeypatch: pytest.MonkeyPatch, by_step: float, by_masks: float, found: float
+) -> None:
+    """Errors that fall by a round of steps, under any masks, say nothing of masks; those under smaller ones do."""
+    ways = Followed(monkeypatch, lambda offset, rounds: 1 - by_step * rounds - by_masks * (offset == -1))
+    assert ways.offset() == found
+
+
+class Followed:
+    """Fits that go on from one another, with errors by their masks' offset and their rounds of steps."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, error: Callable[[float, int], float]) -> None:
+        self.compared: list[tuple[float, float]] = []
+        self.first = self._fitted(0)
+
+        def errors(_views: Views, before: Fitted, after: Fitted, _config: FitConfig) -> list[np.ndarray]:
+            self.compared.append((before.corrections.mask_offset_px, after.corrections.mask_offset_px))
+            each = (
+                (one.corrections.mask_offset_px, round(one.start.proposal.silhouette_px)) for one in (before, after)
+            )
+            return [np.full(8, error(*of)) for of in each]
+
+        monkeypatch.setattr(mask_offset, "errors_in_common", errors)
+
+    @staticmethod
+    def _fitted(rounds: int) -> Fitted:
+        """The rounds stand where a proposal has its distance."""
+        return Fitted(MIRROR, PosedProposal(Proposal(MIRROR.plane, rounds, 1)))
+
+    def offset(self) -> float:
+        """What is found."""
+
+        def refit(_views: Views, before: Fitted, *, anew: bool) -> Fitted:
+            assert not anew
+            return self._fitted(round(before.start.proposal.silhouette_px) + 1)
+
+        return mask_offset.followed_offset(reflecting_views(MIRROR.plane, arc(3, size=16)), self.first, CONFIG, refit)
 
 
 @pytest.mark.slow
