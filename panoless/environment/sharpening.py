@@ -82,9 +82,9 @@ def chosen_sharpness(
     saturation: Float[Tensor, "3"],
     options: FootprintMapOptions = DEFAULTS,
 ) -> Sharpness:
-    """What explains every fifth pixel best by the others. From the coarsest map on, a finer, a
-    smoother and a sharper one are tried as long as one is better, a finer one by the share `least_gain`. One that is as
-    fine as a refused one is not tried again.
+    """What explains every fifth pixel best by the others. From the coarsest map on, a finer, a smoother and a sharper
+    one are tried as long as one is better, a finer one by the share `least_gain`. One that is as fine as a refused one
+    is not tried again.
 
     Held-out pixels that are saturated count as they do in the map; at the borders of lamps they prefer blur. Which kind
     of lamps there is, unsaturated pixels tell before that: those beside lamps that are shown too large. Saturated ones
