@@ -24,7 +24,7 @@ class Stability(Suite):
     method: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Another method as NAME='COMMAND {dataset} {prediction} {seed}'; may be given several times."""
     scenes: tuple[str, ...] = ()
-    """Names of scenes; those of the plan when not given."""
+    """Names of scenes, any of blender_scenes; those of the plan when not given."""
     axes: tuple[str, ...] = ()
     """Names of axes; those of the plan when not given."""
     seeds: tuple[int, ...] = (0, 1)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from shinypartial.core.errors import InputError
+from shinypartial.scene import DEVELOPMENT, SPLITS, scene_names
 from shinypartial.suites.jobs import Job, Size, read_jobs, require_known
 from shinypartial.suites.stability.axes import ANCHORS, AXES, BY_NAME, Axis
 
@@ -16,13 +17,8 @@ FAST, DEFAULT, PAPER = (
     for preset in ("fast", "default", "paper")
 )
 METHODS = {"fast": FAST, "default": DEFAULT, "paper": PAPER}
-SCENES = {
-    "vase": "development",
-    "mirror": "development",
-    "sculpture": "development",
-    "pebble": "held-out",
-    "twisted-column": "held-out",
-}
+SCENES = ("vase", "mirror", "sculpture", "pebble", "twisted-column")
+"""Those of a plan that nobody asks for others."""
 #: The small plan takes what comes with the package, so that it needs no Blender.
 TINY = "tiny-vase"
 SIMPLE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
@@ -93,12 +89,14 @@ def make_plan(
     size: Size = SIZE,
 ) -> Plan:
     """Every cell and job. Raises InputError for scenes, axes or methods that can't be used."""
-    splits = {TINY: "development"} if plan == "tiny" else SCENES
+    usual: Sequence[str] = (TINY,) if plan == "tiny" else SCENES
+    known = {name: split for split in SPLITS for name in scene_names(split)}
+    splits = {TINY: DEVELOPMENT} if plan == "tiny" else known
     require_known("scenes", scenes, splits)
     _check_methods(methods)
     cells: list[Cell] = []
     jobs: dict[str, Job] = {}
-    for scene in scenes or splits:
+    for scene in scenes or usual:
         for axis, level in conditions(plan, axes):
             for seed in seeds:
                 data = _dataset_jobs(scene, BY_NAME.get(axis or ""), level, seed, size)

@@ -108,6 +108,12 @@ def test_unknown_names_are_refused() -> None:
             make_plan("core", COPY, [0], **wrong)
 
 
+def test_any_scene_that_declares_a_split_can_be_asked_for() -> None:
+    """Also one that is not among those of a plan that nobody asks for others."""
+    cells = make_plan("core", COPY, [0], scenes=["rounded-block", "dish"], axes=["masks-eroded"]).cells
+    assert {(cell.scene, cell.split) for cell in cells} == {("rounded-block", "held-out"), ("dish", "development")}
+
+
 def test_a_folder_takes_more_cells_but_no_other_command(tmp_path: Path) -> None:
     write_jobs(tmp_path, make_plan("tiny", COPY, [0]))
     more = make_plan("tiny", COPY, [0, 1])
