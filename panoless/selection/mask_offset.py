@@ -84,9 +84,8 @@ def followed_offset(views: Views, fitted: Fitted, config: FitConfig, refit: Refi
         after = _moved_by(offset_px, views, before, config, refit, anew=False)
         if after is None:
             return 1.0, before
-        was, is_now = errors_in_common(views, before, after, config)
-        left = float(is_now.mean() / max(was.mean(), 1e-12))
-        return (left, after) if is_clearly_lower(is_now, was, config.selection) else (1.0, before)
+        left, better = _left(views, before, after, config)
+        return (left, after) if better else (1.0, before)
 
     _, best = min((followed(each, fitted) for each in (step, -step)), key=lambda each: each[0])
     if best is not fitted and not _explains_more_than_staying(views, fitted, best, config, refit):
@@ -105,10 +104,19 @@ def _explains_more_than_staying(views: Views, fitted: Fitted, moved: Fitted, con
     one that has not settled explains more under any.
     """
     stayed = _moved_by(fitted.corrections.mask_offset_px, views, fitted, config, refit, anew=False)
-    if stayed is None:
-        return True
-    errors = errors_in_common(views, stayed, moved, config)
-    return is_clearly_lower(errors[1], errors[0], config.selection)
+    return stayed is None or _left(views, stayed, moved, config)[1]
+
+
+def _left(views: Views, before: Fitted, after: Fitted, config: FitConfig) -> tuple[float, bool]:
+    """Share of the error that one fit leaves of that of another, and whether that is clearly less; or less beyond its
+    standard errors, where photographs no longer pull its outlines so far off the masks.
+    """
+    was, is_now = errors_in_common(views, before, after, config)
+    pulls = [abs(outline_pull_px(each.corrections.applied(views, config), each.geometry)) for each in (before, after)]
+    options = config.selection
+    if pulls[0] > config.corrections.doubted_inward_px and pulls[1] < config.corrections.settled_pull * pulls[0]:
+        options = replace(options, least_gain=0.0)
+    return float(is_now.mean() / max(was.mean(), 1e-12)), is_clearly_lower(is_now, was, options)
 
 
 def find_mask_offset(source: Family, views: Views, fitted: Fitted, config: FitConfig) -> float:

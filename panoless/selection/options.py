@@ -77,6 +77,9 @@ class CorrectionOptions:
     """The fit to moved masks stays where its outlines lie nearer to them than this. With masks that are right it is
     0.001 on vase and 0.004 on sculpture. Moved by 1.9 px where 2 were missing, vase is not followed with 0.02, and its
     normals are off by 0.17 instead of 0.05 degrees."""
+    settled_pull: Share = 0.5
+    """Share of a doubted pull that is left a step nearer to the right masks: there any gain beyond its standard errors
+    counts. Not tuned."""
     examined_rays: Count = 100_000
     """Most rays from which a fit is told to leave much unexplained, and gains to explain more. Not tuned."""
     rays: Count = 60_000
