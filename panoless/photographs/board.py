@@ -100,13 +100,13 @@ def _write_pdf(board: Board, path: Path) -> None:
 def recognized_board(frames: Frames, folder: Path, options: CaptureOptions) -> Board | None:
     """The board of which most corners are seen, if half of some frames show enough of them; None: there is none.
 
-    A4 has all markers of Letter in the same places, and one row more, so a board on Letter is found as one on A4: its
+    A board on Letter is found as one on A4: that has all of its markers in the same places and one row more, so their
     world is the same.
     """
     photographs = frames.photographs
     some = replace(frames, photographs=photographs[:: -(-len(photographs) // options.board_frames)])
     best, most = None, 0
-    for board in BOARDS.values():
+    for board in (BOARDS["A4"], BOARDS["A3"]):
         seen = [len(each.corners) for each in find_board(board, some, folder)]
         enough = [count for count in seen if count >= options.least_corners]
         if 2 * len(enough) >= len(some.photographs) and sum(enough) > most:

@@ -18,7 +18,7 @@ from panoless.photographs.posed import PosedView, Poses, without_the_rest
 from panoless.photographs.segmenter import Segmented, segment
 from panoless.photographs.stage import stage
 from panoless.photographs.structure import REMEDY, poses_from_structure
-from shinypartial.core.board import BOARDS, Board, Paper
+from shinypartial.core.board import BOARDS, Paper
 from shinypartial.core.errors import InputError
 from shinypartial.core.trajectory import Trajectory
 from shinypartial.dataset.camera_plot import plot_cameras
@@ -128,11 +128,6 @@ def _frames(request: Request, files: list[Path], pictures: Path, work: Path) -> 
     return stage(work, "frames", given, Frames, work_on)
 
 
-def _board(request: Request, drawn: Board | None) -> Board | None:
-    """As it was printed."""
-    return drawn and replace(drawn, square_mm=request.square_mm or drawn.square_mm)
-
-
 def _poses(request: Request, frames: Frames, pictures: Path, work: Path) -> tuple[Poses, dict[str, Path]]:
     """Poses, and the masks that come with the source, in the size of the frames: by `--masks` or by transforms.json."""
     drawn = None if request.board is None or request.board == "none" else BOARDS[request.board]
@@ -140,11 +135,12 @@ def _poses(request: Request, frames: Frames, pictures: Path, work: Path) -> tupl
     transforms = None if drawn or model else find_transforms(request.source)
     if not (request.board or model or transforms):
         drawn = recognized_board(frames, pictures, request.options)
-    board = _board(request, drawn)
+    board = drawn and replace(drawn, square_mm=request.square_mm or drawn.square_mm)
     named: dict[str, Path] = {}
     read = None
     names = [one.name for one in frames.photographs]
-    folder = request.masks or (None if request.hints or transforms else masks_beside(request.source, names))
+    told = request.hints or request.segmenter or transforms
+    folder = request.masks or (None if told else masks_beside(request.source, names))
     if folder:
         named = {name: given_mask(folder, name) for name in names}
     elif transforms:

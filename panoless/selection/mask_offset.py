@@ -88,10 +88,10 @@ def followed_offset(views: Views, fitted: Fitted, config: FitConfig, refit: Refi
         return (left, after) if better else (1.0, before)
 
     _, best = min((followed(each, fitted) for each in (step, -step)), key=lambda each: each[0])
-    if best is not fitted and not _explains_more_than_staying(views, fitted, best, config, refit):
+    if best is fitted or not _explains_more_than_staying(views, fitted, best, config, refit):
         return 0.0
     onward = float(np.copysign(step, best.corrections.mask_offset_px))
-    while best is not fitted and abs(best.corrections.mask_offset_px) + step <= largest:
+    while abs(best.corrections.mask_offset_px) + step <= largest:
         _, farther = followed(best.corrections.mask_offset_px + onward, best)
         if farther is best:
             break
@@ -112,11 +112,14 @@ def _left(views: Views, before: Fitted, after: Fitted, config: FitConfig) -> tup
     standard errors, where photographs no longer pull its outlines so far off the masks.
     """
     was, is_now = errors_in_common(views, before, after, config)
-    pulls = [abs(outline_pull_px(each.corrections.applied(views, config), each.geometry)) for each in (before, after)]
-    options = config.selection
-    if pulls[0] > config.corrections.doubted_inward_px and pulls[1] < config.corrections.settled_pull * pulls[0]:
-        options = replace(options, least_gain=0.0)
-    return float(is_now.mean() / max(was.mean(), 1e-12)), is_clearly_lower(is_now, was, options)
+    left = float(is_now.mean() / max(was.mean(), 1e-12))
+    if is_clearly_lower(is_now, was, config.selection):
+        return left, True
+    if not is_clearly_lower(is_now, was, replace(config.selection, least_gain=0.0)):
+        return left, False
+    options, fits = config.corrections, (before, after)
+    pulls = [abs(outline_pull_px(each.corrections.applied(views, config), each.geometry)) for each in fits]
+    return left, pulls[0] > options.doubted_inward_px and pulls[1] < options.settled_pull * pulls[0]
 
 
 def find_mask_offset(source: Family, views: Views, fitted: Fitted, config: FitConfig) -> float:

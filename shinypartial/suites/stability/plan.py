@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from shinypartial.core.errors import InputError
-from shinypartial.scene import DEVELOPMENT, SPLITS, scene_names
+from shinypartial.scene import DEVELOPMENT, load_scene, scene_names
 from shinypartial.suites.jobs import Job, Size, read_jobs, require_known
 from shinypartial.suites.stability.axes import ANCHORS, AXES, BY_NAME, Axis
 
@@ -90,8 +90,7 @@ def make_plan(
 ) -> Plan:
     """Every cell and job. Raises InputError for scenes, axes or methods that can't be used."""
     usual: Sequence[str] = (TINY,) if plan == "tiny" else SCENES
-    known = {name: split for split in SPLITS for name in scene_names(split)}
-    splits = {TINY: DEVELOPMENT} if plan == "tiny" else known
+    splits = {TINY: DEVELOPMENT} if plan == "tiny" else {name: load_scene(name).split for name in scene_names()}
     require_known("scenes", scenes, splits)
     _check_methods(methods)
     cells: list[Cell] = []
