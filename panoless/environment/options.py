@@ -53,8 +53,9 @@ class FootprintMapOptions:
     trial_steps: int = 2
     """The same in maps that only choose resolution and smoothness: on seven shapes they choose as six do."""
     trial_pixels: Count = 500_000
-    """From about so many pixels at most these maps are made: those that look at some patches of the sky. An eighth of
-    1.5 and 1.9 million chooses as all do on sculpture and pebble at 400 px, a half of 300,000 not always."""
+    """From about so many pixels at most these maps are made: those that look at some patches of the sky. A quarter of
+    1.4 to 1.9 million chooses as all do on sculpture, horseshoe and dish at 400 px; an eighth of dish does not, nor
+    always a half of 300,000."""
     trial_patches: Count = 8
     """Patches along a face side, of which some are chosen. Not tuned."""
     saturated: float = 0.998
