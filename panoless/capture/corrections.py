@@ -1,5 +1,5 @@
 """What photographs get wrong, taken back: masks too small or too large in all views, exposures and white balances that
-differ, and a focal length that is not what it is said to be.
+differ, and a focal length or a distortion that is not what it is said to be.
 
 Views are corrected when they are loaded; what a fit found about them is a few numbers.
 """
@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from panoless.capture.encoding import encoding_of
+from panoless.capture.lens import undistorted_view, with_focal_factor
 from panoless.capture.masks import MASK_LEVEL
 from panoless.capture.silhouettes import mask_distance_px
 from panoless.capture.views import TrainView, Views
@@ -31,6 +32,10 @@ class Corrections:
     """The focal length of all views over what is said of it."""
     focal_uncertainty: float | None = None
     """Standard deviation of that factor; None where it was not found."""
+    k1: float = 0.0
+    """Radial distortion of all views (see `panoless.capture.lens`)."""
+    k1_uncertainty: float | None = None
+    """Its standard deviation; None where it was not found."""
     balances: Float[np.ndarray, "V 3"] | None = None
     """Gains of each view's channels against its exposure; None: white balance is the same in all views."""
 
@@ -56,6 +61,8 @@ class Corrections:
         train = views.train
         if self.focal_factor != 1:
             train = tuple(with_focal_factor(view, self.focal_factor) for view in train)
+        if self.k1:
+            train = tuple(undistorted_view(view, self.k1) for view in train)
         if self.mask_offset_px:
             train = tuple(with_outline_moved(view, self.mask_offset_px) for view in train)
         if self.channel_gains is not None:
@@ -69,12 +76,6 @@ class Corrections:
 
 
 NO_CORRECTIONS = Corrections()
-
-
-def with_focal_factor(view: TrainView, factor: float) -> TrainView:
-    """A view through a lens of so many times the focal length."""
-    camera = view.camera
-    return replace(view, camera=replace(camera, fx=factor * camera.fx, fy=factor * camera.fy))
 
 
 def with_outline_moved(view: TrainView, offset_px: float) -> TrainView:

@@ -259,6 +259,8 @@ def _model_selection(selection: Selection) -> ModelSelection:
             white_balance_stops=each.corrections.white_balance_stops,
             focal_factor=None if each.corrections.focal_uncertainty is None else each.corrections.focal_factor,
             focal_uncertainty=each.corrections.focal_uncertainty,
+            k1=None if each.corrections.k1_uncertainty is None else each.corrections.k1,
+            k1_uncertainty=each.corrections.k1_uncertainty,
         )
         for each in selection.candidates
     )

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 from torch.utils.weak import WeakIdKeyDictionary
 
+from panoless.capture.lens import LensChange
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.poses import Poses
 from panoless.capture.rays import unit_rays_camera
@@ -275,14 +276,16 @@ class Family(Protocol):
         """The geometry that explains silhouettes and photographs best; of an iterative kind, its start."""
         ...
 
-    def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
-        """A fitted geometry with the focal length as an unknown beside it: the geometry by views through that lens, and
-        the logarithm of its focal length over what is said; None for a kind that does not find one.
+    def with_lens(
+        self, views: Views, fitted: Any, unknown: LensChange, config: FitConfig
+    ) -> tuple[Geometry, LensChange] | None:
+        """A fitted geometry with unknowns of the lens beside it: the geometry by views through that lens, and what they
+        are; None for a kind that does not find them.
         """
         ...
 
     def after_as_many_steps(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:
-        """A fitted geometry after the steps of `with_focal_length` without that unknown, for comparison."""
+        """A fitted geometry after the steps of `with_lens` without these unknowns, for comparison."""
         ...
 
     def begin(self, views: Views, geometry: Geometry, config: FitConfig) -> Training | None:

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.encoding import encoding_of
+from panoless.capture.lens import LensChange
 from panoless.capture.poses import Poses
 from panoless.capture.rays import pixel_rays, unit_rays_camera
 from panoless.capture.views import TrainView, Views, at_most_pixels
@@ -115,8 +116,10 @@ class ExactFamily:
         """None: they are found beside the shape (see `panoless.alignment`)."""
         return None
 
-    def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
-        """None: it is told by how far photographs pull (see `panoless.alignment.lens`)."""
+    def with_lens(
+        self, views: Views, fitted: Any, unknown: LensChange, config: FitConfig
+    ) -> tuple[Geometry, LensChange] | None:
+        """None: they are told by how far photographs pull (see `panoless.alignment.lens`)."""
         return None
 
     def after_as_many_steps(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:

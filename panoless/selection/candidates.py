@@ -97,6 +97,8 @@ def describe(candidate: Candidate) -> str:
     if candidate.corrections.focal_uncertainty is not None:
         change, sigma = 100 * (candidate.corrections.focal_factor - 1), 100 * candidate.corrections.focal_uncertainty
         parts.append(f"focal length changed by {change:+.2f} ± {sigma:.2f} %")
+    if candidate.corrections.k1_uncertainty is not None:
+        parts.append(f"distortion k1 {candidate.corrections.k1:+.3f} ± {candidate.corrections.k1_uncertainty:.3f}")
     return "; ".join(parts)
 
 

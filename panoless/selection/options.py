@@ -40,6 +40,28 @@ class SelectionOptions:
 
 
 @dataclass(frozen=True)
+class LensLimits:
+    """When another value of an unknown of the lens is looked for, how far, and when it is believed."""
+
+    least_pull: Positive
+    """It is doubted where the pull is larger…"""
+    least_posed_pull: Positive
+    """…or, where cameras are turned, than this: what is left of that pulls as well."""
+    share: Positive
+    """Share of a change that pulls, for the first trial only."""
+    largest_step: Positive
+    """Trials lie at most so far apart."""
+    settled: Positive
+    """Trials end where the next would lie so near to one before."""
+    prior: Positive
+    """Expected error. What is not told better is not believed."""
+    joint_sigma: Positive
+    """Standard deviation of one that was found as an unknown beside the shape."""
+    least_gain: Share
+    """Share of the held-out error by which it has to lower that, and by `selection.standard_errors`."""
+
+
+@dataclass(frozen=True)
 class CorrectionOptions:
     """What is taken back of the photographs' own errors, where held-out views gain by it.
 
@@ -52,10 +74,10 @@ class CorrectionOptions:
     exposure: Literal["auto", "off"] = "auto"
     """Whether views, or their channels, may be exposed differently; never in a high dynamic range."""
     lens: Literal["auto", "on", "off"] = "auto"
-    """Whether the focal length of all views may be wrong by one factor: where photographs pull a fit and held-out views
-    gain by it, whenever it is found, or never."""
+    """Whether the focal length of all views may be wrong by one factor, and their lens distort: where photographs pull
+    a fit and held-out views gain by it, whenever it is found, or never."""
     largest_error: Share = 0.08
-    """Held-out error of a fit above which masks are doubted, and focal lengths not asked for. Right ones of development
+    """Held-out error of a fit above which masks are doubted. Right ones of development
     scenes leave at most 0.06, masks that are off by 2 px at least 0.10. A kind that goes on from a fit tells of masks
     in seconds, so they are doubted from `explained_error` of the model selection on: drum leaves 0.018, with masks that
     are 1 px too large 0.038; chrome-block leaves 0.031 and sculpture 0.026."""
@@ -92,41 +114,53 @@ class CorrectionOptions:
     """Rounds of map and gains. Not tuned."""
     gain_scale: Positive = 0.1
     """Residual (linear radiance) beyond which a pixel loses its vote on the gain of its view. Not tuned."""
-    focal_rays: Count = 100_000
-    """Rays that tell how far photographs pull a fit toward another focal length. Not tuned."""
-    focal_resolution: Count = 128
+    largest_lens_error: Share = 0.15
+    """Held-out error of a fit above which the lens is not asked for. Vase through a lens of k₁ = 0.1 leaves 0.09."""
+    lens_rays: Count = 100_000
+    """Rays that tell how far photographs pull a fit toward another lens. Not tuned."""
+    lens_resolution: Count = 128
     """Texels along a face side of the map under which they do. With 64, a true focal length pulls mirror by 0.0005."""
-    focal_scale: Positive = 0.15
+    lens_scale: Positive = 0.15
     """Residual (linear radiance) beyond which a ray loses its vote on that. Not tuned."""
-    least_focal_pull: Positive = 0.0004
-    """The focal length is doubted where the pull is larger. A true one pulls by 0.00002 on vase, 0.0002 on mirror and
-    0.00014 on sculpture, one that is 2 % too long by 0.0046, 0.0126 and 0.0010."""
-    least_posed_focal_pull: Positive = 0.002
-    """The same where cameras are turned, too: what is left of that pulls as well, by 0.0008 on vase with turns of 0.5°.
-    """
-    focal_sigmas: Positive = 3.0
-    """And larger than so many of its standard deviations. On vase in a room at 5 radii a true one pulls by 0.0005, 2.3
-    of them; on sculpture, one that is 2 % too long by 5."""
-    focal_share: Positive = 0.06
-    """Share of a change of the focal length that pulls, for the first trial only: the least of development scenes, that
-    of sculpture. On vase it is 0.23, on mirror 0.6."""
-    largest_focal_step: Positive = 0.03
-    """Trials lie at most so far apart, in logarithms of the focal length."""
-    settled_focal: Positive = 0.0015
-    """Trials end where the next would lie so near to one before. On vase the noise of the pull is as much as 0.001."""
-    focal_trials: Count = 3
-    """Most fits to other focal lengths. Not tuned."""
-    focal_prior: Positive = 0.02
-    """Expected error of the focal length as a share of it. A factor that is not told better is not believed."""
-    farthest_focal: Positive = 3.0
-    """A factor that is farther from one than so many expected errors is not believed, nor…"""
-    nearest_focal: Positive = 2.0
-    """…a change that is no larger than so many of its own standard deviations. Neither is tuned."""
-    focal_error: Share = 0.004
-    """Standard deviation of a factor that was found as an unknown beside the shape. On sculpture and chrome-block it is
-    off by 0.0003 to 0.0057."""
-    least_focal_gain: Share = 0.003
-    """Share of the held-out error by which another focal length has to lower it, and by `selection.standard_errors`."""
+    lens_compared_rays: Count = 500_000
+    """Most rays of a map, and most that test it, where lenses are compared. On vase through a lens of k₁ = 0.1 the
+    right lens leaves 0.83 of the error so, under 256 texels; by 240,000 rays and 128 texels it leaves 0.99, and by
+    60,000 and 64 more than the wrong one."""
+    lens_sigmas: Positive = 3.0
+    """The lens is doubted where the pull is larger than so many of its standard deviations, too. On vase in a room at 5
+    radii a true focal length pulls by 0.0005, 2.3 of them; on sculpture, one that is 2 % too long by 5."""
+    lens_trials: Count = 3
+    """Most fits to other focal lengths or distortions. Not tuned."""
+    farthest_lens: Positive = 3.0
+    """A change that is larger than so many expected errors is not believed, nor…"""
+    nearest_lens: Positive = 2.0
+    """…one that is no larger than so many of its own standard deviations. Neither is tuned."""
+    focal: LensLimits = LensLimits(
+        least_pull=0.0004,
+        least_posed_pull=0.002,
+        share=0.06,
+        largest_step=0.03,
+        settled=0.0015,
+        prior=0.02,
+        joint_sigma=0.004,
+        least_gain=0.003,
+    )
+    """Of the logarithm of the focal length. A true one pulls by 0.00002 on vase, 0.0002 on mirror and 0.00014 on
+    sculpture, one that is 2 % too long by 0.0046, 0.0126 and 0.0010; on vase, what is left of turns by 0.5° pulls by
+    0.0008. The share of a change that pulls is 0.06 on sculpture, 0.23 on vase and 0.6 on mirror. On vase the noise of
+    the pull is as much as 0.001 of a change. Found beside the shape it is off by 0.0003 to 0.0057 on sculpture and
+    chrome-block."""
+    k1: LensLimits = LensLimits(
+        least_pull=0.004,
+        least_posed_pull=0.02,
+        share=0.14,
+        largest_step=0.15,
+        settled=0.01,
+        prior=0.1,
+        joint_sigma=0.02,
+        least_gain=0.03,
+    )
+    """Of the radial distortion."""
     least_outline_fall: Share = 0.15
     """Share of the outlines' distance from the masks by which it has to lower that where it takes the place of near
     surroundings. On mirror, 2 % are told by 0.3 of it."""

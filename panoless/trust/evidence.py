@@ -83,6 +83,8 @@ class Evidence:
     """That of the channels from the exposure of their view."""
     focal_factor: float = 1.0
     """The focal length that the fit found over what is said of it."""
+    k1: float = 0.0
+    """The radial distortion that the fit found."""
     roughness: float = 0.0
     """Of the object, as the fit found it."""
     blur_px: float = 0.0
@@ -131,6 +133,7 @@ def gather_evidence(
         exposure_stops=corrections.exposure_stops or 0.0,
         white_balance_stops=corrections.white_balance_stops or 0.0,
         focal_factor=corrections.focal_factor,
+        k1=corrections.k1,
         roughness=roughness or 0.0,
         blur_px=views.blur_px,
         repaired_views=views.repairs.views,

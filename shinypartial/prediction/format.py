@@ -53,8 +53,9 @@ class Candidate:
     poses were unknowns, `mask_offset_px` by how much it moved the outlines of all masks outward, and `exposure_stops`
     the standard deviation of the views' exposures where it found them, `white_balance_stops` that of their channels
     from the mean of a view. `focal_factor` is the focal length of all views over what is said of it where that was an
-    unknown, `focal_uncertainty` its standard deviation, and `principal_point_px` how far to the right and below of what
-    is said it found the principal point. `verdict` is a word such as "chosen" or "rejected", `reason` says why.
+    unknown, `focal_uncertainty` its standard deviation, `k1` and `k1_uncertainty` the same of a radial distortion in
+    OpenCV's model, and `principal_point_px` how far to the right and below of what is said
+    it found the principal point. `verdict` is a word such as "chosen" or "rejected", `reason` says why.
     """
 
     kind: Text
@@ -70,6 +71,8 @@ class Candidate:
     white_balance_stops: NonNegative | None = None
     focal_factor: NonNegative | None = None
     focal_uncertainty: NonNegative | None = None
+    k1: float | None = None
+    k1_uncertainty: NonNegative | None = None
     principal_point_px: tuple[float, float] | None = None
 
 

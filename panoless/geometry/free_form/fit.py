@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
+from panoless.capture.lens import LensChange
 from panoless.capture.poses import Poses, StatedCameras, with_pose_covariances
 from panoless.capture.views import Views, split_held_out
 from panoless.environment.rays import Rays
@@ -46,8 +47,8 @@ class FitStage:
     """Of the round that led here."""
     poses: Poses | None = None
     """Of the views, where they are unknowns."""
-    focal: float | None = None
-    """The focal length, where it is unknown (see `Solution`)."""
+    lens: LensChange | None = None
+    """Of all views, where it is unknown."""
     cost: float = math.inf
     """After that round."""
 
@@ -132,21 +133,23 @@ def follow_views(
     views: Views, fitted: FitStage, options: FreeFormOptions = DEFAULTS, *, longer: bool = False
 ) -> FitStage:
     """What an earlier fit led to after its last round was taken again, with views that changed a little, or with the
-    focal length among the unknowns. A few steps by fewer pixels tell whether that asks for more of them, or for as many
+    lens among the unknowns. A few steps by fewer pixels tell whether that asks for more of them, or for as many
     without where `longer`.
     """
     rounds = [*options.detailing, *options.rounds, *options.finer]
     last = next((each for each in reversed(rounds) if each.cells == fitted.surface.cells), rounds[-1])
     stage, settings = replace(fitted, settings=last), last
     with torch.no_grad():
-        if stage.focal is not None:
+        if stage.lens is not None:
             glance = replace(
-                settings, steps=options.focal_glance_steps, rays=min(options.focal_glance_rays, settings.rays)
+                settings, steps=options.lens_glance_steps, rays=min(options.lens_glance_rays, settings.rays)
             )
             seen = take_round(views, stage, glance, options, last=True)
-            if seen.focal is not None and abs(seen.focal) < options.least_focal_change:
+            assert seen.lens is not None, "the lens was unknown"
+            least = seen.lens.of_unknowns(options.least_focal_change, options.least_k1_change)
+            if (np.abs(seen.lens.values) < least).all():
                 return seen
-        if longer or stage.focal is not None or not stage.surface.surroundings.is_far:
+        if longer or stage.lens is not None or not stage.surface.surroundings.is_far:
             settings = replace(settings, steps=options.shared_steps)
             options = replace(options, least_gain=options.least_shared_gain)
         return take_round(views, stage, settings, options, Progress("fitting on", settings.steps), last=True)
@@ -290,7 +293,7 @@ def take_round(
     if settings.anchored:
         task = replace(task, anchor=surface.coefficients)
     solution = Solution.at(
-        task, surface, stage.trust, stage.environment, options.first_map_rounds, stage.poses, stage.focal
+        task, surface, stage.trust, stage.environment, options.first_map_rounds, stage.poses, stage.lens
     )
     if last and solution.outlines_agree:
         solution = replace(solution, task=task.outlined(options.agreed_outline_gain))
@@ -303,7 +306,7 @@ def take_round(
         damping=damping,
         settings=settings,
         poses=solution.poses,
-        focal=solution.focal,
+        lens=solution.lens,
         cost=solution.cost(solution),
     )
     if solution.poses is None:

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
 from panoless.capture.contrast import contrasted
+from panoless.capture.lens import LensChange
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.poses import Poses, StatedCameras, with_pose_covariances
 from panoless.capture.views import TrainView, Views, at_most_pixels, split_held_out
@@ -225,14 +226,16 @@ class FreeFormFamily(ExactFamily):
         starts, agree = (first.plain, first.hull), first.views_agree
         return poses_by_outlines(stated, starts, config.free_form, views_agree=agree, always=always)
 
-    def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
-        """On from a fit, in rounds with that logarithm among the unknowns, at the poses that it found."""
-        start = replace(_stage(fitted), poses=None, focal=0.0)
+    def with_lens(
+        self, views: Views, fitted: Any, unknown: LensChange, config: FitConfig
+    ) -> tuple[Geometry, LensChange] | None:
+        """On from a fit, in rounds with these unknowns, at the poses that it found."""
+        start = replace(_stage(fitted), poses=None, lens=unknown)
         stage = follow_views(fitted.corrected(views), start, config.free_form)
-        assert stage.focal is not None, "the focal length was unknown"
-        factor = float(np.exp(-stage.focal))
+        assert stage.lens is not None, "the lens was unknown"
+        factor = float(np.exp(-(stage.lens.focal or 0.0)))
         surface, trust = stage.surface.scaled(factor), stage.trust.scaled(factor)
-        return _mirror(surface, trust, fitted.poses, config), stage.focal
+        return _mirror(surface, trust, fitted.poses, config), stage.lens
 
     def after_as_many_steps(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:
         """On from a fit, in a round as long as with that unknown."""

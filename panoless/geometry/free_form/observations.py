@@ -7,12 +7,12 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from panoless.capture.lens import LensChange
 from panoless.capture.masks import remembered
 from panoless.capture.poses import Poses
 from panoless.capture.rays import camera_rays, pose_of
 from panoless.capture.silhouettes import mask_contours
 from panoless.capture.views import Views, concatenated, every_kth_pixel
-from panoless.capture.zoom import farther_rays
 from panoless.kernels.rasterize import RasterCamera
 from shinypartial.core.conventions import PIXEL_CENTER, SOLID_ALPHA
 
@@ -56,11 +56,11 @@ class PixelRays:
         steps = np.matmul(self.steps, turns.transpose(0, 2, 1))
         return PixelRays(self.origins + poses.shifts[self.view], directions, steps, self.size, self.view)
 
-    def zoomed(self, change: float, axes: Float[np.ndarray, "P 3"]) -> "PixelRays":
-        """With cameras eˢ as far from the origin, and eˢ times the focal length; `axes` are the optical ones."""
-        factor = float(np.exp(change))
-        moved = farther_rays(self.origins, self.directions, axes, change)
-        return PixelRays(*moved, self.steps / factor, self.size / factor, self.view)
+    def through_lens(self, lens: LensChange, axes: Float[np.ndarray, "P 3"]) -> "PixelRays":
+        """Through a lens that is not as it is said to be; `axes` are the optical ones of their cameras."""
+        origins, directions = lens.rays(self.origins, self.directions, axes)
+        factor = float(np.exp(lens.focal or 0.0))
+        return PixelRays(origins, directions, self.steps / factor, self.size / factor, self.view)
 
     @classmethod
     def centers(cls, camera: RasterCamera, pixels: Int[np.ndarray, "P"], view: int = 0) -> "PixelRays":

@@ -351,14 +351,18 @@ class FreeFormOptions:
     """Share of the trace of the surroundings' matrix that is added to its diagonal. Not tuned."""
     focal_prior: float = 0.02
     """Expected error of the logarithm of the focal length, where it is unknown."""
+    k1_prior: float = 0.1
+    """Expected radial distortion, where that is."""
     shared_steps: int = 8
-    """Most steps in which it, or how near the surroundings are, is found on from a fit."""
-    focal_glance_steps: int = 2
-    """Steps by which is told whether it is looked for at all…"""
-    focal_glance_rays: int = 60_000
+    """Most steps in which these, or how near the surroundings are, are found on from a fit."""
+    lens_glance_steps: int = 2
+    """Steps by which is told whether they are looked for at all…"""
+    lens_glance_rays: int = 60_000
     """…by so many pixels at most…"""
+    least_k1_change: float = 0.01
+    """…which have to change the distortion by this…"""
     least_focal_change: float = 0.002
-    """…which have to change its logarithm by this. On sculpture, by 40,000 pixels, one step changes it by 0.0003 where
+    """…or log focal length by this. On sculpture, by 40,000 pixels, one step changes it by 0.0003 where
     it is right, and by 0.0055 and more where it is off by 0.5 % or 2 %."""
     least_shared_gain: float = 3e-4
     """Steps end, where that is unknown, when one lowers the cost by less than this share."""

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from panoless.capture.lens import LensChange
 from panoless.capture.poses import Poses, StatedCameras
 from panoless.capture.views import concatenated
-from panoless.capture.zoom import farther_motion
 from panoless.environment.cubemap import resample
 from panoless.environment.footprints import PixelFootprints
 from panoless.geometry.free_form.beside import Beside, BlockRows, pixel_pose_rows
@@ -101,9 +101,9 @@ class Task:
         settings = replace(self.settings, outline_gain=gain)
         return replace(self, settings=settings, outline_weight=self.outline_weight * gain / self.settings.outline_gain)
 
-    def seen_from(self, rays: PixelRays, poses: Poses | None, focal: float | None) -> PixelRays:
+    def seen_from(self, rays: PixelRays, poses: Poses | None, lens: LensChange | None) -> PixelRays:
         """Rays where their cameras are, through the lens that they have."""
-        rays = rays if focal is None else rays.zoomed(focal, self.cameras.rotations[rays.view, 2])
+        rays = rays if lens is None else rays.through_lens(lens, self.cameras.rotations[rays.view, 2])
         return rays if poses is None else rays.moved(poses)
 
 
@@ -136,10 +136,8 @@ class Solution:
     """Weights of the pixels without trust and robust weights."""
     poses: Poses | None = None
     """Of the views; None: as they are said to be."""
-    focal: float | None = None
-    """s where a focal length that is e⁻ˢ of the true one is unknown: cameras are eˢ as far away and see through a lens
-    of eˢ times the focal length, so that outlines stay where they are. None: it is believed.
-    """
+    lens: LensChange | None = None
+    """Of all views, where it is unknown; None: it is believed."""
 
     @classmethod
     def at(
@@ -150,11 +148,11 @@ class Solution:
         start: Float[Tensor, "6 3 M M"] | None,
         rounds: int,
         poses: Poses | None = None,
-        focal: float | None = None,
+        lens: LensChange | None = None,
     ) -> "Solution":
         """With the map solved in so many robust rounds from another one, or from nothing."""
         options, settings = task.options, task.settings
-        rays = task.seen_from(task.pixels.rays, poses, focal)
+        rays = task.seen_from(task.pixels.rays, poses, lens)
         sights = Sights.of(surface, rays, settings.samples, options.least_cosine)
         clear = sights.clear & (task.pixels.inner_px > options.inner_px)
         texel = np.pi / 2 / settings.resolution
@@ -182,12 +180,12 @@ class Solution:
         light, slopes, texels = seen_with_slopes(padded, sights.outgoing)
         counted = gain_of(light)
         residual, slopes = (light - task.pixels.radiance) * counted[:, None], slopes * counted[:, None, None]
-        return cls(task, surface, sights, trust, environment, counted, residual, slopes, texels, free, poses, focal)
+        return cls(task, surface, sights, trust, environment, counted, residual, slopes, texels, free, poses, lens)
 
     @cached_property
     def rays(self) -> PixelRays:
         """Of the pixels, from where their cameras are."""
-        return self.task.seen_from(self.task.pixels.rays, self.poses, self.focal)
+        return self.task.seen_from(self.task.pixels.rays, self.poses, self.lens)
 
     @cached_property
     def weights(self) -> Float[np.ndarray, "P"]:
@@ -231,7 +229,7 @@ class Solution:
     @cached_property
     def _silhouette_rays(self) -> tuple[PixelRays, PixelRays]:
         """Of outlines, and of pixels that miss the surface."""
-        outlines = self.task.seen_from(self.task.outlines, self.poses, self.focal)
+        outlines = self.task.seen_from(self.task.outlines, self.poses, self.lens)
         return outlines, self.rays.chosen(~self.sights.hits.met)
 
     @cached_property
@@ -319,8 +317,8 @@ class Solution:
         prior = self.prior(before)
         if self.poses is not None:
             prior += float(np.einsum("vi,vij,vj", self.poses.stacked, self.task.pose_prior, self.poses.stacked)) / 2
-        if self.focal is not None:
-            prior += (self.focal / self.task.options.focal_prior) ** 2 / 2
+        if self.lens is not None:
+            prior += float((self._lens_precision * self.lens.values**2).sum()) / 2
         return photographs + self.constraints.cost + prior
 
     @cached_property
@@ -342,7 +340,7 @@ class Solution:
     def beside(self) -> tuple[Beside, ...]:
         """What is unknown beside the surface: poses of the views, then what all views share."""
         of_poses = () if self.poses is None else (self._beside_poses(self.poses),)
-        of_all = () if self.focal is None and self.surface.surroundings.is_far else (self._beside_shared(),)
+        of_all = () if self.lens is None and self.surface.surroundings.is_far else (self._beside_shared(),)
         return of_poses + of_all
 
     @property
@@ -357,19 +355,23 @@ class Solution:
         blocks = seen.blocks(count) + outlined.blocks(count) + self.task.pose_prior
         return Beside(seen, outlined, poses.stacked, self.task.pose_prior, blocks)
 
+    @property
+    def _lens_precision(self) -> Float[np.ndarray, "M"]:
+        """Of what is unknown of the lens."""
+        assert self.lens is not None, "the lens was unknown"
+        return self.lens.of_unknowns(self.task.options.focal_prior, self.task.options.k1_prior) ** -2.0
+
     def _beside_shared(self) -> Beside:
-        """Coefficients of the surroundings, and then the logarithm of the focal length. The prior of the former only
-        damps.
-        """
+        """Coefficients of the surroundings, and then unknowns of the lens. The prior of the former only damps."""
         around, options = self.surface.surroundings.coefficients, self.task.options
         photographs, silhouettes = self.photographs, self.silhouettes
         seen = [self.surface.surroundings.rows(self.slopes, self.points, self.sights.mirrored)]
         outlined = [np.zeros((*silhouettes.residual.shape, len(around)))]
-        if self.focal is not None:
+        if self.lens is not None:
             rays = self.rays, concatenated(list(self._silhouette_rays))
             for found, of, by_pose in zip((seen, outlined), rays, self.pose_rows, strict=True):
-                motion = farther_motion(of.origins, of.directions, self.task.cameras.rotations[of.view, 2])
-                found.append(np.matmul(by_pose.rows, motion[..., None]))
+                motions = self.lens.motions(of.origins, of.directions, self.task.cameras.rotations[of.view, 2])
+                found.append(np.matmul(by_pose.rows, motions))
         rows = np.concatenate(seen, 2) * (photographs.weights > 0)[:, None, None]
         beyond = np.stack([self.beyond_map(np.ascontiguousarray(column)) for column in np.moveaxis(rows, 2, 0)], 2)
         of_silhouettes = BlockRows(
@@ -377,9 +379,9 @@ class Solution:
         )
         matrix = np.einsum("pck,p,pcl->kl", rows, photographs.weights, beyond) + of_silhouettes.blocks(1)[0]
         least = options.least_surroundings_share * max(float(np.trace(matrix)), 1e-30)
-        known = [] if self.focal is None else [self.focal]
-        precision = np.diag([least] * len(around) + [options.focal_prior**-2.0] * len(known))[None]
-        value = np.array([0.0] * len(around) + known)
+        of_lens = (np.zeros(0), np.zeros(0)) if self.lens is None else (self._lens_precision, self.lens.values)
+        precision = np.diag(np.append([least] * len(around), of_lens[0]))[None]
+        value = np.append([0.0] * len(around), of_lens[1])
         of_photographs = BlockRows(np.zeros(len(photographs.weights), int), rows, photographs.weights)
         return Beside(of_photographs, of_silhouettes, value[None], precision, matrix + precision)
 
@@ -420,9 +422,9 @@ class Solution:
         if not surface.surroundings.is_far:
             around = surface.surroundings.after(shared[: len(surface.surroundings.coefficients)])
             surface = replace(surface, surroundings=around)
-        focal = None if self.focal is None else self.focal + float(shared[-1])
+        lens = None if self.lens is None else self.lens.after(shared[-len(self.lens.values) :])
         rounds = self.task.options.map_rounds
-        return Solution.at(self.task, surface, self.trust, self.environment, rounds, poses, focal)
+        return Solution.at(self.task, surface, self.trust, self.environment, rounds, poses, lens)
 
     def diagonal(self, smoothing_diagonal: float) -> Float[np.ndarray, "A B C"]:
         """The matrix's diagonal, but for what the map takes over; at least a millionth of its largest."""

@@ -4,6 +4,7 @@ from typing import Any, ClassVar, cast
 
 import torch
 
+from panoless.capture.lens import LensChange
 from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.environment.cubemap import initial_environment, resample
@@ -45,7 +46,9 @@ class SurfelFamily:
         """None: cameras are where the geometry has them that surfels start on."""
         return None
 
-    def with_focal_length(self, views: Views, fitted: Any, config: FitConfig) -> tuple[Geometry, float] | None:
+    def with_lens(
+        self, views: Views, fitted: Any, unknown: LensChange, config: FitConfig
+    ) -> tuple[Geometry, LensChange] | None:
         """None: what surfels are trained on is believed."""
         return None
 

@@ -78,6 +78,7 @@ AXES = (
         "--cameras.position-sigma {level}",
         kind="further",
     ),
+    Axis("distortion", "Distortion k₁", "", 0, (0.03, 0.1, 0.2), "--sensor.k1 {level}", kind="further"),
     Axis("size", "Size of the object", "", 1, (0.75, 0.5, 0.25), "--views.object-scale {level}", kind="further"),
     Axis("cut", "Share of the object cut off", "", 0, (0.1, 0.2, 0.4), "--views.cut {level}", kind="further"),
     Axis("turned", "World turned", "", 0, (1,), "--world.random-turn", own_truth=True, kind="further"),

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from panoless.alignment.search import PosedProposal
-from panoless.capture.corrections import NO_CORRECTIONS, Corrections, with_focal_factor
+from panoless.capture.corrections import NO_CORRECTIONS, Corrections
+from panoless.capture.lens import LensChange, with_focal_factor
 from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.geometry.base import Geometry, Proposal
@@ -20,15 +21,24 @@ from panoless.selection.candidates import Candidate, Selection, Verdict, selecti
 from panoless.selection.choose import choose_geometry
 from panoless.selection.corrections import with_corrections
 from panoless.selection.fitted import Fitted, outline_pull_px
-from panoless.selection.focal_length import with_focal_length
+from panoless.selection.lens import with_lens
 from panoless.selection.options import CorrectionOptions
 from shinypartial.core.conventions import SOLID_ALPHA
 from shinypartial.dataset.perturb.masks import dilated, eroded
+from tests.support.distortion import distorted
+from tests.support.mirror_body import body_views, sphere
 from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
 from tests.support.mirror_revolution import around, goblet, revolution_views
 
 CONFIG = replace(PRESETS["fast"], corrections=CorrectionOptions(rays=10_000, resolution=32))
-FOCAL = replace(CONFIG.corrections, rays=20_000, focal_rays=10_000, focal_resolution=32, least_focal_pull=0.002)
+FOCAL = replace(
+    CONFIG.corrections,
+    rays=20_000,
+    lens_rays=10_000,
+    lens_resolution=32,
+    focal=replace(CONFIG.corrections.focal, least_pull=0.002),
+    k1=replace(CONFIG.corrections.k1, least_pull=0.05),
+)
 """As few pixels tell it."""
 GAINS = np.exp2(np.random.default_rng(4).normal(size=10) * 0.3)
 GAINS /= np.exp(np.log(GAINS).mean())
@@ -106,12 +116,36 @@ def test_a_wrong_focal_length_is_found_and_a_true_one_believed(factor: float) ->
         assert 0 < found.focal_uncertainty < 0.003
 
 
+@pytest.mark.parametrize("k1", [0.0, -0.15, 0.15])
+def test_a_distortion_is_found_and_a_pinhole_believed(k1: float) -> None:
+    """Of a ball that outlines tell, to a third. A ball shows another focal length nearly as well, which is believed."""
+    family = FAMILIES["sphere"]
+    views = distorted(body_views(sphere(0.9), 20, 96), k1)
+
+    def ball(views: Views, before: Fitted | None = None, *, anew: bool = False) -> Fitted:
+        proposal = family.propose(views, CONFIG, asked=True)
+        assert proposal is not None
+        return Fitted(family.fit(views, proposal, CONFIG), PosedProposal(proposal))
+
+    options = replace(FOCAL, exposure="off", masks="off", focal=replace(FOCAL.focal, least_pull=1.0))
+    config = replace(CONFIG, corrections=options)
+    found = with_corrections(family, views, ball(views), config, ball).corrections
+    if k1 == 0:
+        assert found is NO_CORRECTIONS
+    else:
+        assert found.k1 == pytest.approx(k1, rel=0.35)
+        assert found.k1_uncertainty is not None
+        assert 0 < found.k1_uncertainty < 0.05
+
+
 class Slow(PlaneFamily):
     """A kind whose fit, a tilted mirror, ends before it is right; it finds focal lengths beside its shape."""
 
-    def with_focal_length(self, views: Views, fitted: Geometry, config: FitConfig) -> tuple[Geometry, float]:
+    def with_lens(
+        self, views: Views, fitted: Geometry, unknown: LensChange, config: FitConfig
+    ) -> tuple[Geometry, LensChange]:
         """Steps that make the shape right, and with it a focal length that is wrong."""
-        return MIRROR, 0.02
+        return MIRROR, unknown.after(unknown.of_unknowns(0.02, 0.0))
 
     def after_as_many_steps(self, views: Views, fitted: Geometry, config: FitConfig) -> Geometry:
         """Which the same steps do without it."""
@@ -125,7 +159,7 @@ def test_a_focal_length_is_not_believed_for_what_more_steps_explain(monkeypatch:
     turned = np.linalg.qr(np.eye(3) + 0.05 * np.random.default_rng(1).normal(size=(3, 3)))[0]
     tilted = replace(MIRROR, plane=replace(MIRROR.plane, normal=turned @ MIRROR.plane.normal))
     before = Fitted(tilted, PosedProposal(Proposal(MIRROR.plane, 0.0, 1.0)))
-    found = with_focal_length(views, before, replace(CONFIG, corrections=FOCAL), silhouettes_plane)
+    found = with_lens(views, before, replace(CONFIG, corrections=FOCAL), silhouettes_plane)
     assert found.geometry is MIRROR
     assert found.corrections == NO_CORRECTIONS
 
@@ -254,6 +288,6 @@ def test_corrections_survive_a_checkpoint_and_earlier_ones_have_none() -> None:
     found = Candidate("plane", Verdict.CHOSEN, "asked for", corrections=Corrections(focal_factor=0.98))
     plain = selection_to_plain(Selection("plane", (found,)))
     assert selection_from_plain(**plain).corrections.focal_factor == 0.98
-    for name in ("focal_factor", "focal_uncertainty"):
+    for name in ("focal_factor", "focal_uncertainty", "k1", "k1_uncertainty"):
         del plain["candidates"][0]["corrections"][name]
     assert selection_from_plain(**plain).corrections == NO_CORRECTIONS

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from panoless.alignment.search import align_proposal, fit_with_poses
-from panoless.capture.corrections import with_focal_factor
+from panoless.capture.lens import LensChange, with_focal_factor
 from panoless.capture.options import ContrastOptions
 from panoless.capture.poses import Poses, StatedCameras, with_pose_covariances
 from panoless.capture.views import Views, views_of
@@ -39,6 +39,7 @@ from panoless.geometry.free_form.trust import full_trust
 from panoless.kernels.level_set import seen_with_slopes
 from panoless.kernels.reference.cubemap import padded_texels
 from shinypartial.core.camera import Camera, Similarity
+from tests.support.distortion import distorted
 from tests.support.mirror_body import (
     Body,
     block,
@@ -399,16 +400,18 @@ def test_the_kind_keeps_the_protocol(ring: tuple[Views, FreeFormMirror]) -> None
     assert np.median(confidence[mesh.columns["nx"] > 0.8]) > 0.8
 
 
-@pytest.mark.parametrize("unknown", ["poses", "focal length"])
-def test_the_gradient_beside_the_surface_is_that_of_finite_differences(solution: Solution, unknown: str) -> None:
+@pytest.mark.parametrize("unknown", ["poses", LensChange(focal=0.0), LensChange(k1=0.0)])
+def test_the_gradient_beside_the_surface_is_that_of_finite_differences(
+    solution: Solution, unknown: str | LensChange
+) -> None:
     """Of photographs under a map and on a surface that stay, and of outlines."""
-    if unknown == "poses":
+    if isinstance(unknown, str):
         moved = replace(solution, poses=Poses.none(12))
         change = 1e-5 * np.random.default_rng(0).normal(size=(12, 6))
         sides = [replace(moved, poses=moved.poses.after(sign * change)) for sign in (1, -1)]
     else:
-        moved, change = replace(solution, focal=0.0), np.full((1, 1), 1e-5)
-        sides = [replace(moved, focal=sign * 1e-5) for sign in (1, -1)]
+        moved, change = replace(solution, lens=unknown), np.full((1, 1), 1e-5)
+        sides = [replace(moved, lens=unknown.after(sign * change[0])) for sign in (1, -1)]
     photographs, outlines = (
         moved.pose_rows if unknown == "poses" else (moved.beside[0].photographs, moved.beside[0].silhouettes)
     )
@@ -430,10 +433,10 @@ def test_the_gradient_beside_the_surface_is_that_of_finite_differences(solution:
 
 
 def test_the_matrix_with_all_unknowns_is_symmetric(solution: Solution) -> None:
-    """Poses, surroundings and focal length beside the surface."""
+    """Poses, surroundings and lens beside the surface."""
     near = replace(solution.surface, surroundings=Surroundings(np.array([0.1, 0.02, 0.0, 0.01])))
-    moved = replace(solution, surface=near, poses=Poses.none(12), focal=0.01)
-    sizes = moved.surface.shape, (12, 6), (1, 5)
+    moved = replace(solution, surface=near, poses=Poses.none(12), lens=LensChange(0.01, 0.02))
+    sizes = moved.surface.shape, (12, 6), (1, 6)
     rng = np.random.default_rng(1)
     one, other = (([rng.normal(size=size) for size in sizes]) for _ in range(2))
 
@@ -472,10 +475,22 @@ def test_a_wrong_focal_length_is_found_beside_the_shape() -> None:
     wrong = replace(views, train=tuple(with_focal_factor(view, 1.02) for view in views.train))
     family = FreeFormFamily()
     first = family.fit(wrong, family.propose(wrong, CONFIG, asked=False), CONFIG)
-    geometry, change = family.with_focal_length(wrong, first, CONFIG)
-    assert change == pytest.approx(-np.log(1.02), rel=0.2)
+    geometry, change = family.with_lens(wrong, first, LensChange(focal=0.0), CONFIG)
+    assert change.focal == pytest.approx(-np.log(1.02), rel=0.2)
     before, after = (np.abs(wavy_ball().value(each.mesh(views.object_frame).vertices)) for each in (first, geometry))
     assert np.median(after) < 0.3 * np.median(before)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("k1", [0.0, 0.15])
+def test_a_distortion_is_found_beside_the_shape(k1: float) -> None:
+    """Of a wavy ball, to a fifth, with the focal length unknown as well; where nothing bends a glance tells it."""
+    views = distorted(body_views(wavy_ball(), 16, 80), k1)
+    family = FreeFormFamily()
+    first = family.fit(views, family.propose(views, CONFIG, asked=False), CONFIG)
+    _, change = family.with_lens(views, first, LensChange(0.0, 0.0), CONFIG)
+    assert change.k1 == pytest.approx(k1, abs=0.03)
+    assert change.focal == pytest.approx(0, abs=0.006)
 
 
 def test_flat_faces_that_no_outline_shows_are_found_by_a_descent() -> None:
