@@ -83,8 +83,8 @@ def chosen_sharpness(
     options: FootprintMapOptions = DEFAULTS,
 ) -> Sharpness:
     """What explains every fifth pixel best by the others. From the coarsest map on, a finer, a smoother and a sharper
-    one are tried as long as one is better, a finer one by the share `least_gain`. One that is as fine as a refused one
-    is not tried again.
+    one are tried as long as one is better, a finer one by the share `least_gain`, or of unsaturated pixels by
+    `least_unsaturated_gain`. One that is as fine as a refused one is not tried again.
 
     Held-out pixels that are saturated count as they do in the map; at the borders of lamps they prefer blur. Which kind
     of lamps there is, unsaturated pixels tell before that: those beside lamps that are shown too large. Saturated ones
@@ -108,7 +108,7 @@ def chosen_sharpness(
             continue
         tried.add(there)
         found = trial.made(sharpness(there, lamps))
-        if found.error < best.error * (1 - finer * options.least_gain):
+        if found.is_better(best, options) if finer else found.error < best.error:
             best, here, moves = found, there, list(MOVES)
         elif finer:
             sizes = there[0]
@@ -124,6 +124,13 @@ class _Tried:
     error: float
     unsaturated_error: float
     """Of the unsaturated ones."""
+
+    def is_better(self, coarser: "_Tried", options: FootprintMapOptions) -> bool:
+        """Whether a finer map explains more: of all pixels; or of the unsaturated ones, and no less of all."""
+        if self.error < coarser.error * (1 - options.least_gain):
+            return True
+        enough = coarser.unsaturated_error * (1 - options.least_unsaturated_gain)
+        return self.error <= coarser.error and self.unsaturated_error < enough
 
 
 class _Trial:

@@ -38,7 +38,7 @@ def with_corrections(source: Family, views: Views, first: Fitted, config: FitCon
     if options.masks == "auto" and masks_are_doubted(views, best.geometry, errors, config):
         best = with_moved_masks(source, views, best, config, refit)
     is_as_said = best.corrections.gains is None and not best.corrections.mask_offset_px
-    is_explained = errors.mean() <= options.largest_lens_error
+    is_explained = errors.mean() <= config.selection.largest_error
     if options.lens == "on" or (options.lens == "auto" and is_as_said and is_explained):
         best = with_lens(views, best, config, refit)
     if best.corrections.gains is None:

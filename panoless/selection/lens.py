@@ -51,12 +51,20 @@ def with_lens(views: Views, fitted: Fitted, config: FitConfig, refit: Refit) -> 
     than it is known.
 
     A kind that finds a lens beside its shape takes more steps for that, so it is compared with a fit after as many
-    without. Others are fitted through several lenses, of other focal lengths and of other distortions. Either pulls at
-    the other: where photographs ask for both, that is found first which explains more by itself.
+    without, and goes on from what was found as long as more is. Others are fitted through several lenses, of other
+    focal lengths and of other distortions. Either pulls at the other: where photographs ask for both, that is found
+    first which explains more by itself.
     """
-    jointly = _jointly(FAMILIES[fitted.geometry.kind], views, fitted, config)
-    if jointly is not None:
-        return jointly
+    family, before = FAMILIES[fitted.geometry.kind], fitted
+    for _ in range(config.corrections.lens_trials):
+        found = _jointly(family, views, before, config)
+        if found is None:
+            break
+        if found.corrections is before.corrections:
+            return found
+        before = found
+    if before is not fitted:
+        return before
     longer = _by_trials(FOCAL_LENGTH, views, fitted, config, refit)
     bent = _by_trials(DISTORTION, views, fitted, config, refit)
     if bent is fitted:
@@ -86,7 +94,11 @@ def _jointly(family: Family, views: Views, fitted: Fitted, config: FitConfig) ->
         told = replace(fitted, geometry=geometry, corrections=corrections)
         if options.lens == "on":
             return told
-        likely = tuple(each for each in unknowns if _is_likely(told.corrections, each, changes[each], options))
+        likely = tuple(
+            each
+            for each in unknowns
+            if abs(changes[each]) >= _limits(each, options).settled and _is_likely(told.corrections, each, options)
+        )
         if likely == unknowns:
             break
         unknowns = likely
@@ -128,7 +140,7 @@ def _by_trials(unknown: LensUnknown, views: Views, fitted: Fitted, config: FitCo
     told = replace(found.fitted, corrections=_changed(fitted.corrections, unknown, found.change, sigma))
     if options.lens == "on":
         return told
-    is_likely = _is_likely(told.corrections, unknown, found.change, options)
+    is_likely = _is_likely(told.corrections, unknown, options)
     return told if is_likely and _is_earned(views, fitted, told, (unknown,), config) else fitted
 
 
@@ -144,13 +156,13 @@ def _changed(corrections: Corrections, unknown: LensUnknown, change: float, sigm
     return replace(corrections, focal_factor=factor, focal_uncertainty=factor * sigma)
 
 
-def _is_likely(corrections: Corrections, unknown: LensUnknown, change: float, options: CorrectionOptions) -> bool:
-    """Whether a change is told better than it is expected, larger than its uncertainty, and not too large."""
-    limits = _limits(unknown, options)
-    sigma = corrections.k1_uncertainty or 0.0
+def _is_likely(corrections: Corrections, unknown: LensUnknown, options: CorrectionOptions) -> bool:
+    """Whether it is told better than it is expected, off by more than its uncertainty, and not by too much."""
+    limits, off, sigma = _limits(unknown, options), corrections.k1, corrections.k1_uncertainty or 0.0
     if unknown is FOCAL_LENGTH:
+        off = float(np.log(corrections.focal_factor))
         sigma = (corrections.focal_uncertainty or 0.0) / corrections.focal_factor
-    return sigma < limits.prior and options.nearest_lens * sigma < abs(change) < options.farthest_lens * limits.prior
+    return sigma < limits.prior and options.nearest_lens * sigma < abs(off) < options.farthest_lens * limits.prior
 
 
 def _looks_like_a_focal_length(views: Views, geometry: Geometry, options: CorrectionOptions) -> bool:

@@ -52,7 +52,8 @@ class LensLimits:
     largest_step: Positive
     """Trials lie at most so far apart."""
     settled: Positive
-    """Trials end where the next would lie so near to one before."""
+    """Trials end where the next would lie so near to one before, and what is found beside a shape where it changes by
+    less."""
     prior: Positive
     """Expected error. What is not told better is not believed."""
     joint_sigma: Positive
@@ -114,8 +115,6 @@ class CorrectionOptions:
     """Rounds of map and gains. Not tuned."""
     gain_scale: Positive = 0.1
     """Residual (linear radiance) beyond which a pixel loses its vote on the gain of its view. Not tuned."""
-    largest_lens_error: Share = 0.15
-    """Held-out error of a fit above which the lens is not asked for. Vase through a lens of k₁ = 0.1 leaves 0.09."""
     lens_rays: Count = 100_000
     """Rays that tell how far photographs pull a fit toward another lens. Not tuned."""
     lens_resolution: Count = 128
@@ -158,7 +157,7 @@ class CorrectionOptions:
         settled=0.01,
         prior=0.1,
         joint_sigma=0.02,
-        least_gain=0.03,
+        least_gain=0.01,
     )
     """Of the radial distortion."""
     least_outline_fall: Share = 0.15
