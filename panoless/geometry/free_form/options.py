@@ -352,7 +352,7 @@ class FreeFormOptions:
     focal_prior: float = 0.02
     """Expected error of the logarithm of the focal length, where it is unknown."""
     k1_prior: float = 0.1
-    """Expected radial distortion, where that is."""
+    """Expected radial distortion, where that is. Not tuned: lenses of phones have about 0.06."""
     shared_steps: int = 8
     """Most steps in which these, or how near the surroundings are, are found on from a fit."""
     lens_glance_steps: int = 2
@@ -360,7 +360,7 @@ class FreeFormOptions:
     lens_glance_rays: int = 60_000
     """…by so many pixels at most…"""
     least_k1_change: float = 0.01
-    """…which have to change the distortion by this…"""
+    """…which have to change the distortion by this, half of what is told of it…"""
     least_focal_change: float = 0.002
     """…or log focal length by this. On sculpture, by 40,000 pixels, one step changes it by 0.0003 where
     it is right, and by 0.0055 and more where it is off by 0.5 % or 2 %."""
