@@ -150,7 +150,7 @@ class CorrectionOptions:
     the pull is as much as 0.001 of a change. Found beside the shape it is off by 0.0003 to 0.0057 on sculpture and
     chrome-block."""
     k1: LensLimits = LensLimits(
-        least_pull=0.004,
+        least_pull=0.008,
         least_posed_pull=0.02,
         share=0.14,
         largest_step=0.15,
@@ -160,9 +160,9 @@ class CorrectionOptions:
         least_gain=0.01,
     )
     """Of the radial distortion; lenses of phones have about 0.06. A pinhole pulls by 0.0003 on vase, 0.003 on sculpture
-    and cola, a distortion of 0.1 by 0.014 on vase and 0.022 on sculpture: shares of 0.14 and 0.22. Found beside the
-    shape it is off by 0.005 to 0.02 on sculpture and dish. Where it is right it has explained 0.17 and 0.03 more on
-    vase and trial shapes. The pull of turned cameras is not tuned."""
+    and cola and 0.005 on the bundled vase of 88 px, a distortion of 0.1 by 0.014 on vase and 0.022 on sculpture: shares
+    of 0.14 and 0.22. Found beside the shape it is off by 0.005 to 0.02 on sculpture and dish. Where it is right it has
+    explained 0.17 and 0.03 more on vase and trial shapes. The pull of turned cameras is not tuned."""
     least_outline_fall: Share = 0.15
     """Share of the outlines' distance from the masks by which it has to lower that where it takes the place of near
     surroundings. On mirror, 2 % are told by 0.3 of it."""
