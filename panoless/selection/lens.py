@@ -69,9 +69,10 @@ def with_lens(views: Views, fitted: Fitted, config: FitConfig, refit: Refit) -> 
     bent = _by_trials(DISTORTION, views, fitted, config, refit)
     if bent is fitted:
         return longer
-    left = _errors(views, longer, bent, config)
-    if longer is not fitted and left[0].mean() < left[1].mean():
-        return _by_trials(DISTORTION, views, longer, config, refit)
+    if longer is not fitted:
+        by_longer, by_bent = _errors(views, longer, bent, config)
+        if by_longer.mean() < by_bent.mean():
+            return _by_trials(DISTORTION, views, longer, config, refit)
     return _by_trials(FOCAL_LENGTH, views, bent, config, refit)
 
 

@@ -78,10 +78,10 @@ class CorrectionOptions:
     """Whether the focal length of all views may be wrong by one factor, and their lens distort: where photographs pull
     a fit and held-out views gain by it, whenever it is found, or never."""
     largest_error: Share = 0.08
-    """Held-out error of a fit above which masks are doubted. Right ones of development
-    scenes leave at most 0.06, masks that are off by 2 px at least 0.10. A kind that goes on from a fit tells of masks
-    in seconds, so they are doubted from `explained_error` of the model selection on: drum leaves 0.018, with masks that
-    are 1 px too large 0.038; chrome-block leaves 0.031 and sculpture 0.026."""
+    """Held-out error of a fit above which masks are doubted. Right ones of development scenes leave at most 0.06, masks
+    that are off by 2 px at least 0.10. A kind that goes on from a fit tells of masks in seconds, so they are doubted
+    from `explained_error` of the model selection on: drum leaves 0.018, with masks that are 1 px too large 0.038;
+    chrome-block leaves 0.031 and sculpture 0.026."""
     step_px: Positive = 2.0
     """Offsets are tried this far apart. Not tuned."""
     largest_px: Positive = 6.0
