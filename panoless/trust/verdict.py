@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+from panoless.capture.views import HELD_OUT_EVERY
 from panoless.trust.evidence import Evidence
 from panoless.trust.options import TrustOptions
 from shinypartial.prediction.format import Trust, Verdict
@@ -114,8 +115,11 @@ def judge(found: Evidence, options: TrustOptions) -> Trust:
     """The verdict on that evidence."""
     figures = {name: value for name, value in vars(found).items() if value is not None}
     if found.unexplained is None:
-        reason = f"{found.views} usable views leave none to hold out"
-        return Trust("do not trust", reason, VIEWS, options.refused, figures)
+        if found.views <= HELD_OUT_EVERY // 2:
+            reason, remedy = f"{found.views} usable views leave none to hold out", VIEWS
+        else:
+            reason, remedy = "no held-out view shows the surface where its mask has the object", MASKS
+        return Trust("do not trust", reason, remedy, options.refused, figures)
     risks = list(_risks(found, options))
     doubt = max(risks, key=lambda each: each[0])[1]
     risk = math.hypot(*(each for each, _ in risks))

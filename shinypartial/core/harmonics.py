@@ -5,6 +5,7 @@ graphics since: Y₁ = √(3/4π) · (y, z, x) for m = −1, 0, 1. A function of
 """
 
 from math import factorial, pi, prod, sqrt
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -13,13 +14,21 @@ from shinypartial.core.sphere import latlong_directions, latlong_solid_angles
 
 
 def real_harmonics(directions: Float[np.ndarray, "*P 3"], degree: int) -> Float[np.ndarray, "*P K"]:
-    """All (degree + 1)² values at unit directions, polynomials of x, y and z.
+    """All (degree + 1)² values at unit directions, by `harmonic_polynomials`."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    basis = np.empty((*x.shape, (degree + 1) ** 2))
+    for index, values in enumerate(harmonic_polynomials(x, y, z, degree)):
+        basis[..., index] = values
+    return basis
+
+
+def harmonic_polynomials(x: Any, y: Any, z: Any, degree: int) -> list[Any]:
+    """All (degree + 1)² functions as polynomials of x, y and z, which are arrays or tensors; the first is a number.
 
     Y_lm = N · P_l^|m|(z)/sin^|m|θ · {√2 Im, 1, √2 Re}(x + iy)^|m| for m < 0, m = 0, m > 0, with
     N² = (2l+1)/4π · (l−|m|)!/(l+|m|)! and P by its recurrence over l.
     """
-    x, y, z = np.moveaxis(directions, -1, 0)
-    basis = np.empty((*x.shape, (degree + 1) ** 2))
+    basis: list[Any] = [0.0] * (degree + 1) ** 2
     real, imaginary = 1.0, 0.0
     for m in range(degree + 1):
         before, legendre = 0.0, float(prod(range(1, 2 * m, 2)))
@@ -27,8 +36,8 @@ def real_harmonics(directions: Float[np.ndarray, "*P 3"], degree: int) -> Float[
             if el > m:
                 before, legendre = legendre, ((2 * el - 1) * z * legendre - (el + m - 1) * before) / (el - m)
             norm = sqrt((2 * el + 1) / (4 * pi) * factorial(el - m) / factorial(el + m) * (2 if m else 1))
-            basis[..., el * el + el - m] = norm * legendre * imaginary
-            basis[..., el * el + el + m] = norm * legendre * real
+            basis[el * el + el - m] = norm * legendre * imaginary
+            basis[el * el + el + m] = norm * legendre * real
         real, imaginary = x * real - y * imaginary, x * imaginary + y * real
     return basis
 

@@ -128,23 +128,28 @@ def _verdict_lines(results: Results) -> Iterator[str]:
     yield "not lost. Fits that state no risk are left out, and those of a scene and method whose clean fit is"
     yield f"refused by its own verdict: {', '.join(refused) or 'none'}."
     yield ""
-    yield "| Scenes | Fits | Lost | AUROC of the risk |\n| --- | --- | --- | --- |"
+    yield "| Scenes | Method | Fits | Lost | AUROC of the risk |\n| --- | --- | --- | --- | --- |"
     groups = {split: list(judged(results, split)) for split in SPLITS}
     for split, fits in groups.items():
-        area = verdict_auroc(fits)
-        text = "–" if area is None else f"{area:.3f}"
-        yield f"| {split} | {len(fits)} | {sum(each.lost for each in fits)} | {text} |"
+        for method in results.methods:
+            own = [each for each in fits if each.outcome.cell.method == method]
+            area = verdict_auroc(own)
+            if own:
+                text = "–" if area is None else f"{area:.3f}"
+                yield f"| {split} | {method} | {len(own)} | {sum(each.lost for each in own)} | {text} |"
+    main = results.methods[0]
     yield ""
     headings = [f"{split}: {word}" for split in SPLITS for word in ("kept", "lost")]
-    yield "| Verdict | " + " | ".join(headings) + " |"
+    yield f"| Verdict of {main} | " + " | ".join(headings) + " |"
     yield "| --- " * (1 + len(headings)) + "|"
     for verdict in VERDICTS:
-        counts = (_counted(groups[split], verdict, lost) for split in SPLITS for lost in (False, True))
+        counts = (_counted(groups[split], main, verdict, lost) for split in SPLITS for lost in (False, True))
         yield f"| {verdict} | " + " | ".join(map(str, counts)) + " |"
 
 
-def _counted(fits: Sequence[Judged], verdict: str, lost: bool) -> int:
-    return sum(each.lost == lost and each.outcome.verdict == verdict for each in fits)
+def _counted(fits: Sequence[Judged], method: str, verdict: str, lost: bool) -> int:
+    outcomes = (each.outcome for each in fits if each.lost == lost)
+    return sum((each.cell.method, each.verdict) == (method, verdict) for each in outcomes)
 
 
 def _jitter_lines(results: Results) -> Iterator[str]:

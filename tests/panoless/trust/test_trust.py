@@ -15,7 +15,7 @@ from panoless.geometry.plane.kind import PlaneMirror
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.trust.evidence import Evidence, gather_evidence
 from panoless.trust.options import TrustOptions
-from panoless.trust.verdict import AROUND, MATTER, POSES, SHINE, TEXTURE, judge
+from panoless.trust.verdict import AROUND, MASKS, MATTER, POSES, SHINE, TEXTURE, judge
 from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
 
 OPTIONS = TrustOptions(resolution=32)
@@ -168,6 +168,15 @@ def test_too_few_views_to_hold_one_out_are_said_to_be_so(views: Views, count: in
     assert verdict.verdict == "do not trust"
     assert f"{count} usable views" in verdict.reason
     assert all(np.isfinite(value) for value in verdict.evidence.values())
+
+
+def test_a_surface_that_no_view_shows_is_not_put_down_to_the_number_of_views(views: Views) -> None:
+    """Photographs that can be judged, and a mirror so small that it covers no whole pixel."""
+    tiny = PlaneMirror(plane_of(1e-4 * RECTANGLE))
+    found = gather_evidence(views, tiny, VISIBILITY, CONFIG)
+    verdict = judge(found, OPTIONS)
+    assert found.unexplained is None
+    assert (verdict.verdict, verdict.remedy) == ("do not trust", MASKS)
 
 
 def test_views_without_the_object_count_for_nothing(views: Views) -> None:

@@ -7,7 +7,6 @@ import math
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -24,7 +23,7 @@ from panoless.kernels.rasterize import RasterCamera, rasterize
 from panoless.kernels.reference.objective import normal_consistency, surface_depth
 from panoless.kernels.reference.rasterize import rotation_matrices
 from panoless.kernels.splats import blend_splats, project_gaussians
-from shinypartial.core.harmonics import real_harmonics
+from shinypartial.core.harmonics import harmonic_polynomials
 
 HARMONICS = 16
 """Coefficients of spherical harmonics up to degree 3."""
@@ -245,10 +244,10 @@ def harmonic_color(
 
     Coefficients above degree 0 count a twentieth, by which they learn so much slower.
     """
-    count = (degree + 1) ** 2
-    basis = torch.from_numpy(real_harmonics(views.detach().cpu().numpy(), degree).astype(np.float32)).to(views)
-    basis[:, 1:] /= HIGHER_SLOWNESS
-    return ((basis[..., None] * coefficients[:, :count]).sum(1) + 0.5).clamp(min=0)
+    x, y, z = views.detach().unbind(-1)
+    constant, *higher = harmonic_polynomials(x, y, z, degree)
+    basis = torch.stack([torch.full_like(x, constant), *(values / HIGHER_SLOWNESS for values in higher)], -1)
+    return ((basis[..., None] * coefficients[:, : basis.shape[1]]).sum(1) + 0.5).clamp(min=0)
 
 
 @dataclass(frozen=True)
