@@ -11,8 +11,9 @@ mean over its area. Grazing light is spread less across the plane of incidence; 
 """
 
 import math
+import warnings
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ TEXELS_PER_WIDTH = 0.88
 """A blur works on the coarsest map whose mean texels are no wider than its standard deviation over this."""
 CUT = 3.0
 """Standard deviations where a blur ends."""
+_Pair = tuple[Any, Any]
 
 
 def lobe_weights(roughness: float, by_cosine: bool = False) -> Float[np.ndarray, "K"]:
@@ -81,8 +83,21 @@ class _Blur:
         coarse = self._averaged(image)
         if self.matrix is not None:
             rows = coarse.permute(0, 2, 3, 1)
-            coarse = _Product.apply(self.matrix, rows.flatten(0, 2)).view(rows.shape).permute(0, 3, 1, 2).contiguous()
+            pair = self._matrix_pair(image.device)
+            coarse = _Product.apply(pair, rows.flatten(0, 2)).view(rows.shape).permute(0, 3, 1, 2).contiguous()
         return coarse
+
+    def _matrix_pair(self, device: torch.device) -> "_Pair":
+        """The matrix and its transpose, scipy's on the CPU and torch's elsewhere."""
+        if device not in self._pairs:
+            matrix = self.matrix if device.type == "cpu" else _torch_matrix(self.matrix, device)
+            transpose = self.matrix.T if device.type == "cpu" else _torch_matrix(self.matrix.T, device)
+            self._pairs[device] = matrix, transpose
+        return self._pairs[device]
+
+    @cached_property
+    def _pairs(self) -> dict[torch.device, "_Pair"]:
+        return {}
 
     def gathered(self, image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "6 C L L"]:
         """Gᵀ E."""
@@ -163,17 +178,29 @@ class Lobes:
 
 
 class _Product(torch.autograd.Function):
-    """A sparse matrix times rows."""
+    """The first of two sparse matrices times rows; the second is its transpose, and both are scipy's or torch's."""
 
     @staticmethod
-    def forward(ctx, matrix, rows):
-        ctx.matrix = matrix
-        return torch.as_tensor(matrix @ rows.detach().cpu().numpy()).to(rows)
+    def forward(ctx, pair, rows):
+        ctx.pair = pair
+        return _times(pair[0], rows.detach())
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, cotangent):
-        return None, torch.as_tensor(ctx.matrix.T @ cotangent.cpu().numpy()).to(cotangent)
+        return None, _times(ctx.pair[1], cotangent)
+
+
+def _times(matrix: Any, rows: Float[Tensor, "P C"]) -> Float[Tensor, "Q C"]:
+    return matrix @ rows if isinstance(matrix, Tensor) else torch.as_tensor(matrix @ rows.numpy()).to(rows)
+
+
+def _torch_matrix(matrix: Any, device: torch.device) -> Tensor:
+    rows = matrix.tocsr()
+    starts, columns, values = (torch.from_numpy(each).to(device) for each in (rows.indptr, rows.indices, rows.data))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta state")
+        return torch.sparse_csr_tensor(starts, columns, values, size=rows.shape, check_invariants=True)
 
 
 def _as_rows(image: Float[Tensor, "6 C M M"]) -> Float[np.ndarray, "P C"]:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from panoless.environment.lobe import Lobe, lobe_weights
+from panoless.environment.lobe import Lobe, Lobes, _torch_matrix, lobe_weights
 from panoless.kernels.cubemap import cubemap_directions
 
 
@@ -23,6 +23,22 @@ def test_a_plain_world_looks_plain_in_any_mirror() -> None:
     assert Lobe.of(0.2, 32).blurred(plain).numpy() == pytest.approx(0.7, abs=1e-5)
     world = torch.rand(6, 3, 8, 8, generator=torch.Generator().manual_seed(2))
     assert torch.equal(Lobe.of(None, 8).blurred(world), world)
+
+
+def test_products_with_the_matrices_of_other_devices_are_those_of_the_cpu() -> None:
+    """The values and their gradients, with such matrices in main memory."""
+    blurs = [blur for blur in Lobes.by_cosine((0.1, 0.5), 16).blurs if blur.matrix is not None]
+    assert blurs
+    for blur in blurs:
+        image = torch.rand(6, 3, 16, 16, generator=torch.Generator().manual_seed(3), requires_grad=True)
+        expected = blur.shrunk(image)
+        cotangent = torch.rand(expected.shape, generator=torch.Generator().manual_seed(4))
+        gradient = torch.autograd.grad(expected, image, cotangent)[0]
+        blur._pairs[image.device] = tuple(_torch_matrix(each, image.device) for each in (blur.matrix, blur.matrix.T))
+        found = blur.shrunk(image)
+        torch.testing.assert_close(found, expected)
+        torch.testing.assert_close(torch.autograd.grad(found, image, cotangent)[0], gradient)
+        del blur._pairs[image.device]
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 0.75, 0.9, 0.98])
