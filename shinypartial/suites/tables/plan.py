@@ -20,7 +20,7 @@ from shinypartial.suites.tables.published import (
     SILHOUETTE,
 )
 
-TableName = Literal["main", "fairness", "ablation", "roughness", "self-reflection", "pose-jitter"]
+TableName = Literal["main", "fairness", "ablation", "roughness", "matter", "self-reflection", "pose-jitter"]
 SIZE = Size(400, 100, 20)
 """Of its datasets unless another is asked for; those of the paper have 800 pixels, 100 training and 200 test views."""
 OURS, ORACLE = "ours", "oracle baseline"
@@ -173,6 +173,14 @@ TABLES: dict[TableName, Table] = {
             Condition(f"roughness {level}", render=f"--roughness {level}") if level else Condition()
             for level in (0, 0.1, 0.2, 0.3)
         ),
+    ),
+    "matter": Table(
+        "More than a mirror",
+        "Scenes with parts that are rough, colored or matte. The paper prints no figures.",
+        ("teapot", "coffee"),
+        (*COMPARED, PAPERS, DEFAULT, BASELINE),
+        (ENVIRONMENT[0], OBSERVED, *NORMALS[:2], RENDER[0], *COST),
+        {},
     ),
     "self-reflection": Table(
         "Self-reflection",
