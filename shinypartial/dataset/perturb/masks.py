@@ -11,6 +11,8 @@ from shinypartial.core.conventions import PIXEL_CENTER
 RING_STEP_PX = 0.5
 #: Radius of holes and blobs as a share of that of a disk with the object's area; the last ones are smaller.
 BLOB_RADIUS = 0.15
+#: Standard deviation of the Gaussian that smooths what an outline wanders by: it changes sign every 20 pixels or so.
+WOBBLE_LENGTH_PX = 6.0
 
 
 def eroded(alpha: Float[np.ndarray, "H W"], radius_px: float) -> Float[np.ndarray, "H W"]:
@@ -41,6 +43,19 @@ def _shifted(padded: Float[np.ndarray, "_H _W"], down: float, right: float, marg
 def dilated(alpha: Float[np.ndarray, "H W"], radius_px: float) -> Float[np.ndarray, "H W"]:
     """Largest alpha within a disk about each pixel: the erosion of what the mask leaves out."""
     return 1 - eroded(1 - alpha, radius_px)
+
+
+def wobbling(alpha: Float[np.ndarray, "H W"], sigma_px: float, random: np.random.Generator) -> Float[np.ndarray, "H W"]:
+    """The mask by a smooth random shift of each pixel, whose parts have this standard deviation: so has that along the
+    normal of an outline.
+    """
+    from scipy.ndimage import gaussian_filter, map_coordinates
+
+    noise = np.stack([gaussian_filter(random.standard_normal(alpha.shape), WOBBLE_LENGTH_PX) for _ in range(2)])
+    # Of white noise under that filter.
+    places = np.indices(alpha.shape) + sigma_px * noise * (2 * math.sqrt(math.pi) * WOBBLE_LENGTH_PX)
+    wandered: np.ndarray = map_coordinates(alpha, places, order=1, mode="nearest")
+    return wandered.astype(alpha.dtype)
 
 
 def with_holes(alpha: Float[np.ndarray, "H W"], share: float, random: np.random.Generator) -> Float[np.ndarray, "H W"]:

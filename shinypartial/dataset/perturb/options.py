@@ -36,6 +36,9 @@ class MaskErrors:
     """Move the outline inward by this many pixels."""
     dilate_px: NonNegative = 0.0
     """Move the outline outward by this many pixels, after the erosion."""
+    wobble_px: NonNegative = 0.0
+    """Standard deviation in pixels by which the outline of each view then wanders in and out, over some 20 pixels, as
+    outlines of segmenters and by hand do."""
     holes: Annotated[float, Meta(ge=0, le=0.9)] = 0.0
     """Share of the object's area that round holes take away."""
     stray: Share = 0.0

@@ -141,6 +141,8 @@ def masked_wrongly(picture: Picture, options: MaskErrors, is_empty: bool, random
         alpha = masks.eroded(alpha, options.erode_px)
     if options.dilate_px:
         alpha = masks.dilated(alpha, options.dilate_px)
+    if options.wobble_px:
+        alpha = masks.wobbling(alpha, options.wobble_px, random.spawn(1)[0])  # Holes and blobs stay where they were.
     outlined = alpha
     if options.holes:
         alpha = masks.with_holes(outlined, options.holes, random)
