@@ -128,6 +128,22 @@ def carve_hull(views: Views, resolution: int, votes: float, options: FirstSurfac
     return Hull(distance, half_side, pixel, wrong)
 
 
+def contradiction_px(views: Views, options: FirstSurfaceOptions = DEFAULTS) -> float:
+    """How far rays through all outlines pass by the hull of all views, in the median and in pixels; at least 0.
+
+    Outlines of one thing that true cameras see touch the hull, whatever its shape. Those that err by themselves, and
+    those of wrong cameras, carve it away from each other's rays: the median is about the standard deviation of what
+    they err by. What all err by alike, as masks that are too large, contradicts nothing.
+    """
+    outlines = [mask_distance(view) for view in views.train]
+    half_side = max(HULL_HALF_SIDE, SPARE * views.object_frame.reach)
+    count = math.ceil(options.coarse_voxels * half_side / HULL_HALF_SIDE)
+    points = _grid_points(np.arange(count**3), count, half_side, outlines[0].distance_px.device)
+    grid = largest_distances(outlines, points, 1)[0].view(count, count, count).cpu().numpy()
+    hull = Hull(grid, half_side, float(np.median([outline.pixel for outline in outlines])))
+    return max(0.0, _passed_by_px(hull, _points_on_rays(outlines, half_side, options)))
+
+
 def _grid_points(
     flat: Int[np.ndarray, "P"], count: int, half_side: float, device: torch.device
 ) -> Float[Tensor, "P 3"]:

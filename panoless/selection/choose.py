@@ -8,12 +8,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from panoless.alignment.align import pose_prior
 from panoless.alignment.search import PosedProposal, align_proposal, fit_at, fit_with_poses
 from panoless.capture.corrections import NO_CORRECTIONS
+from panoless.capture.silhouettes import silhouette_distance_px
 from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.environment.surroundings import FAR, Surroundings
+from panoless.first_surface.visual_hull import contradiction_px
 from panoless.geometry.base import Family, Geometry, Proposal, usable_views
 from panoless.geometry.registry import FAMILIES
 from panoless.selection.candidates import Candidate, Selection, Verdict
@@ -52,7 +56,7 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
         proposals = refused.get(source.kind, []) if family.refines else _proposals(source, views, config, asked=False)
         candidate, geometry = _examine(family, proposals, views, config, trial)
         table.append(candidate)
-        refused[family.kind] = [each for each in proposals if _is_near(each, config, bent=True)]
+        refused[family.kind] = [each for each in proposals if _is_near(each, views, config, bent=True)]
         if geometry is None:
             continue
         explains = candidate.verdict == Verdict.CHOSEN
@@ -158,16 +162,37 @@ def _few_come_near(source: Family, views: Views, proposal: Proposal, config: Fit
     stride = len(views.train) // config.poses.trial_views
     if stride < 2 or config.poses.mode != "auto" or source.finds_poses:
         return True
-    few = align_proposal(source, replace(views, train=views.train[::stride]), proposal, config)
-    return few is not None and _is_near(few, config, bent=True)
+    asked = replace(views, train=views.train[::stride])
+    few = align_proposal(source, asked, proposal, config)
+    return few is not None and _is_near(few, asked, config, bent=True)
 
 
-def _is_near(start: PosedProposal, config: FitConfig, *, bent: bool) -> bool:
-    """Whether a proposal explains the silhouettes, or would where a kind that refines it bends its edge."""
+def _is_near(start: PosedProposal, views: Views, config: FitConfig, *, bent: bool) -> bool:
+    """Whether a proposal explains the silhouettes, or would where a kind that refines it bends its edge.
+
+    Outlines that contradict each other miss any shape. By d pixels, they leave the share d · length / area of the
+    object to one side alone.
+    """
     options, proposal = config.selection, start.proposal
     farther = options.bent_edge if bent else 1.0
     outside, missed = farther * options.largest_silhouette_px, farther * (1 - options.least_overlap)
-    return proposal.silhouette_px <= outside and 1 - proposal.overlap <= missed
+    away, apart = proposal.silhouette_px, 1 - proposal.overlap
+    if away <= outside and apart <= missed:
+        return True
+    if away > options.farthest * outside or apart > options.farthest * missed:
+        return False
+    error_px = contradiction_px(views if start.poses is None else start.poses.moved(views))
+    return away <= outside + error_px and apart <= missed + error_px * _outline_share(views)
+
+
+def _outline_share(views: Views) -> float:
+    """Length of the outline over the area of the object, in pixels: median over views."""
+    shares = [
+        float(((distance := silhouette_distance_px(view.mask)) < 0).logical_and(distance > -1).sum())
+        / float((distance < 0).sum().clamp(min=1))
+        for view in views.train
+    ]
+    return float(np.median(shares))
 
 
 def _best_fit(
@@ -178,7 +203,7 @@ def _best_fit(
 
     def near(proposals: Sequence[PosedProposal]) -> list[PosedProposal]:
         bent = family.refines is not None
-        return list(proposals) if asked else [each for each in proposals if _is_near(each, config, bent=bent)]
+        return list(proposals) if asked else [each for each in proposals if _is_near(each, views, config, bent=bent)]
 
     def refit(views: Views, before: Fitted, *, anew: bool) -> Fitted | None:
         poses = before.geometry.poses
@@ -257,7 +282,7 @@ def _bends_rather(
         return False
     far = replace(config, surroundings=replace(config.surroundings, mode="off"))
     for other in FAMILIES.values():
-        near = [each for each in proposals if _is_near(each, config, bent=True)]
+        near = [each for each in proposals if _is_near(each, views, config, bent=True)]
         fitted = _first_fit(other, near, views, far) if other.refines == family.kind else None
         if fitted is not None and explains_clearly_more(views, fitted.geometry, geometry, config):
             return True

@@ -13,7 +13,11 @@ class SelectionOptions:
     largest_silhouette_px: NonNegative = 0.5
     """A candidate's silhouette lies at most this far from the masks' contours: median over views of the median."""
     least_overlap: Share = 0.98
-    """Its silhouette and the masks share at least this part of their union: median over views."""
+    """Its silhouette and the masks share at least this part of their union: median over views. Both are for outlines
+    that agree with each other. Where they contradict each other a candidate may be farther from them by as much."""
+    farthest: Positive = 4.0
+    """What is farther off than so many times either is not near, however much outlines contradict each other: wrong
+    cameras make them do so, too, and are turned. Not tuned."""
     bent_edge: Positive = 2.0
     """What a kind refines may be farther from the masks by this factor: its edge bends, too. Not tuned."""
     largest_error: NonNegative = 0.3

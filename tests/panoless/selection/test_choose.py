@@ -21,9 +21,10 @@ from panoless.reconstruct.fit import begin, fit
 from panoless.reconstruct.snapshots import SnapshotSchedule
 from panoless.selection import choose
 from panoless.selection.candidates import Candidate, Selection, Verdict
-from panoless.selection.choose import choose_geometry, least_unexplained, much_less_unexplained
+from panoless.selection.choose import _is_near, choose_geometry, least_unexplained, much_less_unexplained
 from panoless.selection.options import CorrectionOptions
 from shinypartial.core.errors import InputError
+from shinypartial.dataset.perturb.masks import wobbling
 from shinypartial.dataset.schema import Dataset
 from tests.panoless.alignment.test_search import goblet_views, wrong_turns
 from tests.support.mirror_body import body_views, ellipsoid
@@ -113,6 +114,24 @@ def test_a_flat_mirror_takes_the_plane_and_a_bent_one_in_the_same_boundary_does_
     assert (verdicts(selection)["plane"] == Verdict.REFUSED_BY_HELD_OUT_VIEWS) == (bend > 0)
     plane = getattr(geometry, "plane", None) or geometry.height_field.plane
     assert plane.normal @ NORMAL > np.cos(np.radians(0.2))
+
+
+def test_outlines_that_contradict_each_other_refuse_no_kind_for_what_they_err_by() -> None:
+    """A boundary 1.3 px beside wandering outlines is near them, beside right ones it is not; nor is one that is 9 px
+    away.
+    """
+    right = framed(0.0)
+    wandering = replace(
+        right,
+        train=tuple(
+            replace(view, mask=torch.from_numpy(wobbling(view.mask.numpy(), 2.0, np.random.default_rng(index))))
+            for index, view in enumerate(right.train)
+        ),
+    )
+    start, far = (PosedProposal(Proposal(None, away, 0.95)) for away in (1.3, 9.0))
+    for views, near in ((right, False), (wandering, True)):
+        assert _is_near(start, views, CONFIG, bent=False) == near
+        assert not _is_near(far, views, CONFIG, bent=False)
 
 
 @pytest.mark.slow

@@ -103,9 +103,21 @@ def test_the_page_is_the_same_for_the_same_results(tmp_path: Path) -> None:
     assert list(map(str, files)) == ["assets/stability-rotation.svg", "results/stability.json", "stability.md"]
     assert all((tmp_path / "a" / each).read_bytes() == (tmp_path / "b" / each).read_bytes() for each in files)
     page = (tmp_path / "a" / "stability.md").read_text()
-    assert "| development | 5 | 2 | 0.833 |" in page
+    assert "| development | fast | 5 | 2 | 0.833 |" in page
     assert "| 0.5° | 12.04 dB | 14.00 dB |" in page
     assert "error: &lt;none> \\| nothing" in page
+
+
+def test_verdicts_are_counted_by_method() -> None:
+    """The same fits by an earlier version have a row of their own, and those of the first method alone are listed."""
+    earlier = [replace(each, cell=replace(each.cell, method="before")) for each in VASE]
+    page = "\n".join(page_lines(Results(SIZE, (*VASE, *earlier)), []))
+    alone = "\n".join(page_lines(Results(SIZE, tuple(VASE)), []))
+    row = next(line for line in alone.splitlines() if line.startswith("| development | fast |"))
+    assert row in page
+    assert row.replace("| fast |", "| before |") in page
+    for line in alone[alone.index("| Verdict of fast |") :].splitlines()[:5]:
+        assert line in page
 
 
 def test_the_spread_over_seeds_is_stated() -> None:
