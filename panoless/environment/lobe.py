@@ -32,7 +32,7 @@ TEXELS_PER_WIDTH = 0.88
 """A blur works on the coarsest map whose mean texels are no wider than its standard deviation over this."""
 CUT = 3.0
 """Standard deviations where a blur ends."""
-_Pair = tuple[Any, Any]
+_Pair = tuple[Any, ...]
 
 
 def lobe_weights(roughness: float, by_cosine: bool = False) -> Float[np.ndarray, "K"]:
@@ -87,16 +87,15 @@ class _Blur:
             coarse = _Product.apply(pair, rows.flatten(0, 2)).view(rows.shape).permute(0, 3, 1, 2).contiguous()
         return coarse
 
-    def _matrix_pair(self, device: torch.device) -> "_Pair":
+    def _matrix_pair(self, device: torch.device) -> _Pair:
         """The matrix and its transpose, scipy's on the CPU and torch's elsewhere."""
         if device not in self._pairs:
-            matrix = self.matrix if device.type == "cpu" else _torch_matrix(self.matrix, device)
-            transpose = self.matrix.T if device.type == "cpu" else _torch_matrix(self.matrix.T, device)
-            self._pairs[device] = matrix, transpose
+            pair = self.matrix, self.matrix.T
+            self._pairs[device] = pair if device.type == "cpu" else tuple(_torch_matrix(each, device) for each in pair)
         return self._pairs[device]
 
     @cached_property
-    def _pairs(self) -> dict[torch.device, "_Pair"]:
+    def _pairs(self) -> dict[torch.device, _Pair]:
         return {}
 
     def gathered(self, image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "6 C L L"]:

@@ -92,10 +92,8 @@ def carve_hull(views: Views, resolution: int, votes: float, options: FirstSurfac
     cameras are a little off, m is the least with which half of them meet it; but for `votes` of 1, with which all views
     count. Raises InputError when nothing stays, which means masks and poses contradict each other.
     """
-    outlines = [mask_distance(view) for view in views.train]
-    half_side = max(HULL_HALF_SIDE, SPARE * views.object_frame.reach)
+    outlines, half_side, pixel = _outlines_and_cube(views)
     resolution = math.ceil(resolution * half_side / HULL_HALF_SIDE)
-    pixel = float(np.median([outline.pixel for outline in outlines]))
     allowed = math.floor((1 - votes) * len(views.train))
     levels = max(0, round(math.log2(resolution / options.coarse_voxels)))
     device = outlines[0].distance_px.device
@@ -135,13 +133,19 @@ def contradiction_px(views: Views, options: FirstSurfaceOptions = DEFAULTS) -> f
     those of wrong cameras, carve it away from each other's rays: the median is about the standard deviation of what
     they err by. What all err by alike, as masks that are too large, contradicts nothing.
     """
-    outlines = [mask_distance(view) for view in views.train]
-    half_side = max(HULL_HALF_SIDE, SPARE * views.object_frame.reach)
+    outlines, half_side, pixel = _outlines_and_cube(views)
     count = math.ceil(options.coarse_voxels * half_side / HULL_HALF_SIDE)
     points = _grid_points(np.arange(count**3), count, half_side, outlines[0].distance_px.device)
     grid = largest_distances(outlines, points, 1)[0].view(count, count, count).cpu().numpy()
-    hull = Hull(grid, half_side, float(np.median([outline.pixel for outline in outlines])))
+    hull = Hull(grid, half_side, pixel)
     return max(0.0, _passed_by_px(hull, _points_on_rays(outlines, half_side, options)))
+
+
+def _outlines_and_cube(views: Views) -> tuple[list[MaskDistance], float, float]:
+    """The outlines of all views, half a side of the cube that holds the object, and the size of a pixel there."""
+    outlines = [mask_distance(view) for view in views.train]
+    half_side = max(HULL_HALF_SIDE, SPARE * views.object_frame.reach)
+    return outlines, half_side, float(np.median([outline.pixel for outline in outlines]))
 
 
 def _grid_points(
