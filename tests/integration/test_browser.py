@@ -16,6 +16,7 @@ from jaxtyping import Bool, UInt8
 
 from panoless.viewer.server import Address, open_prediction
 from shinypartial.conversion.convert import ConversionOptions, convert
+from shinypartial.conversion.light import Layout
 from shinypartial.conversion.scenes import THREE
 from shinypartial.core.color import to_display
 from shinypartial.core.sphere import latlong_directions
@@ -144,6 +145,19 @@ def drawn(page: Page) -> bool:
     return bool(page.value("!!document.querySelector('canvas')")) and len(np.unique(page.picture())) > 10
 
 
+def by_cube_map(
+    browser: Page, three: Path, prediction: Path, folder: Path, layout: Layout
+) -> UInt8[np.ndarray, "H W 3"]:
+    """What `OWN_PAGE` shows of a prediction's cube map and GLB."""
+    convert(prediction, ("cubemap", "glb"), folder / "web", ConversionOptions(layout=layout))
+    (folder / "index.html").write_text(OWN_PAGE)
+    (folder / "three").symlink_to(three)
+    with served(folder) as address:
+        browser.open(f"{address}/index.html", SIZE, SIZE)
+        browser.wait_until(lambda: browser.value("!!window.drawn") and drawn(browser), READY_WITHIN_S)
+        return browser.picture()
+
+
 def test_the_page_shows_what_blender_shows(
     browser: Page, three: Path, prediction: Path, blender: Path, tmp_path: Path
 ) -> None:
@@ -167,26 +181,14 @@ def test_cube_map_and_surface_show_what_blender_shows(
     """By the lines of the page about using the light."""
     lines = (Path(__file__).parents[2] / "docs" / "how-to" / "use-the-light.md").read_text()
     assert all(line in lines for line in OWN_PAGE.splitlines() if "web/" in line or "scene.environment" in line)
-    convert(prediction, ("cubemap", "glb"), tmp_path / "web")
-    (tmp_path / "index.html").write_text(OWN_PAGE)
-    (tmp_path / "three").symlink_to(three)
-    with served(tmp_path) as address:
-        browser.open(f"{address}/index.html", SIZE, SIZE)
-        browser.wait_until(lambda: browser.value("!!window.drawn") and drawn(browser), READY_WITHIN_S)
-        assert agreement(browser.picture(), by_blender(blender, 4.0)) > 0.99
+    assert agreement(by_cube_map(browser, three, prediction, tmp_path, "three"), by_blender(blender, 4.0)) > 0.99
 
 
 def test_cube_maps_for_other_programs_are_mirrored(
     browser: Page, three: Path, prediction: Path, blender: Path, tmp_path: Path
 ) -> None:
     """So that the tests above can fail: three.js exchanges ±x of a map in OpenGL's own layout."""
-    convert(prediction, ("cubemap", "glb"), tmp_path / "web", ConversionOptions(layout="opengl"))
-    (tmp_path / "index.html").write_text(OWN_PAGE)
-    (tmp_path / "three").symlink_to(three)
-    with served(tmp_path) as address:
-        browser.open(f"{address}/index.html", SIZE, SIZE)
-        browser.wait_until(lambda: browser.value("!!window.drawn") and drawn(browser), READY_WITHIN_S)
-        assert agreement(browser.picture(), by_blender(blender, 4.0)) < 0.98
+    assert agreement(by_cube_map(browser, three, prediction, tmp_path, "opengl"), by_blender(blender, 4.0)) < 0.98
 
 
 def test_the_viewer_shows_surface_light_and_controls(browser: Page, sphere_dataset: Dataset, tmp_path: Path) -> None:
@@ -219,7 +221,6 @@ def test_the_report_opens_whole_and_without_a_complaint(
     """On a wide and on a narrow screen: every picture is decoded, and nothing is wider than the window."""
     prediction = write_truth_prediction(tmp_path / "truth", sphere_dataset)
     evaluate(prediction)
-    browser.complaints.clear()
     with served(tmp_path) as address:
         report = write_report(prediction).relative_to(tmp_path)
         browser.open(f"{address}/{report}", width, 800)

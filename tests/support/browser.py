@@ -58,7 +58,8 @@ class Page:
             self._call(f"{domain}.enable")
 
     def open(self, url: str, width: int, height: int) -> None:
-        """Go to an address in a window of that size."""
+        """Go to an address in a window of that size; complaints of the page before are forgotten."""
+        self.complaints.clear()
         self._call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
         self._call("Page.navigate", url=url)
 
