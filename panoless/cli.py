@@ -72,6 +72,8 @@ class Fit:
             else:
                 label = FAMILIES[result.model].label
                 print(f"No snapshots: this run took {label}, whose map is solved without steps.")
+        if result.info.surroundings:
+            print(f"Surroundings: {result.info.surroundings.sentence()}")
         if result.info.verdict:
             print(f"Verdict: {result.info.verdict.sentence()}")
         if viewer is not None:

@@ -6,17 +6,18 @@ mean of what its rays ask for, and only the rest moves the walls: k ← k − (B
 """
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from panoless.environment.following import FollowingMap
 from panoless.environment.mirrored import radiance_of, slopes_of
 from panoless.environment.options import SurroundingsOptions
 from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
-from panoless.environment.surroundings import Surroundings
+from panoless.environment.surroundings import FAR, Floor, Surroundings
 from panoless.numeric.gauss_newton import damped_step
 from panoless.numeric.robust import bounded_error, robust_weight
 
@@ -37,27 +38,31 @@ class LeavingRays:
 
 @dataclass(frozen=True)
 class Linearized:
-    """The cost of rays in some surroundings, Σ w ‖(1 − Π) e‖²/2, its gradient and matrix over the coefficients."""
+    """The cost of rays in some surroundings, Σ w ‖(1 − Π) e‖²/2, its gradient and matrix over the unknowns."""
 
     cost: float
-    gradient: Float[np.ndarray, "K"]
-    matrix: Float[np.ndarray, "K K"]
+    gradient: Float[np.ndarray, "D"]
+    matrix: Float[np.ndarray, "D D"]
 
     @classmethod
     def at(
-        cls, seen: LeavingRays, surroundings: Surroundings, resolution: int, options: SurroundingsOptions
+        cls,
+        seen: LeavingRays,
+        surroundings: Surroundings,
+        resolution: int,
+        options: SurroundingsOptions,
+        free: Bool[np.ndarray, "D"] | slice = slice(None),
     ) -> "Linearized":
-        """With the map solved there."""
+        """With the map solved there; over those of the unknowns that are free."""
         rays = seen.rays(surroundings)
         directions, environment = rays.directions.numpy().astype(np.float64), solve_environment([rays], resolution)
         residual = radiance_of(environment, directions) - seen.radiance
-        rows = surroundings.rows(slopes_of(environment, directions), seen.points, seen.directions)
+        rows = surroundings.rows(slopes_of(environment, directions), seen.points, seen.directions)[..., free]
         following = FollowingMap.of(directions, robust_weight(residual, options.robust_scale), resolution)
         gradient, matrix = following.equations(rows, residual)
-        cost = options.robust_scale**2 * float(bounded_error(residual, options.robust_scale).sum()) / 2
-        return cls(cost, gradient, matrix)
+        return cls(_cost(residual, options), gradient, matrix)
 
-    def step(self, least_share: float) -> Float[np.ndarray, "K"]:
+    def step(self, least_share: float) -> Float[np.ndarray, "D"]:
         """−(H + λ)⁻¹ g, λ that share of the mean diagonal; none where no ray tells anything."""
         return damped_step(self.gradient, self.matrix, least_share)
 
@@ -66,9 +71,48 @@ class Linearized:
         return float(-self.gradient @ self.step(least_share)) / 2 / max(self.cost, 1e-30)
 
 
-def found_surroundings(seen: LeavingRays, start: Surroundings, options: SurroundingsOptions) -> Surroundings:
-    """After a step under a map of each of the resolutions."""
+def upward(rights: Float[np.ndarray, "V 3"], ups: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "3"]:
+    """Where up is, by cameras that are held level: the direction across all of their right axes, on the side of
+    their own ups.
+    """
+    up = np.linalg.eigh(rights.T @ rights)[1][:, 0]
+    return up if (ups @ up).sum() > 0 else -up
+
+
+def with_floor(
+    seen: LeavingRays, up: Float[np.ndarray, "3"], options: SurroundingsOptions
+) -> tuple[Surroundings, float]:
+    """A level disk below the object in a far world: of a grid of depths and reaches, what explains the rays best; and
+    the share of the cost in a far world that it leaves.
+    """
+
+    def cost(surroundings: Surroundings) -> float:
+        rays = seen.rays(surroundings)
+        environment = solve_environment([rays], options.floor_resolution)
+        return _cost(radiance_of(environment, rays.directions.numpy().astype(np.float64)) - seen.radiance, options)
+
+    grid = product(options.floor_depths, options.floor_reaches)
+    tried = [Surroundings(np.zeros(1), Floor(up, depth, reach)) for depth, reach in grid]
+    costs = [cost(each) for each in tried]
+    best = int(np.argmin(costs))
+    return tried[best], costs[best] / max(cost(FAR), 1e-30)
+
+
+def found_surroundings(
+    seen: LeavingRays, start: Surroundings, options: SurroundingsOptions, *, tilts: bool = False
+) -> Surroundings:
+    """After a step under a map of each of the resolutions. A floor stays level unless it `tilts`, too: wrong normals
+    ask for tilts.
+    """
     for resolution in options.resolutions:
-        step = Linearized.at(seen, start, resolution, options).step(options.least_share)
-        start = start.after(options.stretch * step)
+        free = np.ones(start.num_unknowns, bool)
+        if start.floor is not None and not tilts:
+            free[-3:-1] = False
+        change = np.zeros(start.num_unknowns)
+        change[free] = Linearized.at(seen, start, resolution, options, free).step(options.least_share)
+        start = start.after(options.stretch * change)
     return start
+
+
+def _cost(residual: Float[np.ndarray, "P C"], options: SurroundingsOptions) -> float:
+    return options.robust_scale**2 * float(bounded_error(residual, options.robust_scale).sum()) / 2

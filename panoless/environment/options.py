@@ -138,6 +138,20 @@ class SurroundingsOptions:
     """Factor of a step: it lets each texel follow by the mean of its rays, as a map does not quite."""
     least_share: float = 1e-3
     """Share of the mean diagonal that is added to the diagonal, for walls that no ray tells. Not tuned."""
+    floor: Literal["auto", "off"] = "auto"
+    """Whether what the object stands on is taken for a level disk before the walls, where held-out views gain by it."""
+    floor_depths: NonEmpty[float] = (0.45, 0.55, 0.65, 0.8, 1.0)
+    """Of what the object may stand on below its center, in radii of the object: those that are tried first."""
+    floor_reaches: NonEmpty[float] = (2.5, 4.0, 8.0)
+    """How far that may reach, in radii of the object."""
+    floor_resolution: int = 16
+    """Texels along a face side of the maps that tell which of these explains most."""
+    largest_floor_cost: float = 0.99
+    """Share of the cost in a far world that a floor has to leave, for anyone to look closer: it leaves 0.85 to 0.98
+    below vase, sculpture and the pot of a film, and 1.004 and more of far worlds of seven scenes."""
+    least_floor_gain: float = 0.02
+    """Share by which a floor has to lower the held-out error of a shape from silhouettes. That of *sculpture* filmed on
+    a board falls by 0.034: most of it is the shape's."""
     judged_rays: int = 400_000
     """About so many pixels of all views tell whether a fit in near surroundings explains more than a far one."""
     judged_resolution: int = 64

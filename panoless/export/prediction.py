@@ -45,6 +45,7 @@ from shinypartial.prediction.format import (
     SNAPSHOTS,
     Candidate,
     FoundCamera,
+    FoundFloor,
     ModelSelection,
     NearSurroundings,
     PredictionInfo,
@@ -119,7 +120,7 @@ def export_prediction(
         model_selection=_model_selection(state.selection),
         cameras=_found_cameras(dataset, state),
         verdict=state.verdict,
-        surroundings=_near_surroundings(around, state.frame),
+        surroundings=near_surroundings(around, state.frame),
         reflectance=None if state.reflectance is None else state.reflectance.tint,
         albedo=None if state.reflectance is None else state.reflectance.scattered_share,
         roughness=state.roughness,
@@ -215,12 +216,18 @@ def viewpoint_of(frame: ObjectFrame) -> Float[np.ndarray, "3"]:
     return origin if np.linalg.norm(origin) < 1 else np.zeros(3)
 
 
-def _near_surroundings(surroundings: Surroundings, frame: ObjectFrame) -> NearSurroundings | None:
+def near_surroundings(surroundings: Surroundings, frame: ObjectFrame) -> NearSurroundings | None:
     """What the prediction states of surroundings that are not far."""
     if surroundings.is_far:
         return None
-    radii = 1 / float(surroundings.coefficients[0])
-    return NearSurroundings(surroundings.kind, radii * frame.radius, radii, surroundings.coefficients.tolist())
+    inverse, level = float(surroundings.coefficients[0]), surroundings.floor
+    radii = 1 / inverse if inverse > 0 else None
+    distance = None if radii is None else radii * frame.radius
+    floor = None
+    if level is not None:
+        x, y, z = map(float, level.up)
+        floor = FoundFloor((x, y, z), level.depth * frame.radius, level.reach * frame.radius)
+    return NearSurroundings(surroundings.kind, distance, radii, surroundings.coefficients.tolist(), floor)
 
 
 def cube_to_latlong(

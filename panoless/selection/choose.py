@@ -24,7 +24,7 @@ from panoless.selection.candidates import Candidate, Selection, Verdict
 from panoless.selection.corrections import with_corrections
 from panoless.selection.fitted import Fitted, is_refined, missed_share
 from panoless.selection.held_out import Trial, held_out_errors, is_clearly_lower, train_briefly
-from panoless.selection.surroundings import brought_near, explains_clearly_more, proposed_surroundings
+from panoless.selection.surroundings import brought_near, explains_clearly_more, on_floor, proposed_surroundings
 from shinypartial.core.errors import InputError
 
 ANY = "auto"
@@ -248,20 +248,21 @@ def _fit_around(
     source, posed = _source(family), views if start.poses is None else start.poses.moved(views)
     if family.finds_poses and start.proposal.fitted is not None:
         return fit_with_poses(family, source, views, start, config)
+
+    def follow(fitted: Geometry, surroundings: Surroundings) -> Geometry | None:
+        return fit_at(family, views, start.after(fitted).in_surroundings(surroundings), config)
+
     around = proposed_surroundings(source, posed, start.proposal, config)
     if around.is_far:
         start = start if known.is_far else start.in_surroundings(FAR)
         far = fit_with_poses(family, source, views, start, config)
-        if far is None or not family.finds_poses:
-            return far
-
-        def follow(fitted: Geometry, surroundings: Surroundings) -> Geometry | None:
-            return fit_at(family, views, start.after(fitted).in_surroundings(surroundings), config)
-
-        return brought_near(views, far, follow, config)
+        return far if far is None or not family.finds_poses else brought_near(views, far, follow, config)
     around = around if known.is_far else known
     near = fit_with_poses(family, source, views, start.in_surroundings(around), config)
-    if near is None or config.surroundings.mode == "on" or not known.is_far:
+    if near is None or not known.is_far:
+        return near
+    near = on_floor(views, near, follow, config)
+    if config.surroundings.mode == "on":
         return near
     start = start if family.finds_poses else replace(start, poses=near.poses)
     far = fit_at(family, views, start.after(near).in_surroundings(FAR), config)

@@ -171,7 +171,11 @@ def _looks_like_a_focal_length(views: Views, geometry: Geometry, options: Correc
     from its cameras shows a sphere of the radius d/s as it shows a far world through a lens that is wrong by s.
     """
     coefficients, cameras = geometry.surroundings.coefficients, [np.linalg.norm(view.position) for view in views.train]
-    return len(coefficients) > 0 and bool(coefficients[0] * np.median(cameras) < 3 * options.focal.prior)
+    return (
+        geometry.surroundings.floor is None
+        and len(coefficients) > 0
+        and bool(coefficients[0] * np.median(cameras) < 3 * options.focal.prior)
+    )
 
 
 def _step_from(trial: _Trial, share: float, largest: float) -> float:

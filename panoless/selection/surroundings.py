@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from panoless.capture.views import Views, every_kth_pixel, split_held_out
 from panoless.config import FitConfig
-from panoless.environment.nearness import LeavingRays, Linearized, found_surroundings
+from panoless.environment.nearness import LeavingRays, Linearized, found_surroundings, upward, with_floor
 from panoless.environment.options import SurroundingsOptions
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
@@ -26,30 +26,66 @@ NEARER = 1e-2
 
 
 def proposed_surroundings(family: Family, views: Views, proposal: Proposal, config: FitConfig) -> Surroundings:
-    """A sphere around the proposed shape, if held-out views ask for one clearly; else a far world.
+    """A sphere around the proposed shape, or a floor below it before a sphere, if held-out views ask for one clearly;
+    else a far world.
 
-    Far worlds pay for one linearized step under a coarse map. A wrong shape may ask for a sphere, too, so a fit in it
-    has to prove itself (see `explains_clearly_more`).
+    Far worlds pay for one linearized step and a few floors under coarse maps. A wrong shape may ask for either, too,
+    so a fit in them has to prove itself (see `explains_clearly_more`).
     """
     options, geometry = config.surroundings, family.as_proposed(proposal, config)
     if options.mode == "off" or geometry is None or not np.isfinite(proposal.silhouette_px):
         return FAR
-    start = FAR.with_degree(0)
     with torch.no_grad():
-        if options.mode == "auto" and not _is_pulled(views, geometry, options):
+        if options.mode == "auto" and not _asks_for_near(views, geometry, options):
             return FAR
-        kept, held_out = split_held_out(leaving_rays(views, geometry, options.rays))
+        seen = leaving_rays(views, geometry, options.rays)
+        kept, held_out = split_held_out(seen)
         if not kept or not held_out:
             return FAR
-        found = found_surroundings(joined(kept), start, options)
-        near, far = (_errors(kept, held_out, each, options) for each in (found, FAR))
-    if options.mode == "auto" and not is_clearly_lower(near, far, config.selection):
-        return FAR
-    if found.coefficients[0] <= 0:
-        return FAR
-    return (
-        found if options.degree == 0 else found_surroundings(joined(kept), found.with_degree(options.degree), options)
-    )
+        rays = joined(kept)
+        sphere = found_surroundings(rays, FAR.with_degree(0), options)
+        if options.degree > 0:
+            sphere = found_surroundings(rays, sphere.with_degree(options.degree), options)
+        tried = [sphere] if sphere.coefficients[0] > 0 else []
+        if options.floor == "auto":
+            level, _ = with_floor(rays, _up(views), options)
+            tried.append(found_surroundings(rays, level.with_degree(options.degree), options))
+        best, of_best = FAR, _errors(kept, held_out, FAR, options)
+        for each in tried:
+            errors = _errors(kept, held_out, each, options)
+            always = options.mode == "on" and best.is_far
+            least = config.selection.least_gain if each.floor is None else options.least_floor_gain
+            if always or is_clearly_lower(errors, of_best, replace(config.selection, least_gain=least)):
+                best, of_best = each, errors
+    return best
+
+
+def on_floor(
+    views: Views, near: Geometry, follow: Callable[[Geometry, Surroundings], Geometry | None], config: FitConfig
+) -> Geometry:
+    """A fit above a floor that a shape from silhouettes told, or above that floor as the fit tells it, tilts included,
+    if held-out views are clearly better explained.
+    """
+    options = config.surroundings
+    if near.surroundings.floor is None:
+        return near
+    with torch.no_grad():
+        posed = views if near.poses is None else near.poses.moved(views)
+        kept, held_out = split_held_out(leaving_rays(posed, near, options.rays))
+        if not kept or not held_out:
+            return near
+        found = found_surroundings(joined(kept), near.surroundings, options, tilts=True)
+        of_found, before = (_errors(kept, held_out, each, options) for each in (found, near.surroundings))
+    if not is_clearly_lower(of_found, before, config.selection):
+        return near
+    again = follow(near, found)
+    return again if again is not None and explains_clearly_more(views, again, near, config) else near
+
+
+def _up(views: Views) -> Float[np.ndarray, "3"]:
+    """Where up is, if cameras were held level."""
+    rotations = np.stack([view.camera.world_to_camera[:3, :3].cpu().numpy().astype(np.float64) for view in views.train])
+    return upward(rotations[:, 0], -rotations[:, 1])
 
 
 def brought_near(
@@ -78,10 +114,24 @@ def brought_near(
 
 def _is_pulled(views: Views, geometry: Geometry, options: SurroundingsOptions) -> bool:
     """Whether a step toward near surroundings, under a coarse map and from some of the views, promises enough."""
-    some = replace(views, train=views.train[:: -(-len(views.train) // options.checked_views)])
-    rays = joined(leaving_rays(some, geometry, options.checked_rays))
+    rays = _few_rays(views, geometry, options)
     step = Linearized.at(rays, FAR.with_degree(0), options.checked_resolution, options)
     return step.pull(options.least_share) >= options.least_pull
+
+
+def _few_rays(views: Views, geometry: Geometry, options: SurroundingsOptions) -> LeavingRays:
+    some = replace(views, train=views.train[:: -(-len(views.train) // options.checked_views)])
+    return joined(leaving_rays(some, geometry, options.checked_rays))
+
+
+def _asks_for_near(views: Views, geometry: Geometry, options: SurroundingsOptions) -> bool:
+    """Whether a step toward a sphere promises enough, or a floor leaves little enough."""
+    if _is_pulled(views, geometry, options):
+        return True
+    if options.floor == "off":
+        return False
+    _, left = with_floor(_few_rays(views, geometry, options), _up(views), options)
+    return left < options.largest_floor_cost
 
 
 def explains_clearly_more(views: Views, near: Geometry, far: Geometry, config: FitConfig) -> bool:

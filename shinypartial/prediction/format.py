@@ -115,17 +115,41 @@ class Trust:
 
 
 @dataclass(frozen=True)
+class FoundFloor:
+    """The disk that the object stands on, by its plane and by how far it reaches from the foot of the object's center.
+
+    Lengths are in world units.
+    """
+
+    normal: tuple[float, float, float]
+    """Unit, in world axes, on the object's side."""
+    depth: NonNegative
+    """Of the plane below the object's center."""
+    reach: NonNegative
+
+
+@dataclass(frozen=True)
 class NearSurroundings:
     """How far away the method found what the object mirrors, where that is not infinitely far."""
 
     kind: Text
-    """What the walls are taken for, such as "sphere"."""
-    distance: NonNegative
-    """From the object's center to the walls in world units: of the mean of 1/D, if it varies."""
-    distance_radii: NonNegative
+    """What they are taken for, such as "sphere"."""
+    distance: NonNegative | None
+    """From the object's center to the walls in world units, of the mean of 1/D, if it varies; None: infinitely far."""
+    distance_radii: NonNegative | None
     """The same in radii of the object."""
     inverse_distances: list[float] = field(default_factory=list)
     """What the method describes 1/D by, in inverse radii of the object: of spheres that number alone."""
+    floor: FoundFloor | None = None
+    """Before the walls; None: there is none."""
+
+    def sentence(self) -> str:
+        """Both in words."""
+        far = self.distance is None or self.distance_radii is None
+        walls = "walls infinitely far" if far else f"walls at {self.distance:.3g} ({self.distance_radii:.3g} radii)"
+        if self.floor is None:
+            return walls
+        return f"a floor {self.floor.depth:.3g} below the center, as far as {self.floor.reach:.3g}, and {walls}"
 
 
 @dataclass(frozen=True)

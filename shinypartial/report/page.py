@@ -311,6 +311,7 @@ def _provenance(info: PredictionInfo, scores: Scores) -> list[tuple[str, str]]:
         ("protocol", scores.protocol),
         ("method", info.method),
         *([("model", info.model)] if info.model else []),
+        *([("surroundings", info.surroundings.sentence())] if info.surroundings is not None else []),
         *([("roughness", f"{info.roughness:.2g}")] if info.roughness is not None else []),
         *([("blur of the pictures", f"{info.blur_px:.2g} px")] if info.blur_px is not None else []),
     ]

@@ -363,10 +363,10 @@ class Solution:
 
     def _beside_shared(self) -> Beside:
         """Coefficients of the surroundings, and then unknowns of the lens. The prior of the former only damps."""
-        around, options = self.surface.surroundings.coefficients, self.task.options
+        around, options = len(self.surface.surroundings.coefficients), self.task.options
         photographs, silhouettes = self.photographs, self.silhouettes
-        seen = [self.surface.surroundings.rows(self.slopes, self.points, self.sights.mirrored)]
-        outlined = [np.zeros((*silhouettes.residual.shape, len(around)))]
+        seen = [self.surface.surroundings.rows(self.slopes, self.points, self.sights.mirrored)[..., :around]]
+        outlined = [np.zeros((*silhouettes.residual.shape, around))]
         if self.lens is not None:
             rays = self.rays, concatenated(list(self._silhouette_rays))
             for found, of, by_pose in zip((seen, outlined), rays, self.pose_rows, strict=True):
@@ -380,8 +380,8 @@ class Solution:
         matrix = np.einsum("pck,p,pcl->kl", rows, photographs.weights, beyond) + of_silhouettes.blocks(1)[0]
         least = options.least_surroundings_share * max(float(np.trace(matrix)), 1e-30)
         of_lens = (np.zeros(0), np.zeros(0)) if self.lens is None else (self._lens_precision, self.lens.values)
-        precision = np.diag(np.append([least] * len(around), of_lens[0]))[None]
-        value = np.append([0.0] * len(around), of_lens[1])
+        precision = np.diag(np.append([least] * around, of_lens[0]))[None]
+        value = np.append([0.0] * around, of_lens[1])
         of_photographs = BlockRows(np.zeros(len(photographs.weights), int), rows, photographs.weights)
         return Beside(of_photographs, of_silhouettes, value[None], precision, matrix + precision)
 
@@ -420,7 +420,7 @@ class Solution:
         poses = None if self.poses is None else self.poses.after(moved.pop(0))
         shared = moved[0][0] if moved else np.zeros(0)
         if not surface.surroundings.is_far:
-            around = surface.surroundings.after(shared[: len(surface.surroundings.coefficients)])
+            around = surface.surroundings.after_walls(shared[: len(surface.surroundings.coefficients)])
             surface = replace(surface, surroundings=around)
         lens = None if self.lens is None else self.lens.after(shared[-len(self.lens.values) :])
         rounds = self.task.options.map_rounds

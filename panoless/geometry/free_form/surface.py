@@ -153,7 +153,7 @@ class LevelSet:
 
     def scaled(self, factor: float) -> "LevelSet":
         """The surface and what it stands in, so many times as large."""
-        around = Surroundings(self.surroundings.coefficients / factor)
+        around = self.surroundings.scaled(factor)
         return LevelSet(self.low * factor, self.spacing * factor, self.coefficients, around)
 
     def taken_back(self, common: Similarity) -> "LevelSet":

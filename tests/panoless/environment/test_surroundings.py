@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
-from panoless.environment.nearness import LeavingRays, Linearized, found_surroundings
+from panoless.environment.nearness import LeavingRays, Linearized, found_surroundings, upward, with_floor
 from panoless.environment.options import SurroundingsOptions
-from panoless.environment.surroundings import FAR, Surroundings, harmonics
+from panoless.environment.surroundings import FAR, Floor, Surroundings, harmonics
 from panoless.geometry.base import from_plain, to_plain
 from panoless.geometry.revolution.model import SurfaceOfRevolution
 from tests.support.mirror_revolution import goblet
@@ -16,6 +16,9 @@ from tests.support.synthetic_dataset import environment_radiance
 
 SPHERE = Surroundings(np.array([0.2]))
 WALLS = Surroundings(np.array([0.2, 0.01, -0.02, 0.015, 0.01, -0.005, 0.01, 0.005, 0.02]))
+LEANING = np.array([0.1, -0.05, 1.0]) / np.linalg.norm([0.1, -0.05, 1.0])
+FLOOR = Floor(LEANING, 0.8, 2.5)
+BELOW = Surroundings(np.array([0.2]), FLOOR)
 OPTIONS = SurroundingsOptions()
 
 
@@ -122,3 +125,106 @@ def test_a_surface_keeps_its_surroundings_on_disk_and_older_ones_are_far() -> No
     )
     del content["surroundings"]
     assert from_plain(SurfaceOfRevolution, content).surroundings.is_far
+
+
+def met_floor(
+    points: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"], floor: Floor
+) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P"]]:
+    """Where lines meet its plane, by a linear system, and the distance of that from the middle of the disk; infinite
+    where rays go up.
+    """
+    places = np.empty_like(points)
+    for index, (point, way) in enumerate(zip(points, directions, strict=True)):
+        first = np.cross(way, np.eye(3)[np.abs(way).argmin()])
+        across = np.stack([first, np.cross(way, first), floor.up])
+        places[index] = np.linalg.solve(across, [*(across[:2] @ point), -floor.depth])
+    away = np.linalg.norm(places + floor.depth * floor.up, axis=1)
+    return places, np.where(directions @ floor.up < 0, away, np.inf)
+
+
+def above_floor(count: int, seed: int = 1) -> Float[np.ndarray, "P 3"]:
+    return 0.75 * inside(count, seed)
+
+
+def test_a_floor_is_looked_up_where_rays_meet_it_and_walls_elsewhere() -> None:
+    points, directions = above_floor(2000), unit(2000)
+    places, away = met_floor(points, directions, FLOOR)
+    met = away < FLOOR.reach
+    assert 500 < met.sum() < 1000
+    found = BELOW.looked_up(points, directions)
+    np.testing.assert_allclose(found[met], places[met] / np.linalg.norm(places[met], axis=1, keepdims=True), atol=1e-12)
+    np.testing.assert_array_equal(found[~met], SPHERE.looked_up(points, directions)[~met])
+    inverse = BELOW.inverse_distance_from(points[0], directions)
+    places, away = met_floor(np.tile(points[0], (2000, 1)), directions, FLOOR)
+    met = away < FLOOR.reach
+    np.testing.assert_allclose(1 / inverse[met], np.linalg.norm(places[met] - points[0], axis=1), rtol=1e-9)
+    np.testing.assert_array_equal(inverse[~met], SPHERE.inverse_distance_from(points[0], directions)[~met])
+
+
+def test_light_from_the_floor_changes_as_rows_and_slopes_say() -> None:
+    points, directions = above_floor(400), unit(400)
+    _, away = met_floor(points, directions, FLOOR)
+    kept = np.abs(away - FLOOR.reach) > 0.1
+    kept &= np.abs(directions @ FLOOR.up) > 0.05
+    points, directions = points[kept], directions[kept]
+    looked_up = BELOW.looked_up(points, directions)
+    across = unit(len(points), 3) - (unit(len(points), 3) * looked_up).sum(1, keepdims=True) * looked_up
+    step, turned = 1e-6, np.cross(unit(len(points), 5), directions)
+
+    def moved(sign: int) -> Float[np.ndarray, "P 3"]:
+        way = directions + sign * step * turned
+        return BELOW.looked_up(points, way / np.linalg.norm(way, axis=1, keepdims=True))
+
+    expected = ((moved(1) - moved(-1)) / (2 * step) * across).sum(1)
+    found = (BELOW.slopes_by_mirrored(across[:, None], points, directions)[:, 0] * turned).sum(1)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    rows = BELOW.rows(across[:, None], points, directions)[:, 0]
+    assert rows.shape[1] == BELOW.num_unknowns == 4
+    for number, change in enumerate(np.eye(4)):
+        ahead, behind = (BELOW.after(sign * step * change).looked_up(points, directions) for sign in (1, -1))
+        expected = ((ahead - behind) / (2 * step) * across).sum(1)
+        np.testing.assert_allclose(rows[:, number], expected, atol=1e-5)
+
+
+def test_a_scaled_room_is_looked_up_alike() -> None:
+    points, directions = above_floor(200), unit(200)
+    np.testing.assert_allclose(
+        BELOW.scaled(0.9).looked_up(0.9 * points, directions), BELOW.looked_up(points, directions), atol=1e-12
+    )
+
+
+def test_a_floor_is_found_by_what_is_mirrored() -> None:
+    """Depth within 1 %, the tilt that cameras did not tell within 0.3°, and the walls behind within 5 %."""
+    points, directions = above_floor(20_000), unit(20_000)
+    light = environment_radiance(BELOW.looked_up(points, directions)).clip(0, 1)
+    seen, options = LeavingRays(points, directions, light), replace(OPTIONS, resolutions=(16, 16, 16, 32, 32, 32, 32))
+    level, left = with_floor(seen, np.array([0.0, 0.0, 1.0]), options)
+    assert left < options.largest_floor_cost
+    flat = found_surroundings(seen, level, options)
+    assert flat.floor is not None
+    np.testing.assert_allclose(flat.floor.up, [0, 0, 1], atol=1e-12)
+    found = found_surroundings(seen, flat, options, tilts=True)
+    assert found.floor is not None
+    assert found.floor.depth == pytest.approx(FLOOR.depth, rel=0.01)
+    assert np.degrees(np.arccos(found.floor.up @ LEANING)) < 0.3
+    assert found.coefficients[0] == pytest.approx(0.2, rel=0.05)
+
+
+@pytest.mark.parametrize("radius", [None, 5.0])
+def test_a_world_without_a_floor_asks_for_none(radius: float | None) -> None:
+    _, left = with_floor(seen_in(radius), np.array([0.0, 0.0, 1.0]), OPTIONS)
+    assert left > OPTIONS.largest_floor_cost
+
+
+def test_up_is_across_the_right_axes_of_level_cameras() -> None:
+    turns, leans = np.random.default_rng(0).uniform(-1, 1, (2, 12))
+    rights = np.stack([np.cos(turns), np.sin(turns), np.zeros(12)], 1)
+    ahead = np.stack([-np.sin(turns) * np.cos(leans), np.cos(turns) * np.cos(leans), np.sin(leans)], 1)
+    np.testing.assert_allclose(upward(rights, np.cross(rights, ahead)), [0, 0, 1], atol=1e-12)
+
+
+def test_a_floor_is_kept_on_disk() -> None:
+    kept = from_plain(SurfaceOfRevolution, to_plain(replace(goblet(), surroundings=BELOW))).surroundings.floor
+    assert kept is not None
+    np.testing.assert_array_equal(kept.up, FLOOR.up)
+    assert (kept.depth, kept.reach) == (FLOOR.depth, FLOOR.reach)

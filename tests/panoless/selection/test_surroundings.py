@@ -12,13 +12,14 @@ from panoless.capture.rays import pixel_rays, reflect
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.options import SurroundingsOptions
-from panoless.environment.surroundings import Surroundings
+from panoless.environment.surroundings import Floor, Surroundings
 from panoless.geometry.base import Geometry, Proposal
 from panoless.geometry.plane.kind import PlaneFamily
 from panoless.geometry.plane.model import Plane
+from panoless.kernels.rasterize import RasterCamera
 from panoless.selection.choose import _first_fit
-from panoless.selection.surroundings import brought_near, explains_clearly_more, proposed_surroundings
-from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
+from panoless.selection.surroundings import brought_near, explains_clearly_more, on_floor, proposed_surroundings
+from tests.support.mirror_plane import RECTANGLE, arc, camera_at, plane_of, reflecting_views
 from tests.support.synthetic_dataset import environment_radiance
 
 OPTIONS = SurroundingsOptions(rays=10_000, judged_rays=10_000, resolutions=(8, 8, 16, 16, 32, 32, 32))
@@ -26,8 +27,10 @@ CONFIG = FitConfig(surroundings=OPTIONS)
 FAR_VIEWS = reflecting_views(plane_of(RECTANGLE), arc(10, size=48))
 
 
-def in_room(view: TrainView, plane: Plane, radius: float) -> TrainView:
-    """The same view with the synthetic environment painted on a sphere about the origin."""
+def in_room(view: TrainView, plane: Plane, radius: float, depth: float | None = None) -> TrainView:
+    """The same view with the synthetic environment painted on a sphere about the origin, and on a sheet within 3 radii
+    of the point at a depth below it, where there is one.
+    """
     everything = np.arange(view.camera.height * view.camera.width)
     origins, rays = pixel_rays(view.camera, everything)
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
@@ -36,6 +39,10 @@ def in_room(view: TrainView, plane: Plane, radius: float) -> TrainView:
     half = (points * mirrored).sum(1)
     reach = np.sqrt(np.maximum(half**2 - (points**2).sum(1) + radius**2, 0))
     walls: Float[np.ndarray, "P 3"] = points + (reach - half)[:, None] * mirrored
+    if depth is not None:
+        sheet = points - ((depth + points[:, 2]) / mirrored[:, 2])[:, None] * mirrored
+        falls = (mirrored[:, 2] < 0) & (np.linalg.norm(sheet[:, :2], axis=1) < 3)
+        walls = np.where(falls[:, None], sheet, walls)
     light = environment_radiance(walls / np.linalg.norm(walls, axis=1, keepdims=True)).clip(0, 1)
     image = torch.from_numpy(light.T.reshape(view.radiance.shape)).to(view.radiance)
     return replace(view, radiance=torch.where(view.mask > 0, image, view.radiance))
@@ -53,6 +60,38 @@ def test_a_flat_mirror_in_a_room_tells_how_near_it_is() -> None:
     assert near.surroundings is found
     assert explains_clearly_more(views, near, far, CONFIG)
     assert not explains_clearly_more(views, far, near, CONFIG)
+
+
+def above() -> list[RasterCamera]:
+    """Around the mirror and held level, at three heights."""
+    places = zip(np.radians(np.linspace(-40, 40, 20)), np.radians([12.0, 25.0, 40.0] * 7), strict=False)
+    return [
+        camera_at(3.0 * np.array([np.cos(up) * np.sin(turn), -np.cos(up) * np.cos(turn), np.sin(up)]), 64)
+        for turn, up in places
+    ]
+
+
+def test_a_flat_mirror_on_a_table_tells_how_high_it_stands() -> None:
+    """Depth within 5 % at 64 px, though the disk that is taken reaches too far. Above a floor that leans by 10° a fit
+    goes on above one that leans by less than 3°.
+    """
+    plane = plane_of(RECTANGLE)
+    views = reflecting_views(plane, above())
+    views = replace(views, train=tuple(in_room(view, plane, 6.0, 0.7) for view in views.train))
+    proposal = Proposal(plane, 0.1, 1.0)
+    found = proposed_surroundings(PlaneFamily(), views, proposal, CONFIG)
+    assert found.floor is not None
+    assert found.floor.depth == pytest.approx(0.7, rel=0.05)
+    fitted = PlaneFamily().as_proposed(proposal, CONFIG)
+    assert fitted is not None
+    leaning = np.array([0.15, 0.1, 1.0]) / np.linalg.norm([0.15, 0.1, 1.0])
+    wrong = fitted.in_surroundings(replace(found, floor=replace(found.floor, up=leaning)))
+    again = on_floor(views, wrong, lambda before, around: before.in_surroundings(around), CONFIG)
+    assert again.surroundings.floor is not None
+    assert again.surroundings.floor.up[2] > np.cos(np.radians(3)) > np.cos(np.radians(10)) > leaning[2]
+    right = fitted.in_surroundings(Surroundings(np.array([1 / 6]), Floor(np.array([0.0, 0.0, 1.0]), 0.7, 3.0)))
+    assert on_floor(views, right, lambda *_: pytest.fail("nothing is gained"), CONFIG) is right
+    assert on_floor(views, fitted, lambda *_: pytest.fail("there is no floor"), CONFIG) is fitted
 
 
 def test_a_far_world_stays_far() -> None:
