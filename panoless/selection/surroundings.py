@@ -69,17 +69,20 @@ def on_floor(
     options = config.surroundings
     if near.surroundings.floor is None:
         return near
+    selection = replace(config.selection, least_gain=options.least_refined_floor_gain)
+    finer = replace(options, resolutions=options.refined_floor_resolutions)
     with torch.no_grad():
         posed = views if near.poses is None else near.poses.moved(views)
-        kept, held_out = split_held_out(leaving_rays(posed, near, options.rays))
+        kept, held_out = split_held_out(leaving_rays(posed, near, options.refined_floor_rays))
         if not kept or not held_out:
             return near
-        found = found_surroundings(joined(kept), near.surroundings, options, tilts=True)
+        found = found_surroundings(joined(kept), near.surroundings, finer, tilts=True)
         of_found, before = (_errors(kept, held_out, each, options) for each in (found, near.surroundings))
-    if not is_clearly_lower(of_found, before, config.selection):
+    if not is_clearly_lower(of_found, before, selection):
         return near
     again = follow(near, found)
-    return again if again is not None and explains_clearly_more(views, again, near, config) else near
+    better = again is not None and explains_clearly_more(views, again, near, replace(config, selection=selection))
+    return again if again is not None and better else near
 
 
 def _up(views: Views) -> Float[np.ndarray, "3"]:
