@@ -46,7 +46,7 @@ def with_moved_masks(source: Family, views: Views, fitted: Fitted, config: FitCo
     """
     options, goes_on = config.corrections, source.finds_poses
     if goes_on:
-        offset = followed_offset(views, fitted, config, refit)
+        offset = followed_offset(views, fitted, config, refit) or _pulled_offset(views, fitted, config)
     else:
         offset = find_mask_offset(source, fitted.corrections.applied(views, config), fitted, config)
     found = _moved_by(offset, views, fitted, config, refit, anew=True) if offset else None
@@ -97,6 +97,15 @@ def followed_offset(views: Views, fitted: Fitted, config: FitConfig, refit: Refi
             break
         best = farther
     return best.corrections.mask_offset_px
+
+
+def _pulled_offset(views: Views, fitted: Fitted, config: FitConfig) -> float:
+    """One wide step to where photographs pull the outlines, if they do: a shape that bent for its masks does not come
+    back by going on.
+    """
+    options, pull = config.corrections, outline_pull_px(fitted.corrections.applied(views, config), fitted.geometry)
+    doubted = not -options.doubted_inward_px <= pull <= options.doubted_outward_px
+    return float(np.copysign(options.step_px, pull)) if doubted else 0.0
 
 
 def _explains_more_than_staying(views: Views, fitted: Fitted, moved: Fitted, config: FitConfig, refit: Refit) -> bool:

@@ -216,6 +216,26 @@ def test_a_small_gain_moves_masks_where_the_pull_at_outlines_goes_with_it(
     assert ways.offset() == found
 
 
+@pytest.mark.parametrize(("pull_px", "found"), [(0.05, 2.0), (-0.05, -2.0), (0.0, 0.0), (-0.02, 0.0)])
+def test_a_shape_that_bent_for_its_masks_is_fitted_anew_where_photographs_pull_it(
+    monkeypatch: pytest.MonkeyPatch, pull_px: float, found: float
+) -> None:
+    """On from its fit nothing is gained; a fit that begins again, two pixels farther, leaves a fifth."""
+    anew_after = 100
+    ways = Followed(
+        monkeypatch,
+        lambda offset, rounds: 0.1 if (offset, rounds) == (found, anew_after) else 0.5,
+        lambda offset: 0.0 if offset else pull_px,
+    )
+
+    def refit(_views: Views, _before: Fitted, *, anew: bool) -> Fitted:
+        return ways.fitted(anew_after if anew else 1)
+
+    views = reflecting_views(MIRROR.plane, arc(3, size=16))
+    moved = mask_offset.with_moved_masks(FAMILIES["free_form"], views, ways.first, CONFIG, refit)
+    assert moved.corrections.mask_offset_px == found
+
+
 class Followed:
     """Fits that go on from one another, with errors by their masks' offset and their rounds of steps, and pulls of
     outlines by the offset.
@@ -228,7 +248,7 @@ class Followed:
         pull: Callable[[float], float] = lambda _: 0.0,
     ) -> None:
         self.compared: list[tuple[float, float]] = []
-        self.first = self._fitted(0)
+        self.first = self.fitted(0)
 
         def errors(_views: Views, before: Fitted, after: Fitted, _config: FitConfig) -> list[np.ndarray]:
             self.compared.append((before.corrections.mask_offset_px, after.corrections.mask_offset_px))
@@ -245,7 +265,7 @@ class Followed:
         monkeypatch.setattr(mask_offset, "outline_pull_px", lambda offset, _: pull(offset))
 
     @staticmethod
-    def _fitted(rounds: int) -> Fitted:
+    def fitted(rounds: int) -> Fitted:
         """The rounds stand where a proposal has its distance."""
         return Fitted(MIRROR, PosedProposal(Proposal(MIRROR.plane, rounds, 1)))
 
@@ -254,7 +274,7 @@ class Followed:
 
         def refit(_views: Views, before: Fitted, *, anew: bool) -> Fitted:
             assert not anew
-            return self._fitted(round(before.start.proposal.silhouette_px) + 1)
+            return self.fitted(round(before.start.proposal.silhouette_px) + 1)
 
         return mask_offset.followed_offset(reflecting_views(MIRROR.plane, arc(3, size=16)), self.first, CONFIG, refit)
 
