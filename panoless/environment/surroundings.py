@@ -25,6 +25,8 @@ SHARPEST = 0.6
 """Upper bound of 1/D, in inverse radii of the object: nearer walls would touch it. Not tuned."""
 LEAST_FALL = 1e-3
 """Sine of the angle at which a ray has to come down on the floor. Not tuned."""
+LEAST_DEPTH = 0.05
+"""Of a floor below the object's center, in radii of the object. Not tuned."""
 FLOOR_UNKNOWNS = 3
 ROUNDS = 4
 """Of the fixed point; its error falls by ‖x⊥‖ ‖∇κ‖ in each. Not tuned."""
@@ -54,7 +56,7 @@ class Floor:
     def after(self, step: Float[np.ndarray, "3"]) -> "Floor":
         """With the normal moved along both tilts and with another depth."""
         up = self.up + step[:2] @ self.tilts
-        return Floor(up / np.linalg.norm(up), self.depth + float(step[2]), self.reach)
+        return Floor(up / np.linalg.norm(up), max(self.depth + float(step[2]), LEAST_DEPTH), self.reach)
 
     def scaled(self, factor: float) -> "Floor":
         """As many times as large."""
@@ -144,7 +146,9 @@ class Surroundings:
         )
         along = np.sqrt(np.maximum(1 - inverse**2 * square.sum(-1), 0.0)) - inverse * (points * directions).sum(-1)
         walls = inverse / np.maximum(along, SHARPEST)
-        return walls if self.floor is None else np.maximum(walls, 1 / self.floor.distance(points, directions))
+        if self.floor is None:
+            return walls
+        return np.maximum(walls, 1 / np.maximum(self.floor.distance(points, directions), LEAST_DEPTH))
 
     def looked_up(
         self, points: Float[np.ndarray, "*P 3"], directions: Float[np.ndarray, "*P 3"]

@@ -18,7 +18,7 @@ from panoless.capture.configured import configured_views
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import raster_camera
 from panoless.config import FitConfig
-from panoless.environment.surroundings import FAR, Surroundings
+from panoless.environment.surroundings import FAR, LEAST_DEPTH, Surroundings
 from panoless.export.mesh_files import write_ply
 from panoless.export.pictures import crop_to_object, decomposition_pictures
 from panoless.export.render import Decomposition, render
@@ -80,7 +80,7 @@ def export_prediction(
     (folder / DESCRIPTION).unlink(missing_ok=True)
     remove_partial_files(folder)
     height = 2 * state.environment.shape[-1]
-    around, viewpoint = state.geometry.surroundings, viewpoint_of(state.frame)
+    around, viewpoint = state.geometry.surroundings, viewpoint_of(state.frame, state.geometry.surroundings)
     write_environment_map(folder, cube_to_latlong(state.environment, height, around, viewpoint))
     visibility = cube_to_latlong(state.visibility[:, None], height, around, viewpoint)
     write_visibility(folder, visibility[..., 0].clip(0, 1))
@@ -120,7 +120,7 @@ def export_prediction(
         model_selection=_model_selection(state.selection),
         cameras=_found_cameras(dataset, state),
         verdict=state.verdict,
-        surroundings=near_surroundings(around, state.frame),
+        surroundings=_near_surroundings(around, state.frame),
         reflectance=None if state.reflectance is None else state.reflectance.tint,
         albedo=None if state.reflectance is None else state.reflectance.scattered_share,
         roughness=state.roughness,
@@ -208,15 +208,16 @@ def _render_frame(
     return render(state.geometry, environment, camera, state.frame, config, state.reflectance)
 
 
-def viewpoint_of(frame: ObjectFrame) -> Float[np.ndarray, "3"]:
-    """From where maps are exported, in the object frame: the world's origin if it lies within the object's ball, as
-    the prediction format has it, else the object's center. It matters in near surroundings only.
+def viewpoint_of(frame: ObjectFrame, surroundings: Surroundings = FAR) -> Float[np.ndarray, "3"]:
+    """From where maps are exported, in the object frame: the world's origin if it lies within the object's ball and
+    above its floor, as the prediction format has it, else the object's center. It matters in near surroundings only.
     """
-    origin = -frame.center / frame.radius
-    return origin if np.linalg.norm(origin) < 1 else np.zeros(3)
+    origin, floor = -frame.center / frame.radius, surroundings.floor
+    above = floor is None or origin @ floor.up + floor.depth > LEAST_DEPTH
+    return origin if np.linalg.norm(origin) < 1 and above else np.zeros(3)
 
 
-def near_surroundings(surroundings: Surroundings, frame: ObjectFrame) -> NearSurroundings | None:
+def _near_surroundings(surroundings: Surroundings, frame: ObjectFrame) -> NearSurroundings | None:
     """What the prediction states of surroundings that are not far."""
     if surroundings.is_far:
         return None

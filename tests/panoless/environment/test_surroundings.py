@@ -186,6 +186,10 @@ def test_light_from_the_floor_changes_as_rows_and_slopes_say() -> None:
         np.testing.assert_allclose(rows[:, number], expected, atol=1e-5)
 
 
+def test_a_floor_stays_below_the_center() -> None:
+    assert FLOOR.after(np.array([0.0, 0.0, -5.0])).depth > 0
+
+
 def test_a_scaled_room_is_looked_up_alike() -> None:
     points, directions = above_floor(200), unit(200)
     np.testing.assert_allclose(

@@ -15,7 +15,7 @@ from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.poses import Poses, moved_view
 from panoless.capture.rays import pose_of, raster_camera
 from panoless.capture.views import TrainView
-from panoless.environment.surroundings import Surroundings
+from panoless.environment.surroundings import Floor, Surroundings
 from panoless.export.mesh_files import write_ply
 from panoless.export.pictures import crop_to_object
 from panoless.export.prediction import PICTURES, cube_to_latlong, export_prediction, viewpoint_of
@@ -492,6 +492,10 @@ def test_a_map_of_a_near_room_is_that_of_the_world_s_origin() -> None:
     """A smooth light on a sphere about the object's center, seen from beside it: within the blur of a coarse map."""
     around, frame = Surroundings(np.array([0.25])), ObjectFrame(np.array([0.0, -0.6, 0.3]), 2.0)
     assert viewpoint_of(ObjectFrame(np.array([5.0, 0.0, 0.0]), 2.0)).tolist() == [0, 0, 0]
+    standing = ObjectFrame(np.array([0.0, 0.0, 1.5]), 2.0)
+    assert viewpoint_of(standing).tolist() == [0, 0, -0.75]
+    on_table = Surroundings(np.zeros(1), Floor(np.array([0.0, 0.0, 1.0]), 0.75, 4.0))
+    assert viewpoint_of(standing, on_table).tolist() == [0, 0, 0]
     viewpoint = viewpoint_of(frame)
     cube = cubemap_directions(32).movedim(-1, 1)
     found = cube_to_latlong(cube, 16, around, viewpoint)
