@@ -5,9 +5,12 @@
     result = panoless.fit("datasets/vase-400")
     result.environment, result.visibility, result.model, result.normals(0)
 
-Importing this package loads no torch and no numpy; its functions do when they are first asked for.
+Importing this package loads no torch and no numpy; its functions do when they are first asked for. It gives numpy's
+OpenBLAS a single thread unless `OPENBLAS_NUM_THREADS` says otherwise: a fit solves very many small systems, over which
+two threads wait for each other most of the time.
 """
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +18,8 @@ if TYPE_CHECKING:
     from panoless.api import Reconstruction, fit, load
     from panoless.config import FitConfig
     from panoless.presets import PRESETS
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 __version__ = "0.1.0"
 __all__ = ["PRESETS", "FitConfig", "Reconstruction", "fit", "load"]

@@ -179,3 +179,12 @@ def test_the_block_of_readme_gives_good_maps_of_the_bundled_vase(
     assert scores.environment.as_predicted.full.psnr_linear > 26
     assert scores.normals is not None
     assert scores.normals.median_angular_error_deg < 0.15
+
+
+@pytest.mark.parametrize(("given", "found"), [(None, "1"), ("3", "3")])
+def test_openblas_gets_one_thread_unless_told_otherwise(given: str | None, found: str) -> None:
+    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    environment |= {} if given is None else {"OPENBLAS_NUM_THREADS": given}
+    told = "import os, panoless; print(os.environ['OPENBLAS_NUM_THREADS'])"
+    said = subprocess.run([sys.executable, "-c", told], env=environment, capture_output=True, text=True, check=True)
+    assert said.stdout.strip() == found
