@@ -107,7 +107,7 @@ def found_surroundings(
     for resolution in options.resolutions:
         free = np.ones(start.num_unknowns, bool)
         if start.floor is not None and not tilts:
-            free[-3:-1] = False
+            free[len(start.coefficients) : -1] = False
         change = np.zeros(start.num_unknowns)
         change[free] = Linearized.at(seen, start, resolution, options, free).step(options.least_share)
         start = start.after(options.stretch * change)

@@ -34,7 +34,12 @@ def masks_are_doubted(views: Views, geometry: Geometry, errors: Float[np.ndarray
     goes_on = FAMILIES[geometry.kind].finds_poses
     if errors.mean() > (config.selection.explained_error if goes_on else options.largest_error):
         return True
-    return not -options.doubted_inward_px <= outline_pull_px(views, geometry) <= options.doubted_outward_px
+    return _is_doubted(outline_pull_px(views, geometry), config)
+
+
+def _is_doubted(pull_px: float, config: FitConfig) -> bool:
+    """Whether photographs pull outlines farther off the masks than off right ones."""
+    return not -config.corrections.doubted_inward_px <= pull_px <= config.corrections.doubted_outward_px
 
 
 def with_moved_masks(source: Family, views: Views, fitted: Fitted, config: FitConfig, refit: Refit) -> Fitted:
@@ -103,9 +108,8 @@ def _pulled_offset(views: Views, fitted: Fitted, config: FitConfig) -> float:
     """One wide step to where photographs pull the outlines, if they do: a shape that bent for its masks does not come
     back by going on.
     """
-    options, pull = config.corrections, outline_pull_px(fitted.corrections.applied(views, config), fitted.geometry)
-    doubted = not -options.doubted_inward_px <= pull <= options.doubted_outward_px
-    return float(np.copysign(options.step_px, pull)) if doubted else 0.0
+    pull = outline_pull_px(fitted.corrections.applied(views, config), fitted.geometry)
+    return float(np.copysign(config.corrections.step_px, pull)) if _is_doubted(pull, config) else 0.0
 
 
 def _explains_more_than_staying(views: Views, fitted: Fitted, moved: Fitted, config: FitConfig, refit: Refit) -> bool:

@@ -105,7 +105,8 @@ def brought_near(
     if options.mode == "off":
         return far
     with torch.no_grad():
-        if not _is_pulled(views if far.poses is None else far.poses.moved(views), far, options):
+        posed = views if far.poses is None else far.poses.moved(views)
+        if not _is_pulled(_few_rays(posed, far, options), options):
             return far
     while inverse < SHARPEST:
         near = follow(best, Surroundings(np.array([inverse])))
@@ -115,26 +116,24 @@ def brought_near(
     return best
 
 
-def _is_pulled(views: Views, geometry: Geometry, options: SurroundingsOptions) -> bool:
-    """Whether a step toward near surroundings, under a coarse map and from some of the views, promises enough."""
-    rays = _few_rays(views, geometry, options)
-    step = Linearized.at(rays, FAR.with_degree(0), options.checked_resolution, options)
-    return step.pull(options.least_share) >= options.least_pull
-
-
 def _few_rays(views: Views, geometry: Geometry, options: SurroundingsOptions) -> LeavingRays:
+    """Of some of the views: those that tell whether to look closer."""
     some = replace(views, train=views.train[:: -(-len(views.train) // options.checked_views)])
     return joined(leaving_rays(some, geometry, options.checked_rays))
 
 
+def _is_pulled(rays: LeavingRays, options: SurroundingsOptions) -> bool:
+    """Whether a step toward near surroundings, under a coarse map, promises enough."""
+    step = Linearized.at(rays, FAR.with_degree(0), options.checked_resolution, options)
+    return step.pull(options.least_share) >= options.least_pull
+
+
 def _asks_for_near(views: Views, geometry: Geometry, options: SurroundingsOptions) -> bool:
     """Whether a step toward a sphere promises enough, or a floor leaves little enough."""
-    if _is_pulled(views, geometry, options):
+    rays = _few_rays(views, geometry, options)
+    if _is_pulled(rays, options):
         return True
-    if options.floor == "off":
-        return False
-    _, left = with_floor(_few_rays(views, geometry, options), _up(views), options)
-    return left < options.largest_floor_cost
+    return options.floor == "auto" and with_floor(rays, _up(views), options)[1] < options.largest_floor_cost
 
 
 def explains_clearly_more(views: Views, near: Geometry, far: Geometry, config: FitConfig) -> bool:

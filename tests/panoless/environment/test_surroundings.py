@@ -76,6 +76,19 @@ def test_harmonics_are_polynomials_in_the_order_of_stored_coefficients() -> None
         np.testing.assert_allclose(harmonics(unit(100), count), expected[:, :count], atol=1e-14)
 
 
+def by_turns(
+    around: Surroundings,
+    points: Float[np.ndarray, "P 3"],
+    directions: Float[np.ndarray, "P 3"],
+    turned: Float[np.ndarray, "P 3"],
+    step: float,
+) -> Float[np.ndarray, "P 3"]:
+    """Differences of ω′ by turns of ω."""
+    ways = [directions + sign * step * turned for sign in (1, -1)]
+    ahead, behind = (around.looked_up(points, way / np.linalg.norm(way, axis=1, keepdims=True)) for way in ways)
+    return (ahead - behind) / (2 * step)
+
+
 def test_light_changes_with_direction_and_distance_as_rows_say() -> None:
     """Of linear light a·ω′ differences are derivatives: by mirrored directions for a sphere, by its distance, too."""
     points, directions, slope = inside(50), unit(50), np.array([0.3, -0.5, 0.7])
@@ -83,12 +96,7 @@ def test_light_changes_with_direction_and_distance_as_rows_say() -> None:
     across = slope - (looked_up @ slope)[:, None] * looked_up
     turned = np.cross(unit(50, 5), directions)
     step = 1e-5
-
-    def moved(sign: int) -> Float[np.ndarray, "P 3"]:
-        way = directions + sign * step * turned
-        return SPHERE.looked_up(points, way / np.linalg.norm(way, axis=1, keepdims=True))
-
-    expected = ((moved(1) - moved(-1)) / (2 * step) * across).sum(1)
+    expected = (by_turns(SPHERE, points, directions, turned, step) * across).sum(1)
     found = (SPHERE.slopes_by_mirrored(across[:, None], points, directions)[:, 0] * turned).sum(1)
     np.testing.assert_allclose(found, expected, atol=1e-8)
     nearer, farther = (SPHERE.after(np.array([sign * step])).looked_up(points, directions) for sign in (1, -1))
@@ -170,12 +178,7 @@ def test_light_from_the_floor_changes_as_rows_and_slopes_say() -> None:
     looked_up = BELOW.looked_up(points, directions)
     across = unit(len(points), 3) - (unit(len(points), 3) * looked_up).sum(1, keepdims=True) * looked_up
     step, turned = 1e-6, np.cross(unit(len(points), 5), directions)
-
-    def moved(sign: int) -> Float[np.ndarray, "P 3"]:
-        way = directions + sign * step * turned
-        return BELOW.looked_up(points, way / np.linalg.norm(way, axis=1, keepdims=True))
-
-    expected = ((moved(1) - moved(-1)) / (2 * step) * across).sum(1)
+    expected = (by_turns(BELOW, points, directions, turned, step) * across).sum(1)
     found = (BELOW.slopes_by_mirrored(across[:, None], points, directions)[:, 0] * turned).sum(1)
     np.testing.assert_allclose(found, expected, atol=1e-5)
     rows = BELOW.rows(across[:, None], points, directions)[:, 0]
