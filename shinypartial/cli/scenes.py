@@ -11,7 +11,7 @@ import tyro
 class CameraOptions:
     """The camera path, in the keys of the recipe's [camera]; what is not given is the recipe's."""
 
-    path: Literal["arc", "plus", "golden_spiral", "zigzag", "diamond"] | None = None
+    path: Literal["arc", "plus", "golden_spiral", "zigzag", "diamond", "around"] | None = None
     """Kind of path."""
     radius: float | None = None
     """Distance from the target in scene units; for a plus, that of its middle."""

@@ -1,4 +1,4 @@
-"""Camera paths confined to one hemisphere, and which of their views are for training."""
+"""Camera paths confined to one hemisphere, or all around, and which of their views are for training."""
 
 import math
 from dataclasses import dataclass
@@ -11,8 +11,10 @@ from msgspec import Meta
 from shinypartial.core.camera import Camera, look_at
 from shinypartial.core.errors import InputError
 
-PathKind = Literal["arc", "plus", "golden_spiral", "zigzag", "diamond"]
+PathKind = Literal["arc", "plus", "golden_spiral", "zigzag", "diamond", "around"]
 PATHS = get_args(PathKind)
+#: The path that no hemisphere holds.
+AROUND: PathKind = "around"
 #: The paths that `sweeps` shapes.
 SWEPT_PATHS = ("arc", "zigzag", "diamond")
 Placement = Literal["interleaved", "random"]
@@ -43,7 +45,7 @@ class CameraPath:
     """A path on the side of the object that is photographed; all cameras look at one point."""
 
     path: PathKind = "arc"
-    """Kind of path: `arc`, `plus`, `golden_spiral`, `zigzag` or `diamond`."""
+    """Kind of path: `arc`, `plus`, `golden_spiral`, `zigzag`, `diamond`, or `around` the object from all sides."""
     radius: Annotated[float, limits(1e-3, 1e6)] = 3.2
     """Distance from the target in scene units; for `plus` that of its middle, from which the lines lead away."""
     target: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
@@ -51,7 +53,7 @@ class CameraPath:
     facing_azimuth_deg: Annotated[float, limits(-360.0, 360.0)] = -90.0
     """Azimuth of the hemisphere's axis, from +X toward +Y: the side of the object that is photographed."""
     azimuth_deg: tuple[AzimuthDeg, AzimuthDeg] = (-75.0, 75.0)
-    """First and last azimuth relative to the facing one."""
+    """First and last azimuth relative to the facing one; `around` takes all."""
     elevation_deg: tuple[ElevationDeg, ElevationDeg] = (-10.0, 50.0)
     """First and last elevation from the horizon."""
     sweeps: Annotated[int, limits(1, 10_000)] = 5
@@ -87,7 +89,8 @@ class Trajectory:
 
     train: tuple[Camera, ...]
     test: tuple[Camera, ...]
-    hemisphere_axis: Float[np.ndarray, "3"]
+    hemisphere_axis: Float[np.ndarray, "3"] | None
+    """None for cameras from all sides."""
     target: Float[np.ndarray, "3"]
 
 
@@ -97,9 +100,10 @@ def plan_cameras(spec: CameraPath, resolution: int) -> Trajectory:
     Raises InputError when a camera leaves the open hemisphere about the facing direction, or looks straight down or up.
     """
     count = spec.train + spec.test
-    target, axis = np.array(spec.target), hemisphere_axis(spec)
+    target, axis = np.array(spec.target), None if spec.path == AROUND else hemisphere_axis(spec)
     positions = target + path_offsets(spec, count)
-    check_hemisphere(positions - target, axis)
+    if axis is not None:
+        check_hemisphere(positions - target, axis)
     focal = spec.lens_mm / spec.sensor_mm * resolution
     middle = resolution / 2
     cameras = [
@@ -121,6 +125,7 @@ def path_offsets(spec: CameraPath, count: int) -> Float[np.ndarray, "V 3"]:
         "golden_spiral": golden_spiral_angles_deg,
         "zigzag": zigzag_angles_deg,
         "diamond": diamond_angles_deg,
+        "around": around_angles_deg,
     }[spec.path](spec, count)
     return spec.radius * unit_vectors(angles + np.array([spec.facing_azimuth_deg, 0.0]))
 
@@ -201,6 +206,17 @@ def diamond_angles_deg(spec: CameraPath, count: int) -> Float[np.ndarray, "V 2"]
     # |x| + |y| = 1 at every part of the way round: both are triangle waves, a quarter turn apart.
     wave = np.stack([np.abs((corner + shift) % 4 - 2) - 1 for shift in (0.0, 3.0)], -1)
     return _from_unit_square(spec, wave * (sizes[ring] / spec.sweeps)[:, None])
+
+
+def around_angles_deg(spec: CameraPath, count: int) -> Float[np.ndarray, "V 2"]:
+    """From the lower elevation to the higher one, a golden angle on each time, evenly over that belt of the sphere.
+
+    The first camera stands at the facing azimuth.
+    """
+    low, high = np.sin(np.radians(spec.elevation_deg))
+    heights = low + (high - low) * (np.arange(count) + 0.5) / count
+    azimuths = np.degrees(np.arange(count) * GOLDEN_ANGLE_RAD) % 360
+    return np.stack([azimuths, np.degrees(np.arcsin(heights))], -1)
 
 
 def _from_unit_square(spec: CameraPath, points: Float[np.ndarray, "V 2"]) -> Float[np.ndarray, "V 2"]:

@@ -42,7 +42,8 @@ def plot_cameras(path: Path, trajectory: Trajectory) -> None:
     """Write a PNG with two views, training and test cameras in two colors and a tick along each viewing direction.
 
     The object's place is marked, and the great circle that bounds the hemisphere is drawn at the distance of the
-    farthest camera. The side view looks along the horizontal direction at right angles to the hemisphere's axis.
+    farthest camera. The side view looks along the horizontal direction at right angles to the hemisphere's axis, or
+    along +Y where cameras stand all around.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -50,7 +51,8 @@ def plot_cameras(path: Path, trajectory: Trajectory) -> None:
 
     figure = Figure(figsize=SIZE_INCHES, dpi=DOTS_PER_INCH, layout="constrained")
     canvas = FigureCanvasAgg(figure)
-    views = (top_view(), side_view(trajectory.hemisphere_axis))
+    axis = trajectory.hemisphere_axis
+    views = (top_view(), side_view(np.array([1.0, 0.0, 0.0]) if axis is None else axis))
     for view, axes in zip(views, figure.subplots(1, 2), strict=True):
         _draw(axes, view, trajectory)
     handles, labels = axes.get_legend_handles_labels()
@@ -89,8 +91,9 @@ def _draw(axes: Any, view: PlotView, trajectory: Trajectory) -> None:
     cameras = (*trajectory.train, *trajectory.test)
     target = trajectory.target
     distance = max(float(np.linalg.norm(camera.position_world - target)) for camera in cameras)
-    boundary = view.project(target + hemisphere_boundary(trajectory.hemisphere_axis, distance))
-    axes.plot(*boundary.T, color=BOUNDARY_COLOR, linewidth=1, label="hemisphere boundary")
+    if trajectory.hemisphere_axis is not None:
+        boundary = view.project(target + hemisphere_boundary(trajectory.hemisphere_axis, distance))
+        axes.plot(*boundary.T, color=BOUNDARY_COLOR, linewidth=1, label="hemisphere boundary")
     _draw_split(axes, view, trajectory.test, distance, f"test ({len(trajectory.test)})", TEST_COLOR)
     _draw_split(axes, view, trajectory.train, distance, f"train ({len(trajectory.train)})", TRAIN_COLOR)
     axes.plot(*view.project(target), "*", color=OBJECT_COLOR, markersize=14, label="object", linestyle="none")

@@ -209,14 +209,20 @@ def _make_frame(root: Path, entry: dict[str, Any], content: dict[str, Any]) -> F
 
 
 def _hemisphere_problems(frames: list[Frame], manifest: dict[str, Any]) -> Iterator[str]:
-    """Cameras must lie on one side of the target: that of the recipe's axis, or of their mean direction."""
+    """Cameras must lie on one side of the target: that of the recipe's axis, or of their mean direction.
+
+    A recipe whose axis is null has cameras all around.
+    """
     if not frames:
         return
     recipe = manifest.get("recipe", {})
     camera = recipe.get("camera")
     target = camera.get("target", (0, 0, 0)) if isinstance(camera, dict) else (0, 0, 0)
     offsets = np.stack([frame.camera.position_world for frame in frames]) - _vector(target)
-    axis = _vector(recipe.get("hemisphere_axis", offsets.mean(0)))
+    stated = recipe.get("hemisphere_axis", offsets.mean(0))
+    if stated is None:
+        return
+    axis = _vector(stated)
     for frame, height in zip(frames, offsets @ axis, strict=True):
         if not height > 0:
             yield f"the camera of {frame.name} lies outside the hemisphere that the recipe names"

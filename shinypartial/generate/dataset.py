@@ -83,7 +83,8 @@ def generate(spec: SceneSpec, root: Path, shots: Shots | None = None) -> Generat
     names = {"train": shots.train_name, "test": FRAME_NAME}
     frames = {split: make_frames(root, split, getattr(trajectory, split), names[split]) for split in SPLITS}
     every = [frame for split in SPLITS for frame in frames[split]]
-    begun = {**spec.recipe(), **shots.recipe, "hemisphere_axis": trajectory.hemisphere_axis.tolist()}
+    axis = trajectory.hemisphere_axis
+    begun = {**spec.recipe(), **shots.recipe, "hemisphere_axis": None if axis is None else axis.tolist()}
     recipe = _as_begun(root, begun)
     if not _is_complete(root, every):
         check_blender()

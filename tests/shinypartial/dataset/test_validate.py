@@ -223,6 +223,26 @@ def test_a_sound_dataset_breaks_nothing(sphere_dataset: Dataset) -> None:
     assert validate(sphere_dataset.root) == []
 
 
+def test_cameras_may_stand_all_around_where_the_recipe_says_so(damaged_dataset: Path) -> None:
+    """Half a turn about a line at right angles takes the first camera to the other side of the object."""
+
+    def turn(content: Any) -> None:
+        pose = np.array(first(content)["transform_matrix"])
+        across = np.cross(pose[:3, 3], pose[:3, 0])
+        across /= np.linalg.norm(across)
+        pose[:3] = (2 * np.outer(across, across) - np.eye(3)) @ pose[:3]
+        first(content)["transform_matrix"] = pose.tolist()
+
+    def outside() -> list[str]:
+        renew_checksums(damaged_dataset)
+        return [str(each) for each in validate(damaged_dataset) if "hemisphere" in str(each)]
+
+    edit_json(TRAIN, turn)(damaged_dataset)
+    assert outside()
+    edit_json("dataset.json", lambda m: m["recipe"].update(hemisphere_axis=None))(damaged_dataset)
+    assert not outside()
+
+
 @pytest.mark.parametrize(("damage", "file", "problem"), DAMAGES.values(), ids=DAMAGES.keys())
 def test_damage_is_named_with_its_file_and_a_remedy(
     damaged_dataset: Path, damage: Callable[[Path], object], file: str, problem: str
