@@ -180,7 +180,8 @@ class Capture:
     """Make a dataset of photographs or a video: poses, masks and undistorted pictures; see docs/how-to/capture.md.
 
     Poses come from a COLMAP model or a transforms.json that is there, from a printed board, or from what is seen around
-    the object. Run again to continue where an earlier run stopped.
+    the object. Without masks, a rectangle or clicks, the object is what moves against the patterned ground below it.
+    Run again to continue where an earlier run stopped.
     """
 
     source: Annotated[Path, tyro.conf.Positional]

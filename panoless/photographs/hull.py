@@ -51,6 +51,13 @@ def sighted_ball(
     return center, float(np.median(radii))
 
 
+def cube(center: Float[np.ndarray, "3"], half_side: float, count: int) -> Float[np.ndarray, "P 3"]:
+    """The middles of count³ cells of a cube, the last axis fastest."""
+    steps = (np.arange(count) + 0.5) / count * 2 - 1
+    grid: np.ndarray = center + half_side * np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1)
+    return grid.reshape(-1, 3)
+
+
 def carve(
     seen: Sequence[tuple[Camera, Bool[np.ndarray, "_ _"]]],
     center: Float[np.ndarray, "3"],
@@ -59,11 +66,10 @@ def carve(
     allowed: int = 0,
 ) -> Float[np.ndarray, "P 3"]:
     """Points of a cube of count³ that all masks but `allowed` of them contain; outside of a picture anything may be."""
-    steps = (np.arange(count) + 0.5) / count * 2 - 1
-    points = center + half_side * np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
+    points = cube(center, half_side, count)
     missed = np.zeros(len(points), np.int32)
     for camera, mask in seen:
-        rows, columns, within, depth = _pixels_of(camera, points)
+        rows, columns, within, depth = pixels_of(camera, points)
         outside = within & ~mask[np.where(within, rows, 0), np.where(within, columns, 0)]
         missed += outside | (depth <= 0)
         if not allowed:
@@ -77,7 +83,7 @@ def outline(camera: Camera, points: Float[np.ndarray, "P 3"], spacing: float) ->
     covered = np.zeros((camera.height, camera.width), np.uint8)
     if not len(points):
         return covered > 0
-    rows, columns, within, depth = _pixels_of(camera, points)
+    rows, columns, within, depth = pixels_of(camera, points)
     within &= depth > 0
     covered[rows[within], columns[within]] = 1
     # Cells are seen at any angle: closing by their diagonal leaves no gap and does not grow the whole.
@@ -85,7 +91,7 @@ def outline(camera: Camera, points: Float[np.ndarray, "P 3"], spacing: float) ->
     return cv2.morphologyEx(covered, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8)) > 0
 
 
-def _pixels_of(camera: Camera, points: Float[np.ndarray, "P 3"]) -> tuple[np.ndarray, ...]:
+def pixels_of(camera: Camera, points: Float[np.ndarray, "P 3"]) -> tuple[np.ndarray, ...]:
     """Row, column, whether that is within the picture, and depth of each point."""
     places = project(camera, points)
     columns, rows = np.floor(places[:, :2]).astype(np.int64).T

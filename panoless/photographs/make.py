@@ -10,8 +10,9 @@ import numpy as np
 
 from panoless.photographs.board import poses_from_board, recognized_board
 from panoless.photographs.frames import Frames, block_means, make_frames, source_files
+from panoless.photographs.ground import GIVE_MASKS, ground_masks
 from panoless.photographs.hull import nearest_point
-from panoless.photographs.masks import Hint, Masks, find_masks, given_mask, masks_beside, overlaps_of
+from panoless.photographs.masks import CHECK_MASKS, Hint, Masks, find_masks, given_mask, masks_beside, overlaps_of
 from panoless.photographs.models import find_model, find_transforms, read_colmap, read_transforms
 from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import PosedView, Poses, without_the_rest
@@ -161,7 +162,8 @@ def _poses(request: Request, frames: Frames, pictures: Path, work: Path) -> tupl
         if board:
             found, remedy = poses_from_board(board, frames, pictures, request.options), "Show the board in each frame."
         elif model:
-            found, remedy = read_colmap(model, frames), "Names of pictures must be those that the model knows."
+            found = read_colmap(model, frames, request.options)
+            remedy = "Names of pictures must be those that the model knows."
         elif transforms:
             found = read or read_transforms(transforms, frames)[0]
             remedy = "Names of pictures must be those of file_path."
@@ -225,12 +227,14 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
 
     def work_on() -> Masks:
         shutil.rmtree(train, ignore_errors=True)
+        own, remedy = True, CHECK_MASKS
         cameras = {view.name: view.camera for view in poses.views}
+        told = bool(given_masks or request.hints)
         for view in poses.views:
             picture = view.lens.undistorted(read_png(work / "frames" / f"{view.name}.png"))
             # A mask of its own replaces an alpha channel.
-            own = not (given_masks or request.hints)
-            write_png(train / f"{view.name}.png", picture if own else np.ascontiguousarray(picture[..., :3]))
+            write_png(train / f"{view.name}.png", np.ascontiguousarray(picture[..., :3]) if told else picture)
+            own = own and picture.shape[2] == 4
         if given_masks:
             origin = f"the model {request.segmenter.name}" if request.segmenter else "files"
             for view in poses.views:
@@ -244,10 +248,16 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
             hints = {name: hint.scaled(sides.get(name, 1)) for name, hint in request.hints.items()}
             for name, mask in find_masks(cameras, train, hints, request.options).items():
                 write_png(train / f"{name}_alpha.png", mask)
-        else:
+        elif own or poses.ground is None:
             origin = "alpha channels"
+        else:
+            origin, remedy = "what moves against the ground", GIVE_MASKS
+            found = ground_masks(cameras, train, poses.ground, work / "ground.png", request.options)
+            for name, mask in found.items():
+                write_png(train / f"{name}_alpha.png", mask)
         masks = {view.name: _written_mask(train, view) for view in poses.views}
-        overlaps = overlaps_of([(cameras[name], mask) for name, mask in masks.items()], request.options)
+        judged = [(cameras[name], mask) for name, mask in masks.items()]
+        overlaps = overlaps_of(judged, request.options, remedy)
         _write_mask_sheet(work / "masks.jpg", train, masks, dict(zip(masks, overlaps, strict=True)))
         return Masks(origin, tuple(masks), overlaps)
 
@@ -258,8 +268,7 @@ def _no_mask(view: PosedView) -> InputError:
     return InputError(
         expected=f"a mask of the object in {view.name}",
         found="none",
-        remedy="Give a folder of them (--masks), a model (--segmenter), a rectangle about the object in a frame or two "
-        "(--box X0,Y0,X1,Y1 --box-in NAME), or clicks (--clicks).",
+        remedy=GIVE_MASKS,
     )
 
 

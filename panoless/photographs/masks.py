@@ -31,6 +31,7 @@ Points = tuple[tuple[float, float], ...]
 AROUND, OBJECT, _, PERHAPS_OBJECT = range(4)
 #: Blur of an edge that GrabCut leaves as a staircase, in pixels: the line at one half stays where it was.
 EDGE_PX = 0.7
+CHECK_MASKS = "Check that masks are white on the object, and that the poses are those of these photographs."
 SEED_ITERATIONS, ITERATIONS = 5, 2
 
 
@@ -109,7 +110,11 @@ def hull_of(
     return points, spacing
 
 
-def overlaps_of(views: Sequence[tuple[Camera, Float[np.ndarray, "_ _"]]], options: CaptureOptions) -> tuple[float, ...]:
+def overlaps_of(
+    views: Sequence[tuple[Camera, Float[np.ndarray, "_ _"]]],
+    options: CaptureOptions,
+    remedy: str = CHECK_MASKS,
+) -> tuple[float, ...]:
     """Overlap of each mask with the hull of all; InputError where they contradict each other."""
     points, spacing = hull_of(views, options)
     found = tuple(overlap(mask >= MASK_LEVEL, outline(camera, points, spacing)) for camera, mask in views)
@@ -117,7 +122,7 @@ def overlaps_of(views: Sequence[tuple[Camera, Float[np.ndarray, "_ _"]]], option
         raise InputError(
             expected=f"masks and poses that agree on an object: overlap of at least {options.least_overlap:.0%}",
             found=f"{np.median(found):.0%} in the median view",
-            remedy="Check that masks are white on the object, and that the poses are those of these photographs.",
+            remedy=remedy,
         )
     return found
 

@@ -10,7 +10,8 @@ import numpy as np
 from panoless.photographs.certainty import SeenPoints
 from panoless.photographs.frames import Frames, Photograph
 from panoless.photographs.lens import INSTALL, Lens, lens_of_model
-from panoless.photographs.posed import PosedView, Poses, as_rows, lens_for, with_covariances
+from panoless.photographs.options import CaptureOptions
+from panoless.photographs.posed import PosedView, Poses, as_rows, find_ground, lens_for, with_covariances
 from shinypartial.core.conventions import PIXEL_CENTER
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.transforms import DISTORTION_FIELDS, frames_of
@@ -49,7 +50,7 @@ def is_model(folder: Path) -> bool:
     return any((folder / f"cameras{end}").exists() and (folder / f"images{end}").exists() for end in (".txt", ".bin"))
 
 
-def read_colmap(folder: Path, frames: Frames) -> Poses:
+def read_colmap(folder: Path, frames: Frames, options: CaptureOptions) -> Poses:
     """Poses of the frames that a COLMAP model knows, by the names of their files; its world is kept.
 
     Raises InputError for a folder that is no model, and for cameras with other kinds of distortion.
@@ -69,11 +70,11 @@ def read_colmap(folder: Path, frames: Frames) -> Poses:
             found=str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__,
             remedy="Export it again; cameras, images and points3D belong together.",
         ) from None
-    return poses_of(model, frames, f"the COLMAP model {folder}")
+    return poses_of(model, frames, f"the COLMAP model {folder}", options)
 
 
-def poses_of(model: Any, frames: Frames, origin: str) -> Poses:
-    """Poses of a pycolmap reconstruction."""
+def poses_of(model: Any, frames: Frames, origin: str, options: CaptureOptions) -> Poses:
+    """Poses of a pycolmap reconstruction, and the ground that its points lie on."""
     images = {image.name: image for image in model.images.values() if image.has_pose}
     views, seen = [], []
     numbers = {key: index for index, key in enumerate(model.points3D)}
@@ -95,7 +96,8 @@ def poses_of(model: Any, frames: Frames, origin: str) -> Poses:
         # COLMAP's pixel (0, 0) spans [0, 1]².
         found = np.array([point.xy for point in shown]).reshape(-1, 2) - PIXEL_CENTER
         seen.append(SeenPoints(lens, pose, which, places[which], found))
-    poses = Poses(origin, "unknown", tuple(views))
+    centers = np.array([view.camera_to_world for view in views]).reshape(-1, 4, 4)[:, :3, 3]
+    poses = Poses(origin, "unknown", tuple(views), ground=find_ground(places, centers, options) if views else None)
     return with_covariances(poses, seen, known_points=False) if all(len(each.numbers) for each in seen) else poses
 
 

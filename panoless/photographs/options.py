@@ -57,6 +57,38 @@ class CaptureOptions:
     """Share of the masks that may be left out of the hull, where the others contradict them."""
     least_filled: Share = 0.95
     """Share of the masks, in the median view, that the outline of their hull must fill. Those of *vase* have 0.99."""
+    ground_thickness: Positive = 0.005
+    """Points so near to a plane lie on it, as a share of the distance of the cameras."""
+    ground_points: Share = 0.3
+    """Share of the points of structure from motion that make a plane the ground. Not tuned."""
+    ground_side_px: Count = 640
+    """Masks by the ground are found in pictures averaged to no more than this. The numbers below were chosen on the
+    films *sculpture-board*, *chrome-ball-board* and *pot-ground*."""
+    ground_reach: Share = 0.5
+    """Half side of the square of ground that is looked at, as a share of the distance of the cameras."""
+    ground_texels: Count = 640
+    """Texels along a side of it."""
+    ground_candidates: Count = 8
+    """Views of which each texel takes the one with which most others agree."""
+    ground_difference: Share = 0.1
+    """Codes of one place of the ground differ by less, of 1, between views that agree."""
+    ground_agreeing: Count = 4
+    """So many views must agree on a texel…"""
+    ground_share: Share = 0.15
+    """…and this share of those that reach it; what the object hides in most views is known from the others."""
+    ground_window_px: Count = 7
+    """Side of the window that shows the ground, or does not."""
+    ground_noise: Positive = 0.06
+    """Contrast, in codes of 1, that a plain window counts as having."""
+    ground_match: Share = 0.1
+    """A window shows the ground where less than this share of the contrast is left."""
+    ground_steps: tuple[Positive, Positive] = (0.03, 0.07)
+    """Differences of a pixel from the ground, in codes of 1, between which the odds below hold."""
+    ground_odds: tuple[float, float, float] = (-1.3, 0.5, 4.0)
+    """Logarithms of how much likelier such a pixel is on the object: a quarter of its pixels look like the ground."""
+    ground_cleared: tuple[Share, Share, Share] = (0.12, 0.15, 0.3)
+    """A point of space is the object for sure, likely, or perhaps, where ground is seen at it in a smaller share of the
+    views. At points within the object that share is 0.02 to 0.10."""
     band: Share = 0.03
     """Half width of the band about an outline in which the edge is looked for, as a share of √area."""
     band_of_turn: Share = 0.1

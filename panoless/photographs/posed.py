@@ -41,6 +41,15 @@ class PosedView:
 
 
 @dataclass(frozen=True)
+class GroundPlane:
+    """What the object stands on: points x of the world with n · x = offset."""
+
+    normal: tuple[float, float, float]
+    """n, of length 1, toward the cameras."""
+    offset: float
+
+
+@dataclass(frozen=True)
 class Poses:
     """Poses of the frames, and of which there are none."""
 
@@ -53,6 +62,43 @@ class Poses:
     """Frames without a pose."""
     focal_error: float | None = None
     """Standard deviation of the focal length as a share of it, where it was estimated here."""
+    ground: GroundPlane | None = None
+    """The board's plane, or that of most points that poses were found from."""
+
+
+PLANES_TRIED = 1000
+
+
+def find_ground(
+    points: Float[np.ndarray, "P 3"], centers: Float[np.ndarray, "V 3"], options: CaptureOptions
+) -> GroundPlane | None:
+    """The plane near most points that has all cameras on one side, by consensus of three points each (RANSAC).
+
+    None where fewer than `ground_points` of them lie on it.
+    """
+    if len(points) < 3:
+        return None
+    reach = float(np.median(np.linalg.norm(centers - np.median(points, 0), axis=1)))
+    limit = options.ground_thickness * reach
+    first, second, third = np.random.default_rng(0).choice(points, (3, PLANES_TRIED))
+    normals = np.cross(second - first, third - first)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    offsets = np.sum(normals * first, 1)
+    heights = centers @ normals.T - offsets
+    one_sided = np.abs(np.sign(heights).sum(0)) == len(centers)
+    near = (np.abs(points @ normals.T - offsets) < limit).sum(0) * one_sided
+    best = int(np.argmax(near))
+    if near[best] < options.ground_points * len(points):
+        return None
+    normal, offset = normals[best], offsets[best]
+    for _ in range(3):
+        on = points[np.abs(points @ normal - offset) < limit]
+        middle = on.mean(0)
+        normal = np.linalg.svd(on - middle, full_matrices=False)[2][2]
+        offset = float(normal @ middle)
+    side = float(np.sign(np.median(centers @ normal - offset)))
+    east, north, up = map(float, side * normal)
+    return GroundPlane((east, north, up), side * offset)
 
 
 def as_rows(matrix: Float[np.ndarray, "N N"]) -> Rows:
@@ -80,7 +126,7 @@ def without_the_rest(poses: Poses, frames: Frames, options: CaptureOptions, reme
             found=f"{count} of {total} by {poses.origin}",
             remedy=remedy,
         )
-    return Poses(poses.origin, poses.unit, poses.views, left_out, poses.focal_error)
+    return replace(poses, left_out=left_out)
 
 
 def lens_for(photograph: Photograph, lens: Lens) -> Lens:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from panoless.photographs.frames import Frames, Photograph
 from panoless.photographs.models import poses_of, pycolmap_module
 from panoless.photographs.options import CaptureOptions
-from panoless.photographs.posed import Poses, as_rows
+from panoless.photographs.posed import GroundPlane, Poses, as_rows
 from shinypartial.core.camera import Similarity
 from shinypartial.core.errors import InputError
 from shinypartial.io.images import read_png, write_png
@@ -27,8 +27,8 @@ def poses_from_structure(
 ) -> Poses:
     """Poses of the frames in the largest model that hangs together; what masks mark is left out.
 
-    The world has no known unit; its +z is the mean of the cameras' upward directions. Raises InputError when nothing
-    matches.
+    The world has no known unit. Its +z leads away from the ground, at which z is 0, or along the cameras' mean upward
+    direction where no ground is found. Raises InputError when nothing matches.
     """
     colmap = pycolmap_module()
     shutil.rmtree(work, ignore_errors=True)
@@ -58,7 +58,7 @@ def poses_from_structure(
         )
     model = max(models.values(), key=lambda one: one.num_reg_images())
     in_frames = Frames(tuple(_as_frame(photograph) for photograph in frames.photographs))
-    return upright_world(poses_of(model, in_frames, "structure from motion"))
+    return upright_world(poses_of(model, in_frames, "structure from motion", options))
 
 
 def _as_frame(photograph: Photograph) -> Photograph:
@@ -76,16 +76,20 @@ def _write_outsides(masks: dict[str, Path], frames: Frames, folder: Path) -> Non
 
 
 def upright_world(poses: Poses) -> Poses:
-    """The same cameras in a world that is turned so that their mean upward direction is +z."""
+    """The same cameras in a world whose ground is z = 0; without a ground, their mean upward direction is +z."""
     up = -np.mean([np.array(view.camera_to_world)[:3, 1] for view in poses.views], axis=0)
-    turn = Similarity(1.0, turned_up(up / np.linalg.norm(up)), np.zeros(3))
+    shift, ground = np.zeros(3), None
+    if poses.ground is not None:
+        up, shift[2] = np.array(poses.ground.normal), -poses.ground.offset
+        ground = GroundPlane((0.0, 0.0, 1.0), 0.0)
+    turn = Similarity(1.0, turned_up(up / np.linalg.norm(up)), shift)
     views = []
     for view in poses.views:
         covariance = view.pose_covariance
         turned = None if covariance is None else as_rows(turn.pose_covariance(covariance))
         pose = as_rows(turn.pose(np.array(view.camera_to_world)))
         views.append(replace(view, camera_to_world=pose, covariance=turned))
-    return replace(poses, views=tuple(views))
+    return replace(poses, views=tuple(views), ground=ground)
 
 
 def turned_up(up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

@@ -1,0 +1,281 @@
+"""Masks without a hint, where the object stands on something flat with a pattern, such as a printed board.
+
+The plane is known, so that each photograph can be laid out on it. What the plane shows is the color on which most of
+them agree; a mirror, and all that stands above the plane, moves against it from view to view. A pixel that shows the
+plane tells that nothing is on its ray: so points of space are cleared away by votes, and what is left over is the
+object. Near its outline each view's own pixels decide.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy import ndimage
+
+from panoless.capture.masks import MAIN_SHARE, largest_pieces
+from panoless.photographs.frames import block_means
+from panoless.photographs.hull import carve, cube, nearest_point, outline, pixels_of
+from panoless.photographs.lens import opencv
+from panoless.photographs.options import CaptureOptions
+from panoless.photographs.posed import GroundPlane
+from shinypartial.core.camera import Camera
+from shinypartial.core.errors import InputError
+from shinypartial.io.files import atomic_write
+from shinypartial.io.images import read_png, write_png
+from shinypartial.io.progress import Progress
+
+GIVE_MASKS = (
+    "Give a folder of masks (--masks), a model (--segmenter), a rectangle about the object in a frame or two "
+    "(--box X0,Y0,X1,Y1 --box-in NAME), or clicks (--clicks)."
+)
+#: One texel of this many tells how bright a view is.
+SPARSE = 4
+SPECK_PX = 5
+#: A point is judged where so large a share of the views can tell.
+LEAST_ASKED = 0.3
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A square of the plane as a picture: the middle of texel (column x, row y) is first + x right + y down."""
+
+    first: Float[np.ndarray, "3"]
+    right: Float[np.ndarray, "3"]
+    down: Float[np.ndarray, "3"]
+    count: int
+
+    def to_pixels(self, camera: Camera) -> Float[np.ndarray, "3 3"]:
+        """The homography from (x, y, 1) to pixels whose centers are whole numbers, as OpenCV has them."""
+        axes = np.stack([self.right, self.down, self.first - camera.position_world], 1)
+        intrinsics = np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
+        homography: np.ndarray = intrinsics @ camera.camera_to_world[:3, :3].T @ axes
+        return homography
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the pixels of a view tell about the ground."""
+
+    camera: Camera
+    shown: Bool[np.ndarray, "H W"]
+    """Where the ground is seen for sure: in a whole window."""
+    told: Bool[np.ndarray, "H W"]
+    """Where the ground's color is known."""
+    odds: Float[np.ndarray, "H W"]
+    """Logarithm of how much likelier each pixel's color is on the object than on the ground; 0 where it isn't told."""
+
+
+def sheet_about(cameras: Sequence[Camera], ground: GroundPlane, options: CaptureOptions) -> tuple[Sheet, float]:
+    """A square about the point below the one that all cameras look at, and half its side."""
+    normal = np.array(ground.normal)
+    target = nearest_point(cameras)
+    foot = target - (normal @ target - ground.offset) * normal
+    half = options.ground_reach * float(np.median([np.linalg.norm(each.position_world - foot) for each in cameras]))
+    right = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    right /= np.linalg.norm(right)
+    down = np.cross(normal, right)
+    step = 2 * half / options.ground_texels
+    first = foot - (half - step / 2) * (right + down)
+    return Sheet(first, step * right, step * down, options.ground_texels), half
+
+
+def laid_out(
+    pictures: Sequence[UInt8[np.ndarray, "_ _ 3"]], cameras: Sequence[Camera], sheet: Sheet
+) -> tuple[Float[np.ndarray, "V N N 3"], Bool[np.ndarray, "V N N"]]:
+    """Each picture on the sheet, codes in [0, 1], and where it reaches."""
+    cv2 = opencv()
+    size, flags = (sheet.count, sheet.count), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    colors, seen = [], []
+    for picture, camera in zip(pictures, cameras, strict=True):
+        homography = sheet.to_pixels(camera)
+        whole = np.full(picture.shape[:2], 255, np.uint8)
+        colors.append(cv2.warpPerspective(picture, homography, size, flags=flags).astype(np.float32) / 255)
+        seen.append(cv2.warpPerspective(whole, homography, size, flags=flags) == 255)
+    return np.stack(colors), np.stack(seen)
+
+
+def pattern_of(
+    colors: Float[np.ndarray, "V N N 3"], seen: Bool[np.ndarray, "V N N"], options: CaptureOptions
+) -> tuple[Float[np.ndarray, "N N 3"], Bool[np.ndarray, "N N"]]:
+    """The sheet's own color, and where enough views agree on one.
+
+    Of some views, the one with which most others agree has the color of a texel; it is the mean of these.
+    """
+    most = np.zeros(seen.shape[1:], np.int32)
+    pattern = np.zeros(colors.shape[1:], np.float32)
+    for each in np.linspace(0, len(colors) - 1, min(options.ground_candidates, len(colors))).round().astype(int):
+        count, total = np.zeros(most.shape, np.int32), np.zeros(pattern.shape, np.float32)
+        for color, where in zip(colors, seen, strict=True):
+            near = where & seen[each]
+            for channel in range(3):
+                near &= np.abs(color[..., channel] - colors[each, ..., channel]) < options.ground_difference
+            count += near
+            total += np.where(near[..., None], color, 0)
+        better = count > most
+        pattern[better], most[better] = (total / np.maximum(count, 1)[..., None])[better], count[better]
+    return pattern, (most >= options.ground_agreeing) & (most >= options.ground_share * seen.sum(0))
+
+
+def gains_of(
+    colors: Float[np.ndarray, "V N N 3"], seen: Bool[np.ndarray, "V N N"], options: CaptureOptions
+) -> Float[np.ndarray, "V 3"]:
+    """Factors that make the sheet as bright in each view as in all of them, a channel each."""
+    pattern, known = pattern_of(colors, seen, options)
+    gains = np.ones((len(colors), 3), np.float32)
+    for number, (color, where) in enumerate(zip(colors, seen, strict=True)):
+        both = known & where & (np.abs(color - pattern).max(-1) < 2 * options.ground_difference)
+        both &= np.minimum(pattern, color).min(-1) > options.ground_difference
+        if both.any():
+            gains[number] = np.median(pattern[both] / color[both], axis=0)
+    return gains
+
+
+def evidence_of(
+    picture: UInt8[np.ndarray, "H W 3"],
+    camera: Camera,
+    gain: Float[np.ndarray, "3"],
+    sheet: Sheet,
+    pattern: Float[np.ndarray, "N N 3"],
+    known: Bool[np.ndarray, "N N"],
+    options: CaptureOptions,
+) -> Evidence:
+    """Compare a view with what it would show of the sheet alone, which may be a pixel off.
+
+    A window shows the ground where what is left of it is little beside the contrast of either.
+    """
+    cv2 = opencv()
+    size, homography = (camera.width, camera.height), sheet.to_pixels(camera)
+    expected = cv2.warpPerspective(pattern, homography, size, flags=cv2.INTER_LINEAR)
+    told = cv2.warpPerspective(known.astype(np.uint8) * 255, homography, size, flags=cv2.INTER_LINEAR) == 255
+    color = picture.astype(np.float32) / 255 * gain
+    around = np.ones((3, 3), np.uint8)
+    low, high = cv2.erode(expected, around), cv2.dilate(expected, around)
+    left = np.maximum(np.maximum(low - color, color - high), 0)
+    window = (options.ground_window_px, options.ground_window_px)
+    share = np.maximum(cv2.blur(told.astype(np.float32), window), 1e-6)[..., None]
+
+    def mean(values: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
+        found: np.ndarray = cv2.blur(np.where(told[..., None], values, 0), window) / share
+        return found
+
+    contrast = mean(color**2) - mean(color) ** 2 + mean(expected**2) - mean(expected) ** 2 + options.ground_noise**2
+    shown = told & (mean(left**2).sum(-1) < options.ground_match * contrast.sum(-1))
+    bounds, odds = np.array(options.ground_steps), np.array(options.ground_odds)
+    return Evidence(camera, shown, told, np.where(told, odds[np.searchsorted(bounds, left.max(-1))], 0.0))
+
+
+def cleared(seen: Sequence[Evidence], points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
+    """The share of the views that see ground at each point, of those that can tell; 1 where few can."""
+    clear, asked = np.zeros(len(points)), np.zeros(len(points))
+    for view in seen:
+        rows, columns, within, depth = pixels_of(view.camera, points)
+        within &= depth > 0
+        at = np.where(within, rows, 0), np.where(within, columns, 0)
+        clear += within & view.shown[at]
+        asked += within & view.told[at]
+    return np.where(asked >= LEAST_ASKED * len(seen), clear / np.maximum(asked, 1), 1.0)
+
+
+def ground_masks(
+    whole: Mapping[str, Camera], folder: Path, ground: GroundPlane, picture: Path, options: CaptureOptions
+) -> dict[str, UInt8[np.ndarray, "_ _"]]:
+    """Masks of all views, and the ground as a `picture`. Raises InputError where nothing stands on it."""
+    names = list(whole)
+    longest = max(max(camera.width, camera.height) for camera in whole.values())
+    side = -(-longest // options.ground_side_px)
+    cameras = [whole[name].downscaled(side) for name in names]
+    pictures = [block_means(read_png(folder / f"{name}.png")[..., :3], side) for name in names]
+    progress = Progress("masks by the ground", len(names))
+    sheet, half = sheet_about(cameras, ground, options)
+    colors, reached = laid_out(pictures, cameras, sheet)
+    sparse = (slice(None), slice(None, None, SPARSE), slice(None, None, SPARSE))
+    gains = gains_of(colors[sparse], reached[sparse], options)
+    colors *= gains[:, None, None]
+    pattern, known = pattern_of(colors, reached, options)
+    with atomic_write(picture) as temporary:
+        write_png(temporary, np.rint(255 * np.where(known[..., None], pattern, 0)).clip(0, 255).astype(np.uint8))
+    seen = [
+        evidence_of(each, camera, gain, sheet, pattern, known, options)
+        for each, camera, gain in zip(pictures, cameras, gains, strict=True)
+    ]
+    found = _object_points(seen, ground, half, options)
+    masks = [_mask(view, [outline(view.camera, points, found.spacing) for points in found.sets]) for view in seen]
+    masks = _agreed(seen, masks, found, options)
+    enlarged = {}
+    for name, mask in zip(names, masks, strict=True):
+        enlarged[name] = _at_full_size(mask, whole[name], side)
+        progress.advance()
+    return enlarged
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Grid points that are the object for sure, likely, and perhaps; each set holds the one before."""
+
+    sets: tuple[Float[np.ndarray, "_ 3"], ...]
+    spacing: float
+    center: Float[np.ndarray, "3"]
+    half_side: float
+
+
+def _object_points(seen: Sequence[Evidence], ground: GroundPlane, half: float, options: CaptureOptions) -> _Points:
+    """What stands on the ground and is not cleared away: the largest piece, on a grid about it."""
+    normal, count = np.array(ground.normal), options.hull_voxels
+    target = nearest_point([view.camera for view in seen])
+    half /= 2
+    center = target - (normal @ target - ground.offset - half) * normal
+    for last in (False, True):
+        points = cube(center, half, count)
+        share = np.where(points @ normal > ground.offset, cleared(seen, points), 1.0)
+        pieces, found = ndimage.label((share < options.ground_cleared[-1]).reshape(count, count, count))
+        if not found:
+            raise InputError(
+                expected="an object that stands before the ground in most photographs",
+                found="nothing that moves against the ground",
+                remedy=GIVE_MASKS,
+            )
+        largest = (pieces == 1 + np.argmax(np.bincount(pieces.ravel())[1:])).ravel()
+        sets = tuple(points[largest & (share < limit)] for limit in options.ground_cleared)
+        if not last:
+            low, high = sets[-1].min(0), sets[-1].max(0)
+            center, half = (low + high) / 2, options.hull_spare / 2 * float((high - low).max())
+    return _Points(sets, 2 * half / count, center, half)
+
+
+def _mask(view: Evidence, outlines: Sequence[Bool[np.ndarray, "H W"]]) -> Bool[np.ndarray, "H W"]:
+    """Between the outlines of what is the object for sure and of what is perhaps, the pixels of the view decide."""
+    cv2 = opencv()
+    sure, likely, perhaps = outlines
+    core = cv2.distanceTransform(np.pad(sure, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1] > 2
+    prior = np.where(likely, 2.0, -2.0)
+    odds = cv2.GaussianBlur(np.where(view.told, view.odds, prior).astype(np.float32), (0, 0), 1.0)
+    mask = core | (perhaps & (odds > 0) & (likely | ~view.shown))
+    mask = cv2.medianBlur(mask.astype(np.uint8), SPECK_PX) > 0
+    return largest_pieces(mask, MAIN_SHARE) if mask.any() else mask
+
+
+def _agreed(
+    seen: Sequence[Evidence], masks: Sequence[Bool[np.ndarray, "_ _"]], found: _Points, options: CaptureOptions
+) -> list[Bool[np.ndarray, "_ _"]]:
+    """Masks by the hull of these where the view itself cannot tell, as before the far end of the room."""
+    views = [(view.camera, mask) for view, mask in zip(seen, masks, strict=True)]
+    allowed = int(options.tolerated * len(views))
+    points = carve(views, found.center, found.half_side, options.hull_voxels, allowed)
+    agreed = []
+    for view, mask in zip(seen, masks, strict=True):
+        hull = outline(view.camera, points, found.spacing)
+        both = np.where(view.told, mask, hull)
+        agreed.append(largest_pieces(both, MAIN_SHARE) if both.any() else both)
+    return agreed
+
+
+def _at_full_size(mask: Bool[np.ndarray, "_ _"], camera: Camera, side: int) -> UInt8[np.ndarray, "H W"]:
+    cv2 = opencv()
+    size = (mask.shape[1] * side, mask.shape[0] * side)
+    large = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+    smooth = cv2.GaussianBlur(large, (0, 0), 0.7 * side)
+    beyond = ((0, camera.height - size[1]), (0, camera.width - size[0]))
+    whole: np.ndarray = np.pad(np.rint(255 * smooth), beyond).astype(np.uint8)
+    return whole
