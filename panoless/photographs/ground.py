@@ -153,17 +153,34 @@ def evidence_of(
     around = np.ones((3, 3), np.uint8)
     low, high = cv2.erode(expected, around), cv2.dilate(expected, around)
     left = np.maximum(np.maximum(low - color, color - high), 0)
-    window = (options.ground_window_px, options.ground_window_px)
-    share = np.maximum(cv2.blur(told.astype(np.float32), window), 1e-6)[..., None]
+    shown = told.copy()
+    for width in (options.ground_wide_px, options.ground_window_px):
+        matched = told & _matches(color, expected, left, told, width, options)
+        spread = 2 * ((options.ground_wide_px - width) // 2 + 1) + 1
+        shown = matched & (cv2.dilate(shown.astype(np.uint8), np.ones((spread, spread), np.uint8)) > 0)
+    bounds, odds = np.array(options.ground_steps), np.array(options.ground_odds)
+    return Evidence(camera, shown, told, np.where(told, odds[np.searchsorted(bounds, left.max(-1))], 0.0))
+
+
+def _matches(
+    color: Float[np.ndarray, "H W 3"],
+    expected: Float[np.ndarray, "H W 3"],
+    left: Float[np.ndarray, "H W 3"],
+    told: Bool[np.ndarray, "H W"],
+    width: int,
+    options: CaptureOptions,
+) -> Bool[np.ndarray, "H W"]:
+    """Where little is `left` in a window of that width, beside the contrast of what is seen or expected there."""
+    cv2 = opencv()
+    share = np.maximum(cv2.blur(told.astype(np.float32), (width, width)), 1e-6)[..., None]
 
     def mean(values: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
-        found: np.ndarray = cv2.blur(np.where(told[..., None], values, 0), window) / share
+        found: np.ndarray = cv2.blur(np.where(told[..., None], values, 0), (width, width)) / share
         return found
 
     contrast = mean(color**2) - mean(color) ** 2 + mean(expected**2) - mean(expected) ** 2 + options.ground_noise**2
-    shown = told & (mean(left**2).sum(-1) < options.ground_match * contrast.sum(-1))
-    bounds, odds = np.array(options.ground_steps), np.array(options.ground_odds)
-    return Evidence(camera, shown, told, np.where(told, odds[np.searchsorted(bounds, left.max(-1))], 0.0))
+    matched: np.ndarray = mean(left**2).sum(-1) < options.ground_match * contrast.sum(-1)
+    return matched
 
 
 def cleared(seen: Sequence[Evidence], points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:

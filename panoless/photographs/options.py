@@ -77,7 +77,9 @@ class CaptureOptions:
     ground_share: Share = 0.15
     """…and this share of those that reach it; what the object hides in most views is known from the others."""
     ground_window_px: Count = 7
-    """Side of the window that shows the ground, or does not."""
+    """Side of a window that shows the ground, or does not…"""
+    ground_wide_px: Count = 17
+    """…near a window of this side that does, because a small one can look like it by chance."""
     ground_noise: Positive = 0.06
     """Contrast, in codes of 1, that a plain window counts as having."""
     ground_match: Share = 0.1
