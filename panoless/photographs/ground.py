@@ -33,6 +33,8 @@ GIVE_MASKS = (
 #: One texel of this many tells how bright a view is.
 SPARSE = 4
 SPECK_PX = 5
+#: Differences of a pixel from the ground, in codes of 1, between which they are counted.
+STEPS = np.array([0.005, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.25])
 #: A point is judged where so large a share of the views can tell.
 LEAST_ASKED = 0.3
 
@@ -63,8 +65,8 @@ class Evidence:
     """Where the ground is seen for sure: in a whole window."""
     told: Bool[np.ndarray, "H W"]
     """Where the ground's color is known."""
-    odds: Float[np.ndarray, "H W"]
-    """Logarithm of how much likelier each pixel's color is on the object than on the ground; 0 where it isn't told."""
+    left: Float[np.ndarray, "H W"]
+    """By how much each pixel differs from the ground that it would show, in codes of 1."""
 
 
 def sheet_about(cameras: Sequence[Camera], ground: GroundPlane, options: CaptureOptions) -> tuple[Sheet, float]:
@@ -158,8 +160,7 @@ def evidence_of(
         matched = told & _matches(color, expected, left, told, width, options)
         spread = 2 * ((options.ground_wide_px - width) // 2 + 1) + 1
         shown = matched & (cv2.dilate(shown.astype(np.uint8), np.ones((spread, spread), np.uint8)) > 0)
-    bounds, odds = np.array(options.ground_steps), np.array(options.ground_odds)
-    return Evidence(camera, shown, told, np.where(told, odds[np.searchsorted(bounds, left.max(-1))], 0.0))
+    return Evidence(camera, shown, told, left.max(-1))
 
 
 def _matches(
@@ -218,7 +219,9 @@ def ground_masks(
         for each, camera, gain in zip(pictures, cameras, gains, strict=True)
     ]
     found = _object_points(seen, ground, half, options)
-    masks = [_mask(view, [outline(view.camera, points, found.spacing) for points in found.sets]) for view in seen]
+    outlines = [[outline(view.camera, points, found.spacing) for points in found.sets] for view in seen]
+    odds = odds_of(seen, outlines)
+    masks = [_mask(view, of_view, odds) for view, of_view in zip(seen, outlines, strict=True)]
     masks = _agreed(seen, masks, found, options)
     enlarged = {}
     for name, mask in zip(names, masks, strict=True):
@@ -261,14 +264,41 @@ def _object_points(seen: Sequence[Evidence], ground: GroundPlane, half: float, o
     return _Points(sets, 2 * half / count, center, half)
 
 
-def _mask(view: Evidence, outlines: Sequence[Bool[np.ndarray, "H W"]]) -> Bool[np.ndarray, "H W"]:
-    """Between the outlines of what is the object for sure and of what is perhaps, the pixels of the view decide."""
+def odds_of(seen: Sequence[Evidence], outlines: Sequence[Sequence[Bool[np.ndarray, "_ _"]]]) -> Float[np.ndarray, "_"]:
+    """The logarithm of how much likelier a difference is on the object than on the ground, for each of `STEPS`.
+
+    Counted in these photographs: well within the outline of what is the object for sure, and around that of what is
+    perhaps.
+    """
+    counts = np.ones((2, len(STEPS) + 1))
+    for view, (sure, _, perhaps) in zip(seen, outlines, strict=True):
+        step = np.searchsorted(STEPS, view.left)
+        around = _distance_px(~perhaps)
+        for which, where in enumerate((_distance_px(sure) > 3, (around > 4) & (around < 40))):
+            counts[which] += np.bincount(step[where & view.told], minlength=len(STEPS) + 1)
+    on_object, on_ground = np.log(counts / counts.sum(1, keepdims=True))
+    odds: np.ndarray = on_object - on_ground
+    return odds
+
+
+def _distance_px(where: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    """How far each pixel is from those outside; what is beyond the picture is outside."""
+    cv2 = opencv()
+    found: np.ndarray = cv2.distanceTransform(np.pad(where, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    return found
+
+
+def _mask(
+    view: Evidence, outlines: Sequence[Bool[np.ndarray, "H W"]], odds_of_step: Float[np.ndarray, "_"]
+) -> Bool[np.ndarray, "H W"]:
+    """Between the outlines of what is the object for sure and of what is perhaps, the pixels of the view decide.
+
+    That a place is likely the object counts as a pixel with odds of e; where a pixel can't tell, this alone counts.
+    """
     cv2 = opencv()
     sure, likely, perhaps = outlines
-    core = cv2.distanceTransform(np.pad(sure, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1] > 2
-    prior = np.where(likely, 2.0, -2.0)
-    odds = cv2.GaussianBlur(np.where(view.told, view.odds, prior).astype(np.float32), (0, 0), 1.0)
-    mask = core | (perhaps & (odds > 0) & (likely | ~view.shown))
+    odds = np.where(likely, 1.0, -1.0) + np.where(view.told, odds_of_step[np.searchsorted(STEPS, view.left)], 0.0)
+    mask = (_distance_px(sure) > 2) | (perhaps & (cv2.GaussianBlur(odds, (0, 0), 1.0) > 0))
     mask = cv2.medianBlur(mask.astype(np.uint8), SPECK_PX) > 0
     return largest_pieces(mask, MAIN_SHARE) if mask.any() else mask
 

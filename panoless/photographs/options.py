@@ -84,10 +84,6 @@ class CaptureOptions:
     """Contrast, in codes of 1, that a plain window counts as having."""
     ground_match: Share = 0.1
     """A window shows the ground where less than this share of the contrast is left."""
-    ground_steps: tuple[Positive, Positive] = (0.03, 0.07)
-    """Differences of a pixel from the ground, in codes of 1, between which the odds below hold."""
-    ground_odds: tuple[float, float, float] = (-1.3, 0.5, 4.0)
-    """Logarithms of how much likelier such a pixel is on the object: a quarter of its pixels look like the ground."""
     ground_cleared: tuple[Share, Share, Share] = (0.12, 0.15, 0.3)
     """A point of space is the object for sure, likely, or perhaps, where ground is seen at it in a smaller share of the
     views. At points within the object that share is 0.02 to 0.10."""
