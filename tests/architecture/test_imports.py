@@ -99,8 +99,10 @@ def test_importing_the_benchmark_is_fast() -> None:
     assert min(times) < IMPORT_LIMIT_S
 
 
-def test_importing_prints_nothing_and_changes_no_environment() -> None:
-    program = "import os; before = dict(os.environ)\n{}\nassert dict(os.environ) == before"
+def test_importing_prints_nothing_and_changes_the_environment_by_one_documented_variable() -> None:
+    """`panoless` gives OpenBLAS one thread, which has to be said before numpy is loaded."""
+    said = "import os; os.environ.setdefault('OPENBLAS_NUM_THREADS', '1'); before = dict(os.environ)"
+    program = said + "\n{}\nassert dict(os.environ) == before"
     imports = "\n".join(f"import {module}" for module in FREE_MODULES)
     command = [sys.executable, "-W", "error", "-c", program.format(imports)]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
