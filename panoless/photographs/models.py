@@ -96,8 +96,8 @@ def poses_of(model: Any, frames: Frames, origin: str, options: CaptureOptions) -
         # COLMAP's pixel (0, 0) spans [0, 1]².
         found = np.array([point.xy for point in shown]).reshape(-1, 2) - PIXEL_CENTER
         seen.append(SeenPoints(lens, pose, which, places[which], found))
-    centers = np.array([view.camera_to_world for view in views]).reshape(-1, 4, 4)[:, :3, 3]
-    poses = Poses(origin, "unknown", tuple(views), ground=find_ground(places, centers, options) if views else None)
+    cameras = np.array([view.camera_to_world for view in views]).reshape(-1, 4, 4)
+    poses = Poses(origin, "unknown", tuple(views), ground=find_ground(places, cameras, options) if views else None)
     return with_covariances(poses, seen, known_points=False) if all(len(each.numbers) for each in seen) else poses
 
 

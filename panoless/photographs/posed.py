@@ -67,15 +67,18 @@ class Poses:
 
 
 PLANES_TRIED = 1000
+LEAST_UPWARD = 0.2
 
 
 def find_ground(
-    points: Float[np.ndarray, "P 3"], centers: Float[np.ndarray, "V 3"], options: CaptureOptions
+    points: Float[np.ndarray, "P 3"], poses: Float[np.ndarray, "V 4 4"], options: CaptureOptions
 ) -> GroundPlane | None:
-    """The plane near most points that has all cameras on one side, by consensus of three points each (RANSAC).
+    """The plane near most points that all cameras look down on, by consensus of three points each (RANSAC).
 
-    None where fewer than `ground_points` of them lie on it.
+    Its normal toward the cameras is at less than 78° from their mean upward direction, from which that of a wall before
+    them is at more than 90°. None where fewer than `ground_points` of the points lie on it.
     """
+    centers, up = poses[:, :3, 3], -poses[:, :3, 1].mean(0)
     if len(points) < 3:
         return None
     reach = float(np.median(np.linalg.norm(centers - np.median(points, 0), axis=1)))
@@ -85,8 +88,9 @@ def find_ground(
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     offsets = np.sum(normals * first, 1)
     heights = centers @ normals.T - offsets
-    one_sided = np.abs(np.sign(heights).sum(0)) == len(centers)
-    near = (np.abs(points @ normals.T - offsets) < limit).sum(0) * one_sided
+    sides = np.sign(heights).sum(0)
+    upward = (np.abs(sides) == len(centers)) & (np.sign(sides) * (normals @ up) > LEAST_UPWARD * np.linalg.norm(up))
+    near = (np.abs(points @ normals.T - offsets) < limit).sum(0) * upward
     best = int(np.argmax(near))
     if near[best] < options.ground_points * len(points):
         return None

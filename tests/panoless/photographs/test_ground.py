@@ -136,15 +136,16 @@ def scattered(share: float, tilt: np.ndarray) -> np.ndarray:
 def test_the_ground_is_the_plane_of_most_points_below_all_cameras() -> None:
     tilt = np.array([0.2, -0.3, 1.0])
     tilt /= np.linalg.norm(tilt)
-    centers = np.stack([camera.position_world for camera in CAMERAS])
-    found = find_ground(scattered(0.5, tilt), centers, OPTIONS)
+    poses = np.stack([camera.camera_to_world for camera in CAMERAS])
+    found = find_ground(scattered(0.5, tilt), poses, OPTIONS)
     assert found is not None
     np.testing.assert_allclose(found.normal, tilt, atol=1e-3)
     assert found.offset == pytest.approx(0.2 * tilt[2], abs=1e-3)
-    assert find_ground(scattered(0.1, tilt), centers, OPTIONS) is None
-    assert find_ground(np.zeros((0, 3)), centers, OPTIONS) is None
-    # A wall between the cameras has some on either side.
-    assert find_ground(scattered(0.5, np.array([1.0, 0.0, 0.0])), centers, OPTIONS) is None
+    assert find_ground(scattered(0.1, tilt), poses, OPTIONS) is None
+    assert find_ground(np.zeros((0, 3)), poses, OPTIONS) is None
+    # A wall between the cameras has some on either side, and they do not look down on one before them.
+    assert find_ground(scattered(0.5, np.array([1.0, 0.0, 0.0])), poses, OPTIONS) is None
+    assert find_ground(scattered(0.5, np.array([0.0, 1.0, 0.0])), poses, OPTIONS) is None
 
 
 def test_the_world_of_structure_from_motion_stands_on_its_ground() -> None:
