@@ -17,6 +17,7 @@ from torch import Tensor
 from panoless.capture.rays import reflect
 from panoless.environment.surroundings import Surroundings
 from panoless.kernels.cubemap import sample_cubemap
+from shinypartial.core.sphere import tangents
 
 
 @dataclass(frozen=True)
@@ -94,10 +95,8 @@ def slopes_of(
 ) -> Float[np.ndarray, "P 3 3"]:
     """Slopes of E across unit directions (channel, axis): differences over a texel."""
     step = np.pi / 4 / environment.shape[-1]
-    first = np.cross(directions, np.eye(3)[np.abs(directions).argmin(1)])
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
     slopes = np.zeros((len(directions), 3, 3))
-    for tangent in (first, np.cross(directions, first)):
+    for tangent in tangents(directions):
         ahead, behind = (radiance_of(environment, directions + sign * step * tangent) for sign in (1, -1))
         slopes += ((ahead - behind) / (2 * step))[:, :, None] * tangent[:, None]
     return slopes

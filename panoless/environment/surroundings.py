@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from shinypartial.core.harmonics import real_harmonics
+from shinypartial.core.sphere import tangents
 
 SHARPEST = 0.6
 """Upper bound of 1/D, in inverse radii of the object: nearer walls would touch it. Not tuned."""
@@ -49,9 +50,7 @@ class Floor:
     @property
     def tilts(self) -> Float[np.ndarray, "2 3"]:
         """Two unit directions in the plane, across each other."""
-        first = np.cross(self.up, np.eye(3)[np.abs(self.up).argmin()])
-        first /= np.linalg.norm(first)
-        return np.stack([first, np.cross(self.up, first)])
+        return np.stack(tangents(self.up))
 
     def after(self, step: Float[np.ndarray, "3"]) -> "Floor":
         """With the normal moved along both tilts and with another depth."""

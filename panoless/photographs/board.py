@@ -12,7 +12,7 @@ from panoless.photographs.corners import Sighting, corners_of, locate_corners
 from panoless.photographs.frames import Frames
 from panoless.photographs.lens import Lens, opencv
 from panoless.photographs.options import CaptureOptions
-from panoless.photographs.posed import GroundPlane, PosedView, Poses, as_rows, with_covariances
+from panoless.photographs.posed import LEVEL, PosedView, Poses, as_rows, with_covariances
 from panoless.photographs.video import luminance
 from shinypartial.core.board import BOARDS, CELLS_OF_MARKER, CELLS_OF_SQUARE, MM, Board
 from shinypartial.core.errors import InputError
@@ -183,8 +183,7 @@ def poses_from_board(board: Board, frames: Frames, folder: Path, options: Captur
         views.append(PosedView(sighting.name, adjusted.lens, as_rows(in_world), error))
         points = corners[sighting.corners]
         seen_points.append(SeenPoints(adjusted.lens, in_world, sighting.corners, points, sighting.places_px))
-    ground = GroundPlane((0.0, 0.0, 1.0), 0.0)
-    poses = Poses(origin, "m", tuple(views), focal_error=adjusted.focal_error, ground=ground)
+    poses = Poses(origin, "m", tuple(views), focal_error=adjusted.focal_error, ground=LEVEL)
     return with_covariances(poses, seen_points, known_points=True)
 
 

@@ -15,15 +15,15 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from panoless.capture.masks import MAIN_SHARE, largest_pieces
-from panoless.photographs.frames import block_means
 from panoless.photographs.hull import carve, cube, nearest_point, outline, pixels_of
 from panoless.photographs.lens import opencv
+from panoless.photographs.masks import EDGE_PX, averaged, enlarged
 from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import GroundPlane
 from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
-from shinypartial.io.files import atomic_write
-from shinypartial.io.images import read_png, write_png
+from shinypartial.core.sphere import tangents
+from shinypartial.io.images import write_png
 from shinypartial.io.progress import Progress
 
 GIVE_MASKS = (
@@ -48,6 +48,16 @@ class Sheet:
     down: Float[np.ndarray, "3"]
     count: int
 
+    @property
+    def center(self) -> Float[np.ndarray, "3"]:
+        """Its middle."""
+        return self.first + (self.count - 1) / 2 * (self.right + self.down)
+
+    @property
+    def half_side(self) -> float:
+        """In units of the world."""
+        return self.count / 2 * float(np.linalg.norm(self.right))
+
     def to_pixels(self, camera: Camera) -> Float[np.ndarray, "3 3"]:
         """The homography from (x, y, 1) to pixels whose centers are whole numbers, as OpenCV has them."""
         axes = np.stack([self.right, self.down, self.first - camera.position_world], 1)
@@ -69,18 +79,16 @@ class Evidence:
     """By how much each pixel differs from the ground that it would show, in codes of 1."""
 
 
-def sheet_about(cameras: Sequence[Camera], ground: GroundPlane, options: CaptureOptions) -> tuple[Sheet, float]:
-    """A square about the point below the one that all cameras look at, and half its side."""
+def sheet_about(cameras: Sequence[Camera], ground: GroundPlane, options: CaptureOptions) -> Sheet:
+    """A square about the point below the one that all cameras look at."""
     normal = np.array(ground.normal)
     target = nearest_point(cameras)
     foot = target - (normal @ target - ground.offset) * normal
     half = options.ground_reach * float(np.median([np.linalg.norm(each.position_world - foot) for each in cameras]))
-    right = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    right /= np.linalg.norm(right)
-    down = np.cross(normal, right)
+    right, down = tangents(normal)
     step = 2 * half / options.ground_texels
     first = foot - (half - step / 2) * (right + down)
-    return Sheet(first, step * right, step * down, options.ground_texels), half
+    return Sheet(first, step * right, step * down, options.ground_texels)
 
 
 def laid_out(
@@ -155,11 +163,12 @@ def evidence_of(
     around = np.ones((3, 3), np.uint8)
     low, high = cv2.erode(expected, around), cv2.dilate(expected, around)
     left = np.maximum(np.maximum(low - color, color - high), 0)
-    shown = told.copy()
-    for width in (options.ground_wide_px, options.ground_window_px):
-        matched = told & _matches(color, expected, left, told, width, options)
-        spread = 2 * ((options.ground_wide_px - width) // 2 + 1) + 1
-        shown = matched & (cv2.dilate(shown.astype(np.uint8), np.ones((spread, spread), np.uint8)) > 0)
+    wide, shown = (
+        told & _matches(color, expected, left, told, width, options)
+        for width in (options.ground_wide_px, options.ground_window_px)
+    )
+    spread = 2 * ((options.ground_wide_px - options.ground_window_px) // 2 + 1) + 1
+    shown &= cv2.dilate(wide.astype(np.uint8), np.ones((spread, spread), np.uint8)) > 0
     return Evidence(camera, shown, told, left.max(-1))
 
 
@@ -200,34 +209,26 @@ def ground_masks(
     whole: Mapping[str, Camera], folder: Path, ground: GroundPlane, picture: Path, options: CaptureOptions
 ) -> dict[str, UInt8[np.ndarray, "_ _"]]:
     """Masks of all views, and the ground as a `picture`. Raises InputError where nothing stands on it."""
-    names = list(whole)
-    longest = max(max(camera.width, camera.height) for camera in whole.values())
-    side = -(-longest // options.ground_side_px)
-    cameras = [whole[name].downscaled(side) for name in names]
-    pictures = [block_means(read_png(folder / f"{name}.png")[..., :3], side) for name in names]
-    progress = Progress("masks by the ground", len(names))
-    sheet, half = sheet_about(cameras, ground, options)
+    side, downscaled, blocks = averaged(whole, folder, options.ground_side_px)
+    cameras, pictures = list(downscaled.values()), list(blocks.values())
+    progress = Progress("masks by the ground", len(whole))
+    sheet = sheet_about(cameras, ground, options)
     colors, reached = laid_out(pictures, cameras, sheet)
     sparse = (slice(None), slice(None, None, SPARSE), slice(None, None, SPARSE))
     gains = gains_of(colors[sparse], reached[sparse], options)
     colors *= gains[:, None, None]
     pattern, known = pattern_of(colors, reached, options)
-    with atomic_write(picture) as temporary:
-        write_png(temporary, np.rint(255 * np.where(known[..., None], pattern, 0)).clip(0, 255).astype(np.uint8))
-    seen = [
-        evidence_of(each, camera, gain, sheet, pattern, known, options)
-        for each, camera, gain in zip(pictures, cameras, gains, strict=True)
-    ]
-    found = _object_points(seen, ground, half, options)
+    write_png(picture, np.rint(255 * np.where(known[..., None], pattern, 0)).clip(0, 255).astype(np.uint8))
+    seen = []
+    for each, camera, gain in zip(pictures, cameras, gains, strict=True):
+        seen.append(evidence_of(each, camera, gain, sheet, pattern, known, options))
+        progress.advance()
+    found = _object_points(seen, ground, sheet, options)
     outlines = [[outline(view.camera, points, found.spacing) for points in found.sets] for view in seen]
     odds = odds_of(seen, outlines)
     masks = [_mask(view, of_view, odds) for view, of_view in zip(seen, outlines, strict=True)]
     masks = _agreed(seen, masks, found, options)
-    enlarged = {}
-    for name, mask in zip(names, masks, strict=True):
-        enlarged[name] = _at_full_size(mask, whole[name], side)
-        progress.advance()
-    return enlarged
+    return {name: _at_full_size(mask, whole[name], side) for name, mask in zip(whole, masks, strict=True)}
 
 
 @dataclass(frozen=True)
@@ -240,12 +241,10 @@ class _Points:
     half_side: float
 
 
-def _object_points(seen: Sequence[Evidence], ground: GroundPlane, half: float, options: CaptureOptions) -> _Points:
+def _object_points(seen: Sequence[Evidence], ground: GroundPlane, sheet: Sheet, options: CaptureOptions) -> _Points:
     """What stands on the ground and is not cleared away: the largest piece, on a grid about it."""
-    normal, count = np.array(ground.normal), options.hull_voxels
-    target = nearest_point([view.camera for view in seen])
-    half /= 2
-    center = target - (normal @ target - ground.offset - half) * normal
+    normal, count, half = np.array(ground.normal), options.hull_voxels, sheet.half_side / 2
+    center = sheet.center + half * normal
     for last in (False, True):
         points = cube(center, half, count)
         share = np.where(points @ normal > ground.offset, cleared(seen, points), 1.0)
@@ -299,8 +298,7 @@ def _mask(
     sure, likely, perhaps = outlines
     odds = np.where(likely, 1.0, -1.0) + np.where(view.told, odds_of_step[np.searchsorted(STEPS, view.left)], 0.0)
     mask = (_distance_px(sure) > 2) | (perhaps & (cv2.GaussianBlur(odds, (0, 0), 1.0) > 0))
-    mask = cv2.medianBlur(mask.astype(np.uint8), SPECK_PX) > 0
-    return largest_pieces(mask, MAIN_SHARE) if mask.any() else mask
+    return largest_pieces(cv2.medianBlur(mask.astype(np.uint8), SPECK_PX) > 0, MAIN_SHARE)
 
 
 def _agreed(
@@ -313,16 +311,10 @@ def _agreed(
     agreed = []
     for view, mask in zip(seen, masks, strict=True):
         hull = outline(view.camera, points, found.spacing)
-        both = np.where(view.told, mask, hull)
-        agreed.append(largest_pieces(both, MAIN_SHARE) if both.any() else both)
+        agreed.append(largest_pieces(np.where(view.told, mask, hull), MAIN_SHARE))
     return agreed
 
 
 def _at_full_size(mask: Bool[np.ndarray, "_ _"], camera: Camera, side: int) -> UInt8[np.ndarray, "H W"]:
-    cv2 = opencv()
-    size = (mask.shape[1] * side, mask.shape[0] * side)
-    large = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
-    smooth = cv2.GaussianBlur(large, (0, 0), 0.7 * side)
-    beyond = ((0, camera.height - size[1]), (0, camera.width - size[0]))
-    whole: np.ndarray = np.pad(np.rint(255 * smooth), beyond).astype(np.uint8)
-    return whole
+    smooth = opencv().GaussianBlur(enlarged(mask, camera, side), (0, 0), EDGE_PX * side)
+    return np.rint(255 * smooth).astype(np.uint8)

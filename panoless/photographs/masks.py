@@ -175,10 +175,7 @@ def find_masks(
             remedy="Take names of photographs without their suffix.",
         )
     names = list(whole)
-    longest = max(max(camera.width, camera.height) for camera in whole.values())
-    side = -(-longest // options.mask_side_px)
-    cameras = {name: camera.downscaled(side) for name, camera in whole.items()}
-    pictures = {name: block_means(read_png(folder / f"{name}.png")[..., :3], side) for name in names}
+    side, cameras, pictures = averaged(whole, folder, options.mask_side_px)
     progress = Progress("masks", len(names) * (2 + options.rounds))
     masks: dict[str, Bool[np.ndarray, "_ _"]] = {}
     known = {name: hint.scaled(side) for name, hint in hints.items()}
@@ -202,9 +199,27 @@ def find_masks(
         progress.advance(steps=len(names))
     found = {}
     for name, camera in whole.items():
-        found[name] = smooth_edge(_enlarged(masks[name], camera, side, folder / f"{name}.png"))
+        found[name] = smooth_edge(_sharpened(masks[name], camera, side, folder / f"{name}.png"))
         progress.advance()
     return found
+
+
+def averaged(
+    whole: Mapping[str, Camera], folder: Path, largest_px: int
+) -> tuple[int, dict[str, Camera], dict[str, UInt8[np.ndarray, "_ _ 3"]]]:
+    """All views as means over blocks that leave no side longer than `largest_px`, and the side of these blocks."""
+    longest = max(max(camera.width, camera.height) for camera in whole.values())
+    side = -(-longest // largest_px)
+    cameras = {name: camera.downscaled(side) for name, camera in whole.items()}
+    return side, cameras, {name: block_means(read_png(folder / f"{name}.png")[..., :3], side) for name in whole}
+
+
+def enlarged(mask: Bool[np.ndarray, "_ _"], camera: Camera, side: int) -> Float[np.ndarray, "H W"]:
+    """The mask of blocks of pixels in those pixels themselves, linear in between."""
+    size = (mask.shape[1] * side, mask.shape[0] * side)
+    large = opencv().resize(mask.astype(np.float32), size, interpolation=opencv().INTER_LINEAR)
+    whole: np.ndarray = np.pad(large, ((0, camera.height - size[1]), (0, camera.width - size[0])))
+    return whole
 
 
 def _hinted(trimap: UInt8[np.ndarray, "H W"], hint: Hint, options: CaptureOptions) -> UInt8[np.ndarray, "H W"]:
@@ -220,15 +235,11 @@ def _hinted(trimap: UInt8[np.ndarray, "H W"], hint: Hint, options: CaptureOption
     return found
 
 
-def _enlarged(mask: Bool[np.ndarray, "_ _"], camera: Camera, side: int, picture: Path) -> Bool[np.ndarray, "H W"]:
+def _sharpened(mask: Bool[np.ndarray, "_ _"], camera: Camera, side: int, picture: Path) -> Bool[np.ndarray, "H W"]:
     """The mask of blocks of pixels in those pixels themselves: its edge is found anew near by."""
     if side == 1:
         return mask
-    cv2 = opencv()
-    size = (mask.shape[1] * side, mask.shape[0] * side)
-    large = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5
-    beyond = ((0, camera.height - size[1]), (0, camera.width - size[0]))
-    trimap = _band(np.pad(large, beyond), 0.0, least_px=1.5 * side)
+    trimap = _band(enlarged(mask, camera, side) > 0.5, 0.0, least_px=1.5 * side)
     return _cut(read_png(picture)[..., :3], trimap, 1)
 
 

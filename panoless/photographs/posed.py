@@ -49,6 +49,14 @@ class GroundPlane:
     offset: float
 
 
+LEVEL = GroundPlane((0.0, 0.0, 1.0), 0.0)
+"""The ground of a world that stands on it: z = 0."""
+PLANES_TRIED = 1000
+LEAST_UPWARD = 0.2
+"""Cosine of the angle between the ground's normal and the cameras' mean upward direction. Not tuned, nor is the number
+above."""
+
+
 @dataclass(frozen=True)
 class Poses:
     """Poses of the frames, and of which there are none."""
@@ -64,10 +72,6 @@ class Poses:
     """Standard deviation of the focal length as a share of it, where it was estimated here."""
     ground: GroundPlane | None = None
     """The board's plane, or that of most points that poses were found from."""
-
-
-PLANES_TRIED = 1000
-LEAST_UPWARD = 0.2
 
 
 def find_ground(

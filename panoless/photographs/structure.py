@@ -10,7 +10,7 @@ from jaxtyping import Float
 from panoless.photographs.frames import Frames, Photograph
 from panoless.photographs.models import poses_of, pycolmap_module
 from panoless.photographs.options import CaptureOptions
-from panoless.photographs.posed import GroundPlane, Poses, as_rows
+from panoless.photographs.posed import LEVEL, Poses, as_rows
 from shinypartial.core.camera import Similarity
 from shinypartial.core.errors import InputError
 from shinypartial.io.images import read_png, write_png
@@ -81,7 +81,7 @@ def upright_world(poses: Poses) -> Poses:
     shift, ground = np.zeros(3), None
     if poses.ground is not None:
         up, shift[2] = np.array(poses.ground.normal), -poses.ground.offset
-        ground = GroundPlane((0.0, 0.0, 1.0), 0.0)
+        ground = LEVEL
     turn = Similarity(1.0, turned_up(up / np.linalg.norm(up)), shift)
     views = []
     for view in poses.views:

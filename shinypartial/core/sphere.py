@@ -83,6 +83,13 @@ def cube_solid_angles(resolution: int) -> Float[np.ndarray, "L L"]:
     return corner[1:, 1:] - corner[:-1, 1:] - corner[1:, :-1] + corner[:-1, :-1]
 
 
+def tangents(directions: Float[np.ndarray, "*P 3"]) -> tuple[Float[np.ndarray, "*P 3"], Float[np.ndarray, "*P 3"]]:
+    """Unit directions e₁ and e₂ = d × e₁ at right angles to each unit direction d, and to the axis farthest from it."""
+    first = np.cross(directions, np.eye(3)[np.abs(directions).argmin(-1)])
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return first, np.cross(directions, first)
+
+
 def fibonacci_directions(count: int) -> Float[np.ndarray, "N 3"]:
     """So many unit directions evenly over the sphere, from +Z to −Z: each is turned on by the golden angle."""
     index = np.arange(count) + 0.5

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from shinypartial.core.camera import Camera
+from shinypartial.core.sphere import tangents
 from shinypartial.core.trajectory import Trajectory
 from shinypartial.io.files import atomic_write
 
@@ -80,9 +81,7 @@ def side_view(axis: Float[np.ndarray, "3"]) -> PlotView:
 
 def hemisphere_boundary(axis: Float[np.ndarray, "3"], radius: float) -> Float[np.ndarray, "P 3"]:
     """Points of the great circle at right angles to the axis, closed, about the origin."""
-    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    first /= np.linalg.norm(first)
-    second = np.cross(axis, first)
+    first, second = tangents(axis)
     turn = np.linspace(0, 2 * np.pi, BOUNDARY_POINTS)[:, None]
     return radius * (np.cos(turn) * first + np.sin(turn) * second)
 

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from panoless.geometry.free_form.options import ConcaveOptions
 from panoless.geometry.free_form.surface import NODE, LevelSet
+from shinypartial.core.sphere import tangents
 
 KNOTS = np.linspace(0, np.pi / 2, 5)
 """Angles from a hollow's axis at which its reach is given; at the first and the last of them it is 1."""
@@ -29,9 +30,7 @@ class Chart:
     @classmethod
     def about(cls, origin: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"], radius: float) -> "Chart":
         """With w along a unit normal."""
-        across = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-        across /= np.linalg.norm(across)
-        return cls(origin, np.stack([across, np.cross(normal, across), normal]), radius)
+        return cls(origin, np.stack([*tangents(normal), normal]), radius)
 
     def coordinates(self, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
         """Of points of the normalized frame."""

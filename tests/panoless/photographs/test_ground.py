@@ -71,9 +71,9 @@ def test_a_mirror_ball_is_found_without_a_hint(photographed) -> None:
 
 def test_the_sheet_is_known_below_the_ball_from_views_that_look_past_it() -> None:
     pictures = [seen_by(camera)[0] for camera in CAMERAS]
-    sheet, half = sheet_about(CAMERAS, GROUND, OPTIONS)
+    sheet = sheet_about(CAMERAS, GROUND, OPTIONS)
     foot = np.linalg.norm([camera.position_world for camera in CAMERAS], axis=1)
-    assert half == pytest.approx(0.5 * np.median(foot), rel=0.01)
+    assert sheet.half_side == pytest.approx(0.5 * np.median(foot), rel=0.01)
     pattern, known = pattern_of(*laid_out(pictures, CAMERAS, sheet), OPTIONS)
     rows, columns = np.indices(known.shape)
     places = sheet.first + rows[..., None] * sheet.down + columns[..., None] * sheet.right
@@ -94,7 +94,7 @@ def test_the_sheet_is_known_below_the_ball_from_views_that_look_past_it() -> Non
 def test_gains_even_out_exposure_and_white_balance() -> None:
     factors = np.random.default_rng(2).uniform(0.85, 1.1, (len(CAMERAS), 3))
     pictures = [(seen_by(c)[0] * f).clip(0, 255).astype(np.uint8) for c, f in zip(CAMERAS, factors, strict=True)]
-    sheet, _ = sheet_about(CAMERAS, GROUND, OPTIONS)
+    sheet = sheet_about(CAMERAS, GROUND, OPTIONS)
     even = factors * gains_of(*laid_out(pictures, CAMERAS, sheet), OPTIONS)
     assert (even.std(0) / even.mean(0)).max() < 0.03
     assert (factors.std(0) / factors.mean(0)).min() > 0.05
@@ -102,7 +102,7 @@ def test_gains_even_out_exposure_and_white_balance() -> None:
 
 def test_a_view_tells_ground_from_mirror() -> None:
     pictures = [seen_by(camera)[0] for camera in CAMERAS]
-    sheet, _ = sheet_about(CAMERAS, GROUND, OPTIONS)
+    sheet = sheet_about(CAMERAS, GROUND, OPTIONS)
     pattern, known = pattern_of(*laid_out(pictures, CAMERAS, sheet), OPTIONS)
     mask = seen_by(CAMERAS[4])[1]
     view = evidence_of(pictures[4], CAMERAS[4], np.ones(3, np.float32), sheet, pattern, known, OPTIONS)

@@ -19,6 +19,7 @@ from shinypartial.core.sphere import (
     latlong_to_directions,
     sample_cube,
     sample_latlong,
+    tangents,
 )
 
 units = st.floats(0, 1)
@@ -214,3 +215,15 @@ def test_axis_colors_survive_both_resamplings(name: str) -> None:
     cube = latlong_to_cube(smooth(latlong_directions(64)), 32)
     np.testing.assert_allclose(sample_cube(cube, direction), smooth(direction), atol=2e-2)
     np.testing.assert_allclose(sample_latlong(cube_to_latlong(cube, 64), direction), smooth(direction), atol=5e-2)
+
+
+@pytest.mark.parametrize("shape", [(3,), (50, 3), (4, 5, 3)])
+def test_tangents_and_their_direction_are_a_right_handed_frame(shape: tuple[int, ...]) -> None:
+    directions = np.random.default_rng(0).normal(size=shape)
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    first, second = tangents(directions)
+    frames = np.stack([first, second, directions], -2)
+    np.testing.assert_allclose(
+        frames @ np.swapaxes(frames, -1, -2), np.broadcast_to(np.eye(3), frames.shape), atol=1e-14
+    )
+    np.testing.assert_allclose(np.linalg.det(frames), 1)
