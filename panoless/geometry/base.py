@@ -254,6 +254,9 @@ class Family(Protocol):
     """The kind whose proposal it takes on where that one is not chosen; None: it makes its own."""
     needs_depth: ClassVar[bool]
     """Whether views have to come from different directions, which tell how far away the object is."""
+    told_by_outlines: ClassVar[bool]
+    """Whether outlines tell the whole shape, so that what photographs leave unexplained is no doubt of it unless
+    surfels explain more: noise, or who holds the camera."""
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """A shape that explains the silhouettes; None where they determine none.

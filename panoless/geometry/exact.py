@@ -111,6 +111,7 @@ class ExactFamily:
     finds_poses: ClassVar[bool] = False
     refines: ClassVar[str | None] = None
     needs_depth: ClassVar[bool] = True
+    told_by_outlines: ClassVar[bool] = False
 
     def poses_by_outlines(self, views: Views, proposal: Proposal, config: FitConfig) -> ToldPoses | None:
         """None: they are found beside the shape (see `panoless.alignment`)."""

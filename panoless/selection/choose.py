@@ -38,9 +38,9 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
 
     Candidates are examined from the simplest on. One is refused when it misses the silhouettes, or when surfels that
     start on it explain held-out views clearly better. One that leaves more than right ones do is taken unless one after
-    it leaves much less. One that leaves too much waits until all others are refused. Surfels explain what is left; of
-    the candidates that explained the silhouettes they start on the one from which they explained held-out views best.
-    `config.model` overrides.
+    it leaves much less, or at once where outlines tell its whole shape. One that leaves too much waits until all others
+    are refused. Surfels explain what is left; of the candidates that explained the silhouettes they start on the one
+    from which they explained held-out views best. `config.model` overrides.
     Raises InputError when a kind is asked for and can't be proposed, and when views along one line show no kind that
     these tell.
     """
@@ -66,7 +66,7 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
             table[-1] = replace(candidate, verdict=Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason=BENT)
             continue
         fitted.append((candidate, geometry))
-        if explains and error_of(fitted[-1]) <= config.selection.doubted_error:
+        if explains and (family.told_by_outlines or error_of(fitted[-1]) <= config.selection.doubted_error):
             break
     chosen = [each for each in fitted if each[0].verdict == Verdict.CHOSEN]
     if chosen:

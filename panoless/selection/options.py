@@ -24,8 +24,8 @@ class SelectionOptions:
     """A candidate that leaves more of the held-out views unexplained is refused even if surfels do no better, unless no
     later kind explains more. Right ones leave a twentieth."""
     doubted_error: NonNegative = 0.15
-    """Where a candidate leaves more, those after it are asked, too. Right ones of development scenes leave up to
-    0.143."""
+    """Where a candidate leaves more, those after it are asked, too, but after one that outlines tell wholly. Right ones
+    of development scenes leave up to 0.143."""
     doubted_share: Share = 0.5
     """One of those is preferred where it leaves less than this share of that. Not tuned."""
     explained_error: Share = 0.03

@@ -25,6 +25,7 @@ class SurfelFamily:
     finds_poses: ClassVar[bool] = True
     refines: ClassVar[str | None] = None
     needs_depth: ClassVar[bool] = True
+    told_by_outlines: ClassVar[bool] = False
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """Surfels explain any silhouettes."""

@@ -201,6 +201,19 @@ def test_model_selection_takes_the_sphere() -> None:
     assert [each.verdict for each in selection.candidates] == [Verdict.CHOSEN]
 
 
+def test_noise_raises_no_doubt_of_a_sphere() -> None:
+    """Outlines tell it, so no other kind is asked where photographs leave more than right ones do of another."""
+    views, noise = ball_views(12), torch.Generator().manual_seed(3)
+    noisy = [
+        replace(view, radiance=(view.radiance + 0.03 * torch.randn(view.radiance.shape, generator=noise)).clamp(0, 1))
+        for view in views.train
+    ]
+    mirror, selection = choose_geometry(replace(views, train=tuple(noisy)), CONFIG, as_started)
+    (candidate,) = selection.candidates
+    assert mirror.kind == candidate.kind == "sphere"
+    assert CONFIG.selection.doubted_error < candidate.held_out_error < CONFIG.selection.largest_error
+
+
 @pytest.mark.parametrize("count", [2, 9])
 def test_the_operator_of_one_view_is_replaced_by_another(count: int) -> None:
     """A black figure that stands at each camera, 8° wide, where others see the surroundings."""
