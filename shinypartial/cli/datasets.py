@@ -128,7 +128,7 @@ class Align:
     output: Path
     """Folder to write."""
     gauge: Literal["board", "similarity", "same"] | None = None
-    """By the board's known place, which estimates nothing; by the similarity that brings camera centers together; or
+    """By the board's known place, which estimates nothing; by the similarity that brings all poses nearest; or
     not at all, where cameras are in the truth's world. By the board, where the film has one, when not given."""
 
     def run(self) -> None:

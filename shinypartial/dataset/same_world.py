@@ -23,9 +23,11 @@ from shinypartial.io.records import write_record
 
 GaugeKind = Literal["board", "similarity", "same"]
 ALIGNMENT = "alignment.json"
-#: Camera centers that span less than this share of their spread in two directions tell no rotation.
-LEAST_SPREAD = 1e-3
-FEWEST_CAMERAS = 3
+#: Camera centers that span less than this share of their distance from the world's origin tell no scale.
+LEAST_SPREAD = 1e-6
+FEWEST_CAMERAS = 2
+#: Of rotation and scale in turn, which then stand still to the last digits.
+ROUNDS = 20
 
 
 @dataclass(frozen=True)
@@ -56,32 +58,41 @@ class Alignment:
         )
 
 
-def similarity(captured: Float[np.ndarray, "V 3"], true: Float[np.ndarray, "V 3"]) -> Similarity:
-    """The one that brings captured camera centers nearest to the true ones in least squares (Umeyama 1991).
+def similarity(captured: Float[np.ndarray, "V 4 4"], true: Float[np.ndarray, "V 4 4"]) -> Similarity:
+    """The one that brings captured camera-to-world poses nearest to the true ones.
 
-    Raises InputError for fewer than three, and for centers on a line, which leave a turn about it open.
+    Least squares of what is left of the turns, and of the shifts over the median true distance d from the origin, where
+    the object is: Σ ‖R Aᵢ − Bᵢ‖²/2 + ‖s R xᵢ + t − yᵢ‖²/d², with rotations A and centers x of the captured cameras, B
+    and y of the true ones. For a scale s that is an orthogonal Procrustes problem (Schönemann 1966), and for R the
+    scale is that of Umeyama (1991). Centers alone leave the turn about a line open on which they almost stand.
+    Raises InputError for fewer than two, and for centers at one place, which tell no scale.
     """
-    spread = np.linalg.svd(captured - captured.mean(0), compute_uv=False) if len(captured) else np.zeros(1)
-    if len(captured) < FEWEST_CAMERAS or spread[1] < LEAST_SPREAD * spread[0]:
+    ours, theirs = (poses[:, :3, 3] - poses[:, :3, 3].mean(0) for poses in (captured, true))
+    distance = np.median(np.linalg.norm(true[:, :3, 3], axis=1)) if len(true) else 1.0
+    spread = np.linalg.norm(ours, axis=1).max(initial=0.0)
+    if len(captured) < FEWEST_CAMERAS or spread <= LEAST_SPREAD * np.abs(captured[:, :3, 3]).max():
         raise InputError(
-            expected="at least three captured cameras that do not stand on a line",
-            found=f"{len(captured)}" + (" on a line" if len(captured) >= FEWEST_CAMERAS else ""),
-            remedy="Capture more frames, at two heights.",
+            expected="captured cameras in at least two places",
+            found=f"{len(captured)}" + (" in one place" if len(captured) >= FEWEST_CAMERAS else ""),
+            remedy="Capture frames from several sides.",
         )
-    ours, theirs = captured - captured.mean(0), true - true.mean(0)
-    left, values, right = np.linalg.svd(theirs.T @ ours)
-    proper = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    rotation = left @ np.diag(proper) @ right
-    scale = float((values * proper).sum() / np.sum(ours**2))
-    return Similarity(scale, rotation, true.mean(0) - scale * rotation @ captured.mean(0))
+    by_turns = np.einsum("vij,vkj->ik", true[:, :3, :3], captured[:, :3, :3])
+    by_centers = theirs.T @ ours / distance**2
+    scale = float(np.linalg.norm(theirs) / np.linalg.norm(ours))
+    for _ in range(ROUNDS):
+        left, _, right = np.linalg.svd(by_turns + 2 * scale * by_centers)
+        rotation = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
+        scale = float(np.sum(theirs * (ours @ rotation.T)) / np.sum(ours**2))
+    return Similarity(scale, rotation, true[:, :3, 3].mean(0) - scale * rotation @ captured[:, :3, 3].mean(0))
 
 
 def align(captured: Path, truth: Path, output: Path, gauge: GaugeKind | None = None) -> Alignment:
     """Write a copy of a captured dataset whose cameras are in the truth's world, with the truth's test cameras.
 
     Frames of the same name belong together. `board` shifts by the known place of the board's corner and estimates
-    nothing; `similarity` is estimated from camera centers; with `same` the captured world is the truth's. When not
-    given, it is `board` where the truth has a board, else `similarity`. The test views have cameras and no pictures.
+    nothing; `similarity` is estimated from the poses of all cameras; with `same` the captured world is the truth's.
+    When not given, it is `board` where the truth has a board, else `similarity`. The test views have cameras and no
+    pictures.
     Raises InputError for frames that the truth doesn't know.
     """
     ours, theirs = open_dataset(captured), open_dataset(truth)
@@ -113,8 +124,8 @@ def _pairs(ours: Dataset, theirs: Dataset) -> list[tuple[Frame, Frame]]:
 
 def _gauge(kind: GaugeKind, pairs: Sequence[tuple[Frame, Frame]], truth: Dataset) -> Similarity:
     if kind == "similarity":
-        centers = np.array([[frame.camera.position_world for frame in pair] for pair in pairs])
-        return similarity(centers[:, 0], centers[:, 1])
+        poses = np.array([[frame.camera.camera_to_world for frame in pair] for pair in pairs])
+        return similarity(poses[:, 0], poses[:, 1])
     if kind == "same":
         return Similarity(1.0, np.eye(3), np.zeros(3))
     if truth.board_corner is None:
