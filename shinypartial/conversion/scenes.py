@@ -84,6 +84,7 @@ def usd_scene(world: str, surface: Mesh | None, reflectance: tuple[float, float,
     return f"""#usda 1.0
 (
     defaultPrim = "scene"
+    metersPerUnit = 1
     upAxis = "Z"
 )
 
