@@ -41,7 +41,10 @@ def fit_height_field(
         height_field = flat_height_field(plane, options.cells)
         for scale_px in options.edge_scales_px:
             height_field = step_height_field(contours, height_field, scale_px, options.edge_bending, options)[0]
-        progress = Progress("fitting a bent mirror", len(options.rounds) + 1)
+        progress = Progress("fitting a bent mirror", len(options.rounds) + 2)
+        domes = [height_field.domed(slope) for slope in options.start_slopes]
+        height_field = min(domes, key=lambda each: _unexplained(views, views, each, options.rounds[0], options))
+        progress.advance()
         for each in options.rounds:
             height_field = _refine(views, contours, height_field, each, options)
             progress.advance()
@@ -63,10 +66,7 @@ def _refine_grid(
         return height_field
 
     def error(each: HeightField) -> float:
-        environment = solve_environment([observe(kept, each, last.rays, options).rays], last.resolution)
-        observed = observe(held_out, each, last.rays, options)
-        shown = observed.mirrored_by(each, observed.hits).light(environment)
-        return float(bounded_error(shown - observed.radiance, last.robust_scale).mean()) if len(shown) else 1.0
+        return _unexplained(kept, held_out, each, last, options)
 
     judged, of_kept = replace(last, steps=options.judged_steps), _contours(kept, options)
     for _ in range(options.halvings):
@@ -75,6 +75,16 @@ def _refine_grid(
             return height_field
         height_field = _refine(views, contours, candidate, last, options)
     return height_field
+
+
+def _unexplained(
+    solved: Views, tested: Views, height_field: HeightField, each: HeightFieldRound, options: HeightFieldOptions
+) -> float:
+    """The mean bounded error of some views under the map of others; 1 where nothing is seen."""
+    environment = solve_environment([observe(solved, height_field, each.rays, options).rays], each.resolution)
+    observed = observe(tested, height_field, each.rays, options)
+    shown = observed.mirrored_by(height_field, observed.hits).light(environment)
+    return float(bounded_error(shown - observed.radiance, each.robust_scale).mean()) if len(shown) else 1.0
 
 
 def _refine(

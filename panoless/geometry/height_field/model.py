@@ -15,7 +15,7 @@ from panoless.geometry.plane.model import Plane
 from panoless.kernels.height_field import first_hits
 from panoless.kernels.rasterize import RasterCamera
 from panoless.numeric.bspline import cubic_bsplines_at, with_halved_knots
-from panoless.numeric.polygon import depth_inside, projected_coverage
+from panoless.numeric.polygon import depth_inside, projected_coverage, with_cut_sides
 
 ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 """Derivatives along u and v: height, slopes, bending."""
@@ -102,6 +102,22 @@ class HeightField:
         finer = with_halved_knots(with_halved_knots(self.coefficients).T).T
         return replace(self, spacing=self.spacing / 2, coefficients=finer)
 
+    def domed(self, slope: float) -> "HeightField":
+        """With a dome more, of that mean slope at the boundary, where it is zero in the mean; a bowl where negative.
+
+        Its height is slope·R/2 (1 − pᵀ A p) over places p from the boundary's middle, A⁻¹ being as their covariance
+        and R² its determinant's root.
+        """
+        middle = self.plane.boundary.mean(0)
+        away = self.plane.boundary - middle
+        form = np.linalg.inv(away.T @ away)
+        form /= np.einsum("pi,ij,pj->p", away, form, away).mean()
+        radius = np.linalg.det(form) ** -0.25
+        index = np.stack(np.meshgrid(*map(np.arange, self.coefficients.shape), indexing="ij"), -1)
+        places = self.low + self.spacing * (index - 1) - middle
+        dome = slope * radius / 2 * (1 - np.einsum("mni,ij,mnj->mn", places, form, places))
+        return replace(self, coefficients=self.coefficients + dome)
+
     def quadrilaterals(self) -> tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, "F 4"]]:
         """Points in the normalized frame, over a grid of the boundary's box, and the faces within the boundary."""
         low, high = self.plane.boundary.min(0), self.plane.boundary.max(0)
@@ -146,11 +162,14 @@ class HeightField:
 
 
 def flat_height_field(plane: Plane, cells: int) -> HeightField:
-    """A height field without height, of that many cells along the longer side of the boundary."""
+    """A height field without height, of that many cells along the longer side of the boundary, whose sides are cut
+    until they are no longer than a cell: the edge is straight between vertices.
+    """
     low, extent = plane.boundary.min(0), np.ptp(plane.boundary, 0)
     spacing = float(extent.max()) / cells
     rows, columns = (int(np.ceil(length / spacing - 1e-9)) + 3 for length in extent)
-    return HeightField(plane, low, spacing, np.zeros((rows, columns)))
+    cut = replace(plane, boundary=with_cut_sides(plane.boundary, spacing))
+    return HeightField(cut, low, spacing, np.zeros((rows, columns)))
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,10 @@ class HeightFieldOptions:
     """Most contour points of all views. Not tuned."""
     edge_scales_px: NonEmpty[float] = (2.0, 1.0, 1.0, 0.5, 0.5, 0.5)
     """Robust scales, in pixels, of the first steps, which ask contours only. Not tuned."""
+    start_slopes: NonEmpty[float] = (0.0, 0.2, 0.4, 0.6, -0.2, -0.4, -0.6)
+    """Domes and bowls, by their slope at the edge, of which the one that photographs agree on best is the start. With a
+    spherical cap of slope 0.45, photographs leave half as much of 0.4 and 0.5 as of 0.2 and 0.6, and of a flat mirror
+    half as much as of 0.1."""
     edge_bending: float = 1e-2
     """Weight of the bending energy in these steps, against the mean diagonal of the data: contours say nothing of the
     inside. Not tuned.

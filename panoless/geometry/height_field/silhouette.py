@@ -21,9 +21,8 @@ if TYPE_CHECKING:
 
 def edge_residuals(contours: MaskContours, height_field: HeightField, options: HeightFieldOptions) -> BoundaryResiduals:
     """Distances of the contours from the mirror's edge or its frame, whichever hides the other."""
-    return boundary_residuals(
-        contours, height_field.plane, options.contours, lambda places: height_field.heights(places, 0)[0]
-    )
+    plane = height_field.plane
+    return boundary_residuals(contours, plane, options.contours, height_field.heights(plane.boundary, 0)[0])
 
 
 def edge_jacobian(residuals: BoundaryResiduals, height_field: HeightField) -> "csr_matrix":
@@ -34,9 +33,14 @@ def edge_jacobian(residuals: BoundaryResiduals, height_field: HeightField) -> "c
     from scipy import sparse
 
     boundary, framed = height_field.plane.boundary, height_field.plane.frame_height > 0
-    start, end = boundary[residuals.side], np.roll(boundary, -1, 0)[residuals.side]
-    index, basis = height_field.basis(start + residuals.along[:, None] * (end - start), 0)
-    by_height = jacobian_of_rows(residuals.by_height[:, None] * basis[0], index, height_field.coefficients.size)
+    index, basis = height_field.basis(boundary, 0)
+    ends = np.stack([residuals.side, (residuals.side + 1) % len(boundary)], 1)
+    shares = residuals.by_height[:, None] * np.stack([1 - residuals.along, residuals.along], 1)
+    by_height = jacobian_of_rows(
+        (shares[:, :, None] * basis[0][ends]).reshape(len(ends), -1),
+        index[ends].reshape(len(ends), -1),
+        height_field.coefficients.size,
+    )
     known = sparse.diags(np.append([framed, framed, 0.0, framed], np.ones(boundary.size)))
     return sparse.hstack([boundary_jacobian(residuals, len(boundary)) @ known, by_height]).tocsr()
 

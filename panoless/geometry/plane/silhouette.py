@@ -2,7 +2,6 @@
 and the boundary's vertices.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,8 +17,6 @@ from panoless.numeric.robust import bounded_error, robust_scale, robust_weight
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
-
-HeightOf = Callable[[Float[np.ndarray, "P 2"]], Float[np.ndarray, "P"]]
 
 
 @dataclass(frozen=True)
@@ -67,7 +64,10 @@ def back_project(contours: MaskContours, plane: Plane) -> tuple[Float[np.ndarray
 
 
 def boundary_residuals(
-    contours: MaskContours, plane: Plane, options: PlaneOptions = PlaneOptions(), height_of: HeightOf | None = None
+    contours: MaskContours,
+    plane: Plane,
+    options: PlaneOptions = PlaneOptions(),
+    heights: Float[np.ndarray, "N"] | None = None,
 ) -> BoundaryResiduals:
     """First-order pixel distances: the plane distance from a side times |det J|/‖J τ‖, J = ∂pixel/∂coordinates.
 
@@ -75,7 +75,7 @@ def boundary_residuals(
     along its ray r. What stands at height z over a side is seen (ν·v) z/(H − z) inside of it, ν the outward normal,
     v = camera − side and H = n·v. The same turn and shift change ν·v by −H ν·(a, b) and H by
     a (v₁ + p₁) + b (v₂ + p₂) − c. What stands there is the frame where the camera stands beyond the side, and elsewhere
-    the edge of the mirror itself, at height zero unless `height_of` gives one.
+    the edge of the mirror itself, at height zero unless vertices have `heights`, between which it is straight.
     """
     coordinates, valid = back_project(contours, plane)
     corners, tangent_u, tangent_v = plane.boundary, plane.tangent_u, plane.tangent_v
@@ -96,8 +96,9 @@ def boundary_residuals(
     foot = corners[side] + along[:, None] * sides[side]
     camera = np.stack([contours.centers @ tangent_u, contours.centers @ tangent_v], 1)
     beyond = (outward * (camera - foot)).sum(1)
-    own_height = np.zeros(len(side)) if height_of is None else height_of(foot)
-    framed = plane.frame_height > 0 or height_of is None
+    lifted = np.zeros(len(corners)) if heights is None else heights
+    own_height = (1 - along) * lifted[side] + along * np.roll(lifted, -1)[side]
+    framed = plane.frame_height > 0 or heights is None
     by_frame = (beyond > 0) & (own_height <= plane.frame_height) & framed
     level = np.where(by_frame, plane.frame_height, own_height)
     camera_height = np.where(valid, contours.centers @ plane.normal - plane.offset, np.inf)

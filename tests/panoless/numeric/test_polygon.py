@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from jaxtyping import Float
 from matplotlib.path import Path as PolygonPath
 
-from panoless.numeric.polygon import contains, depth_inside, nearest_side, polygon_coverage
+from panoless.numeric.polygon import contains, depth_inside, nearest_side, polygon_coverage, with_cut_sides
 
 
 def area(polygon: Float[np.ndarray, "N 2"]) -> float:
@@ -82,3 +82,14 @@ def test_inside_is_as_another_implementation_has_it_and_gives_the_sign_of_the_de
     np.testing.assert_array_equal(depth_inside(points, POLYGON) > 0, inside)
     np.testing.assert_array_equal(contains(POLYGON[::-1].copy(), points), inside)
     assert depth_inside(np.array([[0.5, 2.0], [-0.5, 2.0]]), POLYGON).tolist() == [0.5, -0.5]
+
+
+@given(star_polygons(), st.floats(0.1, 30))
+def test_cut_sides_are_short_and_the_polygon_is_the_same(polygon: np.ndarray, longest: float) -> None:
+    """No vertex is lost, area and length stay, and no piece could be spared."""
+    cut = with_cut_sides(polygon, longest)
+    lengths, whole = (np.linalg.norm(np.roll(each, -1, 0) - each, axis=1) for each in (cut, polygon))
+    assert lengths.max() <= longest * (1 + 1e-6)
+    assert len(cut) == np.maximum(np.ceil(whole / longest - 1e-9), 1).sum()
+    assert all((cut == corner).all(1).any() for corner in polygon)
+    np.testing.assert_allclose([area(cut), lengths.sum()], [area(polygon), whole.sum()])

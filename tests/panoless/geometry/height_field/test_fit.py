@@ -43,7 +43,7 @@ def views(truth: HeightField) -> Views:
 def test_derivatives_of_contour_distances_are_finite_differences(truth: HeightField, views: Views, kind: str) -> None:
     """Of each distance, a step away from the truth, but for points that change sides: 2 % of the root mean square."""
     contours = mask_contours(views)
-    size, vertices = truth.coefficients.size, len(PLANE.boundary)
+    size, vertices = truth.coefficients.size, len(truth.plane.boundary)
     direction = np.zeros(4 + 2 * vertices + size)
     parts = {"tilt": slice(0, 2), "frame": slice(3, 4), "boundary": slice(4, -size), "heights": slice(-size, None)}
     chosen = direction[parts[kind]]
@@ -106,7 +106,7 @@ def test_the_photometric_gradient_is_that_of_what_no_map_explains(truth: HeightF
 
     def cost(sign: float) -> float:
         shifted = apply_height_field_step(
-            height_field, sign * step * np.append(np.zeros(4 + PLANE.boundary.size), direction)
+            height_field, sign * step * np.append(np.zeros(4 + truth.plane.boundary.size), direction)
         )
         bare = replace(shifted, plane=replace(shifted.plane, frame_height=0.0))
         total, parts = 0.0, []
@@ -147,6 +147,32 @@ def test_a_bent_and_tilted_mirror_is_recovered(truth: HeightField) -> None:
         np.mean(normal_errors_deg(found, truth, camera))
         < np.mean(normal_errors_deg(flat_height_field(TILTED, 4), truth, camera)) / 10
     )
+
+
+@pytest.mark.parametrize("slope", [0.45, -0.3])
+def test_a_dome_and_a_bowl_are_found_from_a_flat_start(slope: float) -> None:
+    """Round convex mirrors turn rays by 50 degrees from edge to edge; a flat mirror explains nothing of that."""
+    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    disc = plane_of(0.7 * np.stack([np.cos(turn), np.sin(turn)], 1))
+    truth = flat_height_field(disc, 6).domed(slope)
+    views, camera = height_field_views(truth, arc(16, size=64)), arc(16)[8]
+    found = fit_height_field(views, disc, replace(OPTIONS, cells=6, halvings=0))
+    assert np.mean(normal_errors_deg(flat_height_field(disc, 6), truth, camera)) > 9
+    assert np.mean(normal_errors_deg(found, truth, camera)) < 0.5
+
+
+def test_a_round_outline_bends_no_mirror() -> None:
+    """What a polygon of few sides misses of a circle, more than a pixel here, is not put down to heights."""
+    circle, few = (
+        0.7 * np.stack([np.cos(turn), np.sin(turn)], 1)
+        for turn in (np.linspace(0, 2 * np.pi, count, endpoint=False) for count in (256, 16))
+    )
+    views = height_field_views(flat_height_field(plane_of(circle), 16), arc(12, size=96))
+    contours, height_field = mask_contours(views), flat_height_field(plane_of(few), 16)
+    for scale in OPTIONS.edge_scales_px:
+        height_field, _ = step_height_field(contours, height_field, scale, OPTIONS.edge_bending, OPTIONS)
+    middle = height_field.plane.boundary.mean(0, keepdims=True)
+    assert abs(height_field.heights(middle, 0)[0, 0]) < 0.01
 
 
 def test_a_tilt_that_photographs_do_not_tell_changes_nothing_for_them(truth: HeightField, views: Views) -> None:
@@ -203,7 +229,7 @@ def test_the_cost_of_photographs_has_the_gradient_of_their_equations(truth: Heig
     photographs = photographs_at(height_field, observe(views, height_field, 20_000), texel_map(128))
     gradient, matrix = photographs.equations()
     direction = np.random.default_rng(7).normal(size=len(gradient))
-    step = 1e-3 * np.append(np.zeros(4 + PLANE.boundary.size), direction)
+    step = 1e-3 * np.append(np.zeros(4 + truth.plane.boundary.size), direction)
     ahead, behind = (photographs.cost(apply_height_field_step(height_field, sign * step)) for sign in (1, -1))
     scale = np.sqrt(2 * photographs.cost(height_field) * (direction @ matrix @ direction))
     assert abs(gradient @ direction - (ahead - behind) / 2e-3) < 0.05 * scale
