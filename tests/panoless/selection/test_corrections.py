@@ -8,11 +8,13 @@ import pytest
 import torch
 
 from panoless.alignment.search import PosedProposal
-from panoless.capture.corrections import NO_CORRECTIONS, Corrections
+from panoless.capture.corrections import NO_CORRECTIONS, Corrections, with_outline_moved
 from panoless.capture.lens import LensChange, with_focal_factor
 from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.geometry.base import Geometry, Proposal
+from panoless.geometry.height_field.kind import HeightFieldMirror
+from panoless.geometry.height_field.model import flat_height_field
 from panoless.geometry.plane.kind import PlaneFamily, PlaneMirror
 from panoless.geometry.registry import FAMILIES
 from panoless.presets import PRESETS
@@ -27,6 +29,7 @@ from shinypartial.core.conventions import SOLID_ALPHA
 from shinypartial.dataset.perturb.masks import dilated, eroded
 from tests.support.distortion import distorted
 from tests.support.mirror_body import body_views, sphere
+from tests.support.mirror_height_field import height_field_views
 from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
 from tests.support.mirror_revolution import around, goblet, revolution_views
 
@@ -311,3 +314,16 @@ def test_corrections_survive_a_checkpoint_and_earlier_ones_have_none() -> None:
     for name in ("focal_factor", "focal_uncertainty", "k1", "k1_uncertainty"):
         del plain["candidates"][0]["corrections"][name]
     assert selection_from_plain(**plain).corrections == NO_CORRECTIONS
+
+
+@pytest.mark.parametrize(("slope", "told"), [(0.0, True), (0.45, False)])
+def test_a_proposal_that_explains_nothing_tells_no_offset_of_masks(slope: float, told: bool) -> None:
+    """A flat proposal for a convex mirror; of a flat one, masks that are 3 px too large are told."""
+    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    disc = plane_of(0.7 * np.stack([np.cos(turn), np.sin(turn)], 1))
+    mirror = flat_height_field(disc, 6).domed(slope)
+    views = height_field_views(mirror, arc(10, 15.0, size=64))
+    large = replace(views, train=tuple(with_outline_moved(view, 3.0) for view in views.train))
+    fitted = Fitted(HeightFieldMirror(mirror), PosedProposal(Proposal(disc, 0.0, 1.0)))
+    found = mask_offset.find_mask_offset(PlaneFamily(), large, fitted, CONFIG)
+    assert found < -1 if told else found == 0
