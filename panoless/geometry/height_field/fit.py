@@ -41,7 +41,7 @@ def fit_height_field(
         height_field = flat_height_field(plane, options.cells)
         for scale_px in options.edge_scales_px:
             height_field = step_height_field(contours, height_field, scale_px, options.edge_bending, options)[0]
-        progress = Progress("fitting a bent mirror", len(options.rounds) + 2)
+        progress = Progress("fitting a bent mirror", len(options.rounds) + 3)
         domes = [height_field.domed(slope) for slope in options.start_slopes]
         height_field = min(domes, key=lambda each: _unexplained(views, views, each, options.rounds[0], options))
         progress.advance()
@@ -50,6 +50,29 @@ def fit_height_field(
             progress.advance()
         height_field = _refine_grid(views, contours, height_field, options)
         progress.advance()
+        cleared = _cleared(views, height_field, options)
+        if cleared is not height_field:
+            height_field = _refine(views, contours, cleared, options.rounds[-1], options)
+        progress.advance()
+    return height_field
+
+
+def _cleared(views: Views, height_field: HeightField, options: HeightFieldOptions) -> HeightField:
+    """With the height that mirrored rays have to pass, as long as what is left out was clearly worse explained."""
+    kept, held_out = (replace(views, train=tuple(part)) for part in split_held_out(views.train))
+    if not held_out.train:
+        return height_field
+
+    def error(each: HeightField) -> float:
+        return _unexplained(kept, held_out, each, options.rounds[-1], options)
+
+    least = error(height_field)
+    for height in options.clearances:
+        higher = replace(height_field, clearance=height)
+        left = error(higher)
+        if left > (1 - options.least_cleared) * least:
+            break
+        height_field, least = higher, left
     return height_field
 
 

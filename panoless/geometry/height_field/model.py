@@ -66,6 +66,10 @@ class HeightField:
     low: Float[np.ndarray, "2"]
     spacing: float
     coefficients: Float[np.ndarray, "M N"]
+    clearance: float = 0.0
+    """Mirrored rays have to pass the boundary at this height over the plane, if it is above that of the frame: a round
+    rim is higher than outlines tell.
+    """
 
     @property
     def num_parameters(self) -> int:
@@ -194,13 +198,14 @@ def visible_reflections(
     """Those of the given pixels whose mirrored rays pass the frame, if there is one, by a pixel or more."""
     origins, directions = pixel_rays(view.camera, pixels.cpu().numpy())
     plane, hits = height_field.plane, height_field.hits(origins, directions)
+    passed_height = max(plane.frame_height, height_field.clearance)
     directions_local = directions @ height_field.frame.T
     outgoing = reflect(directions_local, hits.normals)
     kept = hits.met & (outgoing[:, 2] > 0)
-    if plane.frame_height > 0:
+    if passed_height > 0:
         distance = np.where(kept, hits.distance, 0.0)
         height = origins @ plane.normal - plane.offset + distance * directions_local[:, 2]
-        rise = np.maximum(plane.frame_height - height, 0.0) / np.where(kept, outgoing[:, 2], 1.0)
+        rise = np.maximum(passed_height - height, 0.0) / np.where(kept, outgoing[:, 2], 1.0)
         passed = hits.places + rise[:, None] * outgoing[:, :2]
         pixel = (distance + rise) / view.camera.fx
         kept &= depth_inside(passed, plane.boundary) > options.clear_px * pixel

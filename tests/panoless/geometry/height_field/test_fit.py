@@ -175,6 +175,18 @@ def test_a_round_outline_bends_no_mirror() -> None:
     assert abs(height_field.heights(middle, 0)[0, 0]) < 0.01
 
 
+@pytest.mark.parametrize("rim", [0.0, 0.1])
+def test_what_a_rim_hides_of_the_surroundings_is_left_out(rim: float) -> None:
+    """Outlines tell nothing of a rim that stands back, and mirrored rays that meet it see black. Without one, none is
+    found.
+    """
+    truth = replace(flat_height_field(plane_of(RECTANGLE), 6).domed(0.3), clearance=rim)
+    views, camera = height_field_views(truth, arc(16, size=64)), arc(16)[8]
+    found = fit_height_field(views, plane_of(RECTANGLE), replace(OPTIONS, cells=6, halvings=0))
+    assert found.clearance in ((0.06, 0.12) if rim else (0.0,))
+    assert np.mean(normal_errors_deg(found, truth, camera)) < 0.5
+
+
 def test_a_tilt_that_photographs_do_not_tell_changes_nothing_for_them(truth: HeightField, views: Views) -> None:
     """Neither gradient nor matrix has anything along coefficients of a linear height; the rest is as it was."""
     photographs = photographs_at(truth, observe(views, truth, 10_000), texel_map(32))
