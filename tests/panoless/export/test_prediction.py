@@ -453,8 +453,9 @@ def normals_in(table: dict[str, np.ndarray]) -> np.ndarray:
 def test_the_normals_of_a_plane_and_of_a_height_field_are_in_the_ply(tmp_path: Path) -> None:
     """Those of the height field are perpendicular to differences of its heights."""
     height_field, frame = bumpy(plane_of(RECTANGLE), 0.02), ObjectFrame(np.array([1.0, -2.0, 0.5]), 3.0)
-    write_ply(tmp_path / "p.ply", PlaneMirror(height_field.plane).mesh(frame))
-    np.testing.assert_allclose(normals_in(read_ply(tmp_path / "p.ply")), [height_field.plane.normal] * 4, atol=1e-12)
+    plane = plane_of(RECTANGLE)
+    write_ply(tmp_path / "p.ply", PlaneMirror(plane).mesh(frame))
+    np.testing.assert_allclose(normals_in(read_ply(tmp_path / "p.ply")), [plane.normal] * 4, atol=1e-12)
     write_ply(tmp_path / "h.ply", HeightFieldMirror(height_field).mesh(frame))
     table, plane, step = read_ply(tmp_path / "h.ply"), height_field.plane, 1e-5
     points, normals = (vertices_of(table) - frame.center) / frame.radius, normals_in(table)
