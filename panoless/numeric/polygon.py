@@ -99,6 +99,17 @@ def depth_inside(points: Float[np.ndarray, "P 2"], boundary: Float[np.ndarray, "
     return np.where(contains(boundary, points), 1.0, -1.0) * np.sqrt(least)
 
 
+def with_cut_sides(corners: Float[np.ndarray, "N 2"], longest: float) -> Float[np.ndarray, "M 2"]:
+    """The same polygon with sides of equal pieces that are no longer."""
+    sides = _sides(corners)
+    counts = np.maximum(np.ceil(np.linalg.norm(sides, axis=1) / longest - 1e-9), 1).astype(int)
+    parts = [
+        corner + np.arange(count)[:, None] / count * side
+        for corner, side, count in zip(corners, sides, counts, strict=True)
+    ]
+    return np.concatenate(parts)
+
+
 def _feet(
     points: Float[np.ndarray, "P 2"], boundary: Float[np.ndarray, "N 2"]
 ) -> Iterator[tuple[Float[np.ndarray, "P"], Float[np.ndarray, "P"]]]:
@@ -111,14 +122,3 @@ def _feet(
 
 def _sides(boundary: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
     return np.roll(boundary, -1, 0) - boundary
-
-
-def with_cut_sides(corners: Float[np.ndarray, "N 2"], longest: float) -> Float[np.ndarray, "M 2"]:
-    """The same polygon with sides of equal pieces that are no longer."""
-    sides = np.roll(corners, -1, 0) - corners
-    counts = np.maximum(np.ceil(np.linalg.norm(sides, axis=1) / longest - 1e-9), 1).astype(int)
-    parts = [
-        corner + np.arange(count)[:, None] / count * side
-        for corner, side, count in zip(corners, sides, counts, strict=True)
-    ]
-    return np.concatenate(parts)

@@ -35,6 +35,12 @@ L_SHAPE = np.array([[-0.6, -0.5], [0.6, -0.5], [0.6, 0.1], [0.0, 0.1], [0.0, 0.5
 RECTANGLE = np.array([[-0.65, -0.5], [0.65, -0.5], [0.65, 0.5], [-0.65, 0.5]])
 
 
+def disc(count: int) -> Float[np.ndarray, "N 2"]:
+    """A boundary of so many vertices on a circle of radius 0.7."""
+    turn = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return 0.7 * np.stack([np.cos(turn), np.sin(turn)], 1)
+
+
 def plane_of(boundary: Float[np.ndarray, "N 2"], frame_height: float = 0.0, offset: float = 0.07) -> Plane:
     tangent_u = np.cross([0.0, 0.0, 1.0], NORMAL)
     tangent_u /= np.linalg.norm(tangent_u)

@@ -2,6 +2,7 @@
 fine as held-out views ask for.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -48,24 +49,26 @@ def fit_height_field(
         for each in options.rounds:
             height_field = _refine(views, contours, height_field, each, options)
             progress.advance()
-        height_field = _refine_grid(views, contours, height_field, options)
+        kept, held_out = (replace(views, train=tuple(part)) for part in split_held_out(views.train))
+
+        def error(each: HeightField) -> float:
+            return _unexplained(kept, held_out, each, options.rounds[-1], options)
+
+        if held_out.train:
+            height_field = _refine_grid(views, kept, contours, height_field, error, options)
         progress.advance()
-        cleared = _cleared(views, height_field, options)
-        if cleared is not height_field:
-            height_field = _refine(views, contours, cleared, options.rounds[-1], options)
+        if held_out.train:
+            cleared = _cleared(height_field, error, options)
+            if cleared is not height_field:
+                height_field = _refine(views, contours, cleared, options.rounds[-1], options)
         progress.advance()
     return height_field
 
 
-def _cleared(views: Views, height_field: HeightField, options: HeightFieldOptions) -> HeightField:
+def _cleared(
+    height_field: HeightField, error: Callable[[HeightField], float], options: HeightFieldOptions
+) -> HeightField:
     """With the height that mirrored rays have to pass, as long as what is left out was clearly worse explained."""
-    kept, held_out = (replace(views, train=tuple(part)) for part in split_held_out(views.train))
-    if not held_out.train:
-        return height_field
-
-    def error(each: HeightField) -> float:
-        return _unexplained(kept, held_out, each, options.rounds[-1], options)
-
     least = error(height_field)
     for height in options.clearances:
         higher = replace(height_field, clearance=height)
@@ -77,20 +80,18 @@ def _cleared(views: Views, height_field: HeightField, options: HeightFieldOption
 
 
 def _refine_grid(
-    views: Views, contours: MaskContours, height_field: HeightField, options: HeightFieldOptions
+    views: Views,
+    kept: Views,
+    contours: MaskContours,
+    height_field: HeightField,
+    error: Callable[[HeightField], float],
+    options: HeightFieldOptions,
 ) -> HeightField:
     """The height field on finer grids, as long as held-out views gain by them.
 
     What is there already was fitted to all views, so a finer grid has to gain a little more than that.
     """
-    kept, held_out = (replace(views, train=tuple(part)) for part in split_held_out(views.train))
     last = options.rounds[-1]
-    if not held_out.train:
-        return height_field
-
-    def error(each: HeightField) -> float:
-        return _unexplained(kept, held_out, each, last, options)
-
     judged, of_kept = replace(last, steps=options.judged_steps), _contours(kept, options)
     for _ in range(options.halvings):
         candidate = _refine(kept, of_kept, height_field.with_halved_cells(), judged, options)
@@ -104,8 +105,9 @@ def _unexplained(
     solved: Views, tested: Views, height_field: HeightField, each: HeightFieldRound, options: HeightFieldOptions
 ) -> float:
     """The mean bounded error of some views under the map of others; 1 where nothing is seen."""
-    environment = solve_environment([observe(solved, height_field, each.rays, options).rays], each.resolution)
-    observed = observe(tested, height_field, each.rays, options)
+    known = observe(solved, height_field, each.rays, options)
+    environment = solve_environment([known.rays], each.resolution)
+    observed = known if tested is solved else observe(tested, height_field, each.rays, options)
     shown = observed.mirrored_by(height_field, observed.hits).light(environment)
     return float(bounded_error(shown - observed.radiance, each.robust_scale).mean()) if len(shown) else 1.0
 

@@ -34,7 +34,7 @@ def edge_jacobian(residuals: BoundaryResiduals, height_field: HeightField) -> "c
 
     boundary, framed = height_field.plane.boundary, height_field.plane.frame_height > 0
     index, basis = height_field.basis(boundary, 0)
-    ends = np.stack([residuals.side, (residuals.side + 1) % len(boundary)], 1)
+    ends = residuals.ends(len(boundary))
     shares = residuals.by_height[:, None] * np.stack([1 - residuals.along, residuals.along], 1)
     by_height = jacobian_of_rows(
         (shares[:, :, None] * basis[0][ends]).reshape(len(ends), -1),

@@ -41,6 +41,10 @@ class BoundaryResiduals:
     counted: Bool[np.ndarray, "P"]
     """Valid, and not at a corner."""
 
+    def ends(self, vertices: int) -> Int[np.ndarray, "P 2"]:
+        """The first and the second vertex of each side, of so many."""
+        return np.stack([self.side, (self.side + 1) % vertices], 1)
+
     def scale(self, scale_px: float, options: PlaneOptions) -> float:
         """The robust scale: `scale_px`, or a multiple of the median distance if that is larger."""
         return robust_scale(self.pixels[self.valid], scale_px, options.noise_scale)
@@ -133,7 +137,7 @@ def boundary_residuals(
 def boundary_jacobian(residuals: BoundaryResiduals, vertices: int) -> "csr_matrix":
     """Derivatives of the distances by the four numbers of the plane and by two of each vertex, P rows."""
     count = len(residuals.side)
-    ends = np.stack([residuals.side, (residuals.side + 1) % vertices], 1)
+    ends = residuals.ends(vertices)
     shares = np.stack([1 - residuals.end_share, residuals.end_share], 1)
     values = shares[:, :, None] * residuals.by_side[:, None, :]
     columns = 4 + 2 * ends[:, :, None] + np.arange(2)

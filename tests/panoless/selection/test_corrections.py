@@ -30,7 +30,7 @@ from shinypartial.dataset.perturb.masks import dilated, eroded
 from tests.support.distortion import distorted
 from tests.support.mirror_body import body_views, sphere
 from tests.support.mirror_height_field import height_field_views
-from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
+from tests.support.mirror_plane import RECTANGLE, arc, disc, plane_of, reflecting_views
 from tests.support.mirror_revolution import around, goblet, revolution_views
 
 CONFIG = replace(PRESETS["fast"], corrections=CorrectionOptions(rays=10_000, resolution=32))
@@ -319,11 +319,10 @@ def test_corrections_survive_a_checkpoint_and_earlier_ones_have_none() -> None:
 @pytest.mark.parametrize(("slope", "told"), [(0.0, True), (0.45, False)])
 def test_a_proposal_that_explains_nothing_tells_no_offset_of_masks(slope: float, told: bool) -> None:
     """A flat proposal for a convex mirror; of a flat one, masks that are 3 px too large are told."""
-    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    disc = plane_of(0.7 * np.stack([np.cos(turn), np.sin(turn)], 1))
-    mirror = flat_height_field(disc, 6).domed(slope)
+    plane = plane_of(disc(24))
+    mirror = flat_height_field(plane, 6).domed(slope)
     views = height_field_views(mirror, arc(10, 15.0, size=64))
     large = replace(views, train=tuple(with_outline_moved(view, 3.0) for view in views.train))
-    fitted = Fitted(HeightFieldMirror(mirror), PosedProposal(Proposal(disc, 0.0, 1.0)))
+    fitted = Fitted(HeightFieldMirror(mirror), PosedProposal(Proposal(plane, 0.0, 1.0)))
     found = mask_offset.find_mask_offset(PlaneFamily(), large, fitted, CONFIG)
     assert found < -1 if told else found == 0

@@ -17,7 +17,7 @@ from panoless.geometry.plane.silhouette import apply_plane_step
 from panoless.kernels.cubemap import cubemap_directions
 from shinypartial.core.sphere import directions_to_cube
 from tests.support.mirror_height_field import bumpy, height_field_views, normal_errors_deg, patterned
-from tests.support.mirror_plane import RECTANGLE, arc, plane_of
+from tests.support.mirror_plane import RECTANGLE, arc, disc, plane_of
 
 PLANE = plane_of(RECTANGLE, frame_height=0.08)
 TILTED = apply_plane_step(
@@ -152,23 +152,18 @@ def test_a_bent_and_tilted_mirror_is_recovered(truth: HeightField) -> None:
 @pytest.mark.parametrize("slope", [0.45, -0.3])
 def test_a_dome_and_a_bowl_are_found_from_a_flat_start(slope: float) -> None:
     """Round convex mirrors turn rays by 50 degrees from edge to edge; a flat mirror explains nothing of that."""
-    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    disc = plane_of(0.7 * np.stack([np.cos(turn), np.sin(turn)], 1))
-    truth = flat_height_field(disc, 6).domed(slope)
+    plane = plane_of(disc(24))
+    truth = flat_height_field(plane, 6).domed(slope)
     views, camera = height_field_views(truth, arc(16, size=64)), arc(16)[8]
-    found = fit_height_field(views, disc, replace(OPTIONS, cells=6, halvings=0))
-    assert np.mean(normal_errors_deg(flat_height_field(disc, 6), truth, camera)) > 9
+    found = fit_height_field(views, plane, replace(OPTIONS, cells=6, halvings=0))
+    assert np.mean(normal_errors_deg(flat_height_field(plane, 6), truth, camera)) > 9
     assert np.mean(normal_errors_deg(found, truth, camera)) < 0.5
 
 
 def test_a_round_outline_bends_no_mirror() -> None:
     """What a polygon of few sides misses of a circle, more than a pixel here, is not put down to heights."""
-    circle, few = (
-        0.7 * np.stack([np.cos(turn), np.sin(turn)], 1)
-        for turn in (np.linspace(0, 2 * np.pi, count, endpoint=False) for count in (256, 16))
-    )
-    views = height_field_views(flat_height_field(plane_of(circle), 16), arc(12, size=96))
-    contours, height_field = mask_contours(views), flat_height_field(plane_of(few), 16)
+    views = height_field_views(flat_height_field(plane_of(disc(256)), 16), arc(12, size=96))
+    contours, height_field = mask_contours(views), flat_height_field(plane_of(disc(16)), 16)
     for scale in OPTIONS.edge_scales_px:
         height_field, _ = step_height_field(contours, height_field, scale, OPTIONS.edge_bending, OPTIONS)
     middle = height_field.plane.boundary.mean(0, keepdims=True)
