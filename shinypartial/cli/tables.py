@@ -35,19 +35,30 @@ class Tables(Suite):
     page: Path | None = None
     """Page to write, such as docs/results/tables.md, with numbers beside it, which keep what an earlier run left there;
     OUTPUT/tables.md by default."""
+    missing: bool = False
+    """Only the cells that the page's numbers lack, where it was begun on another machine or its folder is gone."""
 
     def run(self) -> None:
         """Run the plan, collect it and write the page."""
-        from shinypartial.suites.tables.collect import collect
-        from shinypartial.suites.tables.page import write_tables_page
+        from shinypartial.suites.tables.collect import collect, read_measured
+        from shinypartial.suites.tables.page import numbers_of, write_tables_page
         from shinypartial.suites.tables.plan import make_plan
 
+        page = self.page or self.output / "tables.md"
         plan = make_plan(
-            self.tables, self.seeds, self.size, scenes=self.scenes, methods=self.methods, schedule=self.schedule
+            self.tables,
+            self.seeds,
+            self.size,
+            scenes=self.scenes,
+            methods=self.methods,
+            schedule=self.schedule,
+            without=read_measured(numbers_of(page)) if self.missing else (),
         )
+        if not plan.cells:
+            print(f"{page} has every cell of these tables")
+            return
         results = self._collected(self.output, plan, collect)
         if results is None:
             return
-        page = self.page or self.output / "tables.md"
         write_tables_page(page, results)
         print(f"Page: {page}")

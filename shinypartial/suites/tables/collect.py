@@ -11,7 +11,7 @@ from shinypartial.io.records import read_record as read_table
 from shinypartial.prediction.format import read_info
 from shinypartial.suites.attempt import read_record
 from shinypartial.suites.jobs import Size
-from shinypartial.suites.tables.plan import OF_COST, TABLES, Cell, TablePlan
+from shinypartial.suites.tables.plan import OF_COST, TABLES, Cell, CellKey, TablePlan
 
 FORMAT, FORMAT_VERSION = "shinypartial-tables", 1
 DIGITS = 6
@@ -30,7 +30,7 @@ class Outcome:
     failure: str = ""
 
     @property
-    def key(self) -> tuple[str, str, int]:
+    def key(self) -> CellKey:
         """As that of its cell."""
         return self.scene, self.method, self.seed
 
@@ -83,6 +83,12 @@ def merged(path: Path, results: Results) -> Results:
         )
     known = {each.key: each for each in (*earlier.outcomes, *results.outcomes)}
     return replace(results, outcomes=tuple(known.values()))
+
+
+def read_measured(path: Path) -> frozenset[CellKey]:
+    """The keys of cells that have figures in a file; none where there is no file."""
+    outcomes = read_results(path).outcomes if path.exists() else ()
+    return frozenset(each.key for each in outcomes if not each.failure)
 
 
 def write_results(path: Path, results: Results) -> None:

@@ -26,9 +26,14 @@ class Line:
         return statistics.median(self.values[column]) if self.values[column] else None
 
 
+def numbers_of(page: Path) -> Path:
+    """Where the numbers of a page are."""
+    return page.with_suffix(".json")
+
+
 def write_tables_page(page: Path, results: Results) -> Results:
     """Write PAGE and, beside it, its numbers as JSON, with what an earlier run left there; return these numbers."""
-    numbers = page.with_suffix(".json")
+    numbers = numbers_of(page)
     every = merged(numbers, results)
     write_results(numbers, every)
     write_text(page, "\n".join(page_lines(every, numbers.name)) + "\n")

@@ -1,7 +1,7 @@
 """The tables as data: rows that are commands, columns that are scores, and the jobs that make them."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -24,6 +24,8 @@ TableName = Literal["main", "fairness", "start", "ablation", "roughness", "matte
 SIZE = Size(400, 100, 20)
 """Of its datasets unless another is asked for; those of the paper have 800 pixels, 100 training and 200 test views."""
 OURS, ORACLE = "ours", "oracle baseline"
+CellKey = tuple[str, str, int]
+"""Scene with condition, method, seed."""
 
 
 @dataclass(frozen=True)
@@ -237,8 +239,8 @@ class Cell:
         return f"{self.dataset}.{self.method.slug}.{self.seed}"
 
     @property
-    def key(self) -> tuple[str, str, int]:
-        """What tells its figures from others: scene with condition, method, seed."""
+    def key(self) -> CellKey:
+        """What tells its figures from others."""
         return self.condition.of(self.scene), self.method.name, self.seed
 
 
@@ -265,8 +267,11 @@ def make_plan(
     scenes: Sequence[str] = (),
     methods: Sequence[str] = (),
     schedule: str = "",
+    without: Collection[CellKey] = (),
 ) -> TablePlan:
-    """Every cell of the tables, once, and its jobs. `schedule` are options of `panoless fit` for all but ours.
+    """Every cell of the tables but those of `without`, once, and its jobs.
+
+    `schedule` are options of `panoless fit` for all but ours.
 
     Raises InputError for scenes and methods of no table.
     """
@@ -276,7 +281,8 @@ def make_plan(
     jobs: dict[str, Job] = {}
     for name in tables:
         for cell in _cells(TABLES[name], seeds):
-            if (not scenes or cell.scene in scenes) and (not methods or cell.method.slug in methods):
+            asked = (not scenes or cell.scene in scenes) and (not methods or cell.method.slug in methods)
+            if asked and cell.key not in without:
                 cells[cell.name] = cell
                 jobs |= {job.name: job for job in _jobs(cell, size, schedule)}
     return TablePlan(size, schedule, tuple(cells.values()), tuple(jobs.values()))

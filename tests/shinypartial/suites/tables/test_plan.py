@@ -63,6 +63,14 @@ def test_copies_are_fitted_and_the_dataset_itself_is_scored_against() -> None:
     assert "--seed 3 --cameras.rotation-deg 0.5" in jobs["perturb/vase.cameras-turned-by-0.5.3"].command
 
 
+def test_cells_that_have_figures_already_and_what_only_they_need_are_left_out() -> None:
+    whole = make_plan(["roughness"], [0])
+    known = [cell.key for cell in whole.cells if "0.3" not in cell.key[0]]
+    rest = make_plan(["roughness"], [0], without=known)
+    assert {cell.key for cell in whole.cells} == {*known, *(cell.key for cell in rest.cells)}
+    assert {job.name for job in rest.jobs if job.name.startswith("render")} == {"render/vase.roughness-0.3"}
+
+
 def test_columns_are_registered_metrics() -> None:
     for table in TABLES.values():
         for column in table.columns:
