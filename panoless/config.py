@@ -163,6 +163,7 @@ class RateConfig:
     strength_logits: NonNegative = 6e-3
     base_color_logits: NonNegative = 7.5e-3
     normal_residuals: NonNegative = 5e-3
+    indirect_harmonics: NonNegative = 7.5e-3
     environment: NonNegative = 3e-2
     drop_at: Share = 0.4
     """Share of the iterations after which every rate falls geometrically."""

@@ -24,6 +24,7 @@ from panoless.geometry.base import (
     Geometry,
     Mesh,
     SurfaceBuffers,
+    from_plain,
     poses_from_plain,
     to_plain,
 )
@@ -160,8 +161,8 @@ class SurfelMirror:
         """What the steps of its fit minimize."""
         return MirrorObjective(config)
 
-    def at(self, surfels: Surfels, share: float) -> "SurfelMirror":
-        """With its surfels as they are when that share of the steps is taken."""
+    def at(self, surfels: Surfels, share: float, objective: StepObjective) -> "SurfelMirror":
+        """With its surfels as they are when that share of the steps of its objective is taken."""
         return replace(self, surfels=surfels)
 
     def to_surfels(self, config: FitConfig) -> "SurfelMirror":
@@ -204,11 +205,14 @@ class SurfelMirror:
         """The geometry that `state_dict` was taken from."""
         from panoless.geometry.registry import FAMILIES
         from panoless.geometry.surfels.shading.geometry import ShadedMirror
+        from panoless.geometry.surfels.shading.occlusion import Occluder
 
         start = content["started_on"]
         started_on = None if start is None else FAMILIES[start[0]].geometry.from_state_dict(start[1])
         poses = poses_from_plain(content)
         kind, primitives = (ShadedMirror, ShadedSurfels) if "shading" in content else (cls, Surfels)
+        if content.get("occluder") is not None:
+            content = {**content, "occluder": from_plain(Occluder, content["occluder"])}
         surfels = primitives(**content["surfels"])
         return kind(**{**content, "surfels": surfels, "started_on": started_on, "poses": poses})
 

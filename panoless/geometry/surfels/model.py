@@ -79,10 +79,12 @@ class ShadedSurfels(Surfels):
     What a method does not learn stays as it is. `harmonics` are coefficients of diffuse light that depends on where it
     is seen from, in the order of `shinypartial.core.harmonics`; `strength_logits` of how strongly a primitive reflects,
     or of its metalness; `base_color_logits` of its reflectance; `normal_residuals` are added to its normal where its
-    front and where its back is seen.
+    front and where its back is seen; `indirect_harmonics` are of light from the object itself, by the direction that it
+    comes from, with I = 0 where a method has none.
     """
 
     harmonics: Float[Tensor, "K B 3"]
     strength_logits: Float[Tensor, "K"]
     base_color_logits: Float[Tensor, "K 3"]
     normal_residuals: Float[Tensor, "K 2 3"]
+    indirect_harmonics: Float[Tensor, "K I 3"]

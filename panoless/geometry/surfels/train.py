@@ -70,7 +70,8 @@ class SurfelTrainer:
         optimizer = {"adam": self.optimizer.state_dict(), "gradients": gradients}
         environment = self.optimizer.environment.detach()
         training = Training(environment, self.evidence, self.iteration, optimizer)
-        return self._mirror.at(self.optimizer.surfels.detached(), self.iteration / self.config.iterations), training
+        share = self.iteration / self.config.iterations
+        return self._mirror.at(self.optimizer.surfels.detached(), share, self._objective), training
 
     def step(self) -> LossTerms:
         """One step on one view."""

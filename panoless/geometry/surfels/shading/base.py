@@ -18,6 +18,7 @@ from panoless.environment.split_sum import LEVELS, Prefiltered, look_up_rough, s
 from panoless.geometry.surfels.density import PROPAGATED_OPACITY, PROPAGATION_GROWTH
 from panoless.geometry.surfels.model import ShadedSurfels, Surfels
 from panoless.geometry.surfels.rendering import ALPHA_FLOOR
+from panoless.geometry.surfels.shading.occlusion import Occluder, OccluderOptions
 from panoless.kernels.image import depth_normals
 from panoless.kernels.rasterize import RasterCamera, rasterize
 from panoless.kernels.reference.objective import normal_consistency, surface_depth
@@ -64,6 +65,11 @@ class Shading(Protocol):
         """Share of the steps after which materials and map begin anew; 0: they never do."""
         ...
 
+    @property
+    def occlusion(self) -> OccluderOptions | None:
+        """When and how it traces what the object hides of its surroundings; None: it does not."""
+        ...
+
     def begun(self, surfels: Surfels, *, random: bool) -> ShadedSurfels:
         """Its primitives where surfels lie, which were placed at random or on a surface."""
         ...
@@ -75,6 +81,7 @@ class Shading(Protocol):
         environment: Float[Tensor, "6 3 L L"],
         share: float,
         offsets: Float[Tensor, "K 2"] | None = None,
+        occluder: Occluder | None = None,
     ) -> Seen:
         """A camera's view when that share of the steps is taken; the map holds values in [0, 1], no logits."""
         ...
@@ -120,7 +127,13 @@ def at_least(surfels: ShadedSurfels, strength: float) -> ShadedSurfels:
 
 
 def shaded(
-    surfels: Surfels, log_scales: Float[Tensor, "K _"], strength: float, roughness: float, base_color: float = 0.5
+    surfels: Surfels,
+    log_scales: Float[Tensor, "K _"],
+    strength: float,
+    roughness: float,
+    base_color: float = 0.5,
+    *,
+    indirect: bool = False,
 ) -> ShadedSurfels:
     """Primitives with the shapes of surfels, gray, without normals of their own and with equal materials."""
     flat, count = surfels.opacity_logits, surfels.count
@@ -133,6 +146,7 @@ def shaded(
             "strength_logits": torch.full_like(flat, logit(strength)),
             "base_color_logits": flat.new_full((count, 3), logit(base_color)),
             "normal_residuals": flat.new_zeros(count, 2, 3),
+            "indirect_harmonics": flat.new_zeros(count, HARMONICS * indirect, 3),
         }
     )
 
@@ -238,7 +252,7 @@ def ambient_light(light: Prefiltered, normals: Float[Tensor, "P 3"]) -> Float[Te
 
 
 def harmonic_color(
-    coefficients: Float[Tensor, "K B 3"], views: Float[Tensor, "K 3"], degree: int
+    coefficients: Float[Tensor, "K B 3"], views: Float[Tensor, "K 3"], degree: int, middle: float = 0.5
 ) -> Float[Tensor, "K 3"]:
     """max(0, ½ + Σ c Y(v)) up to a degree (Kerbl et al. 2023); the direction passes no gradient.
 
@@ -247,7 +261,16 @@ def harmonic_color(
     x, y, z = views.detach().unbind(-1)
     constant, *higher = harmonic_polynomials(x, y, z, degree)
     basis = torch.stack([torch.full_like(x, constant), *(values / HIGHER_SLOWNESS for values in higher)], -1)
-    return ((basis[..., None] * coefficients[:, : basis.shape[1]]).sum(1) + 0.5).clamp(min=0)
+    return ((basis[..., None] * coefficients[:, : basis.shape[1]]).sum(1) + middle).clamp(min=0)
+
+
+def points_at(
+    camera: RasterCamera, depth: Float[Tensor, "H W"], pixels: Int[Tensor, "P"], views: Float[Tensor, "P 3"]
+) -> Float[Tensor, "P 3"]:
+    """World points that pixels show at their depth along +z of the camera; unit world directions are given."""
+    pose = camera.world_to_camera.to(depth)
+    reach = depth.flatten()[pixels] / (views @ pose[2, :3])
+    return views * reach[:, None] - pose[:3, :3].T @ pose[:3, 3]
 
 
 @dataclass(frozen=True)
@@ -268,6 +291,10 @@ class SurfacePixels:
         rays = unit_rays_camera(camera, alpha.device).to(alpha.dtype).flatten(1)[:, pixels]
         normals = normalize(to_world @ surface.normals_camera.flatten(1)[:, pixels], dim=0, eps=1e-8)
         return cls(pixels, alpha[pixels], normals.T, (to_world @ rays).T)
+
+    def points(self, depth: Float[Tensor, "H W"], camera: RasterCamera) -> Float[Tensor, "P 3"]:
+        """Where they show the surface."""
+        return points_at(camera, depth, self.pixels, self.views)
 
     def of_image(self, image: Float[Tensor, "C H W"]) -> Float[Tensor, "P C"]:
         """What a premultiplied image holds there, divided by alpha."""

@@ -24,6 +24,7 @@ from panoless.geometry.surfels.shading.base import (
     solid_scales,
     split_sum_light,
 )
+from panoless.geometry.surfels.shading.occlusion import Occluder
 from panoless.kernels.rasterize import RasterCamera
 
 LN_3 = 1.0986123
@@ -38,6 +39,7 @@ class GaussianShader(Unchanging):
     )
     restarts_at: float = 0.0
     """Never."""
+    occlusion: None = None
     tint: float = 0.5
     roughness: float = 0.65
     predicted_normal: float = 0.2
@@ -60,6 +62,7 @@ class GaussianShader(Unchanging):
         environment: Float[Tensor, "6 3 L L"],
         share: float,
         offsets: Float[Tensor, "K 2"] | None = None,
+        occluder: Occluder | None = None,
     ) -> Seen:
         """σ(k_d − ln 3) + (1 − k_s) P(n, 1) + P(ω, ρ)(k_s A + B) of each Gaussian, blended."""
         levels, views = prefiltered(environment), seen_from(camera, surfels.means)

@@ -1,7 +1,7 @@
 """Primitives that another method shades, as a geometry."""
 
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float, Int
@@ -11,14 +11,15 @@ from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.rays import Rays
-from panoless.geometry.base import SOLID_SURFACE_ALPHA, Mesh, SurfaceBuffers
+from panoless.geometry.base import SOLID_SURFACE_ALPHA, Mesh, SurfaceBuffers, to_plain
 from panoless.geometry.exact import mirrored_directions
 from panoless.geometry.surfels.mirror import SH_DEGREE_0, SurfelMirror
 from panoless.geometry.surfels.model import ShadedSurfels, Surfels
 from panoless.geometry.surfels.objective import StepObjective
 from panoless.geometry.surfels.rendering import ALPHA_FLOOR
-from panoless.geometry.surfels.shading.base import Seen
+from panoless.geometry.surfels.shading.base import Seen, points_at
 from panoless.geometry.surfels.shading.objective import ShadedObjective, learned_by
+from panoless.geometry.surfels.shading.occlusion import Occluder
 from panoless.geometry.surfels.shading.registry import SHADINGS
 from panoless.kernels.rasterize import RasterCamera
 
@@ -31,6 +32,8 @@ class ShadedMirror(SurfelMirror):
     """The method's name."""
     share: float = 0.0
     """Of the steps that were taken, which methods go by."""
+    occluder: Occluder | None = None
+    """What hides the map, where the method traces it."""
 
     @classmethod
     def begun(cls, mirror: SurfelMirror, config: FitConfig) -> SurfelMirror:
@@ -49,11 +52,21 @@ class ShadedMirror(SurfelMirror):
 
     def objective(self, views: Views, config: FitConfig) -> StepObjective:
         """That of its method."""
-        return ShadedObjective(SHADINGS[self.shading], views, config)
+        return ShadedObjective(SHADINGS[self.shading], views, config, self.occluder)
 
-    def at(self, surfels: Surfels, share: float) -> "ShadedMirror":
-        """With its primitives as they are when that share of the steps is taken."""
-        return replace(self, surfels=surfels, share=share)
+    def at(self, surfels: Surfels, share: float, objective: StepObjective) -> "ShadedMirror":
+        """With its primitives as they are when that share of the steps of its objective is taken."""
+        return replace(self, surfels=surfels, share=share, occluder=cast(ShadedObjective, objective).occluder)
+
+    def to(self, device: torch.device) -> "ShadedMirror":
+        """The same numbers on a device."""
+        occluder = None if self.occluder is None else self.occluder.to(device)
+        return replace(self, surfels=self.surfels.to(device), occluder=occluder)
+
+    def state_dict(self) -> dict[str, Any]:
+        """That of a mirror, and what hides the map."""
+        occluder = None if self.occluder is None else to_plain(self.occluder)
+        return {**super().state_dict(), "occluder": occluder}
 
     def observe_covered(self, view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Rays, Int[Tensor, "Q"]]:
         """The rays of pixels that primitives cover, less what is diffuse without surroundings."""
@@ -61,6 +74,10 @@ class ShadedMirror(SurfelMirror):
         pixels = pixels[buffers.alpha.flatten()[pixels] > SOLID_SURFACE_ALPHA]
         radiance = view.radiance_at(pixels) - buffers.albedo.flatten(1)[:, pixels].T
         directions = mirrored_directions(view.camera, pixels, buffers.normals_camera.flatten(1)[:, pixels])
+        if self.occluder is not None:
+            points = points_at(view.camera, buffers.depth, pixels, view.directions_world(pixels))
+            sees = ~self.occluder.hides(points, directions)
+            pixels, radiance, directions = pixels[sees], radiance[sees], directions[sees]
         return Rays(directions, radiance, incoming=view.directions_world(pixels)), pixels
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
@@ -90,4 +107,4 @@ class ShadedMirror(SurfelMirror):
     def _seen(self, camera: RasterCamera, environment: Float[Tensor, "6 3 L L"]) -> Seen:
         with torch.no_grad():
             surfels = cast(ShadedSurfels, self.surfels.detached())
-            return SHADINGS[self.shading].seen(surfels, camera, environment, self.share)
+            return SHADINGS[self.shading].seen(surfels, camera, environment, self.share, occluder=self.occluder)

@@ -5,6 +5,7 @@ Left out: normals that a network predicts, its perceptual term, and surroundings
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -25,6 +26,9 @@ COLOR, METAL, ROUGH = slice(3, 6), slice(6, 7), slice(7, 8)
 class MaterialRefGS(RefGaussian):
     """The published constants; shares are of its 50,000 steps."""
 
+    learned: ClassVar[frozenset[str]] = RefGaussian.learned - {"indirect_harmonics"}
+    occlusion: None = None
+    """Surroundings of Gaussians would tell it."""
     restarts_at: float = 0.0
     """Pixels are shaded from the first step on."""
     harmonics_from: float = 3_000 / 50_000

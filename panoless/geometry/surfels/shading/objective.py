@@ -1,5 +1,7 @@
 """What the steps of other methods minimize: their image beside the photograph, and what a method adds to that."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import cast
 
@@ -14,7 +16,8 @@ from panoless.geometry.surfels.losses import photometric_paper
 from panoless.geometry.surfels.model import ShadedSurfels, Surfels
 from panoless.geometry.surfels.objective import LossTerms, Step, composited, generator_of
 from panoless.geometry.surfels.schedule import Schedule
-from panoless.geometry.surfels.shading.base import Shading, consistency_with_depth
+from panoless.geometry.surfels.shading.base import Shading, blend_surfels, consistency_with_depth
+from panoless.geometry.surfels.shading.occlusion import DepthMap, Occluder, OccluderOptions
 from panoless.kernels.rasterize import RasterCamera
 from panoless.kernels.reference.objective import silhouette
 
@@ -29,9 +32,11 @@ def learned_by(shading: Shading) -> frozenset[str]:
 class ShadedObjective:
     """(1 − λ_s) L1 + λ_s (1 − SSIM) + λ_nd · consistency + λ_α · silhouette + the method's own penalty."""
 
-    def __init__(self, shading: Shading, views: Views, config: FitConfig) -> None:
-        """Of one method, with the weights of a configuration."""
-        self._neighbors = nearest_views(views)
+    def __init__(self, shading: Shading, views: Views, config: FitConfig, occluder: Occluder | None = None) -> None:
+        """Of one method, with the weights of a configuration, and what is known already of what hides its map."""
+        self._neighbors, self._cameras = nearest_views(views), [view.camera for view in views.train]
+        self.occluder = occluder
+        """What hides the map, of the surface as it was when it was last asked for."""
         self._shading, self._config, self._schedule = shading, config, Schedule(config)
         self.learned = learned_by(shading)
 
@@ -47,7 +52,8 @@ class ShadedObjective:
         primitives, loss, share = cast(ShadedSurfels, surfels), self._config.loss, iteration / self._config.iterations
         sigmoid = self._config.environment.activation == "sigmoid"
         light = torch.sigmoid(environment) if sigmoid else environment
-        seen = self._shading.seen(primitives, view.camera, light, share, offsets)
+        self._renew_occluder(primitives, iteration)
+        seen = self._shading.seen(primitives, view.camera, light, share, offsets, self.occluder)
         surface = seen.surface
         everywhere = torch.arange(view.mask.numel(), device=view.mask.device)
         color = (seen.diffuse + seen.specular).flatten(1)
@@ -82,9 +88,24 @@ class ShadedObjective:
         fresh = self._shading.begun(surfels, random=False).named()
         return replace(surfels, **{name: fresh[name] for name in self._shading.learned})
 
+    def _renew_occluder(self, primitives: ShadedSurfels, iteration: int) -> None:
+        options, steps = self._shading.occlusion, self._config.iterations
+        if options is None or iteration < round(options.begins * steps):
+            return
+        if self.occluder is None or iteration % max(round(options.every * steps), 1) == 0:
+            self.occluder = occluder_of(primitives.detached(), self._cameras, options)
+
     def revived(self, surfels: Surfels) -> Surfels:
         """After opacities were reset."""
         return self._shading.revived(cast(ShadedSurfels, surfels))
+
+
+@torch.no_grad()
+def occluder_of(surfels: ShadedSurfels, cameras: Sequence[RasterCamera], options: OccluderOptions) -> Occluder:
+    """Distances to the surface that cameras see of surfels."""
+    chosen = cameras[:: math.ceil(len(cameras) / options.most_views)]
+    seen = ((camera, blend_surfels(surfels, camera, surfels.base_color_logits, None)) for camera in chosen)
+    return Occluder.fused((DepthMap(camera, each.depth, each.alpha) for camera, each in seen), options)
 
 
 def nearest_views(views: Views) -> dict[int, RasterCamera]:

@@ -1,7 +1,8 @@
 """Ref-Gaussian (Yao et al. 2024): surfels with a base color, a metalness and a roughness, under the split sum.
 
 Primitives are shaded one by one at first, then the pixels that they blend to; between the two, materials and map begin
-anew. Occlusion and what the object mirrors of itself, which it traces by a mesh of its surface, are left out.
+anew. Where a mirrored ray meets the object again, as a grid of distances to its surface tells, light that primitives
+hold by direction takes the place of the map's.
 """
 
 from dataclasses import dataclass
@@ -11,7 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from panoless.environment.split_sum import prefiltered
+from panoless.capture.rays import reflect
+from panoless.environment.split_sum import prefiltered, specular_share
 from panoless.geometry.surfels.model import ShadedSurfels, Surfels
 from panoless.geometry.surfels.shading.base import (
     Blended,
@@ -23,11 +25,13 @@ from panoless.geometry.surfels.shading.base import (
     blend_surfels,
     facing,
     harmonic_color,
+    incidence_cosines,
     propagated,
     seen_from,
     shaded,
     split_sum_light,
 )
+from panoless.geometry.surfels.shading.occlusion import Occluder, OccluderOptions
 from panoless.kernels.rasterize import RasterCamera
 
 DIELECTRIC = 0.04
@@ -39,7 +43,7 @@ class RefGaussian(Unchanging):
     """The published constants; shares are of its 50,000 steps."""
 
     learned: ClassVar[frozenset[str]] = frozenset(
-        {"harmonics", "strength_logits", "roughness_logits", "base_color_logits"}
+        {"harmonics", "strength_logits", "roughness_logits", "base_color_logits", "indirect_harmonics"}
     )
     restarts_at: float = 18_000 / 50_000
     """Share of the steps that shade primitives, not pixels."""
@@ -54,10 +58,12 @@ class RefGaussian(Unchanging):
     """…and at most this roughness are enlarged to spread their normals."""
     disturbance: float = 0.4
     """Diffuse color of the others changes at random by up to so much, once pixels are shaded."""
+    occlusion: OccluderOptions | None = OccluderOptions()
 
     def begun(self, surfels: Surfels, *, random: bool) -> ShadedSurfels:
         """Gray, hardly metallic, rather smooth."""
-        return shaded(surfels, surfels.log_scales, self.metalness, self.roughness, self.base_color)
+        materials = self.metalness, self.roughness, self.base_color
+        return shaded(surfels, surfels.log_scales, *materials, indirect=self.occlusion is not None)
 
     def seen(
         self,
@@ -66,12 +72,13 @@ class RefGaussian(Unchanging):
         environment: Float[Tensor, "6 3 L L"],
         share: float,
         offsets: Float[Tensor, "K 2"] | None = None,
+        occluder: Occluder | None = None,
     ) -> Seen:
         """By primitives first, then by pixels."""
         levels = prefiltered(environment)
         if share < self.restarts_at:
             return self._by_primitives(surfels, camera, levels, offsets)
-        return self._by_pixels(surfels, camera, levels, share, offsets)
+        return self._by_pixels(surfels, camera, levels, share, offsets, occluder)
 
     def propagated(self, surfels: ShadedSurfels, share: float, generator: torch.Generator) -> ShadedSurfels:
         """All more opaque, smooth metals larger, and later the diffuse color of the others disturbed."""
@@ -95,22 +102,37 @@ class RefGaussian(Unchanging):
         return Seen(surface, surface.attributes[:3], surface.attributes[3:])
 
     def blended(
-        self, surfels: ShadedSurfels, camera: RasterCamera, share: float, offsets: Float[Tensor, "K 2"] | None
+        self,
+        surfels: ShadedSurfels,
+        camera: RasterCamera,
+        share: float,
+        offsets: Float[Tensor, "K 2"] | None,
+        *,
+        indirect: bool = False,
     ) -> Blended:
-        """Diffuse and base color, metalness and roughness, eight channels in that order."""
+        """Diffuse and base color, metalness and roughness, eight channels in that order; if asked for, three more of
+        the light that comes to each primitive from the object itself, out of the direction that it mirrors.
+        """
         views = seen_from(camera, surfels.means)
         metal, rough = torch.sigmoid(surfels.strength_logits), torch.sigmoid(surfels.roughness_logits)
         color = torch.sigmoid(surfels.base_color_logits)
         diffuse = harmonic_color(surfels.harmonics, views, 3 if share >= self.harmonics_from else 0)
         diffuse = diffuse * (1 - metal)[:, None]
-        attributes = torch.cat([diffuse, color, metal[:, None], rough[:, None]], 1)
-        return blend_surfels(surfels, camera, attributes, offsets)
+        attributes = [diffuse, color, metal[:, None], rough[:, None]]
+        if indirect:
+            mirrored = reflect(views, facing(surfels.normals, views))
+            attributes.append(harmonic_color(surfels.indirect_harmonics, mirrored, 3, middle=0.0))
+        return blend_surfels(surfels, camera, torch.cat(attributes, 1), offsets)
 
-    def _by_pixels(self, surfels, camera, levels, share, offsets) -> Seen:
-        surface = self.blended(surfels, camera, share, offsets)
+    def _by_pixels(self, surfels, camera, levels, share, offsets, occluder) -> Seen:
+        surface = self.blended(surfels, camera, share, offsets, indirect=occluder is not None)
         at = SurfacePixels.of(surface, camera)
-        color, metal, rough = at.of_image(surface.attributes[3:]).split((3, 1, 1), 1)
+        color, metal, rough = at.of_image(surface.attributes[3:8]).split((3, 1, 1), 1)
         rough = rough[:, 0].clamp(0, 1)
         at_normal = DIELECTRIC * (1 - metal) + color * metal
         specular = split_sum_light(levels, at.views, at.normals, at_normal, rough)
+        if occluder is not None:
+            hidden = occluder.hides(at.points(surface.depth, camera), reflect(at.views, at.normals))
+            weight = specular_share(at_normal, incidence_cosines(at.views, at.normals), rough)
+            specular = torch.where(hidden[:, None], at.of_image(surface.attributes[8:]) * weight, specular)
         return Seen(surface, surface.attributes[:3], at.image(specular, surface.attributes))

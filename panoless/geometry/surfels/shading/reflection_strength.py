@@ -23,6 +23,7 @@ from panoless.geometry.surfels.shading.base import (
     shortest_axes,
     solid_scales,
 )
+from panoless.geometry.surfels.shading.occlusion import Occluder
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.kernels.rasterize import RasterCamera
 
@@ -34,6 +35,7 @@ class ReflectionStrength(Unchanging):
     learned: ClassVar[frozenset[str]] = frozenset({"harmonics", "strength_logits"})
     restarts_at: float = 0.0
     """Never."""
+    occlusion: None = None
     reflects_from: float = 3_000 / 61_000
     """Share of the steps before which nothing is reflected."""
     harmonics_from: tuple[float, ...] = (10_000 / 61_000, 11_000 / 61_000, 12_000 / 61_000)
@@ -55,6 +57,7 @@ class ReflectionStrength(Unchanging):
         environment: Float[Tensor, "6 3 L L"],
         share: float,
         offsets: Float[Tensor, "K 2"] | None = None,
+        occluder: Occluder | None = None,
     ) -> Seen:
         """(1 − R) B + R E(ω) of blended B, R and normals."""
         views = seen_from(camera, surfels.means)

@@ -7,7 +7,7 @@ from panoless.geometry.surfels.shading.ref_gaussian import RefGaussian
 from panoless.geometry.surfels.shading.reflection_strength import ReflectionStrength
 
 LEFT_OUT: dict[str, tuple[str, ...]] = {
-    "ref-gaussian": ("occlusion and light of the object on itself, by a mesh that is traced",),
+    "ref-gaussian": ("a smoothness of normals that it asks for on some scenes",),
     "material-refgs": (
         "normals and masks that a network predicts",
         "the perceptual loss",

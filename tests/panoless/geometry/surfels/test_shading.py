@@ -19,6 +19,7 @@ from panoless.geometry.surfels.shading.base import harmonic_color, logit, propag
 from panoless.geometry.surfels.shading.geometry import ShadedMirror
 from panoless.geometry.surfels.shading.material_refgs import MaterialRefGS, flatness, seen_at
 from panoless.geometry.surfels.shading.objective import ShadedObjective
+from panoless.geometry.surfels.shading.occlusion import Occluder, OccluderOptions
 from panoless.geometry.surfels.shading.registry import SHADINGS
 from panoless.geometry.surfels.train import SurfelTrainer
 from panoless.kernels.cubemap import cubemap_directions
@@ -54,6 +55,15 @@ def sphere(name: str, views: Views) -> ShadedSurfels:
     surfels = sphere_surfels(900, 1 / frame.radius)
     surfels = replace(surfels, means=surfels.means - torch.from_numpy(frame.center / frame.radius).float())
     return SHADINGS[name].begun(surfels, random=False)
+
+
+def shell(*, half: bool = False) -> Occluder:
+    """Hides the map from what lies about the origin, or half of it: solid beyond a radius of 1.1."""
+    options = OccluderOptions()
+    axis = torch.linspace(-options.half_edge, options.half_edge, options.cells)
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+    solid = (torch.stack([z, y, x]).norm(dim=0) > 1.1) & ((x > 0) if half else True)
+    return Occluder(1 - 2 * solid.float(), options)
 
 
 def mirrors(primitives: ShadedSurfels) -> ShadedSurfels:
@@ -100,12 +110,17 @@ def test_shading_by_primitives_becomes_the_mirror_where_they_are_small(
 
 @pytest.mark.parametrize("name", SHADINGS)
 def test_gradients_of_materials(name: str, views: Views, view: TrainView) -> None:
-    """Along a random direction, against differences of the mean square of the picture; and of the map."""
+    """Along a random direction, against differences of the mean square of the picture; and of the map, half of which
+    is hidden where a method traces that.
+    """
     primitives, shading = sphere(name, views), SHADINGS[name]
+    # Light from the object begins at 0, which is a kink.
+    primitives = replace(primitives, indirect_harmonics=primitives.indirect_harmonics + 0.5)
+    occluder = shell(half=True) if shading.occlusion else None
     generator = torch.Generator().manual_seed(2)
 
     def total(values: dict[str, Tensor], light: Tensor) -> Tensor:
-        seen = shading.seen(replace(primitives, **values), view.camera, light, share=0.9)
+        seen = shading.seen(replace(primitives, **values), view.camera, light, share=0.9, occluder=occluder)
         return (seen.diffuse + seen.specular).double().square().mean()
 
     leaves = {key: primitives.named()[key].clone().requires_grad_() for key in sorted(shading.learned)}
