@@ -5,7 +5,16 @@ from collections.abc import Sequence
 import tyro
 
 from shinypartial.cli.converting import Convert, Import, Relight
-from shinypartial.cli.datasets import Align, ExportCameras, ImportDataset, Perturb, Release, Subset, Validate
+from shinypartial.cli.datasets import (
+    Align,
+    ExportCameras,
+    FindLight,
+    ImportDataset,
+    Perturb,
+    Release,
+    Subset,
+    Validate,
+)
 from shinypartial.cli.presenting import Chart, Leaderboard, Report
 from shinypartial.cli.scenes import Film, Generate
 from shinypartial.cli.scoring import Compare, Evaluate, Oracle, Postprocess, Weights
@@ -17,6 +26,7 @@ Command = (
     Generate
     | Film
     | Subset
+    | FindLight
     | ImportDataset
     | Perturb
     | Align

@@ -46,6 +46,41 @@ class Subset:
 
 
 @dataclass(frozen=True)
+class FindLight:
+    """Recognize the map that lights a dataset without an environment, and copy the dataset with it.
+
+    Blender's eight studio lights are tried in all turns about the vertical. Ground-truth normals are needed.
+    """
+
+    source: tyro.conf.Positional[Path]
+    """Dataset folder, such as one of Shiny Blender or a subset of it; it is only read."""
+    output: Path | None = None
+    """Folder to write; datasets/NAME-lit when not given."""
+    worlds: tuple[Path, ...] = ()
+    """Maps to try in place of Blender's: linear 2:1 EXR files with +Z on top."""
+    strength: float = 1.0
+    """What the map is multiplied by, as the scene does; 1 is what scenes in Blender begin with."""
+    link: bool = False
+    """Make hard links in place of copies."""
+
+    def run(self) -> None:
+        """Say which map it is, and write the copy."""
+        from shinypartial.blender.runtime import studio_light
+        from shinypartial.dataset.read import DEFAULT_FOLDER
+        from shinypartial.oracle.known_light import find_light
+        from shinypartial.scene import STUDIO_LIGHTS
+
+        known = {path.stem: path for path in self.worlds} or {name: studio_light(name) for name in STUDIO_LIGHTS}
+        root = self.output or DEFAULT_FOLDER / f"{self.source.resolve().name}-lit"
+        found = find_light(self.source, root, known, strength=self.strength, link=self.link)
+        match = found.match
+        print(f"Lit by {match.name}, turned by {match.turn_deg:.2f}° about +Z, of which it shows {2**match.stops:.2f}")
+        near = f"; next {found.others[0].name} {found.others[0].correlation:.2f}" if found.others else ""
+        print(f"Correlation of details {match.correlation:.2f}{near}")
+        print(f"Next: panoless fit {found.root}")
+
+
+@dataclass(frozen=True)
 class ImportDataset:
     """Make a dataset folder of a capture of a public set of real objects, with its light and its normals.
 

@@ -30,7 +30,7 @@ FACING_TOLERANCE = 0.1
 #: Creases and outlines are a small share; normals in another frame or encoding are wrong nearly everywhere.
 TOLERATED_SHARE = 0.1
 #: What the recipe of a folder names that was made of another one.
-DERIVED = ("subset_of", "perturbation_of", "import_of")
+DERIVED = ("subset_of", "perturbation_of", "import_of", "lit_copy_of")
 
 
 def is_plain(root: Path, manifest: dict[str, Any]) -> bool:
