@@ -266,9 +266,13 @@ class Family(Protocol):
         ...
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry | None:
-        """A proposal as a geometry, which tells what is wrong with cameras and masks and how near the surroundings are;
-        None for a kind that has none to show.
+        """A proposal as a geometry, which tells what is wrong with cameras and masks; None for a kind that has none to
+        show.
         """
+        ...
+
+    def before_steps(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry | None:
+        """The shape that a fit takes its first step from, which tells how near the surroundings are; None likewise."""
         ...
 
     def poses_by_outlines(self, views: Views, proposal: Proposal, config: FitConfig) -> ToldPoses | None:

@@ -21,6 +21,7 @@ from panoless.environment.sharpening import sharpest_map
 from panoless.environment.solve import merged, solve_environment
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import (
+    Family,
     Geometry,
     Proposal,
     ToldPoses,
@@ -112,6 +113,10 @@ class ExactFamily:
     refines: ClassVar[str | None] = None
     needs_depth: ClassVar[bool] = True
     told_by_outlines: ClassVar[bool] = False
+
+    def before_steps(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry | None:
+        """The proposal itself."""
+        return cast(Family, self).as_proposed(proposal, config)
 
     def poses_by_outlines(self, views: Views, proposal: Proposal, config: FitConfig) -> ToldPoses | None:
         """None: they are found beside the shape (see `panoless.alignment`)."""

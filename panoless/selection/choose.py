@@ -252,7 +252,7 @@ def _fit_around(
     def follow(fitted: Geometry, surroundings: Surroundings) -> Geometry | None:
         return fit_at(family, views, start.after(fitted).in_surroundings(surroundings), config)
 
-    around = proposed_surroundings(source, posed, start.proposal, config)
+    around = proposed_surroundings(family, posed, start.proposal, config)
     if around.is_far:
         start = start if known.is_far else start.in_surroundings(FAR)
         far = fit_with_poses(family, source, views, start, config)

@@ -32,10 +32,13 @@ def proposed_surroundings(family: Family, views: Views, proposal: Proposal, conf
     Far worlds pay for one linearized step and a few floors under coarse maps. A wrong shape may ask for either, too,
     so a fit in them has to prove itself (see `explains_clearly_more`).
     """
-    options, geometry = config.surroundings, family.as_proposed(proposal, config)
-    if options.mode == "off" or geometry is None or not np.isfinite(proposal.silhouette_px):
+    options = config.surroundings
+    if options.mode == "off" or not np.isfinite(proposal.silhouette_px):
         return FAR
     with torch.no_grad():
+        geometry = family.before_steps(views, proposal, config)
+        if geometry is None:
+            return FAR
         if options.mode == "auto" and not _asks_for_near(views, geometry, options):
             return FAR
         seen = leaving_rays(views, geometry, options.rays)

@@ -2,7 +2,7 @@
 fine as held-out views ask for.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -43,8 +43,7 @@ def fit_height_field(
         for scale_px in options.edge_scales_px:
             height_field = step_height_field(contours, height_field, scale_px, options.edge_bending, options)[0]
         progress = Progress("fitting a bent mirror", len(options.rounds) + 3)
-        domes = [height_field.domed(slope) for slope in options.start_slopes]
-        height_field = min(domes, key=lambda each: _unexplained(views, views, each, options.rounds[0], options))
+        height_field = best_dome(views, height_field, options)
         progress.advance()
         for each in options.rounds:
             height_field = _refine(views, contours, height_field, each, options)
@@ -63,6 +62,24 @@ def fit_height_field(
                 height_field = _refine(views, contours, cleared, options.rounds[-1], options)
         progress.advance()
     return height_field
+
+
+def best_dome(views: Views, height_field: HeightField, options: HeightFieldOptions) -> HeightField:
+    """The heights with the dome or bowl more under which photographs agree best: of those to begin with, and then of
+    others that are a little steeper or flatter.
+    """
+    errors: dict[float, float] = {}
+
+    def best_of(slopes: Iterable[float]) -> float:
+        for slope in slopes:
+            if slope not in errors:
+                errors[slope] = _unexplained(views, views, height_field.domed(slope), options.rounds[0], options)
+        return min(errors, key=errors.__getitem__)
+
+    slope = best_of(options.start_slopes)
+    for step in options.slope_steps if slope else ():
+        slope = best_of((slope - step, slope + step))
+    return height_field.domed(slope)
 
 
 def _cleared(

@@ -14,7 +14,7 @@ from panoless.config import FitConfig
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers
 from panoless.geometry.exact import ExactFamily, SeenByCenters
-from panoless.geometry.height_field.fit import fit_height_field
+from panoless.geometry.height_field.fit import best_dome, fit_height_field
 from panoless.geometry.height_field.model import (
     HeightField,
     flat_height_field,
@@ -105,6 +105,11 @@ class HeightFieldFamily(ExactFamily):
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The plane that it bends, flat as yet."""
         return HeightFieldMirror(flat_height_field(proposal.shape, config.height_field.cells))
+
+    def before_steps(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
+        """The dome or bowl over the plane that photographs agree on best, or the plane."""
+        flat = flat_height_field(proposal.shape, config.height_field.cells)
+        return HeightFieldMirror(best_dome(views, flat, config.height_field))
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """Heights, plane and boundary by silhouettes and photographs together."""

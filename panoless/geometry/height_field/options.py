@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from panoless.geometry.plane.options import PlaneOptions
-from shinypartial.io.records import NonEmpty
+from shinypartial.io.records import NonEmpty, Positive
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,9 @@ class HeightFieldOptions:
     """Domes and bowls, by their slope at the edge, of which the one that photographs agree on best is the start. With a
     spherical cap of slope 0.45, photographs leave half as much of 0.4 and 0.5 as of 0.2 and 0.6, and of a flat mirror
     half as much as of 0.1."""
+    slope_steps: tuple[Positive, ...] = (0.1, 0.05, 0.025)
+    """By these the best of them is made steeper or flatter, unless it is flat. Halves of the steps between them, and of
+    these; not tuned."""
     edge_bending: float = 1e-2
     """Weight of the bending energy in these steps, against the mean diagonal of the data: contours say nothing of the
     inside. Not tuned.

@@ -35,6 +35,10 @@ class SurfelFamily:
         """None: they begin on another geometry, or on the first surface."""
         return None
 
+    def before_steps(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry | None:
+        """None: they know only a far world."""
+        return None
+
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """Those that the steps begin with: on a geometry that was proposed, else on the first surface."""
         if proposal.shape is not None:

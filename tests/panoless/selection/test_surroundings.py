@@ -14,12 +14,15 @@ from panoless.config import FitConfig
 from panoless.environment.options import SurroundingsOptions
 from panoless.environment.surroundings import Floor, Surroundings
 from panoless.geometry.base import Geometry, Proposal
+from panoless.geometry.height_field.kind import HeightFieldFamily
+from panoless.geometry.height_field.model import flat_height_field
 from panoless.geometry.plane.kind import PlaneFamily
 from panoless.geometry.plane.model import Plane
 from panoless.kernels.rasterize import RasterCamera
 from panoless.selection.choose import _first_fit
 from panoless.selection.surroundings import brought_near, explains_clearly_more, on_floor, proposed_surroundings
-from tests.support.mirror_plane import RECTANGLE, arc, camera_at, plane_of, reflecting_views
+from tests.support.mirror_height_field import height_field_views
+from tests.support.mirror_plane import RECTANGLE, arc, camera_at, disc, plane_of, reflecting_views
 from tests.support.synthetic_dataset import environment_radiance
 
 OPTIONS = SurroundingsOptions(
@@ -66,6 +69,18 @@ def test_a_flat_mirror_in_a_room_tells_how_near_it_is() -> None:
     assert near.surroundings is found
     assert explains_clearly_more(views, near, far, CONFIG)
     assert not explains_clearly_more(views, far, near, CONFIG)
+    assert proposed_surroundings(HeightFieldFamily(), views, proposal, CONFIG).coefficients == pytest.approx(
+        found.coefficients, rel=0.02
+    )
+
+
+def test_a_convex_mirror_in_a_far_world_is_not_put_into_a_room() -> None:
+    """A flat mirror in near surroundings shows more of the sphere than in far ones, too, as a plane takes it for."""
+    plane = plane_of(disc(24))
+    views = height_field_views(flat_height_field(plane, 6).domed(0.45), arc(16, size=64))
+    proposal = Proposal(plane, 0.0, 1.0)
+    assert not proposed_surroundings(PlaneFamily(), views, proposal, CONFIG).is_far
+    assert proposed_surroundings(HeightFieldFamily(), views, proposal, CONFIG).is_far
 
 
 def above() -> list[RasterCamera]:
