@@ -126,10 +126,14 @@ def find_light(
             found=f"{dataset.root / ENVIRONMENT_LATLONG}",
             remedy="Score against it: its light is known already.",
         )
-    seen = mirrored_rays(dataset)
-    matches = match_worlds(seen, {name: read_exr_rgb(path) for name, path in worlds.items()}, options)
+    if not (np.isfinite(strength) and strength > 0):
+        raise InputError(
+            expected="a --strength above 0", found=f"{strength}", remedy="Give what the scene multiplies its map by."
+        )
+    maps = {name: _read_world(path) for name, path in worlds.items()}
+    matches = match_worlds(mirrored_rays(dataset), maps, options)
     match = clear_winner(matches, options)
-    world = turned(read_exr_rgb(worlds[match.name]), match.turn_deg) * np.float32(strength)
+    world = turned(maps[match.name], match.turn_deg) * np.float32(strength)
     files = [path for split in SPLITS for frame in dataset.split(split) for path in _files(frame)]
     transforms = [path for split in SPLITS if (path := dataset.root / f"transforms_{split}.json").exists()]
     plot = dataset.root / CAMERA_PLOT
@@ -146,6 +150,18 @@ def find_light(
     statistics = {**dataset.manifest.get("statistics", {}), "lights_tried": [asdict(each) for each in matches]}
     write_derived(root, [*licenses_of(dataset), asset], recipe, jobs, "Copying", lambda: statistics)
     return LitDataset(root, match, tuple(each for each in matches if each is not match))
+
+
+def _read_world(path: Path) -> Float[np.ndarray, "H W 3"]:
+    world = read_exr_rgb(path)
+    height, width = world.shape[:2]
+    if width != 2 * height:
+        raise InputError(
+            expected=f"a map of the whole sphere in {path}, twice as wide as high",
+            found=f"{width}×{height} pixels",
+            remedy="Name an equirectangular EXR with +Z on top.",
+        )
+    return world
 
 
 def _files(frame: Frame) -> list[Path]:

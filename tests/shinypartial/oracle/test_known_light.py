@@ -56,6 +56,18 @@ def worlds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: folder / f"{name}.exr" for name in maps}
 
 
+def test_what_is_no_map_of_the_sphere_is_refused(source: Dataset, tmp_path: Path) -> None:
+    write_exr_rgb(tmp_path / "wrong.exr", np.full((8, 12, 3), 0.5, np.float32))
+    with pytest.raises(InputError, match="map of the whole sphere"):
+        find_light(source.root, tmp_path / "lit", {"wrong": tmp_path / "wrong.exr"})
+
+
+@pytest.mark.parametrize("strength", [0.0, -1.0, float("nan")])
+def test_a_strength_is_positive(strength: float, source: Dataset, worlds: dict[str, Path], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--strength"):
+        find_light(source.root, tmp_path / "lit", worlds, strength=strength)
+
+
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """A ball in the layout of Shiny Blender, photographed from all around, in that light."""
