@@ -275,5 +275,10 @@ def files_of(frame: Frame) -> list[Path]:
     return files
 
 
+def all_files_of(frame: Frame) -> list[Path]:
+    """Those, and its mask where that is a file of another name."""
+    return [*files_of(frame), *([] if frame.mask is None else [frame.mask])]
+
+
 def _mask_name(mask: Path, index: int) -> str:
     return f"r_{index}_mask_path{mask.suffix}"

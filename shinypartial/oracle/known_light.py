@@ -20,13 +20,13 @@ from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import (
     blur_latlong,
     directions_to_latlong,
-    interpolate_wrapped,
     latlong_directions,
     latlong_solid_angles,
     sample_latlong,
 )
 from shinypartial.dataset.camera_plot import CAMERA_PLOT
 from shinypartial.dataset.derived import Job, licenses_of, open_source, write_derived
+from shinypartial.dataset.perturb.turned import Turn, turned_latlong
 from shinypartial.dataset.read import read_view
 from shinypartial.dataset.schema import (
     ENVIRONMENT_CUBE,
@@ -36,7 +36,7 @@ from shinypartial.dataset.schema import (
     Dataset,
     Frame,
 )
-from shinypartial.dataset.subset import files_of
+from shinypartial.dataset.subset import all_files_of
 from shinypartial.dataset.write import write_environment
 from shinypartial.evaluation.masks import environment_mask
 from shinypartial.io.files import sha256_of
@@ -133,8 +133,8 @@ def find_light(
     maps = {name: _read_world(path) for name, path in worlds.items()}
     matches = match_worlds(mirrored_rays(dataset), maps, options)
     match = clear_winner(matches, options)
-    world = turned(maps[match.name], match.turn_deg) * np.float32(strength)
-    files = [path for split in SPLITS for frame in dataset.split(split) for path in _files(frame)]
+    world = turned_latlong(maps[match.name], _about_z(match.turn_deg)) * np.float32(strength)
+    files = [path for split in SPLITS for frame in dataset.split(split) for path in all_files_of(frame)]
     transforms = [path for split in SPLITS if (path := dataset.root / f"transforms_{split}.json").exists()]
     plot = dataset.root / CAMERA_PLOT
     copies = [*files, *transforms, *([plot] if plot.exists() else [])]
@@ -162,10 +162,6 @@ def _read_world(path: Path) -> Float[np.ndarray, "H W 3"]:
             remedy="Name an equirectangular EXR with +Z on top.",
         )
     return world
-
-
-def _files(frame: Frame) -> list[Path]:
-    return [*files_of(frame), *([] if frame.mask is None else [frame.mask])]
 
 
 def mirrored_rays(dataset: Dataset) -> Seen:
@@ -226,12 +222,11 @@ def clear_winner(matches: Iterable[Match], options: LightOptions = LightOptions(
     return best
 
 
-def turned(world: Float[np.ndarray, "H W 3"], turn_deg: float) -> Float[np.ndarray, "H W 3"]:
-    """The map of a world that is turned counterclockwise about +Z, seen from above."""
-    height, width = world.shape[:2]
-    columns = np.arange(width) + turn_deg / 360 * width
-    y, x = np.meshgrid(np.arange(height, dtype=float), columns, indexing="ij")
-    return interpolate_wrapped(world, x, y).astype(np.float32)
+def _about_z(turn_deg: float) -> Turn:
+    """Counterclockwise, seen from above."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
 
 
 def _seen_details(seen: Seen, options: LightOptions) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]:
@@ -304,10 +299,8 @@ def _exact(match: Match, seen: Seen, world: Float[np.ndarray, "H W 3"], column_d
     """
 
     def shown(turn_deg: float, stops: float) -> Float[np.ndarray, "P 3"]:
-        angle = np.radians(-turn_deg)
-        x, y, z = seen.directions.T
-        back = np.stack([np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y, z], -1)
-        return linear_to_srgb(np.clip(sample_latlong(world, back) * 2.0**stops, 0, 1))
+        unturned = sample_latlong(world, seen.directions @ _about_z(turn_deg))
+        return linear_to_srgb(np.clip(unturned * 2.0**stops, 0, 1))
 
     def unlike(turn_deg: float, stops: float) -> float:
         return float(np.abs(shown(turn_deg, stops) - seen.codes).mean())

@@ -19,13 +19,18 @@ class Schedule:
     def _iteration(self, share: float) -> int:
         return round(share * self.config.iterations)
 
-    def _due(self, iteration: int, share: float) -> bool:
+    def begun(self, iteration: int, share: float) -> bool:
+        """Whether that share of the iterations is over."""
+        return iteration >= self._iteration(share)
+
+    def due(self, iteration: int, share: float) -> bool:
+        """Whether something happens in this iteration that does each time after so large a share of them."""
         period = max(self._iteration(share), 1)
         return share > 0 and iteration > 0 and iteration % period == 0
 
     def geometry_moves(self, iteration: int) -> bool:
         """False while only the environment is warmed up."""
-        return iteration >= self._iteration(self.config.environment.warmup)
+        return self.begun(iteration, self.config.environment.warmup)
 
     def rate_factor(self, iteration: int) -> float:
         """1 until the drop begins, then a geometric fall that ends at the drop factor with the last iteration."""
@@ -47,16 +52,16 @@ class Schedule:
 
     def _density_active(self, iteration: int) -> bool:
         density = self.config.density
-        begun = iteration >= self._iteration(density.start)
-        return density.enabled and begun and iteration < self._iteration(density.stop)
+        within = self.begun(iteration, density.start) and not self.begun(iteration, density.stop)
+        return density.enabled and within
 
     def density_round(self, iteration: int) -> bool:
         """Whether surfels are cloned, split and pruned after this iteration."""
-        return self._density_active(iteration) and self._due(iteration, self.config.density.every)
+        return self._density_active(iteration) and self.due(iteration, self.config.density.every)
 
     def opacity_reset(self, iteration: int) -> bool:
         """Whether opacities are reset after this iteration."""
-        return self._density_active(iteration) and self._due(iteration, self.config.density.reset_every)
+        return self._density_active(iteration) and self.due(iteration, self.config.density.reset_every)
 
     def opacities_recovered(self, iteration: int) -> bool:
         """Whether surfels had time to earn their opacity back since the last reset, so that pruning is fair.
@@ -69,9 +74,9 @@ class Schedule:
     def propagation(self, iteration: int) -> bool:
         """Whether normals are propagated after this iteration; an opacity reset has precedence."""
         density = self.config.density
-        begun = iteration >= self._iteration(density.propagate_from)
-        active = self._density_active(iteration) and begun and iteration < self._iteration(density.propagate_until)
-        return active and self._due(iteration, density.propagate_every) and not self.opacity_reset(iteration)
+        within = self.begun(iteration, density.propagate_from) and not self.begun(iteration, density.propagate_until)
+        active = self._density_active(iteration) and within
+        return active and self.due(iteration, density.propagate_every) and not self.opacity_reset(iteration)
 
     def resting(self, iteration: int) -> frozenset[str]:
         """The parameters that hold still in this iteration: opacities for a while after a propagation."""

@@ -28,7 +28,7 @@ from shinypartial.dataset.schema import (
     Frame,
     View,
 )
-from shinypartial.dataset.subset import files_of
+from shinypartial.dataset.subset import all_files_of, files_of
 from shinypartial.dataset.write import (
     display_rgba,
     encode_normals,
@@ -100,7 +100,7 @@ class _Copy:
     def kept_frame(self, frame: Frame) -> Iterator[Job]:
         """Files of a frame that stay the same, but for normals where the world turns."""
         turn = self.plan.turn
-        for path in (*files_of(frame), *([frame.mask] if frame.mask else [])):
+        for path in all_files_of(frame):
             if turn is not None and path in (frame.exr, frame.normal_png):
                 yield Job((self.place(path),), partial(write_turned_normals, path, self.place(path), turn))
             else:

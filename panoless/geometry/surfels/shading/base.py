@@ -292,10 +292,6 @@ class SurfacePixels:
         normals = normalize(to_world @ surface.normals_camera.flatten(1)[:, pixels], dim=0, eps=1e-8)
         return cls(pixels, alpha[pixels], normals.T, (to_world @ rays).T)
 
-    def points(self, depth: Float[Tensor, "H W"], camera: RasterCamera) -> Float[Tensor, "P 3"]:
-        """Where they show the surface."""
-        return points_at(camera, depth, self.pixels, self.views)
-
     def of_image(self, image: Float[Tensor, "C H W"]) -> Float[Tensor, "P C"]:
         """What a premultiplied image holds there, divided by alpha."""
         return (image.flatten(1)[:, self.pixels] / self.alpha).T

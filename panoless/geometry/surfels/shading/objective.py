@@ -89,10 +89,10 @@ class ShadedObjective:
         return replace(surfels, **{name: fresh[name] for name in self._shading.learned})
 
     def _renew_occluder(self, primitives: ShadedSurfels, iteration: int) -> None:
-        options, steps = self._shading.occlusion, self._config.iterations
-        if options is None or iteration < round(options.begins * steps):
+        options = self._shading.occlusion
+        if options is None or not self._schedule.begun(iteration, options.begins):
             return
-        if self.occluder is None or iteration % max(round(options.every * steps), 1) == 0:
+        if self.occluder is None or self._schedule.due(iteration, options.every):
             self.occluder = occluder_of(primitives.detached(), self._cameras, options)
 
     def revived(self, surfels: Surfels) -> Surfels:
@@ -105,7 +105,8 @@ def occluder_of(surfels: ShadedSurfels, cameras: Sequence[RasterCamera], options
     """Distances to the surface that cameras see of surfels."""
     chosen = cameras[:: math.ceil(len(cameras) / options.most_views)]
     seen = ((camera, blend_surfels(surfels, camera, surfels.base_color_logits, None)) for camera in chosen)
-    return Occluder.fused((DepthMap(camera, each.depth, each.alpha) for camera, each in seen), options)
+    maps = (DepthMap(camera, each.depth, each.alpha) for camera, each in seen)
+    return Occluder.fused(maps, options, surfels.means.device)
 
 
 def nearest_views(views: Views) -> dict[int, RasterCamera]:

@@ -62,22 +62,20 @@ class Occluder:
     options: OccluderOptions
 
     @classmethod
-    def fused(cls, maps: Iterable[DepthMap], options: OccluderOptions) -> "Occluder":
+    def fused(
+        cls, maps: Iterable[DepthMap], options: OccluderOptions, device: torch.device | None = None
+    ) -> "Occluder":
         """The mean over the views of how far each grid point lies before the surface (Curless and Levoy 1996).
 
         A view says nothing of points that lie deeper behind its surface than the truncation. Of what is behind, the
         largest connected part is kept, so that nothing that floats beside the object hides anything.
         """
-        axis = None
-        total = count = torch.zeros(())
-        points = torch.zeros(0, 3)
-        for camera, depth, alpha in maps:
-            if axis is None:
-                axis = torch.linspace(-options.half_edge, options.half_edge, options.cells, device=depth.device)
-                z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
-                points = torch.stack([x, y, z], -1).view(-1, 3)
-                total, count = points.new_zeros(len(points)), points.new_zeros(len(points))
-            signed, known = _signed_distances(points, DepthMap(camera, depth, alpha), options)
+        axis = torch.linspace(-options.half_edge, options.half_edge, options.cells, device=device)
+        z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+        points = torch.stack([x, y, z], -1).view(-1, 3)
+        total = count = torch.zeros_like(points[:, 0])
+        for seen in maps:
+            signed, known = _signed_distances(points, seen, options)
             total, count = total + signed * known, count + known
         mean = torch.where(count > 0, total / count.clamp(min=1), 1.0)
         return cls(_largest_part(mean.view(3 * (options.cells,))), options)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from panoless.capture.rays import reflect
-from panoless.environment.split_sum import prefiltered, specular_share
+from panoless.environment.split_sum import look_up_rough, prefiltered, specular_share
 from panoless.geometry.surfels.model import ShadedSurfels, Surfels
 from panoless.geometry.surfels.shading.base import (
     Blended,
@@ -26,6 +26,7 @@ from panoless.geometry.surfels.shading.base import (
     facing,
     harmonic_color,
     incidence_cosines,
+    points_at,
     propagated,
     seen_from,
     shaded,
@@ -130,9 +131,10 @@ class RefGaussian(Unchanging):
         color, metal, rough = at.of_image(surface.attributes[3:8]).split((3, 1, 1), 1)
         rough = rough[:, 0].clamp(0, 1)
         at_normal = DIELECTRIC * (1 - metal) + color * metal
-        specular = split_sum_light(levels, at.views, at.normals, at_normal, rough)
+        mirrored = reflect(at.views, at.normals)
+        light = look_up_rough(levels, mirrored, rough)
         if occluder is not None:
-            hidden = occluder.hides(at.points(surface.depth, camera), reflect(at.views, at.normals))
-            weight = specular_share(at_normal, incidence_cosines(at.views, at.normals), rough)
-            specular = torch.where(hidden[:, None], at.of_image(surface.attributes[8:]) * weight, specular)
+            hidden = occluder.hides(points_at(camera, surface.depth, at.pixels, at.views), mirrored)
+            light = torch.where(hidden[:, None], at.of_image(surface.attributes[8:]), light)
+        specular = light * specular_share(at_normal, incidence_cosines(at.views, at.normals), rough)
         return Seen(surface, surface.attributes[:3], at.image(specular, surface.attributes))
