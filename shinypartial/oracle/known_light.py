@@ -153,6 +153,7 @@ def find_light(
 
 
 def _read_world(path: Path) -> Float[np.ndarray, "H W 3"]:
+    """The map, without what lossy compression leaves below zero in Blender's own."""
     world = read_exr_rgb(path)
     height, width = world.shape[:2]
     if width != 2 * height:
@@ -161,7 +162,7 @@ def _read_world(path: Path) -> Float[np.ndarray, "H W 3"]:
             found=f"{width}×{height} pixels",
             remedy="Name an equirectangular EXR with +Z on top.",
         )
-    return world
+    return np.maximum(world, 0)
 
 
 def mirrored_rays(dataset: Dataset) -> Seen:

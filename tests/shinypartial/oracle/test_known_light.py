@@ -13,7 +13,7 @@ from shinypartial.dataset.read import open_dataset, read_environment
 from shinypartial.dataset.schema import Dataset
 from shinypartial.dataset.subset import SubsetOptions, make_subset
 from shinypartial.dataset.validate import unscored, validate
-from shinypartial.io.images import write_exr_rgb
+from shinypartial.io.images import read_exr_rgb, write_exr_rgb
 from shinypartial.oracle.known_light import find_light
 from tests.support import synthetic_dataset
 from tests.support.shiny_blender import make_shiny_blender_dataset
@@ -99,6 +99,14 @@ def test_a_subset_keeps_what_it_states(source: Dataset, worlds: dict[str, Path],
     recipe = open_dataset(tmp_path / "lit").manifest["recipe"]
     assert recipe["subset_of"]["name"] == "ball"
     assert recipe["light"]["name"] == "right"
+
+
+def test_what_compression_left_below_zero_is_no_light(source: Dataset, worlds: dict[str, Path], tmp_path: Path) -> None:
+    radiance = read_exr_rgb(worlds["right"]).copy()
+    radiance[-1, :4] = -1e-3
+    write_exr_rgb(tmp_path / "right.exr", radiance)
+    find_light(source.root, tmp_path / "lit", {**worlds, "right": tmp_path / "right.exr"})
+    assert not validate(tmp_path / "lit")
 
 
 def test_where_none_is_the_light_none_is_taken(source: Dataset, worlds: dict[str, Path], tmp_path: Path) -> None:
