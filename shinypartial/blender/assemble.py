@@ -15,13 +15,10 @@ from shinypartial.blender.objects import mesh_of, place_objects
 from shinypartial.blender.output import add_passes, set_file
 from shinypartial.blender.runtime import choose_device, studio_light
 from shinypartial.blender.self_reflection import assemble_probe
-from shinypartial.core.errors import InputError
-from shinypartial.io.images import read_exr_rgb
+from shinypartial.io.images import read_light
 from shinypartial.scene import FileWorld, Render, Room, SceneSpec, Sphere, StudioWorld
 
 ROOM = "room"
-#: Measured in Blender's own maps: −0.0022 (forest), beside radiance up to 1400.
-LOWEST_RADIANCE = -1e-2
 
 
 def assemble(bpy: Any, spec: SceneSpec) -> str:
@@ -47,20 +44,8 @@ def world_file(world: StudioWorld | FileWorld) -> Path:
 
 
 def world_radiance(world: StudioWorld | FileWorld, exposure: float = 0.0) -> Float[np.ndarray, "H W 3"]:
-    """The lat-long map that lights the scene: the file times the strength times 2^exposure, in the world frame.
-
-    Lossy compression leaves values a hair below zero in Blender's own maps; they become zero.
-    """
-    path = world_file(world)
-    radiance = read_exr_rgb(path)
-    height, width = radiance.shape[:2]
-    if width != 2 * height or not np.isfinite(radiance).all() or radiance.min() < LOWEST_RADIANCE:
-        raise InputError(
-            expected=f"a finite lat-long map ≥ 0, twice as wide as high, in {path}",
-            found=f"{width}×{height}, lowest value {radiance.min():.4g}, highest {radiance.max():.4g}",
-            remedy="Use another world, or export this one as a 2:1 map without NaN, infinity or negative values.",
-        )
-    return np.maximum(radiance, 0) * np.float32(world.strength * 2.0**exposure)
+    """The lat-long map that lights the scene: the file times the strength times 2^exposure, in the world frame."""
+    return read_light(world_file(world)) * np.float32(world.strength * 2.0**exposure)
 
 
 def _set_sampling(scene: Any, render: Render) -> None:

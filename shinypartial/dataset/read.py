@@ -29,7 +29,16 @@ from shinypartial.dataset.schema import (
 )
 from shinypartial.dataset.transforms import read_frames
 from shinypartial.io.files import newest_folder, read_json, sha256_of
-from shinypartial.io.images import EXR, read_exr, read_exr_rgb, read_picture, read_png, stack_channels, unit_values
+from shinypartial.io.images import (
+    EXR,
+    read_exr,
+    read_exr_rgb,
+    read_picture,
+    read_png,
+    require_latlong,
+    stack_channels,
+    unit_values,
+)
 
 DEFAULT_FOLDER = Path("datasets")
 
@@ -277,11 +286,5 @@ def read_inverse_distance(dataset: Dataset) -> Float[np.ndarray, "H W"] | None:
 def read_inverse_distance_map(path: Path) -> Float[np.ndarray, "H W"]:
     """Read such a map from a file; raises InputError unless it is a finite 2:1 map ≥ 0."""
     inverse = stack_channels(read_exr(path), (INVERSE_DISTANCE_CHANNEL,), path)[..., 0]
-    height, width = inverse.shape
-    if width != 2 * height or not np.isfinite(inverse).all() or inverse.min() < 0:
-        raise InputError(
-            expected=f"a finite lat-long map of 1/D ≥ 0, twice as wide as high, in {path}",
-            found=f"{width}×{height}, lowest value {inverse.min():.4g}, highest {inverse.max():.4g}",
-            remedy="Export the map again: 0 stands for infinitely far.",
-        )
+    require_latlong(inverse, path, "1/D ≥ 0", "Export the map again: 0 stands for infinitely far.", lowest=0.0)
     return inverse

@@ -42,7 +42,7 @@ from shinypartial.dataset.validate_frame import check_frame
 from shinypartial.dataset.violations import REMAKE, Violation, violation_of
 from shinypartial.dataset.write import latlong_to_y_up
 from shinypartial.io.files import read_json, sha256_of
-from shinypartial.io.images import has_envmap_tag, read_exr_rgb
+from shinypartial.io.images import has_envmap_tag, read_exr_rgb, require_latlong
 from shinypartial.io.progress import Progress
 
 RESTORE = "Restore the file from the released dataset, or generate the dataset again."
@@ -241,12 +241,9 @@ def _check_environment(root: Path) -> Iterator[Violation]:
     file = ENVIRONMENT_LATLONG.as_posix()
     try:
         latlong = read_exr_rgb(root / ENVIRONMENT_LATLONG)
+        require_latlong(latlong, root / ENVIRONMENT_LATLONG, "radiance ≥ 0", REMAKE, lowest=0.0)
     except InputError as error:
         yield violation_of(file, error)
-        return
-    height, width = latlong.shape[:2]
-    if width != 2 * height or not np.isfinite(latlong).all() or latlong.min() < 0:
-        yield Violation(file, f"expected a finite map ≥ 0, twice as wide as high, found {width}×{height}", REMAKE)
         return
     faces = [ENVIRONMENT_CUBE / f"{name}.exr" for name in FACES]
     maps: dict[Path, np.ndarray] = {}

@@ -56,7 +56,7 @@ from shinypartial.evaluation.view_scores import (
     read_prediction,
     score_view,
 )
-from shinypartial.io.images import write_png
+from shinypartial.io.images import require_latlong, write_png
 from shinypartial.io.progress import Progress
 from shinypartial.io.threads import in_threads
 from shinypartial.metrics import coverage as coverage_metrics
@@ -325,7 +325,14 @@ def _score_calibration(
     if visibility is None:
         left_out.append(LeftOut("calibration", f"the prediction has no {VISIBILITY_FILE}"))
         return None
-    _require_visibility(visibility, prediction / VISIBILITY_FILE)
+    require_latlong(
+        visibility,
+        prediction / VISIBILITY_FILE,
+        "visibility in [0, 1]",
+        "Export the visibility again: see docs/reference/prediction-format.md.",
+        lowest=-VISIBILITY_TOLERANCE,
+        highest=1 + VISIBILITY_TOLERANCE,
+    )
     resized = environment_metrics.to_protocol_size(np.clip(visibility, 0, 1)[..., None])[..., 0]
     write_png(prediction / EVALUATION / VISIBILITY_MAP, scalar_picture(resized, VISIBILITY))
     weights = environment_metrics.direction_weights()
@@ -333,18 +340,6 @@ def _score_calibration(
     undefined = "undefined: visibility or error is the same everywhere, or no direction is wrong"
     left_out += [LeftOut(name, undefined) for name, value in vars(scores).items() if value is None]
     return scores
-
-
-def _require_visibility(visibility: Float[np.ndarray, "H W"], path: Path) -> None:
-    height, width = visibility.shape
-    bounds = float(visibility.min()), float(visibility.max())
-    if width == 2 * height and bounds[0] >= -VISIBILITY_TOLERANCE and bounds[1] <= 1 + VISIBILITY_TOLERANCE:
-        return
-    raise InputError(
-        expected=f"finite visibility in [0, 1], twice as wide as high, in {path}",
-        found=f"{width}×{height} with values from {bounds[0]:.4g} to {bounds[1]:.4g}",
-        remedy="Export the visibility again: see docs/reference/prediction-format.md.",
-    )
 
 
 def _score_views(

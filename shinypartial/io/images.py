@@ -7,6 +7,7 @@ keeps each channel's own type.
 """
 
 import errno
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,6 +26,8 @@ EXR = ".exr"
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".hdr")
 #: Channels that `read_picture` returns: gray, RGB, RGBA; gray with alpha becomes the last.
 CHANNEL_COUNTS = (1, 3, 4)
+#: Of maps that light scenes. Measured in Blender's own: −0.0022 (forest), beside radiance up to 1400.
+LOWEST_RADIANCE = -1e-2
 #: What brings stored pixels upright, by the EXIF orientation: whether rows and columns change places, then which axes
 #: of the result run backward.
 UPRIGHT = {
@@ -117,6 +120,37 @@ def write_exr_rgb(path: Path, radiance: Float[np.ndarray, "H W 3"], *, y_up_envi
 def read_exr_rgb(path: Path) -> Float[np.ndarray, "H W 3"]:
     """Read linear radiance."""
     return stack_channels(read_exr(path), ("R", "G", "B"), path)
+
+
+def require_latlong(
+    values: Float[np.ndarray, "H W *C"],
+    path: Path,
+    what: str,
+    remedy: str,
+    *,
+    lowest: float = -math.inf,
+    highest: float = math.inf,
+) -> None:
+    """Raise InputError unless values of a file are a finite lat-long map between two bounds; `what` names them."""
+    height, width = values.shape[:2]
+    least, largest = float(values.min()), float(values.max())
+    if width != 2 * height or not (math.isfinite(least + largest) and lowest <= least and largest <= highest):
+        raise InputError(
+            expected=f"a lat-long map of {what}, finite and twice as wide as high, in {path}",
+            found=f"{width}×{height} with values from {least:.4g} to {largest:.4g}",
+            remedy=remedy,
+        )
+
+
+def read_light(path: Path) -> Float[np.ndarray, "H W 3"]:
+    """A lat-long map of radiance ≥ 0 that lights a scene.
+
+    Lossy compression leaves values a hair below zero in Blender's own maps; they become zero.
+    """
+    radiance = read_exr_rgb(path)
+    remedy = "Use another world, or export this one as a 2:1 map without NaN, infinity or negative values."
+    require_latlong(radiance, path, "radiance ≥ 0", remedy, lowest=LOWEST_RADIANCE)
+    return np.maximum(radiance, 0)
 
 
 def write_png(path: Path, image: UInt8[np.ndarray, "H W *C"]) -> None:

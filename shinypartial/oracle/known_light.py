@@ -40,7 +40,7 @@ from shinypartial.dataset.subset import all_files_of
 from shinypartial.dataset.write import write_environment
 from shinypartial.evaluation.masks import environment_mask
 from shinypartial.io.files import sha256_of
-from shinypartial.io.images import read_exr_rgb
+from shinypartial.io.images import read_light
 from shinypartial.io.progress import Progress
 
 ENVIRONMENT_FILES = (
@@ -130,7 +130,7 @@ def find_light(
         raise InputError(
             expected="a --strength above 0", found=f"{strength}", remedy="Give what the scene multiplies its map by."
         )
-    maps = {name: _read_world(path) for name, path in worlds.items()}
+    maps = {name: read_light(path) for name, path in worlds.items()}
     matches = match_worlds(mirrored_rays(dataset), maps, options)
     match = clear_winner(matches, options)
     world = turned_latlong(maps[match.name], _about_z(match.turn_deg)) * np.float32(strength)
@@ -150,19 +150,6 @@ def find_light(
     statistics = {**dataset.manifest.get("statistics", {}), "lights_tried": [asdict(each) for each in matches]}
     write_derived(root, [*licenses_of(dataset), asset], recipe, jobs, "Copying", lambda: statistics)
     return LitDataset(root, match, tuple(each for each in matches if each is not match))
-
-
-def _read_world(path: Path) -> Float[np.ndarray, "H W 3"]:
-    """The map, without what lossy compression leaves below zero in Blender's own."""
-    world = read_exr_rgb(path)
-    height, width = world.shape[:2]
-    if width != 2 * height:
-        raise InputError(
-            expected=f"a map of the whole sphere in {path}, twice as wide as high",
-            found=f"{width}×{height} pixels",
-            remedy="Name an equirectangular EXR with +Z on top.",
-        )
-    return np.maximum(world, 0)
 
 
 def mirrored_rays(dataset: Dataset) -> Seen:

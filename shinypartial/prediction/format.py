@@ -22,7 +22,7 @@ from shinypartial.dataset.read import read_inverse_distance_map
 from shinypartial.dataset.schema import CHECKSUMS, Dataset, Frame, View
 from shinypartial.dataset.write import write_inverse_distance_map, write_view
 from shinypartial.io.files import newest_folder, read_json, sha256_of, write_json
-from shinypartial.io.images import read_exr, read_exr_rgb, stack_channels, write_exr, write_exr_rgb
+from shinypartial.io.images import read_exr, read_exr_rgb, require_latlong, stack_channels, write_exr, write_exr_rgb
 from shinypartial.io.records import NonNegative, Share, Text, read_record, write_record
 
 FORMAT = "shinypartial-prediction"
@@ -325,13 +325,7 @@ def read_info(root: Path) -> PredictionInfo:
 def read_environment_map(root: Path) -> Float[np.ndarray, "H W 3"]:
     """Read the predicted environment; raises InputError unless it is a finite 2:1 map."""
     radiance = read_exr_rgb(root / ENVIRONMENT)
-    height, width = radiance.shape[:2]
-    if width != 2 * height or not np.isfinite(radiance).all():
-        raise InputError(
-            expected=f"a finite lat-long map, twice as wide as high, in {root / ENVIRONMENT}",
-            found=f"{width}×{height} with {int((~np.isfinite(radiance)).sum())} values that are not finite",
-            remedy="Export the environment again.",
-        )
+    require_latlong(radiance, root / ENVIRONMENT, "radiance", "Export the environment again.")
     return radiance
 
 

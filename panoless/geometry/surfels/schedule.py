@@ -23,6 +23,10 @@ class Schedule:
         """Whether that share of the iterations is over."""
         return iteration >= self._iteration(share)
 
+    def reached(self, iteration: int, share: float) -> bool:
+        """Whether that share of the iterations, which is not none of them, is over with the one before."""
+        return 0 < iteration == self._iteration(share)
+
     def due(self, iteration: int, share: float) -> bool:
         """Whether something happens in this iteration that does each time after so large a share of them."""
         period = max(self._iteration(share), 1)

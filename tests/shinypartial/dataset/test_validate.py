@@ -197,8 +197,8 @@ DAMAGES = {
     "mirrored face": (edit_map("cube/ny.exr", lambda m: m[:, ::-1]), "environment/cube/ny.exr", "differ"),
     "small face": (edit_map("cube/pz.exr", lambda m: m[::2, ::2]), "environment/cube/pz.exr", "texels"),
     "no object radius": (add_inverse_distance(np.ones(MAP_SHAPE)), "dataset.json", "object_radius"),
-    "negative distance": (add_inverse_distance(np.full(MAP_SHAPE, -1.0)), INVERSE_DISTANCE, "lowest value -1"),
-    "distance without end": (add_inverse_distance(np.full(MAP_SHAPE, np.inf)), INVERSE_DISTANCE, "highest inf"),
+    "negative distance": (add_inverse_distance(np.full(MAP_SHAPE, -1.0)), INVERSE_DISTANCE, "values from -1 to -1"),
+    "distance without end": (add_inverse_distance(np.full(MAP_SHAPE, np.inf)), INVERSE_DISTANCE, "to inf"),
     "small map of distance": (
         add_inverse_distance(np.ones((MAP_HEIGHT // 2, MAP_HEIGHT))),
         INVERSE_DISTANCE,

@@ -16,9 +16,11 @@ from shinypartial.io.images import (
     read_as_stored,
     read_exr,
     read_exr_rgb,
+    read_light,
     read_picture,
     read_png,
     read_upright,
+    require_latlong,
     stack_channels,
     unit_values,
     write_exr,
@@ -276,3 +278,30 @@ def test_a_full_disk_leaves_no_short_png(tmp_path: Path) -> None:
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == errno.ENOSPC
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lat_long_map_is_finite_twice_as_wide_as_high_and_within_its_bounds() -> None:
+    good = GENERATOR.uniform(size=(4, 8, 3))
+    require_latlong(good, Path("a.exr"), "radiance", "Mend it.", lowest=0.0, highest=1.0)
+    require_latlong(good[..., 0] * 100 - 50, Path("a.exr"), "radiance", "Mend it.")
+    spoiled = good.copy()
+    for value in (np.nan, np.inf, -np.inf, -0.01, 1.01):
+        spoiled[1, 2, 1] = value
+        with pytest.raises(InputError, match="finite and twice as wide as high"):
+            require_latlong(spoiled, Path("a.exr"), "radiance", "Mend it.", lowest=0.0, highest=1.0)
+    for shape in ((8, 4), (4, 7), (4, 9)):
+        with pytest.raises(InputError, match=f"{shape[1]}×{shape[0]}"):
+            require_latlong(GENERATOR.uniform(size=shape), Path("a.exr"), "radiance", "Mend it.")
+
+
+def test_light_loses_what_compression_left_below_zero_and_is_refused_below_that(tmp_path: Path) -> None:
+    light = GENERATOR.uniform(1, 2, size=(4, 8, 3))
+    light[0, 0] = -0.002
+    write_exr_rgb(tmp_path / "a.exr", light)
+    found = read_light(tmp_path / "a.exr")
+    np.testing.assert_array_equal(found[0, 0], 0)
+    np.testing.assert_allclose(found[1:], light[1:], rtol=2**-11)
+    light[0, 0] = -0.5
+    write_exr_rgb(tmp_path / "b.exr", light)
+    with pytest.raises(InputError, match="radiance ≥ 0"):
+        read_light(tmp_path / "b.exr")

@@ -58,7 +58,7 @@ def worlds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 def test_what_is_no_map_of_the_sphere_is_refused(source: Dataset, tmp_path: Path) -> None:
     write_exr_rgb(tmp_path / "wrong.exr", np.full((8, 12, 3), 0.5, np.float32))
-    with pytest.raises(InputError, match="map of the whole sphere"):
+    with pytest.raises(InputError, match="twice as wide as high"):
         find_light(source.root, tmp_path / "lit", {"wrong": tmp_path / "wrong.exr"})
 
 

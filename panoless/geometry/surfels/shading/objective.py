@@ -81,7 +81,7 @@ class ShadedObjective:
 
     def restarts(self, iteration: int) -> bool:
         """At the method's share of the steps."""
-        return 0 < iteration == round(self._shading.restarts_at * self._config.iterations)
+        return self._schedule.reached(iteration, self._shading.restarts_at)
 
     def restarted(self, surfels: Surfels) -> Surfels:
         """With the method's first materials; shapes stay."""
