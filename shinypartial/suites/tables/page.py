@@ -10,6 +10,8 @@ from shinypartial.metrics.registry import Direction
 from shinypartial.suites.tables.collect import Outcome, Results, merged, write_results
 from shinypartial.suites.tables.plan import ORACLE, TABLES, Column, Table
 
+FEWER_STEPS = "--config.iterations"
+"""What a schedule has that is not the whole one of each method."""
 Values = tuple[tuple[float, ...], ...]
 
 
@@ -43,12 +45,14 @@ def write_tables_page(page: Path, results: Results) -> Results:
 def page_lines(results: Results, numbers: str) -> Iterator[str]:
     """The page as Markdown."""
     size = results.size
-    yield from ("# Tables of the paper", "", "<!-- `shinypartial tables` makes this page. -->", "")
-    how = f"with `{results.schedule}`" if results.schedule else "by their whole schedules"
+    whole = FEWER_STEPS not in results.schedule
+    title = "# Tables of the paper, by whole schedules" if whole else "# Tables of the paper"
+    yield from (title, "", "<!-- `shinypartial tables` makes this page. -->", "")
+    how = ["in all of their steps"] * whole + [f"with `{results.schedule}`"] * bool(results.schedule)
     yield f"{size.train} training and {size.test} test views of {size.resolution} × {size.resolution} pixels;"
     yield "[what the methods are](../explanation/compared-methods.md). Rows *as published* are the paper's figures, of"
     yield "its own scenes and its own size: compare orders, not levels. The paper's method and those that it compares"
-    yield f"with are our implementations, {how}."
+    yield f"with are our implementations, {', '.join(how)}."
     yield "Of several seeds the median is given, with the lowest and the highest. **Best** and *second best* are marked"
     yield "among the rows of a scene that were measured here, and among those published; the"
     yield "[oracle baseline](../explanation/oracle-baseline.md), which knows the true normals, takes no part. Seconds"

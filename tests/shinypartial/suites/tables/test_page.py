@@ -11,7 +11,7 @@ from shinypartial.evaluation.evaluate import evaluate
 from shinypartial.io.files import write_json
 from shinypartial.suites.jobs import Size
 from shinypartial.suites.tables.collect import Outcome, Results, collect, read_results
-from shinypartial.suites.tables.page import Line, marked, published_lines, write_tables_page
+from shinypartial.suites.tables.page import Line, marked, page_lines, published_lines, write_tables_page
 from shinypartial.suites.tables.plan import ORACLE, OURS, SIZE, TABLES, Column, make_plan
 from shinypartial.suites.tables.published import DR, MATERIAL, PAPER, REF, SHADER
 from tests.support.truth_prediction import write_truth_prediction
@@ -64,6 +64,20 @@ def test_the_page_has_published_and_measured_rows_and_keeps_earlier_ones(tmp_pat
     assert len(read_results(page.with_suffix(".json")).outcomes) == 5
     with pytest.raises(InputError, match="Choose another --page"):
         write_tables_page(page, replace(first, size=SIZE))
+
+
+@pytest.mark.parametrize(
+    ("schedule", "title", "said"),
+    [
+        ("", "# Tables of the paper, by whole schedules", "in all of their steps."),
+        ("--x 3", "# Tables of the paper, by whole schedules", "in all of their steps, with `--x 3`."),
+        ("--config.iterations 60 --x 3", "# Tables of the paper", "with `--config.iterations 60 --x 3`."),
+    ],
+)
+def test_the_page_says_whether_schedules_are_whole(schedule: str, title: str, said: str) -> None:
+    lines = list(page_lines(Results(Size(80, 12, 3), schedule, ()), "tables.json"))
+    assert lines[0] == title
+    assert f"with are our implementations, {said}" in lines
 
 
 def test_figures_are_those_of_the_scores(tmp_path: Path, sphere_dataset: Dataset) -> None:
