@@ -53,8 +53,8 @@ def page_lines(results: Results, numbers: str) -> Iterator[str]:
     yield "[what the methods are](../explanation/compared-methods.md). Rows *as published* are the paper's figures, of"
     yield "its own scenes and its own size: compare orders, not levels. The paper's method and those that it compares"
     yield f"with are our implementations, {', '.join(how)}."
-    yield "Of several seeds the median is given, with the lowest and the highest. **Best** and *second best* are marked"
-    yield "among the rows of a scene that were measured here, and among those published; the"
+    yield "Of several seeds the median is given, with the lowest and the highest where they differ. **Best** and"
+    yield "*second best* are marked among the rows of a scene that were measured here, and among those published; the"
     yield "[oracle baseline](../explanation/oracle-baseline.md), which knows the true normals, takes no part. Seconds"
     yield "are processor time of the whole command. Environment, normals and renders follow the paper's protocol where"
     yield f"nothing else is said. [Numbers]({numbers})"
@@ -149,4 +149,4 @@ def _text(column: Column, values: tuple[float, ...]) -> str:
     if not values:
         return "–"
     texts = [f"{value:,.{column.digits}f}" for value in (statistics.median(values), min(values), max(values))]
-    return texts[0] if len(values) == 1 else f"{texts[0]} ({texts[1]} to {texts[2]})"
+    return texts[0] if len(set(texts)) == 1 else f"{texts[0]} ({texts[1]} to {texts[2]})"

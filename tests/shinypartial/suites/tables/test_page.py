@@ -40,6 +40,8 @@ def test_what_prints_alike_is_marked_alike_and_one_row_is_not_marked() -> None:
     assert marked((PSNR,), [line("a", 10)]) == {"a": ["10.00"]}
     seeds = Line("vase", "a", ((1.0, 3.0, 2.0),))
     assert marked((PSNR,), [seeds]) == {"a": ["2.00 (1.00 to 3.00)"]}
+    alike = Line("vase", "a", ((2.001, 2.002, 2.0),))
+    assert marked((PSNR,), [alike]) == {"a": ["2.00"]}
 
 
 def outcome(scene: str, method: str, psnr: float) -> Outcome:
