@@ -50,8 +50,11 @@ def is_refined(kind: str) -> bool:
 
 
 def another_takes_on(geometry: Geometry, errors: Float[np.ndarray, "V"], config: FitConfig) -> bool:
-    """Whether a geometry leaves so much unexplained that another kind is to take it on."""
-    return bool(is_refined(geometry.kind) and errors.mean() > config.selection.largest_error)
+    """Whether a geometry leaves so much unexplained that another kind is to take it on; none does where one is asked
+    for.
+    """
+    asked = config.model == geometry.kind
+    return bool(not asked and is_refined(geometry.kind) and errors.mean() > config.selection.largest_error)
 
 
 def _few(views: Views) -> tuple[TrainView, ...]:

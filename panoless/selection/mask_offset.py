@@ -139,8 +139,8 @@ def find_mask_offset(source: Family, views: Views, fitted: Fitted, config: FitCo
     """By how much all masks are too small, in pixels: where proposals of moved outlines leave least unexplained.
 
     Counted are the pixels that all trials have in common, and all that each has: those beside an outline that lies too
-    far outside show no object. The least of a parabola through the best offset and its neighbors. Zero where the
-    proposal itself leaves too much unexplained to tell anything, as a flat mirror does of a convex one.
+    far outside show no object. The least of a parabola through the best offset and its neighbors. Zero where all
+    of them leave too much unexplained to tell anything, as flat mirrors do of a convex one.
     """
     options, poses = config.corrections, fitted.geometry.poses
     inner = [pixels_inside(view.mask, options.largest_px) for view in views.train]
@@ -157,13 +157,13 @@ def find_mask_offset(source: Family, views: Views, fitted: Fitted, config: FitCo
         common = with_solid(moved, inner)
         return float(sum(held_out_errors(each, outline.with_poses(poses), config).mean() for each in (moved, common)))
 
-    step, as_said = options.step_px, disagreement(0.0)
-    if as_said > 2 * config.selection.largest_error:
-        return 0.0
-    tried = {-step: disagreement(-step), 0.0: as_said, step: disagreement(step)}
+    step = options.step_px
+    tried = {offset: disagreement(offset) for offset in (-step, 0.0, step)}
     while (best := min(tried, key=tried.__getitem__)) in (min(tried), max(tried)) and abs(best) < options.largest_px:
         beyond = best + float(np.copysign(step, best))
         tried[beyond] = disagreement(beyond)
+    if tried[best] > 2 * config.selection.largest_error:
+        return 0.0
     before, least, after = (tried.get(best + shift, np.inf) for shift in (-step, 0, step))
     if not np.isfinite([before, least, after]).all():
         return best
