@@ -164,6 +164,10 @@ def find_mask_offset(source: Family, views: Views, fitted: Fitted, config: FitCo
         tried[beyond] = disagreement(beyond)
     if tried[best] > 2 * config.selection.largest_error:
         return 0.0
+    for _ in range(options.halvings):
+        step /= 2
+        tried |= {offset: disagreement(offset) for offset in (best - step, best + step)}
+        best = min(tried, key=tried.__getitem__)
     before, least, after = (tried.get(best + shift, np.inf) for shift in (-step, 0, step))
     if not np.isfinite([before, least, after]).all():
         return best

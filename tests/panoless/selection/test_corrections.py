@@ -295,7 +295,7 @@ def test_masks_with_a_black_rim_are_shrunk() -> None:
 @pytest.mark.parametrize("offset_px", [-2.0, 1.5])
 def test_a_surface_of_revolution_is_found_under_wrong_masks(offset_px: float) -> None:
     """Whose profile is what outlines tell: its offset comes back to a third of a pixel, of 80 px."""
-    views = with_masks(revolution_views(goblet(), around(12, 80)), offset_px)
+    views = with_masks(revolution_views(goblet(), around(25, 80)), offset_px)
     _, selection = choose_geometry(views, replace(PRESETS["fast"], model="revolution"))
     assert selection.corrections.mask_offset_px == pytest.approx(-offset_px, abs=0.33)
 
