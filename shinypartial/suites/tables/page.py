@@ -48,7 +48,8 @@ def page_lines(results: Results, numbers: str) -> Iterator[str]:
     whole = FEWER_STEPS not in results.schedule
     title = "# Tables of the paper, by whole schedules" if whole else "# Tables of the paper"
     yield from (title, "", "<!-- `shinypartial tables` makes this page. -->", "")
-    how = ["in all of their steps"] * whole + [f"with `{results.schedule}`"] * bool(results.schedule)
+    steps = "in all of their steps" if whole else "in fewer steps than published"
+    how = [steps] + [f"with `{results.schedule}`"] * bool(results.schedule)
     yield f"{size.train} training and {size.test} test views of {size.resolution} × {size.resolution} pixels;"
     yield "[what the methods are](../explanation/compared-methods.md). Rows *as published* are the paper's figures, of"
     yield "its own scenes and its own size: compare orders, not levels. The paper's method and those that it compares"

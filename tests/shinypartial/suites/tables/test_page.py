@@ -73,7 +73,11 @@ def test_the_page_has_published_and_measured_rows_and_keeps_earlier_ones(tmp_pat
     [
         ("", "# Tables of the paper, by whole schedules", "in all of their steps."),
         ("--x 3", "# Tables of the paper, by whole schedules", "in all of their steps, with `--x 3`."),
-        ("--config.iterations 60 --x 3", "# Tables of the paper", "with `--config.iterations 60 --x 3`."),
+        (
+            "--config.iterations 60 --x 3",
+            "# Tables of the paper",
+            "in fewer steps than published, with `--config.iterations 60 --x 3`.",
+        ),
     ],
 )
 def test_the_page_says_whether_schedules_are_whole(schedule: str, title: str, said: str) -> None:
