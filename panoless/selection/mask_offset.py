@@ -166,7 +166,8 @@ def find_mask_offset(source: Family, views: Views, fitted: Fitted, config: FitCo
         return 0.0
     for _ in range(options.halvings):
         step /= 2
-        tried |= {offset: disagreement(offset) for offset in (best - step, best + step)}
+        beside = (each for each in (best - step, best + step) if abs(each) <= options.largest_px)
+        tried |= {offset: disagreement(offset) for offset in beside}
         best = min(tried, key=tried.__getitem__)
     before, least, after = (tried.get(best + shift, np.inf) for shift in (-step, 0, step))
     if not np.isfinite([before, least, after]).all():
