@@ -24,7 +24,7 @@ class Schedule:
         return iteration >= self._iteration(share)
 
     def reached(self, iteration: int, share: float) -> bool:
-        """Whether that share of the iterations, which is not none of them, is over with the one before."""
+        """Whether that share of the iterations ends right before this one; never for a share of 0."""
         return 0 < iteration == self._iteration(share)
 
     def due(self, iteration: int, share: float) -> bool:
