@@ -52,7 +52,7 @@ class Schedule:
     def lambda_silhouette(self, iteration: int) -> float:
         """The weight of Eq. 13, zero when its time is over ([t < 3000] in Eq. 14)."""
         loss = self.config.loss
-        return loss.lambda_silhouette if iteration < self._iteration(loss.silhouette_until) else 0.0
+        return 0.0 if self.begun(iteration, loss.silhouette_until) else loss.lambda_silhouette
 
     def _density_active(self, iteration: int) -> bool:
         density = self.config.density

@@ -49,11 +49,11 @@ def page_lines(results: Results, numbers: str) -> Iterator[str]:
     title = "# Tables of the paper, by whole schedules" if whole else "# Tables of the paper"
     yield from (title, "", "<!-- `shinypartial tables` makes this page. -->", "")
     steps = "in all of their steps" if whole else "in fewer steps than published"
-    how = [steps] + [f"with `{results.schedule}`"] * bool(results.schedule)
+    options = f", with `{results.schedule}`" if results.schedule else ""
     yield f"{size.train} training and {size.test} test views of {size.resolution} × {size.resolution} pixels;"
     yield "[what the methods are](../explanation/compared-methods.md). Rows *as published* are the paper's figures, of"
     yield "its own scenes and its own size: compare orders, not levels. The paper's method and those that it compares"
-    yield f"with are our implementations, {', '.join(how)}."
+    yield f"with are our implementations, {steps}{options}."
     yield "Of several seeds the median is given, with the lowest and the highest where they differ. **Best** and"
     yield "*second best* are marked among the rows of a scene that were measured here, and among those published; the"
     yield "[oracle baseline](../explanation/oracle-baseline.md), which knows the true normals, takes no part. Seconds"
