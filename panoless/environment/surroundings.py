@@ -144,7 +144,7 @@ class Surroundings:
             (across_rays(points, directions) ** 2),
         )
         along = np.sqrt(np.maximum(1 - inverse**2 * square.sum(-1), 0.0)) - inverse * (points * directions).sum(-1)
-        walls = inverse / np.maximum(along, SHARPEST)
+        walls = inverse / np.maximum(along, 1 - SHARPEST)
         if self.floor is None:
             return walls
         return np.maximum(walls, 1 / np.maximum(self.floor.distance(points, directions), LEAST_DEPTH))

@@ -22,9 +22,10 @@ from panoless.selection.material import Softness, as_perfect_mirror, earned_refl
 GRAY = 0.5
 
 
-def complete(state: FitState, views: Views, config: FitConfig) -> Views:
+def complete(state: FitState, views: Views, config: FitConfig) -> tuple[Views, FitConfig]:
     """Set reflectance, roughness, blur, environment and visibility of a state from its geometry and corrected
-    photographs. These are returned as a mirror of all light would have shown them.
+    photographs. These are returned as a mirror of all light would have shown them, with the configuration that says at
+    which radiance they are saturated.
 
     The map is solved in closed form, unless the configuration keeps that of an iterative fit, which knows no material.
     It is that of photographs as they were taken: exposed more, their robust scales would leave out what is beside a
@@ -44,7 +45,7 @@ def complete(state: FitState, views: Views, config: FitConfig) -> Views:
     state.roughness, state.blur_px = softness.roughness, softness.blur_px
     taken = exposed(usable if state.blur_px is None else replace(usable, blur_px=state.blur_px), 1 / exposure)
     _solve(state, taken, replace(config, exposure=1.0))
-    return views if state.blur_px is None else replace(views, blur_px=state.blur_px)
+    return views if state.blur_px is None else replace(views, blur_px=state.blur_px), config
 
 
 def _solve(state: FitState, views: Views, config: FitConfig) -> None:

@@ -67,9 +67,9 @@ def fit(
             family, recorder = FAMILIES[state.geometry.kind], Recorder(folder, schedule, state)
             state.geometry, state.training = family.train(views, state.geometry, state.training, config, recorder)
         with timed(state.seconds, "solve environment"):
-            photographs = complete(state, photographs, config)
+            photographs, shown = complete(state, photographs, config)
         with timed(state.seconds, "judge"):
-            state.verdict = assess(state, photographs, config)
+            state.verdict = assess(state, photographs, shown)
             if state.geometry.poses is not None:
                 with torch.no_grad():
                     found = Alignment(photographs, config.poses).uncertainty(state.geometry)
@@ -96,10 +96,11 @@ def begin(views: Views, config: FitConfig) -> FitState:
     Where that geometry shows that the object scatters light, another is chosen by photographs without it.
     """
     geometry, selection = choose_geometry(views, config)
-    shown = without_scattered_light(views, geometry, selection.held_out_error, config)
+    corrected = selection.corrections.applied(views, config)
+    shown = without_scattered_light(views, corrected, geometry, selection.held_out_error, config)
     if shown is not None:
         geometry, selection = choose_geometry(*shown)
-    corrected = selection.corrections.applied(views, config)
+        corrected = selection.corrections.applied(views, config)
     training = FAMILIES[geometry.kind].begin(usable_views(corrected, geometry), geometry, config)
     return FitState(geometry, views.object_frame, selection, training)
 

@@ -60,9 +60,13 @@ def with_moved_masks(source: Family, views: Views, fitted: Fitted, config: FitCo
     pull = outline_pull_px(found.corrections.applied(views, config), found.geometry)
     if abs(pull) < options.least_pull_px:
         return found
-    nearer_px = found.corrections.mask_offset_px + pull / options.pull_share
+    nearer_px = _within_largest(found.corrections.mask_offset_px + pull / options.pull_share, config)
     nearer = _moved_by(nearer_px, views, found, config, refit, anew=not goes_on)
     return nearer if nearer is not None and _explains_more(views, found, nearer, config) else found
+
+
+def _within_largest(offset_px: float, config: FitConfig) -> float:
+    return float(np.clip(offset_px, -config.corrections.largest_px, config.corrections.largest_px))
 
 
 def _moved_by(
@@ -160,7 +164,7 @@ def find_mask_offset(source: Family, views: Views, fitted: Fitted, config: FitCo
     step = options.step_px
     tried = {offset: disagreement(offset) for offset in (-step, 0.0, step)}
     while (best := min(tried, key=tried.__getitem__)) in (min(tried), max(tried)) and abs(best) < options.largest_px:
-        beyond = best + float(np.copysign(step, best))
+        beyond = _within_largest(best + np.copysign(step, best), config)
         tried[beyond] = disagreement(beyond)
     if tried[best] > 2 * config.selection.largest_error:
         return 0.0

@@ -104,15 +104,18 @@ def as_perfect_mirror(
 
 
 def without_scattered_light(
-    views: Views, geometry: Geometry, error: float, config: FitConfig
+    views: Views, corrected: Views, geometry: Geometry, error: float, config: FitConfig
 ) -> tuple[Views, FitConfig] | None:
     """The views as a perfect mirror would have shown them, if an object of that geometry is found to scatter light, and
     held-out views are left with an `error` that this may have made; else None. The configuration says at which radiance
     they are saturated.
+
+    `corrected` are the same views as the geometry was fitted to. They tell the light and where the cameras stand; what
+    their exposures and their lens differ by is small beside what is scattered, and is left to the next choice.
     """
     if error < config.material.least_scattering_error:
         return None
-    usable = usable_views(views, geometry)
+    usable = usable_views(corrected, geometry)
     found = earned_reflectance(usable, geometry, config)
     if found is None or not found.albedo.any():
         return None

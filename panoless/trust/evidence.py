@@ -124,7 +124,7 @@ def gather_evidence(
         overlap=_median(overlap),
         missed=float(missed.mean()) if len(missed) else 0.0,
         left_out=1 - kept / solid,
-        saturated=_saturated(seen, float(encoding_of(config).saturation.min()), options),
+        saturated=_saturated(seen, encoding_of(config).saturation, options),
         coverage=float((visibility > 0).float().mean()),
         camera_turn_deg=_median(np.array([_turn_deg(*each) for each in zip(seen, usable.train, strict=True)])),
         views=len(seen),
@@ -211,7 +211,7 @@ def _light(
         "one_color": plain["one_color"].value,
         "matte": plain["matte"].value,
         "unexplained_part": parts.share_above(options.part_unexplained * plain["matte"].value),
-        "noise": noise / encoding_of(config).exposure,
+        "noise": noise if contrast.knee is not None else noise / encoding_of(config).exposure,
         "error_in_noise": float(every.abs().median()) / max(noise, options.least_noise),
         "rank_correlation": _rank_correlation(sure, every.square().sum(1)),
     }
@@ -346,11 +346,13 @@ def _noise(view: TrainView) -> float:
     return float(values.abs().median()) / (NORMAL_MEDIAN * 6**0.5) if values.numel() else 0.0
 
 
-def _saturated(views: Sequence[TrainView], saturation: float, options: TrustOptions) -> float:
+def _saturated(views: Sequence[TrainView], saturation: Float[Tensor, "3"], options: TrustOptions) -> float:
+    """Share of the object's pixels that end at the largest value in some channel."""
     count, total = 0, 0
     for view in views:
-        brightest = view.radiance_at(view.solid).amax(1)
-        count, total = count + int((brightest >= options.saturated * saturation).sum()), total + len(brightest)
+        radiance = view.radiance_at(view.solid)
+        ends = (radiance >= options.saturated * saturation.to(radiance)).any(1)
+        count, total = count + int(ends.sum()), total + len(ends)
     return count / max(total, 1)
 
 

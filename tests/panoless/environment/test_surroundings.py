@@ -40,13 +40,16 @@ def met_sphere(
     return points + distance[:, None] * directions
 
 
-def test_a_sphere_is_looked_up_where_rays_meet_it() -> None:
-    points, directions = inside(500), unit(500)
-    hits = met_sphere(points, directions, 5.0)
-    np.testing.assert_allclose(SPHERE.looked_up(points, directions), hits / 5.0, atol=1e-12)
-    found = SPHERE.inverse_distance_from(points[0], directions)
-    expected = np.linalg.norm(met_sphere(np.tile(points[0], (500, 1)), directions, 5.0) - points[0], axis=1)
-    np.testing.assert_allclose(1 / found, expected, rtol=1e-12)
+@pytest.mark.parametrize("radius", [5.0, 1 / 0.59])
+def test_a_sphere_is_looked_up_where_rays_meet_it(radius: float) -> None:
+    """Also where it nearly touches the unit ball, and the ray begins on that."""
+    sphere, points, directions = Surroundings(np.array([1 / radius])), inside(500), unit(500)
+    hits = met_sphere(points, directions, radius)
+    np.testing.assert_allclose(sphere.looked_up(points, directions), hits / radius, atol=1e-12)
+    for start in (points[0], directions[0]):
+        found = sphere.inverse_distance_from(start, directions)
+        expected = np.linalg.norm(met_sphere(np.tile(start, (500, 1)), directions, radius) - start, axis=1)
+        np.testing.assert_allclose(1 / found, expected, rtol=1e-12)
 
 
 def test_walls_are_looked_up_where_rays_meet_them() -> None:

@@ -160,6 +160,23 @@ def test_noise_and_saturation_are_measured(views: Views) -> None:
     assert evidence(each(views, bright)).saturated == pytest.approx(0.25, abs=0.001)
 
 
+def test_gold_is_judged_by_where_its_channels_end(views: Views) -> None:
+    """A golden mirror of a brighter world, divided by its color: blue goes beyond 1 and is no more saturated, nor less
+    explained, than it would be of a perfect mirror; pixels of whose channels one ends are.
+    """
+    gold = (1.0, 0.8, 0.34)
+    largest = 1 / torch.tensor(gold)[:, None, None]
+    shown = each(views, lambda _, view: replace(view, radiance=torch.minimum(1.7 * view.radiance, largest)))
+    found = gather_evidence(shown, MIRROR, VISIBILITY, replace(CONFIG, tint=gold))
+    ends = [(view.radiance_at(view.solid) >= 0.998 * largest[:, 0, 0]).any(1) for view in shown.train]
+    assert 0 < found.saturated == pytest.approx(float(torch.cat(ends).float().mean()))
+    of_no_color = evidence(shown)
+    assert of_no_color.saturated > found.saturated + 0.05
+    assert found.unexplained is not None
+    assert of_no_color.unexplained is not None
+    assert found.unexplained < of_no_color.unexplained / 3
+
+
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_views_to_hold_one_out_are_said_to_be_so(views: Views, count: int) -> None:
     found = evidence(replace(views, train=views.train[:count]))
