@@ -81,4 +81,4 @@ SPLAT_DILATION = 0.3
 """Variance, in square pixels, that is added to every splat, so that none falls between pixels (Kerbl et al. 2023)."""
 
 SPLAT_TANGENT_SHARE = 1.3
-"""The slope at which a Gaussian is projected ends at so many times that of the picture's edges (Kerbl et al. 2023)."""
+"""The slope at which a Gaussian is projected ends so many halves of the picture from its middle (Kerbl et al. 2023)."""

@@ -24,8 +24,8 @@ def project_gaussians(means, quats, scales, camera) -> tuple[Tensor, Tensor, Ten
         (x, camera.fx, camera.cx, camera.width),
         (y, camera.fy, camera.cy, camera.height),
     ):
-        low, high = (SPLAT_TANGENT_SHARE * (edge - center) / focal for edge in (0, extent))
-        tangent = (along / z).clamp(low, high)
+        middle, half = (extent / 2 - center) / focal, SPLAT_TANGENT_SHARE * extent / 2 / focal
+        tangent = (along / z).clamp(middle - half, middle + half)
         side = axes[:, 0] if along is x else axes[:, 1]
         rows.append((side - tangent[:, None] * axes[:, 2]) * (focal / z)[:, None])
     (u, v) = rows

@@ -1,5 +1,7 @@
 """Splats: closed forms, gradients of the definition, and a kernel that agrees with it forward and backward."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -112,6 +114,21 @@ def test_a_projected_gaussian_spreads_as_its_points_do() -> None:
     precision = torch.stack([xx, xy, xy, yy], 1).view(6, 2, 2)
     dilated = spread + 0.3 * torch.eye(2, dtype=torch.float64)
     assert torch.allclose(precision @ dilated, torch.eye(2, dtype=torch.float64).expand(6, 2, 2), atol=1e-5)
+
+
+def test_a_crop_shows_what_the_whole_picture_shows() -> None:
+    """Also one that lies wholly to one side of the principal point."""
+    whole, left = straight_camera(200, focal=100.0), 150
+    crop = replace(whole, cx=whole.cx - left, width=40)
+    generator = torch.Generator().manual_seed(4)
+    means = torch.rand(20, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.4, 0.1, 0.0])
+    means += torch.tensor([0.5, 0.0, 1.0])  # Columns 150 to 190.
+    quats = torch.randn(20, 4, generator=generator, dtype=torch.float64)
+    scales = 0.05 + 0.1 * torch.rand(20, 3, generator=generator, dtype=torch.float64)
+    seen, cropped = (project_gaussians(means, quats, scales, camera) for camera in (whole, crop))
+    assert ((cropped.centers[:, 0] > 0) & (cropped.centers[:, 0] < crop.width)).all()
+    assert torch.allclose(seen.centers[:, 0] - left, cropped.centers[:, 0])
+    assert torch.allclose(seen.precisions, cropped.precisions)
 
 
 def test_gradients_of_the_projection() -> None:
