@@ -173,7 +173,10 @@ class _SeenView:
         ]
         best, least, step = Poses(start[None, :3], start[None, 3:]), np.inf, np.zeros((1, 6))
         pose = best
-        for _ in range(self.options.steps):
+        for index in range(self.options.steps):
+            if index:
+                pose = best.after(step)
+                rows = self.rows(scene, pose.stacked[0])
             parts = [each.equations(*numbers) for each, *numbers in zip(rows, scales, noise, strict=True)]
             cost = sum(part[2] for part in parts) + float(pose.stacked[0] @ prior @ pose.stacked[0]) / 2
             if cost < least:
@@ -183,8 +186,6 @@ class _SeenView:
                 step[0, free] = -np.linalg.solve(matrix[free, free], gradient[free])
             else:
                 step *= self.options.shortening
-            pose = best.after(step)
-            rows = self.rows(scene, pose.stacked[0])
         return best.stacked[0]
 
 

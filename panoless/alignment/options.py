@@ -72,7 +72,8 @@ class PoseOptions:
     rounds it changes by 1 % on mirror.
     """
     steps: Count = 4
-    """Gauss–Newton steps of a view by itself, under a geometry and a map that stay. Not tuned."""
+    """Poses of a view by itself that are compared, each a Gauss–Newton step after the best, under a geometry and a map
+    that stay. Not tuned."""
     shortening: Share = 0.3
     """Factor of a step that raises the cost. Not tuned."""
     noise_multiple: Positive = 3.0
