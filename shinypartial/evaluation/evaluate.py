@@ -26,7 +26,6 @@ from shinypartial.evaluation.pictures import (
     ENVIRONMENT_EXPOSED,
     ENVIRONMENT_PREDICTION,
     ENVIRONMENT_TRUTH,
-    EVALUATION,
     OBSERVED_MAP,
     VISIBILITY,
     VISIBILITY_MAP,
@@ -73,6 +72,7 @@ from shinypartial.metrics.paper import (
 )
 from shinypartial.prediction.format import (
     ENVIRONMENT,
+    EVALUATION,
     PredictionInfo,
     dataset_hash,
     read_environment_map,

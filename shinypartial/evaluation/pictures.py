@@ -13,8 +13,7 @@ from shinypartial.evaluation.masks import solid_mask
 from shinypartial.io.images import write_png
 from shinypartial.metrics.angular import normal_errors_deg
 
-#: Where an evaluation leaves its pictures, and their names.
-EVALUATION = "evaluation"
+#: Names of the pictures that an evaluation leaves.
 ENVIRONMENT_TRUTH = "environment_truth.png"
 ENVIRONMENT_PREDICTION = "environment_prediction.png"
 ENVIRONMENT_EXPOSED = "environment_best_exposure.png"

@@ -16,12 +16,11 @@ from shinypartial.metrics.calibration import CalibrationScores
 from shinypartial.metrics.environment import Regions, UnweightedScores
 from shinypartial.metrics.paper import PaperScores
 from shinypartial.metrics.registry import METRICS, Metric, metric
-from shinypartial.prediction.format import ORACLE_SUFFIX
+from shinypartial.prediction.format import ORACLE_SUFFIX, SCORES
 
 FORMAT = "shinypartial-scores"
 FORMAT_VERSION = 3
 PROTOCOL = "linear-v1"
-SCORES = "scores.json"
 
 
 @dataclass(frozen=True)

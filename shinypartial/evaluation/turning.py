@@ -11,9 +11,10 @@ from shinypartial.core.camera import Camera, project
 from shinypartial.core.conventions import PIXEL_CENTER
 from shinypartial.dataset.schema import View
 from shinypartial.evaluation.masks import solid_mask
-from shinypartial.evaluation.pictures import EVALUATION, VISIBILITY, Scale, normal_picture, scalar_picture
+from shinypartial.evaluation.pictures import VISIBILITY, Scale, normal_picture, scalar_picture
 from shinypartial.io.files import atomic_write
 from shinypartial.metrics.angular import normal_errors_deg
+from shinypartial.prediction.format import EVALUATION
 from shinypartial.prediction.surface import PredictedSurface, surface_of, triangles_of
 
 TURNING = "surface.webp"

@@ -16,6 +16,7 @@ from shinypartial.core.sphere import pixel_footprint_sr, sample_latlong
 from shinypartial.dataset.read import open_dataset, read_environment, read_view, require_normals
 from shinypartial.dataset.schema import ENVIRONMENT_LATLONG, Dataset, Frame, View
 from shinypartial.evaluation.masks import environment_mask
+from shinypartial.io.files import folder_lock
 from shinypartial.io.memory import peak_memory_bytes
 from shinypartial.io.progress import Progress
 from shinypartial.io.threads import in_threads
@@ -24,7 +25,7 @@ from shinypartial.metrics.environment import PROTOCOL_HEIGHT, RegionMasks, regio
 from shinypartial.oracle.latlong_solver import ROBUST_SCALES, Rays, SolvedMap, solve_latlong
 from shinypartial.prediction.format import (
     PredictionInfo,
-    acquire_prediction,
+    begin_prediction,
     dataset_hash,
     write_environment_map,
     write_info,
@@ -68,12 +69,21 @@ def make_oracle(dataset: Path, output: Path) -> Oracle:
 
     Of the plain average and the robust least squares, on grids as fine as the rays allow, the one with the smallest
     error against the ground truth over observed directions is taken: this makes the baseline as good as they can be.
-    Raises InputError when the dataset has no normals, and when `output` holds something else than a prediction.
+    Raises InputError when the dataset has no normals, and when `output` holds something else than a prediction or is in
+    use.
     """
-    start, data = time.monotonic(), open_dataset(dataset)
+    data = open_dataset(dataset)
     _require_normals(data)
-    acquire_prediction(output)
-    (output / "test").mkdir(exist_ok=True)  # Marks the folder as begun, so that a run after a kill is not refused.
+    with folder_lock(output):
+        begin_prediction(output)
+        oracle = _solve(data, output)
+        write_info(output, _info(oracle, data))
+    return oracle
+
+
+def _solve(data: Dataset, output: Path) -> Oracle:
+    """Write the maps and the test views."""
+    start = time.monotonic()
     solves = len(HEIGHTS) * len(ROBUST_SCALES)
     progress = Progress("oracle", total=len(data.train) + solves + len(data.test))
     rays = _read_rays(data, progress)
@@ -90,9 +100,7 @@ def make_oracle(dataset: Path, output: Path) -> Oracle:
     seconds = {
         name: round(times[i + 1] - times[i], 2) for i, name in enumerate(("read views", "solve", "write test views"))
     }
-    oracle = Oracle(output, chosen, candidates, len(rays.directions), seconds)
-    write_info(output, _info(oracle, data))
-    return oracle
+    return Oracle(output, chosen, candidates, len(rays.directions), seconds)
 
 
 def _require_normals(data: Dataset) -> None:

@@ -10,6 +10,7 @@ PREDICTION/snapshots/000250           optional: earlier moments of the fit, each
 """
 
 import math
+import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -41,6 +42,8 @@ VISIBILITY_CHANNEL = "Y"
 INVERSE_DISTANCE = "inverse_distance.exr"
 #: One picture of what a test view is made of, optional.
 DECOMPOSITION = "decomposition.jpg"
+#: What `shinypartial evaluate` and `report` add to the folder: scores, pictures and a page.
+SCORES, EVALUATION, REPORT = "scores.json", "evaluation", "report.html"
 
 
 @dataclass(frozen=True)
@@ -271,6 +274,19 @@ def acquire_prediction(root: Path) -> None:
             remedy="Choose another --output.",
         )
     root.mkdir(parents=True, exist_ok=True)
+
+
+def begin_prediction(root: Path) -> None:
+    """Acquire `root` and take from it what says something of an earlier prediction there: prediction.json, scores,
+    report.
+
+    The folder of test views marks it as begun, so that a run after a kill is not refused.
+    """
+    acquire_prediction(root)
+    (root / TEST_VIEWS).mkdir(exist_ok=True)
+    for name in (DESCRIPTION, SCORES, REPORT):
+        (root / name).unlink(missing_ok=True)
+    shutil.rmtree(root / EVALUATION, ignore_errors=True)
 
 
 def write_info(root: Path, info: PredictionInfo) -> None:

@@ -1,5 +1,6 @@
 """Directions that a prediction hardly saw, smoothed: one use of the visibility map, for any method that writes one."""
 
+import shutil
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -13,10 +14,14 @@ from shinypartial.io.files import copy_or_link, folder_lock
 from shinypartial.prediction.format import (
     DESCRIPTION,
     ENVIRONMENT,
+    EVALUATION,
+    REPORT,
+    SCORES,
     SNAPSHOTS,
+    TEST_VIEWS,
     VISIBILITY,
     PredictionInfo,
-    acquire_prediction,
+    begin_prediction,
     read_environment_map,
     read_info,
     read_visibility,
@@ -25,8 +30,8 @@ from shinypartial.prediction.format import (
 )
 
 #: What is written anew, or says nothing about the changed map; everything else is taken over as it is.
-NOT_TAKEN_OVER = (DESCRIPTION, ENVIRONMENT, "scores.json", "report.html")
-FOLDERS_NOT_TAKEN_OVER = (SNAPSHOTS, "evaluation")
+NOT_TAKEN_OVER = (DESCRIPTION, ENVIRONMENT, SCORES, REPORT)
+FOLDERS_NOT_TAKEN_OVER = (SNAPSHOTS, EVALUATION)
 LEVELS = 256
 
 
@@ -104,14 +109,14 @@ def postprocess(prediction: Path, output: Path, options: BlurOptions = BlurOptio
         )
     blurred = blur_hardly_seen(radiance, visibility, options)
     with folder_lock(output):
-        acquire_prediction(output)
-        (output / "test").mkdir(exist_ok=True)  # Marks the folder as begun, so that a run after a kill is not refused.
-        (output / DESCRIPTION).unlink(missing_ok=True)
+        begin_prediction(output)
         for path in sorted(prediction.rglob("*")):
             place = path.relative_to(prediction)
             if path.is_file() and str(place) not in NOT_TAKEN_OVER and place.parts[0] not in FOLDERS_NOT_TAKEN_OVER:
                 _take_over(path, output / place)
         write_environment_map(output, blurred.radiance)
+        if not (prediction / TEST_VIEWS).is_dir():
+            shutil.rmtree(output / TEST_VIEWS)  # Where that folder is, an evaluation asks for every test view.
         write_info(output, _describe(info, prediction, blurred, options, time.monotonic() - start))
     return blurred
 

@@ -21,7 +21,6 @@ from shinypartial.evaluation.pictures import (
     ENVIRONMENT_EXPOSED,
     ENVIRONMENT_PREDICTION,
     ENVIRONMENT_TRUTH,
-    EVALUATION,
     NORMAL_ERROR,
     OBSERVED_MAP,
     RENDER_ERROR,
@@ -42,12 +41,11 @@ from shinypartial.evaluation.turning import SURFACE_ERROR, TURNING
 from shinypartial.io.images import read_png
 from shinypartial.io.progress import format_seconds
 from shinypartial.metrics.registry import Direction
-from shinypartial.prediction.format import DECOMPOSITION, PredictionInfo, read_info
+from shinypartial.prediction.format import DECOMPOSITION, EVALUATION, REPORT, PredictionInfo, read_info
 from shinypartial.report.html import write_page
 from shinypartial.report.line_chart import ColorBar, LineChart, Series, color_bar, line_chart
 from shinypartial.report.tables import OracleRows, metric_tables, oracle_note, oracle_rows, paper_tables
 
-REPORT = "report.html"
 #: Pictures that the method itself exports, shown under the names of their files.
 METHOD_PICTURES = "pictures"
 CURVE_ABSCISSA = "iteration"

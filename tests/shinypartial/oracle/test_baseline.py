@@ -21,7 +21,14 @@ from shinypartial.metrics import perceptual
 from shinypartial.metrics.environment import RegionMasks, region_scores
 from shinypartial.oracle.baseline import Oracle, heights_to_try, make_oracle, rays_of_view
 from shinypartial.oracle.latlong_solver import Rays, solve_latlong
-from shinypartial.prediction.format import dataset_hash, newest_prediction, read_info, read_visibility
+from shinypartial.prediction.format import (
+    DESCRIPTION,
+    SCORES,
+    dataset_hash,
+    newest_prediction,
+    read_info,
+    read_visibility,
+)
 from shinypartial.report.page import summary_lines, write_report
 from tests.support.synthetic_dataset import make_plain_sphere_dataset, make_sphere_dataset
 from tests.support.truth_prediction import write_truth_prediction
@@ -174,6 +181,25 @@ def test_the_command_writes_beside_the_predictions_and_never_into_the_dataset(
     out = capsys.readouterr().out
     assert "averaged" in out
     assert "taken" in out
+
+
+def test_a_baseline_that_is_made_again_is_not_complete_before_it_ends(
+    sphere_dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither the old description nor old scores stand beside new maps, and no other run writes there meanwhile."""
+    root = write_truth_prediction(tmp_path / "oracle", sphere_dataset)
+    write_json(root / SCORES, {})
+
+    def stop(rays: Rays, height: int, after_round: object) -> None:
+        with pytest.raises(InputError, match="the only run"):
+            make_oracle(sphere_dataset.root, root)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("shinypartial.oracle.baseline.solve_latlong", stop)
+    with pytest.raises(KeyboardInterrupt):
+        make_oracle(sphere_dataset.root, root)
+    assert not (root / DESCRIPTION).exists()
+    assert not (root / SCORES).exists()
 
 
 def test_an_older_baseline_is_passed_over(oracle: Oracle, dataset: Dataset, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Blurring what was hardly seen touches nothing else, knows no seam and no pole, and leaves a prediction to score."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,10 @@ from shinypartial.evaluation.evaluate import evaluate
 from shinypartial.evaluation.scores import read_scores
 from shinypartial.prediction.format import (
     DESCRIPTION,
+    EVALUATION,
+    REPORT,
+    SCORES,
+    TEST_VIEWS,
     VISIBILITY,
     prediction_frame,
     read_environment_map,
@@ -108,6 +113,24 @@ def test_scores_and_pictures_of_the_source_are_not_taken_over(prediction: Path, 
     postprocess(prediction, tmp_path / "made")
     assert not (tmp_path / "made" / "scores.json").exists()
     assert not (tmp_path / "made" / "evaluation").exists()
+
+
+def test_a_prediction_of_maps_alone_is_scored_like_its_source(prediction: Path, tmp_path: Path) -> None:
+    shutil.rmtree(prediction / TEST_VIEWS)
+    postprocess(prediction, tmp_path / "made")
+    scores = evaluate(tmp_path / "made", protocol="linear-v1")
+    assert scores.environment is not None
+    assert scores.views == ()
+
+
+def test_made_again_it_has_no_scores_of_the_first_time(prediction: Path, tmp_path: Path) -> None:
+    made = tmp_path / "made"
+    postprocess(prediction, made)
+    (made / EVALUATION).mkdir()
+    for path in (made / SCORES, made / REPORT, made / EVALUATION / "environment_error.png"):
+        path.write_text("of the first time")
+    postprocess(prediction, made, BlurOptions(blur_deg=10.0))
+    assert not {SCORES, REPORT, EVALUATION} & {path.name for path in made.iterdir()}
 
 
 @pytest.mark.parametrize("damage", ["missing", "constant", "same folder", "no blur"])
