@@ -55,7 +55,7 @@ from shinypartial.evaluation.view_scores import (
     read_prediction,
     score_view,
 )
-from shinypartial.io.images import require_latlong, write_png
+from shinypartial.io.images import write_png
 from shinypartial.io.progress import Progress
 from shinypartial.io.threads import in_threads
 from shinypartial.metrics import coverage as coverage_metrics
@@ -86,8 +86,6 @@ from shinypartial.prediction.format import read_inverse_distance as read_predict
 PICTURED_VIEWS = 4
 #: Test views whose normals tell the errors of the surface, spread likewise.
 SURFACE_VIEWS = 16
-#: Slack for values that 16-bit storage rounds beyond [0, 1].
-VISIBILITY_TOLERANCE = 1e-3
 
 #: What to score: the benchmark's own protocol, with or without the one that serves comparison with published tables.
 Protocols = Literal["both", "linear-v1"]
@@ -325,15 +323,7 @@ def _score_calibration(
     if visibility is None:
         left_out.append(LeftOut("calibration", f"the prediction has no {VISIBILITY_FILE}"))
         return None
-    require_latlong(
-        visibility,
-        prediction / VISIBILITY_FILE,
-        "visibility in [0, 1]",
-        "Export the visibility again: see docs/reference/prediction-format.md.",
-        lowest=-VISIBILITY_TOLERANCE,
-        highest=1 + VISIBILITY_TOLERANCE,
-    )
-    resized = environment_metrics.to_protocol_size(np.clip(visibility, 0, 1)[..., None])[..., 0]
+    resized = environment_metrics.to_protocol_size(visibility[..., None])[..., 0]
     write_png(prediction / EVALUATION / VISIBILITY_MAP, scalar_picture(resized, VISIBILITY))
     weights = environment_metrics.direction_weights()
     scores = calibration_scores(resized.ravel(), error.ravel(), weights.ravel())

@@ -39,6 +39,8 @@ TEST_VIEWS = "test"
 ENVIRONMENT = "environment.exr"
 VISIBILITY = "visibility.exr"
 VISIBILITY_CHANNEL = "Y"
+#: Slack for values that 16-bit storage rounds beyond [0, 1].
+VISIBILITY_TOLERANCE = 1e-3
 INVERSE_DISTANCE = "inverse_distance.exr"
 #: One picture of what a test view is made of, optional.
 DECOMPOSITION = "decomposition.jpg"
@@ -346,11 +348,20 @@ def read_environment_map(root: Path) -> Float[np.ndarray, "H W 3"]:
 
 
 def read_visibility(root: Path) -> Float[np.ndarray, "H W"] | None:
-    """Read visibility, or None when the method wrote none."""
+    """Read visibility, or None when the method wrote none; raises InputError unless it is a 2:1 map in [0, 1]."""
     path = root / VISIBILITY
     if not path.exists():
         return None
-    return stack_channels(read_exr(path), (VISIBILITY_CHANNEL,), path)[..., 0]
+    visibility = stack_channels(read_exr(path), (VISIBILITY_CHANNEL,), path)[..., 0]
+    require_latlong(
+        visibility,
+        path,
+        "visibility in [0, 1]",
+        "Export the visibility again: see docs/reference/prediction-format.md.",
+        lowest=-VISIBILITY_TOLERANCE,
+        highest=1 + VISIBILITY_TOLERANCE,
+    )
+    return np.clip(visibility, 0, 1)
 
 
 def read_inverse_distance(root: Path) -> Float[np.ndarray, "H W"] | None:

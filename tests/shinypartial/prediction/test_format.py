@@ -5,11 +5,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
-from shinypartial.prediction.format import DESCRIPTION, Candidate, ModelSelection, Trust, read_info, write_info
+from shinypartial.prediction.format import (
+    DESCRIPTION,
+    Candidate,
+    ModelSelection,
+    Trust,
+    read_info,
+    read_visibility,
+    write_info,
+    write_visibility,
+)
 from tests.support.truth_prediction import write_truth_prediction
 
 SELECTION = ModelSelection(
@@ -75,6 +85,20 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "negative seconds": ({"seconds": {"fit": -1.0}}, "seconds"),
     "an unknown field": ({"speed": 3}, "speed"),
 }
+
+
+@pytest.mark.parametrize(
+    "visibility", [np.full((8, 16), np.nan), np.full((8, 16), 255.0), np.zeros((8, 8))], ids=["NaN", "8-bit", "square"]
+)
+def test_visibility_is_a_map_of_shares(tmp_path: Path, visibility: np.ndarray) -> None:
+    write_visibility(tmp_path, visibility)
+    with pytest.raises(InputError, match=r"visibility in \[0, 1\].*visibility\.exr"):
+        read_visibility(tmp_path)
+
+
+def test_visibility_that_storage_rounds_beyond_one_is_one(tmp_path: Path) -> None:
+    write_visibility(tmp_path, np.full((8, 16), 1.0005))
+    np.testing.assert_array_equal(read_visibility(tmp_path), 1)
 
 
 @pytest.mark.parametrize(("entries", "words"), WRONG.values(), ids=WRONG.keys())
