@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal
 
 import numpy as np
@@ -41,7 +42,7 @@ from shinypartial.evaluation.scores import (
     PerceptualScores,
     Scores,
     SurroundingsScores,
-    read_oracle_baseline,
+    require_oracle_baseline,
     write_scores,
 )
 from shinypartial.evaluation.turning import TURNING, write_turning
@@ -55,6 +56,7 @@ from shinypartial.evaluation.view_scores import (
     read_prediction,
     score_view,
 )
+from shinypartial.io.files import copy_or_link
 from shinypartial.io.images import write_png
 from shinypartial.io.progress import Progress
 from shinypartial.io.threads import in_threads
@@ -73,6 +75,7 @@ from shinypartial.metrics.paper import (
 from shinypartial.prediction.format import (
     ENVIRONMENT,
     EVALUATION,
+    SCORES,
     PredictionInfo,
     dataset_hash,
     read_environment_map,
@@ -137,53 +140,65 @@ def evaluate(
     prediction = Path(prediction)
     info = read_info(prediction)
     data = _open_dataset(info, None if dataset is None else Path(dataset), prediction)
+    data_hash = dataset_hash(data)
+    if oracle is not None:
+        require_oracle_baseline(Path(oracle), prediction, data.name, data_hash)
     left_out: list[LeftOut] = []
     networks = _load_networks(lpips_weights, left_out)
-    for old in (*(prediction / EVALUATION).glob("*.png"), prediction / EVALUATION / TURNING):
-        old.unlink(missing_ok=True)
     frames = frames_to_score(prediction, data)
     progress = Progress("evaluate", total=len(data.train) + len(frames) + 1)
     observed = _observed_directions(data, left_out, progress)
     with_paper = protocol == "both"
     _import_metrics()
-    with ThreadPoolExecutor(1) as beside:
-        scoring = beside.submit(_score_maps, prediction, data, observed, networks, left_out, with_paper)
-        results = list(_score_views(prediction, frames, networks, progress, with_paper))
-        maps = scoring.result()
-    _picture_surface(prediction, data, left_out)
-    progress.advance("environment")
-    if not with_paper:
-        left_out.append(LeftOut(PAPER_PROTOCOL, "not asked for (--protocol both)"))
-    scores = Scores(
-        protocol=PROTOCOL,
-        dataset=data.name,
-        split=data.scene_split,
-        dataset_hash=dataset_hash(data),
-        dataset_hash_matches=dataset_hash(data) == info.dataset_hash,
-        coverage=observed.coverage,
-        resolved_coverage=observed.resolved_coverage,
-        environment=maps.environment,
-        normals=pool_normals(results, left_out),
-        normals_environment=pool_environment_normals(results, left_out),
-        render=pool_renders(results, networks.alex, left_out, own_masks=info.masks is None),
-        calibration=maps.calibration,
-        paper=_pool_paper(maps, results) if with_paper else None,
-        oracle=None if oracle is None else str(Path(oracle).resolve()),
-        views=tuple(result.scores for result in results),
-        counts=count_all(data, results),
-        surroundings=_score_surroundings(prediction, data, observed, left_out),
-        left_out=tuple(left_out),  # Last: the others add to it.
-    )
-    read_oracle_baseline(prediction, scores)
-    write_scores(prediction, scores)
+    with TemporaryDirectory() as folder:
+        pictures = Path(folder)
+        with ThreadPoolExecutor(1) as beside:
+            scoring = beside.submit(_score_maps, prediction, pictures, data, observed, networks, left_out, with_paper)
+            results = list(_score_views(prediction, pictures, frames, networks, progress, with_paper))
+            maps = scoring.result()
+        _picture_surface(prediction, pictures, data, left_out)
+        progress.advance("environment")
+        if not with_paper:
+            left_out.append(LeftOut(PAPER_PROTOCOL, "not asked for (--protocol both)"))
+        scores = Scores(
+            protocol=PROTOCOL,
+            dataset=data.name,
+            split=data.scene_split,
+            dataset_hash=data_hash,
+            dataset_hash_matches=data_hash == info.dataset_hash,
+            coverage=observed.coverage,
+            resolved_coverage=observed.resolved_coverage,
+            environment=maps.environment,
+            normals=pool_normals(results, left_out),
+            normals_environment=pool_environment_normals(results, left_out),
+            render=pool_renders(results, networks.alex, left_out, own_masks=info.masks is None),
+            calibration=maps.calibration,
+            paper=_pool_paper(maps, results) if with_paper else None,
+            oracle=None if oracle is None else str(Path(oracle).resolve()),
+            views=tuple(result.scores for result in results),
+            counts=count_all(data, results),
+            surroundings=_score_surroundings(prediction, data, observed, left_out),
+            left_out=tuple(left_out),  # Last: the others add to it.
+        )
+        _replace(prediction, scores, pictures)
     return scores
 
 
-def _picture_surface(prediction: Path, data: Dataset, left_out: list[LeftOut]) -> None:
+def _replace(prediction: Path, scores: Scores, pictures: Path) -> None:
+    """Put scores and pictures in the place of those of an earlier evaluation, which stay together if one fails."""
+    folder = prediction / EVALUATION
+    for old in (prediction / SCORES, *folder.glob("*.png"), folder / TURNING):
+        old.unlink(missing_ok=True)
+    for new in pictures.iterdir():
+        copy_or_link(new, folder / new.name, link=False)
+    write_scores(prediction, scores)
+
+
+def _picture_surface(prediction: Path, pictures: Path, data: Dataset, left_out: list[LeftOut]) -> None:
     """The surface as a picture; one that can't be read is left out, for no score is made of it."""
     frames = data.test[:: -(-len(data.test) // SURFACE_VIEWS) or 1]
     try:
-        write_turning(prediction, ((frame.camera, read_view(frame)) for frame in frames))
+        write_turning(pictures / TURNING, prediction, ((frame.camera, read_view(frame)) for frame in frames))
     except InputError as error:
         left_out.append(LeftOut("picture of the surface", f"expected {error.expected}; found {error.found}"))
 
@@ -251,6 +266,7 @@ def _cells_of_view(frame: Frame) -> coverage_metrics.ObservedCells:
 
 def _score_maps(
     prediction: Path,
+    pictures: Path,
     data: Dataset,
     observed: _Observed,
     networks: _Networks,
@@ -269,7 +285,7 @@ def _score_maps(
     stops = environment_metrics.best_exposure_stops(predicted, truth)
     exposed = predicted * np.float32(2.0**stops)
     error = environment_metrics.absolute_error_srgb(predicted, truth)
-    _write_environment_pictures(prediction / EVALUATION, (predicted, exposed, truth), error, observed)
+    _write_environment_pictures(pictures, (predicted, exposed, truth), error, observed)
     srgb = [linear_to_srgb(environment_metrics.clipped_map(radiance)) for radiance in (predicted, truth)]
     scores = EnvironmentScores(
         as_predicted=environment_metrics.region_scores(predicted, truth, observed.masks),
@@ -281,7 +297,7 @@ def _score_maps(
         ),
     )
     paper = _score_paper(predicted, truth, networks) if with_paper else None
-    return _MapScores(scores, _score_calibration(prediction, error, left_out), paper)
+    return _MapScores(scores, _score_calibration(prediction, pictures, error, left_out), paper)
 
 
 def _score_paper(predicted: Latlong, truth: Latlong, networks: _Networks) -> PaperEnvironment:
@@ -317,14 +333,14 @@ def _score_surroundings(
 
 
 def _score_calibration(
-    prediction: Path, error: Float[np.ndarray, "H W"], left_out: list[LeftOut]
+    prediction: Path, pictures: Path, error: Float[np.ndarray, "H W"], left_out: list[LeftOut]
 ) -> CalibrationScores | None:
     visibility = read_visibility(prediction)
     if visibility is None:
         left_out.append(LeftOut("calibration", f"the prediction has no {VISIBILITY_FILE}"))
         return None
     resized = environment_metrics.to_protocol_size(visibility[..., None])[..., 0]
-    write_png(prediction / EVALUATION / VISIBILITY_MAP, scalar_picture(resized, VISIBILITY))
+    write_png(pictures / VISIBILITY_MAP, scalar_picture(resized, VISIBILITY))
     weights = environment_metrics.direction_weights()
     scores = calibration_scores(resized.ravel(), error.ravel(), weights.ravel())
     undefined = "undefined: visibility or error is the same everywhere, or no direction is wrong"
@@ -333,7 +349,12 @@ def _score_calibration(
 
 
 def _score_views(
-    prediction: Path, frames: tuple[Frame, ...], networks: _Networks, progress: Progress, with_paper: bool
+    prediction: Path,
+    pictures: Path,
+    frames: tuple[Frame, ...],
+    networks: _Networks,
+    progress: Progress,
+    with_paper: bool,
 ) -> Iterator[ViewResult]:
     spread = np.linspace(0, len(frames) - 1, min(PICTURED_VIEWS, len(frames)))
     pictured = {frames[round(index)].name for index in spread}
@@ -341,7 +362,7 @@ def _score_views(
     def score(frame: Frame) -> ViewResult:
         truth, predicted = read_view(frame), read_prediction(prediction, frame)
         if frame.name in pictured:
-            write_view_pictures(prediction / EVALUATION, frame.stem.name, predicted, truth)
+            write_view_pictures(pictures, frame.stem.name, predicted, truth)
         return score_view(frame, predicted, truth, networks.alex, with_paper=with_paper)
 
     for result in in_threads(score, frames):

@@ -177,19 +177,37 @@ def read_scores(prediction: Path) -> Scores:
 def read_oracle_baseline(prediction: Path, scores: Scores) -> Scores | None:
     """Scores of the dataset's oracle, from the folder that the scores name or the sibling DATASET-oracle.
 
-    None when there is no such sibling, when it is the prediction itself, or when it was made from another version of
-    the dataset; a folder that was named must hold scores of the same dataset, else InputError.
+    None when there is no such sibling that can be read, when it is the prediction itself, or when it was made from
+    another version of the dataset; a folder that was named must hold scores of the same dataset, else InputError.
     """
-    folder = Path(scores.oracle) if scores.oracle else prediction.resolve().parent / (scores.dataset + ORACLE_SUFFIX)
-    if folder.resolve() == prediction.resolve() or (scores.oracle is None and not (folder / SCORES).is_file()):
+    if scores.oracle is not None:
+        return require_oracle_baseline(Path(scores.oracle), prediction, scores.dataset, scores.dataset_hash)
+    folder = prediction.resolve().parent / (scores.dataset + ORACLE_SUFFIX)
+    if folder.resolve() == prediction.resolve():
+        return None
+    try:
+        baseline = read_scores(folder)
+    except InputError:
+        return None
+    return baseline if _is_oracle_of(baseline, scores.dataset_hash) else None
+
+
+def require_oracle_baseline(folder: Path, prediction: Path, dataset: str, dataset_hash: str) -> Scores | None:
+    """Scores of the oracle of that dataset from the folder that was named; None where it is the prediction itself.
+
+    Raises InputError when the folder holds no such scores.
+    """
+    if folder.resolve() == prediction.resolve():
         return None
     baseline = read_scores(folder)
-    if baseline.dataset_hash == scores.dataset_hash and baseline.dataset_hash_matches:
-        return baseline
-    if scores.oracle is None:
-        return None
-    raise InputError(
-        expected=f"the oracle of {scores.dataset} (hash {scores.dataset_hash[:12]}…) in {folder}",
-        found=f"that of {baseline.dataset} (hash {baseline.dataset_hash[:12]}…)",
-        remedy=f"Make it: `shinypartial oracle {scores.dataset}`, or leave out --oracle.",
-    )
+    if not _is_oracle_of(baseline, dataset_hash):
+        raise InputError(
+            expected=f"the oracle of {dataset} (hash {dataset_hash[:12]}…) in {folder}",
+            found=f"that of {baseline.dataset} (hash {baseline.dataset_hash[:12]}…)",
+            remedy=f"Make it: `shinypartial oracle {dataset}`, or leave out --oracle.",
+        )
+    return baseline
+
+
+def _is_oracle_of(baseline: Scores, dataset_hash: str) -> bool:
+    return baseline.dataset_hash == dataset_hash and baseline.dataset_hash_matches

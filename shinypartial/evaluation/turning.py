@@ -14,7 +14,6 @@ from shinypartial.evaluation.masks import solid_mask
 from shinypartial.evaluation.pictures import VISIBILITY, Scale, normal_picture, scalar_picture
 from shinypartial.io.files import atomic_write
 from shinypartial.metrics.angular import normal_errors_deg
-from shinypartial.prediction.format import EVALUATION
 from shinypartial.prediction.surface import PredictedSurface, surface_of, triangles_of
 
 TURNING = "surface.webp"
@@ -143,18 +142,15 @@ def turning_frames(
     return found
 
 
-def write_turning(prediction: Path, views: Iterable[tuple[Camera, View]]) -> None:
-    """Write PREDICTION/evaluation/surface.webp: the surface with its errors in these views; nothing where the method
-    exported none.
-    """
+def write_turning(path: Path, prediction: Path, views: Iterable[tuple[Camera, View]]) -> None:
+    """Write the surface with its errors in these views; nothing where the method exported none."""
     surface = surface_of(prediction)
     if surface is None:
         return
     points = SurfacePoints.spread(surface)
     errors = errors_on_surface(points, views)
     panels = turning_panels(points, None if np.isnan(errors).all() else errors)
-    frames = turning_frames(points, panels)
-    write_frames(prediction / EVALUATION / TURNING, frames)
+    write_frames(path, turning_frames(points, panels))
 
 
 def write_frames(path: Path, frames: list[UInt8[np.ndarray, "S W 3"]]) -> None:

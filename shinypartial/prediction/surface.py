@@ -22,10 +22,9 @@ def surface_of(prediction: Path, *, clouds: bool = False) -> PredictedSurface | 
     asked for as surfaces without faces.
 
     Normals are its columns nx, ny, nz; where it has none, those of the faces around a vertex, weighted by area.
-    Confidence is its column `confidence`.
+    Confidence is its column `confidence`. Raises InputError for a PLY that is incomplete, has vertices that are not
+    finite, faces of vertices that are not there, or no face with an area.
     """
-    from plyfile import PlyData, PlyParseError
-
     paths = sorted(prediction.glob("*.ply"))
     if len(paths) > 1:
         raise InputError(
@@ -35,24 +34,44 @@ def surface_of(prediction: Path, *, clouds: bool = False) -> PredictedSurface | 
         )
     if not paths:
         return None
-    try:
-        content = PlyData.read(str(paths[0]))
-    except PlyParseError as error:
-        raise InputError(
-            expected=f"a complete PLY at {paths[0]}", found=str(error), remedy="Export the prediction again."
-        ) from None
-    corners = [] if "face" not in content else content["face"].data[content["face"].properties[0].name]
-    if not len(corners) and not clouds:
+    table, faces = _read_ply(paths[0])
+    if not faces and not clouds:
         return None
-    table = content["vertex"].data
+    if table is None or not set("xyz") <= set(table.dtype.names):
+        raise _unusable(paths[0], "no vertices with x, y and z")
     vertices = np.stack([table[name] for name in "xyz"], 1).astype(np.float64)
-    faces = [tuple(face.tolist()) for face in corners]
+    if not np.isfinite(vertices).all():
+        raise _unusable(paths[0], "coordinates that are not finite")
+    if not all(0 <= index < len(vertices) for face in faces for index in face):
+        raise _unusable(paths[0], f"faces of other vertices than the {len(vertices)} that there are")
     if {"nx", "ny", "nz"} <= set(table.dtype.names):
         normals = np.stack([table[name] for name in ("nx", "ny", "nz")], 1).astype(np.float64)
     else:
         normals = polygon_normals(vertices, faces)
     confidence = table["confidence"].astype(np.float64) if "confidence" in table.dtype.names else None
-    return PredictedSurface(vertices, normals, faces, confidence)
+    surface = PredictedSurface(vertices, normals, faces, confidence)
+    if faces and not len(triangles_of(surface)):
+        raise _unusable(paths[0], "no face with an area")
+    return surface
+
+
+def _read_ply(path: Path) -> tuple[np.ndarray | None, list[tuple[int, ...]]]:
+    """The table of vertices, None where there is none, and the first list of each face."""
+    from plyfile import PlyData, PlyListProperty, PlyParseError
+
+    try:
+        content = PlyData.read(str(path))
+    except PlyParseError as error:
+        raise _unusable(path, str(error)) from None
+    vertices = content["vertex"].data if "vertex" in content else None
+    if "face" not in content:
+        return vertices, []
+    lists = [each.name for each in content["face"].properties if isinstance(each, PlyListProperty)]
+    return vertices, [tuple(face.tolist()) for face in content["face"].data[lists[0]]] if lists else []
+
+
+def _unusable(path: Path, found: str) -> InputError:
+    return InputError(expected=f"a whole surface in {path}", found=found, remedy="Export the prediction again.")
 
 
 def triangles_of(mesh: Mesh) -> Int[np.ndarray, "T 3"]:

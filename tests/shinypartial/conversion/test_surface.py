@@ -10,6 +10,7 @@ from plyfile import PlyData, PlyElement
 
 from shinypartial.cli import main
 from shinypartial.conversion.gltf import write_glb
+from shinypartial.core.errors import InputError
 from shinypartial.prediction.format import PredictionInfo, write_info
 from shinypartial.prediction.surface import surface_of, triangles_of
 from tests.support.polyhedra import L_SHAPE, spiral, wavy_patch
@@ -117,6 +118,26 @@ def test_a_cloud_is_no_surface(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert surface_of(folder) is None
     assert main(["convert", str(folder), "--to", "glb"]) == 2
     assert "cloud of points" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "found"),
+    [
+        (np.eye(3), [[0, 1, 3]], "faces of other vertices than the 3"),
+        (np.diag([1, 1, np.nan]), [[0, 1, 2]], "not finite"),
+        (np.eye(3), [[0, 1, 1]], "no face with an area"),
+    ],
+)
+def test_a_surface_that_is_not_whole_is_refused(tmp_path: Path, vertices: np.ndarray, faces: list, found: str) -> None:
+    with pytest.raises(InputError, match=rf"a whole surface in .*{found}"):
+        surface_of(prediction(tmp_path / "p", vertices, np.array(faces)))
+
+
+def test_faces_without_vertices_are_refused(tmp_path: Path) -> None:
+    lists = np.array([((0, 1, 2),)], [("vertex_indices", "<i4", 3)])
+    PlyData([PlyElement.describe(lists, "face")]).write(str(tmp_path / "surface.ply"))
+    with pytest.raises(InputError, match="no vertices with x, y and z"):
+        surface_of(tmp_path)
 
 
 def test_two_surfaces_are_one_too_many(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,6 +24,8 @@ from shinypartial.metrics import perceptual
 from shinypartial.metrics.registry import Direction
 from shinypartial.prediction.format import (
     ENVIRONMENT,
+    EVALUATION,
+    SCORES,
     prediction_frame,
     read_info,
     read_inverse_distance,
@@ -33,6 +35,7 @@ from shinypartial.prediction.format import (
     write_test_view,
     write_visibility,
 )
+from tests.shinypartial.conversion.test_surface import write_ply
 from tests.support.synthetic_dataset import make_plain_sphere_dataset
 from tests.support.truth_prediction import write_truth_prediction
 
@@ -108,9 +111,15 @@ def out_of_order(function: Callable[[object], object], items: Sequence[object]) 
 
 
 def test_a_failing_map_and_a_failing_view_both_end_the_evaluation(truth: Path, sphere_dataset: Dataset) -> None:
-    """Although they are scored beside each other; the scores of an earlier evaluation stay as they were."""
+    """Although they are scored beside each other; scores and pictures of an earlier evaluation stay as they were."""
     evaluate(truth, protocol="linear-v1")
-    before = (truth / "scores.json").read_bytes()
+
+    def result() -> dict[str, bytes]:
+        return {path.name: path.read_bytes() for path in (truth / SCORES, *(truth / EVALUATION).iterdir())}
+
+    before = result()
+    with pytest.raises(InputError, match="scores at"):
+        evaluate(truth, protocol="linear-v1", oracle=truth.parent)
     write_environment_map(truth, np.zeros((32, 32, 3), np.float32))
     with pytest.raises(InputError, match=r"environment\.exr"):
         evaluate(truth)
@@ -118,7 +127,8 @@ def test_a_failing_map_and_a_failing_view_both_end_the_evaluation(truth: Path, s
         path.unlink()
     with pytest.raises(InputError, match="test/r_000"):
         evaluate(truth)
-    assert (truth / "scores.json").read_bytes() == before
+    assert result() == before
+    assert len(before) > 10
 
 
 def test_normals_where_the_object_sees_itself_count_in_one_group_and_not_in_the_other(sphere_dataset: Dataset) -> None:
@@ -236,6 +246,12 @@ def test_a_dataset_without_test_views_is_scored_on_its_environment(damaged_datas
     assert scores.environment is not None
     assert (scores.normals, scores.render, scores.views) == (None, None, ())
     assert {"normals", "render"} <= {entry.name for entry in scores.left_out}
+
+
+def test_a_surface_without_area_is_left_out_of_the_pictures_by_name(truth_views: Path) -> None:
+    write_ply(truth_views / "surface.ply", np.zeros((3, 3)), np.array([[0, 1, 2]]))
+    left_out = {entry.name: entry.reason for entry in evaluate(truth_views, protocol="linear-v1").left_out}
+    assert "no face with an area" in left_out["picture of the surface"]
 
 
 def test_another_version_of_the_dataset_is_flagged(truth_views: Path) -> None:

@@ -213,5 +213,6 @@ def test_an_older_baseline_is_passed_over(oracle: Oracle, dataset: Dataset, tmp_
     (tmp_path / "ball-oracle" / "scores.json").unlink()
     assert read_oracle_baseline(prediction, mine) is None
     write_json(tmp_path / "ball-oracle" / "scores.json", {})
+    assert read_oracle_baseline(prediction, mine) is None
     with pytest.raises(InputError, match="Evaluate again"):
-        read_oracle_baseline(prediction, mine)
+        read_oracle_baseline(prediction, replace(mine, oracle=str(tmp_path / "ball-oracle")))
