@@ -24,12 +24,14 @@ class Suite:
     def _collected(self, output: Path, plan: Any, collect: Callable[[Path, Any], Any]) -> Any:
         """What `collect` finds of the cells of a plan that have ended, after its jobs were run; None after a dry run.
 
-        Raises InputError where none has ended.
+        Raises InputError where none has ended, or one has by another command than the plan's.
         """
         from shinypartial.core.errors import InputError
+        from shinypartial.suites.attempt import require_records
         from shinypartial.suites.run import run_suite
 
         print(f"{len(plan.cells)} cells, {len(plan.jobs)} jobs in {output}")
+        require_records(output, plan)
         if not self.collect_only and not run_suite(output, plan, self.cores, self.snakemake, retry=self.retry):
             return None
         results = collect(output, plan)

@@ -16,9 +16,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from shinypartial.core.errors import EXIT_INTERRUPTED
+from shinypartial.core.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, InputError
 from shinypartial.io.files import read_json, write_json
-from shinypartial.suites.jobs import PLAN
+from shinypartial.io.records import read_record as read_table
+from shinypartial.suites.jobs import Plan, read_jobs, require_commands
 
 RECORDS, LOGS = Path("records"), Path("logs")
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -41,36 +42,45 @@ class Record:
 
 
 def read_record(folder: Path, job: str) -> Record | None:
-    """The record of a job, or None."""
+    """The record of a job, or None; InputError where the file is something else."""
     path = folder / RECORDS / f"{job}.json"
-    return Record(**read_json(path, "the record of a job")) if path.exists() else None
+    if not path.exists():
+        return None
+    content = read_json(path, "the record of a job")
+    return read_table(Record, content, str(path), remedy="Restore that file, or choose another --output.")
+
+
+def require_records(folder: Path, plan: Plan) -> None:
+    """Raise InputError where a job of the plan has ended by another command: its result is not the plan's."""
+    records = ((job.name, read_record(folder, job.name)) for job in plan.jobs)
+    require_commands(plan, {name: record.command for name, record in records if record}, folder / RECORDS)
 
 
 def attempt(job: str, threads: int, folder: Path = Path()) -> int:
     """Run a job of the folder's plan unless its record is there; 0 unless it was stopped."""
     import fcntl
 
-    planned = read_json(folder / PLAN, "the plan")["jobs"][job]
+    planned = next(each for each in read_jobs(folder) if each.name == job)
     log = folder / LOGS / f"{job}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("ab") as stream:
         fcntl.flock(stream, fcntl.LOCK_EX)
         earlier = read_record(folder, job)
-        if earlier is not None and earlier.command == planned["command"]:
+        if earlier is not None and earlier.command == planned.command:
             return 0
-        befores = ((name, read_record(folder, name)) for name in planned["after"])
+        befores = ((name, read_record(folder, name)) for name in planned.after)
         failed = next(((name, record) for name, record in befores if record and record.reason), None)
         if failed is not None:
-            record = Record(planned["command"], None, 0.0, f"{failed[0]}: {failed[1].reason}"[:REASON_CHARACTERS])
+            record = Record(planned.command, None, 0.0, f"{failed[0]}: {failed[1].reason}"[:REASON_CHARACTERS])
         else:
             begun = stream.tell()
             started, worked = time.monotonic(), _worked()
-            code = _run(planned["command"], threads, folder, stream.fileno())
+            code = _run(planned.command, threads, folder, stream.fileno())
             if code in STOP_CODES:
                 return code if code > 0 else 128 - code
             reason = _reason(log.read_bytes()[begun:].decode(errors="replace"), code) if code else ""
             seconds = round(time.monotonic() - started, 3)
-            record = Record(planned["command"], code, seconds, reason, round(_worked() - worked, 3))
+            record = Record(planned.command, code, seconds, reason, round(_worked() - worked, 3))
         write_json(folder / RECORDS / f"{job}.json", asdict(record))
     return 0
 
@@ -107,6 +117,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return attempt(options.job, options.threads, options.folder)
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return EXIT_BAD_INPUT
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from shinypartial.core.errors import InputError
 from shinypartial.io.files import read_json, write_json
+from shinypartial.io.records import read_record
 
 PLAN = "plan.json"
 
@@ -59,23 +60,38 @@ def require_known(what: str, names: Sequence[str], known: Collection[str]) -> No
 
 def write_jobs(folder: Path, plan: Plan) -> None:
     """Write FOLDER/plan.json; InputError where a job of the same name that is there means another command."""
-    begun = {job.name: job.command for job in read_jobs(folder)[0]} if (folder / PLAN).exists() else {}
+    if (folder / PLAN).exists():
+        require_commands(plan, {job.name: job.command for job in read_jobs(folder)}, folder / PLAN)
+    write_json(folder / PLAN, {**plan.facts, "jobs": _table(plan.jobs)})
+
+
+def require_commands(plan: Plan, begun: Mapping[str, str], where: Path) -> None:
+    """Raise InputError for a job of the plan that was begun by another command, as `where` holds."""
     for job in plan.jobs:
         if begun.get(job.name, job.command) != job.command:
             raise InputError(
-                expected=f"{job.name} to be `{begun[job.name]}`, as in {folder / PLAN}",
+                expected=f"{job.name} to be `{begun[job.name]}`, as in {where}",
                 found=f"`{job.command}`",
                 remedy="Choose another --output, another name for the method, or the options of the earlier run.",
             )
-    write_json(folder / PLAN, {**plan.facts, "jobs": _table(plan.jobs)})
 
 
 def _table(jobs: Sequence[Job]) -> dict[str, dict[str, Any]]:
     return {job.name: {"command": job.command, "after": list(job.after)} for job in jobs}
 
 
-def read_jobs(folder: Path) -> tuple[tuple[Job, ...], dict[str, Any]]:
-    """The jobs that a folder was made by, and what is stored beside them."""
-    content = read_json(folder / PLAN, "the plan of a suite")
-    table = content.pop("jobs")
-    return tuple(Job(name, job["command"], tuple(job["after"])) for name, job in table.items()), content
+@dataclass(frozen=True)
+class _Stored:
+    """What of plan.json every suite has."""
+
+    jobs: dict[str, dict[str, Any]]
+
+
+def read_jobs(folder: Path) -> tuple[Job, ...]:
+    """The jobs that a folder was made by; InputError where its plan is missing or something else."""
+    path, remedy = folder / PLAN, "Restore that file, or choose another --output."
+    content = read_json(path, "the plan of a suite")
+    stored = read_record(_Stored, content, str(path), allow_unknown=True, remedy=remedy).jobs
+    return tuple(
+        read_record(Job, {**job, "name": name}, f"{name} in {path}", remedy=remedy) for name, job in stored.items()
+    )

@@ -76,9 +76,9 @@ def write_pictures(folder: Path, suite: Path, results: Results, method: str) -> 
     for scene, name in SHOWN:
         axis, pictures = BY_NAME[name], {}
         for position, level in results.along(axis, method, scene).items():
-            prediction = suite / "predictions" / level[0].cell.name
-            if (prediction / DESCRIPTION).exists() and not level[0].failure:
-                title = f"{axis.text(position).strip() if position else 'clean'}: {level[0].environment_db:.1f} dB"
+            prediction, decibels = suite / "predictions" / level[0].cell.name, level[0].environment_db
+            if (prediction / DESCRIPTION).exists() and decibels is not None:
+                title = f"{axis.text(position).strip() if position else 'clean'}: {decibels:.1f} dB"
                 pictures[title] = to_display(to_protocol_size(read_environment_map(prediction), MAP_HEIGHT))
         path = folder / f"stability-{scene}-{name}.jpg"
         if len(pictures) > 1:

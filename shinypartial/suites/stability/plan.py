@@ -4,12 +4,11 @@ import re
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 from shinypartial.core.errors import InputError
 from shinypartial.scene import DEVELOPMENT, load_scene, scene_names
-from shinypartial.suites.jobs import Job, Size, read_jobs, require_known
+from shinypartial.suites.jobs import Job, Size, require_known
 from shinypartial.suites.stability.axes import ANCHORS, AXES, BY_NAME, Axis
 
 FAST, DEFAULT, PAPER = (
@@ -159,9 +158,3 @@ def _fit_jobs(cell: Cell, template: str, data: Sequence[Job]) -> Iterator[Job]:
     yield Job(f"fit/{cell.name}", command, (data[-1].name,))
     score = f"shinypartial evaluate {prediction} --dataset {truth}"
     yield Job(f"score/{cell.name}", score, (f"fit/{cell.name}", *dict.fromkeys((data[0].name, data[-1].name))))
-
-
-def read_plan(folder: Path) -> Plan:
-    """The plan that a folder was made by."""
-    jobs, facts = read_jobs(folder)
-    return Plan(Size(**facts["size"]), tuple(Cell(**cell) for cell in facts["cells"]), jobs)

@@ -7,16 +7,20 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
+from shinypartial.cli import main
 from shinypartial.core.errors import InputError
-from shinypartial.suites.attempt import attempt, read_record
+from shinypartial.io.files import write_json
+from shinypartial.suites.attempt import RECORDS, Record, attempt, read_record
 from shinypartial.suites.jobs import Job, write_jobs
 from shinypartial.suites.run import forget_failures, run_suite, snakemake_arguments
 from shinypartial.suites.stability.collect import collect
 from shinypartial.suites.stability.plan import SIZE, Cell, Plan, make_plan
+from shinypartial.suites.tables.plan import make_plan as make_tables
 
 ROOT = Path(__file__).resolve().parents[3]
 CELL = Cell("tiny-vase", "development", "broken", None, None, 0)
@@ -63,6 +67,28 @@ def test_a_job_that_was_stopped_has_not_failed(tmp_path: Path) -> None:
     write_jobs(tmp_path, plan_of(Job("fit/a", "kill -TERM $$")))
     assert attempt("fit/a", 1, tmp_path) == 128 + signal.SIGTERM
     assert read_record(tmp_path, "fit/a") is None
+
+
+def test_only_results_of_the_same_commands_are_collected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A dataset of another size has another one, though its fits are the plan's; records of other jobs don't count."""
+    words = ["tables", "--tables", "main", "--scenes", "vase", "--methods", "ours", "--output", str(tmp_path)]
+    plan = make_tables(["main"], [0], scenes=["vase"], methods=["ours"])
+    for job in (*plan.jobs, Job("fit/another", "a command")):
+        write_record(tmp_path, job, reason="no light")
+    assert main([*words, "--collect-only"]) == 0
+    capsys.readouterr()
+    assert main([*words, "--collect-only", "--resolution", "80"]) == 2
+    assert "--resolution 80" in capsys.readouterr().err
+
+
+def test_a_record_that_is_none_is_named(tmp_path: Path) -> None:
+    write_json(tmp_path / RECORDS / "fit/a.json", {"code": 0})
+    with pytest.raises(InputError, match=r"fit/a\.json"):
+        read_record(tmp_path, "fit/a")
+
+
+def write_record(folder: Path, job: Job, reason: str = "") -> None:
+    write_json(folder / RECORDS / f"{job.name}.json", asdict(Record(job.command, 1, 1.0, reason)))
 
 
 def test_arguments_of_snakemake(tmp_path: Path) -> None:

@@ -8,9 +8,9 @@ import tyro
 from shinypartial.cli.datasets import Perturb
 from shinypartial.cli.scenes import Generate
 from shinypartial.core.errors import InputError
-from shinypartial.suites.jobs import write_jobs
+from shinypartial.suites.jobs import PLAN, read_jobs, write_jobs
 from shinypartial.suites.stability.axes import AXES, BY_NAME, Axis
-from shinypartial.suites.stability.plan import METHODS, Plan, conditions, make_plan, parse_methods, read_plan
+from shinypartial.suites.stability.plan import METHODS, Plan, conditions, make_plan, parse_methods
 
 COPY = {"copy": "cp -r {dataset} {prediction} # {seed}"}
 
@@ -118,6 +118,13 @@ def test_a_folder_takes_more_cells_but_no_other_command(tmp_path: Path) -> None:
     write_jobs(tmp_path, make_plan("tiny", COPY, [0]))
     more = make_plan("tiny", COPY, [0, 1])
     write_jobs(tmp_path, more)
-    assert read_plan(tmp_path) == more
+    assert read_jobs(tmp_path) == more.jobs
     with pytest.raises(InputError, match="another name for the method"):
         write_jobs(tmp_path, make_plan("tiny", {"copy": "false {dataset}"}, [0]))
+
+
+@pytest.mark.parametrize("content", ["{}", "[]", '{"jobs": {"fit/a": {"after": []}}}'])
+def test_a_plan_that_is_none_is_named(tmp_path: Path, content: str) -> None:
+    (tmp_path / PLAN).write_text(content)
+    with pytest.raises(InputError, match=r"plan\.json"):
+        write_jobs(tmp_path, make_plan("tiny", COPY, [0]))

@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 from shinypartial.core.errors import InputError
+from shinypartial.io.files import write_json
+from shinypartial.prediction.format import DESCRIPTION
 from shinypartial.suites.stability.axes import BY_NAME
 from shinypartial.suites.stability.collect import (
     Outcome,
@@ -19,6 +21,7 @@ from shinypartial.suites.stability.collect import (
     verdict_auroc,
     write_results,
 )
+from shinypartial.suites.stability.figures import write_pictures
 from shinypartial.suites.stability.page import page_lines, write_stability_page
 from shinypartial.suites.stability.plan import SIZE, Cell
 
@@ -106,6 +109,13 @@ def test_the_page_is_the_same_for_the_same_results(tmp_path: Path) -> None:
     assert "| development | fast | 5 | 2 | 0.833 |" in page
     assert "| 0.5° | 12.04 dB | 14.00 dB |" in page
     assert "error: &lt;none> \\| nothing" in page
+
+
+def test_a_fit_without_a_map_has_no_picture(tmp_path: Path) -> None:
+    unknown = [replace(each, environment_db=None) for each in VASE]
+    for each in unknown:
+        write_json(tmp_path / "predictions" / each.cell.name / DESCRIPTION, {})
+    assert write_pictures(tmp_path, tmp_path, Results(SIZE, tuple(unknown)), "fast") == []
 
 
 def test_verdicts_are_counted_by_method() -> None:
