@@ -13,13 +13,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from shinypartial.core.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, InputError
 from shinypartial.io.files import read_json, write_json
 from shinypartial.io.records import read_record as read_table
-from shinypartial.suites.jobs import Plan, read_jobs, require_commands
+from shinypartial.suites.jobs import Job, Plan, read_jobs, require_commands
 
 RECORDS, LOGS = Path("records"), Path("logs")
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -31,7 +31,10 @@ REASON_CHARACTERS = 300
 
 @dataclass(frozen=True)
 class Record:
-    """How a command ended; `reason` is empty unless it failed, `code` None where it was not begun."""
+    """How a command ended; `reason` is empty unless it failed, `code` None where it was not begun or was stopped.
+
+    Times are those of all attempts, for a fit goes on where it was stopped.
+    """
 
     command: str
     code: int | None
@@ -43,11 +46,19 @@ class Record:
 
 def read_record(folder: Path, job: str) -> Record | None:
     """The record of a job, or None; InputError where the file is something else."""
-    path = folder / RECORDS / f"{job}.json"
+    path = _record_path(folder, job)
     if not path.exists():
         return None
     content = read_json(path, "the record of a job")
     return read_table(Record, content, str(path), remedy="Restore that file, or choose another --output.")
+
+
+def _record_path(folder: Path, job: str) -> Path:
+    return folder / RECORDS / f"{job}.json"
+
+
+def _write_record(folder: Path, job: str, record: Record) -> None:
+    write_json(_record_path(folder, job), asdict(record))
 
 
 def require_records(folder: Path, plan: Plan) -> None:
@@ -74,15 +85,36 @@ def attempt(job: str, threads: int, folder: Path = Path()) -> int:
             record = Record(planned.command, None, 0.0, f"{failed[0]}: {failed[1].reason}"[:REASON_CHARACTERS])
         else:
             begun = stream.tell()
-            started, worked = time.monotonic(), _worked()
-            code = _run(planned.command, threads, folder, stream.fileno())
+            record = _timed(planned, threads, folder, stream.fileno())
+            code = record.code or 0
             if code in STOP_CODES:
                 return code if code > 0 else 128 - code
-            reason = _reason(log.read_bytes()[begun:].decode(errors="replace"), code) if code else ""
-            seconds = round(time.monotonic() - started, 3)
-            record = Record(planned.command, code, seconds, reason, round(_worked() - worked, 3))
-        write_json(folder / RECORDS / f"{job}.json", asdict(record))
+            if code:
+                record = replace(record, reason=_reason(log.read_bytes()[begun:].decode(errors="replace"), code))
+        _write_record(folder, job, record)
+        _record_path(folder, _stopped(job)).unlink(missing_ok=True)
     return 0
+
+
+def _stopped(job: str) -> str:
+    """Whose record says how long the attempts at a job took that were stopped."""
+    return f"{job}.stopped"
+
+
+def _timed(job: Job, threads: int, folder: Path, log: int) -> Record:
+    """Run a command; its times are added to those of earlier attempts, and kept for the next one if it is stopped."""
+    before = read_record(folder, _stopped(job.name))
+    if before is None or before.command != job.command:
+        before = Record(job.command, None, 0.0, cpu_seconds=0.0)
+    started, worked, code = time.monotonic() - before.seconds, _worked() - (before.cpu_seconds or 0.0), None
+    try:
+        code = _run(job.command, threads, folder, log)
+    finally:
+        seconds, cpu_seconds = round(time.monotonic() - started, 3), round(_worked() - worked, 3)
+        record = Record(job.command, code, seconds, cpu_seconds=cpu_seconds)
+        if code is None or code in STOP_CODES:
+            _write_record(folder, _stopped(job.name), replace(record, code=None))
+    return record
 
 
 def _worked() -> float:

@@ -69,6 +69,32 @@ def test_a_job_that_was_stopped_has_not_failed(tmp_path: Path) -> None:
     assert read_record(tmp_path, "fit/a") is None
 
 
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_time_is_added_up_over_attempts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interrupted: bool) -> None:
+    """Work of 0.1 s before a stop, of the command or of its attempt, and none after it."""
+    work = f"{sys.executable} -c 'import os; [0 for _ in iter(lambda: os.times().user < 0.1, False)]'"
+    write_jobs(tmp_path, plan_of(Job("fit/a", f"test -e begun && exit; touch begun; {work}; kill -TERM $$")))
+
+    def interrupt(command: str, threads: int, folder: Path, log: int) -> int:
+        subprocess.run(command, shell=True, cwd=folder, check=False)
+        raise KeyboardInterrupt
+
+    if interrupted:
+        monkeypatch.setattr("shinypartial.suites.attempt._run", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            attempt("fit/a", 1, tmp_path)
+        monkeypatch.undo()
+    else:
+        attempt("fit/a", 1, tmp_path)
+    assert read_record(tmp_path, "fit/a") is None
+    assert attempt("fit/a", 1, tmp_path) == 0
+    record = read_record(tmp_path, "fit/a")
+    assert record is not None
+    assert record.code == 0
+    assert min(record.seconds, record.cpu_seconds) >= 0.1
+    assert [path.name for path in (tmp_path / RECORDS / "fit").iterdir()] == ["a.json"]
+
+
 def test_only_results_of_the_same_commands_are_collected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A dataset of another size has another one, though its fits are the plan's; records of other jobs don't count."""
     words = ["tables", "--tables", "main", "--scenes", "vase", "--methods", "ours", "--output", str(tmp_path)]
