@@ -76,7 +76,6 @@ def assemble_directions(bpy: Any, spec: SceneSpec) -> None:
     main = bpy.context.scene
     scene = bpy.data.scenes.new(DIRECTIONS)
     set_single_sample(scene, main, spec.render.max_bounces)
-    scene.render.resolution_x = scene.render.resolution_y = GRID * main.render.resolution_x
     set_file(scene)
     add_passes(scene)
     mark = make_mark_material(bpy, MARK)
@@ -98,6 +97,7 @@ def assemble_directions(bpy: Any, spec: SceneSpec) -> None:
 def render_directions(bpy: Any, path: Path, region: Region, camera: Camera) -> MirrorPaths:
     """Trace the paths of the camera's present view; arrays are GRID times as large as the region."""
     scene = bpy.data.scenes[DIRECTIONS]
+    scene.render.resolution_x, scene.render.resolution_y = GRID * camera.width, GRID * camera.height
     set_border(scene, region, camera)
     scene.render.use_crop_to_border = True
     scene.render.filepath = str(path)

@@ -86,7 +86,7 @@ class Renderer:
     """What a perfectly mirroring object is rendered with; None where every pixel is path traced."""
 
     def render(self, camera: Camera) -> RenderedView:
-        """Render one view with the recipe's lens; its size may be another where every pixel is path traced."""
+        """Render one view with the recipe's lens, of the camera's size."""
         region = image_region(camera, self.body_vertices_world)
         with self._at(camera, backdrop=False):
             if self.mirror and (depth := nearest_depth(camera, self.mirror.vertices_world)) > SMALLEST_DEPTH:
@@ -105,8 +105,7 @@ class Renderer:
         """Move the camera there, and raise InputError where Blender fails within the block."""
         set_view(self.bpy, camera, self.spec)
         show_backdrop(self.bpy, backdrop)
-        if not self.mirror:
-            set_size(self.bpy, camera.width, camera.height)
+        set_size(self.bpy, camera.width, camera.height)
         try:
             with interrupts_deferred(), quiet():
                 yield
@@ -196,7 +195,7 @@ def _prepare_mirror(bpy: Any, spec: SceneSpec, body: Float[np.ndarray, "P 3"], t
     """Add the two scenes that a perfect mirror needs."""
     props = [world_vertices(bpy, each) for each in props_of(bpy.context.scene)]
     assemble_directions(bpy, spec)
-    assemble_sparse(bpy, spec.camera)
+    assemble_sparse(bpy)
     return _Mirror(FarWorld(world_radiance(spec.world, spec.render.exposure)), np.concatenate([body, *props]), threads)
 
 

@@ -14,14 +14,13 @@ from jaxtyping import Bool, Float
 from shinypartial.blender.materials import image_of
 from shinypartial.blender.passes import PASSES, read_passes
 from shinypartial.core.camera import Camera, project
-from shinypartial.core.trajectory import CameraPath
 
 SPARSE, PORTAL, PIXELS = "sparse pixels", "portal", "places of sparse pixels"
 #: The plane's distance, and that at which rays go on, as shares of the nearest surface's depth.
 PLANE_SHARE, EXIT_SHARE = 0.3, 0.45
 
 
-def assemble_sparse(bpy: Any, spec: CameraPath) -> None:
+def assemble_sparse(bpy: Any) -> None:
     """Add the scene: everything of the open one, linked, and the plane."""
     main = bpy.context.scene
     scene = main.copy()
@@ -34,7 +33,7 @@ def assemble_sparse(bpy: Any, spec: CameraPath) -> None:
     scene.collection.objects.link(plane)
     for kind in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
         setattr(plane, f"visible_{kind}", False)
-    _send_rays_on(mesh.materials[0], main.render.resolution_x, spec)
+    _send_rays_on(mesh.materials[0])
 
 
 def nearest_depth(camera: Camera, vertices_world: Float[np.ndarray, "P 3"]) -> float:
@@ -62,16 +61,22 @@ def render_sparse(
     if before:
         bpy.data.images.remove(before)
     nodes["size"].inputs[1].default_value = (width, height, 0)
+    # Camera axes of Blender: +y up, −z forward; the ray (x, y, −1) in the plane's units.
+    lens, (view_height, view_width) = scene.camera.data, chosen.shape
+    slope = lens.sensor_width / (lens.lens * view_width)
+    nodes["ray"].inputs[1].default_value = (slope, -slope, 0)
+    nodes["ray"].inputs[2].default_value = (-slope * view_width / 2, slope * view_height / 2, -1)
     scene.render.filepath = str(path)
     bpy.ops.render.render(write_still=True, scene=SPARSE)
     return {name: channel.ravel()[: len(rows)] for name, channel in read_passes(path, PASSES).items()}
 
 
-def _send_rays_on(material: Any, resolution: int, spec: CameraPath) -> None:
+def _send_rays_on(material: Any) -> None:
     """Shader of the plane, whose frame is the camera's, moved and scaled so that the camera is at (0, 0, 1).
 
     On the small image, (x, y) from the lower left in its pixels, the integer part says which pixel of the view is meant
-    and the fraction where in it the ray goes through: at column + x, row + 1 − y of the view.
+    and the fraction where in it the ray goes through: at column + x, row + 1 − y of the view. `render_sparse` fills in
+    the nodes that have names.
     """
     nodes, links = material.node_tree.nodes, material.node_tree.links
     nodes.clear()
@@ -101,10 +106,8 @@ def _send_rays_on(material: Any, resolution: int, spec: CameraPath) -> None:
     within = vector("FRACTION", size.outputs["Vector"]).outputs["Vector"]
     downward = vector("MULTIPLY_ADD", within, (1.0, -1.0, 0.0), (0.0, 1.0, 0.0)).outputs["Vector"]
     pixel = vector("ADD", places.outputs["Color"], downward).outputs["Vector"]
-    # Camera axes of Blender: +y up, −z forward; the ray (x, y, −1) in the plane's units.
-    slope = spec.sensor_mm / (spec.lens_mm * resolution)
-    middle = slope * resolution / 2
-    ray = vector("MULTIPLY_ADD", pixel, (slope, -slope, 0.0), (-middle, middle, -1.0)).outputs["Vector"]
+    to_ray = vector("MULTIPLY_ADD", pixel)
+    to_ray.name, ray = "ray", to_ray.outputs["Vector"]
     reach = EXIT_SHARE / PLANE_SHARE
     exit_point = vector("MULTIPLY_ADD", ray, (reach,) * 3, (0.0, 0.0, 1.0)).outputs["Vector"]
     portal = nodes.new("ShaderNodeBsdfRayPortal")

@@ -151,6 +151,22 @@ def test_the_picture_is_that_of_path_tracing(lit: SceneSpec) -> None:
     assert errors[0] < 1.1 * errors[1]
 
 
+def test_a_wide_view_is_the_middle_of_a_square_one(lit: SceneSpec) -> None:
+    """As a film has it, before and after one of the recipe's size; pixels at the outline are path traced, by chance."""
+    square = camera_of(lit)
+    wide = replace(square, cy=square.cy - 5, height=square.height - 10)
+    with open_renderer(replace(lit, props=())) as renderer:
+        assert renderer.mirror
+        views = [renderer.render(camera) for camera in (wide, square, wide)]
+    seen = views[1].alpha[5:-5] > 0
+    for view in (views[0], views[2]):
+        for name in ("radiance", "alpha", "normals_world", "depth"):
+            error = np.abs(getattr(view, name) - getattr(views[1], name)[5:-5])[seen]
+            assert np.median(error) < 1e-5, name
+        # Measured 0.006 with 16 samples.
+        assert np.abs(view.alpha - views[1].alpha[5:-5])[seen].mean() < 0.02
+
+
 def test_picked_pixels_are_those_of_the_whole_view(lit: SceneSpec) -> None:
     """In all passes, whatever the material, where chance leaves them the same: the mean difference is none."""
     camera = camera_of(lit)
