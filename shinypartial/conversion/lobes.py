@@ -8,6 +8,7 @@ from jaxtyping import Float
 from shinypartial.core.conventions import Y_UP_TO_WORLD
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import fibonacci_directions, latlong_directions, latlong_solid_angles
+from shinypartial.metrics.environment import to_protocol_size
 
 ROWS = 32
 """Of the grid on which lobes are fitted; narrower ones than of some 5° are not told."""
@@ -43,13 +44,12 @@ def lobes_of(latlong: Float[np.ndarray, "H W 3"], count: int) -> dict[str, Any]:
 def _means(
     latlong: Float[np.ndarray, "H W 3"],
 ) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"], Float[np.ndarray, "P"]]:
-    """The map in blocks of at most `ROWS` rows, as means weighted by solid angle: light, directions, solid angles."""
-    step = max(len(latlong) // ROWS, 1)
-    rows = len(latlong) // step
-    areas = latlong_solid_angles(len(latlong))[: rows * step, : 2 * rows * step]
-    weighted = np.concatenate([latlong[: rows * step, : 2 * rows * step] * areas[..., None], areas[..., None]], -1)
-    blocks = weighted.reshape(rows, step, 2 * rows, step, 4).sum((1, 3)).reshape(-1, 4)
-    return blocks[:, :3] / blocks[:, 3:], latlong_directions(rows).reshape(-1, 3), blocks[:, 3]
+    """The map in at most `ROWS` rows, as means weighted by solid angle: light, directions, solid angles."""
+    rows = min(len(latlong), ROWS)
+    areas = latlong_solid_angles(len(latlong))[..., None]
+    means = to_protocol_size(np.concatenate([latlong * areas, areas], -1), rows).reshape(-1, 4)
+    light, directions = means[:, :3] / means[:, 3:], latlong_directions(rows).reshape(-1, 3)
+    return light, directions, latlong_solid_angles(rows).ravel()
 
 
 def _fitted(

@@ -43,11 +43,18 @@ def box_of(inverse_distance: Float[np.ndarray, "H W"]) -> tuple[Float[np.ndarray
     """Lowest and highest corner, about Y-up axes: a wall at the median of (ω·a)/κ(ω) of directions ω near its axis a.
 
     Exact for the walls of a box about the origin. An axis without a wall in sight is open as far as the farthest wall.
+    Raises InputError where no axis has one.
     """
     directions, distances = latlong_directions(len(inverse_distance)) @ Y_UP_TO_WORLD, []
     for axis in np.concatenate([-np.eye(3), np.eye(3)]):
         cosine = directions @ axis
         seen = (cosine > np.cos(np.radians(WALL_DEG))) & (inverse_distance > LEAST_INVERSE)
         distances.append(float(np.median(cosine[seen] / inverse_distance[seen])) if seen.any() else np.nan)
+    if np.isnan(distances).all():
+        raise InputError(
+            expected=f"near surroundings within {WALL_DEG:.0f}° of an axis, for --to room",
+            found="only some that no wall of a box stands for",
+            remedy="Leave room out.",
+        )
     walls = np.where(np.isnan(distances), np.nanmax(distances), distances)
     return -walls[:3], walls[3:]
