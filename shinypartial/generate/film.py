@@ -20,7 +20,7 @@ from shinypartial.dataset.schema import Frame
 from shinypartial.dataset.write import intrinsics_of
 from shinypartial.generate.dataset import Shots, generate, render_frames
 from shinypartial.generate.recording import moments, recorded_mask, recorded_picture
-from shinypartial.io.files import copy_or_link, folder_lock, read_json, remove_partial_files, write_json
+from shinypartial.io.files import folder_lock, link_or_copy, read_json, remove_partial_files, write_json
 from shinypartial.io.images import write_jpeg, write_png
 from shinypartial.io.records import write_record
 from shinypartial.scene import FilmSpec
@@ -137,7 +137,7 @@ def _write_known(spec: FilmSpec, root: Path, frames: tuple[Frame, ...]) -> None:
     entries = []
     for frame in frames:
         name = frame.stem.name
-        copy_or_link(_picture(root, frame), root / KNOWN / "images" / f"{name}.jpg", True)
+        link_or_copy(_picture(root, frame), root / KNOWN / "images" / f"{name}.jpg")
         pose = opencv_to_opengl(frame.camera.camera_to_world).tolist()
         mask = f"../{MASKS}/{name}.png"
         entries.append({"file_path": f"images/{name}.jpg", "mask_path": mask, "transform_matrix": pose})

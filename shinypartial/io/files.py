@@ -57,6 +57,14 @@ def copy_or_link(old: Path, new: Path, link: bool) -> None:
     temporary.replace(new)
 
 
+def link_or_copy(old: Path, new: Path) -> None:
+    """Hard-link a file, or copy it where the file system can't link, whole or not at all."""
+    try:
+        copy_or_link(old, new, link=True)
+    except InputError:
+        copy_or_link(old, new, link=False)
+
+
 def remove_partial_files(root: Path) -> None:
     """Delete the temporary files of a process that was killed while it wrote below `root`."""
     for path in root.rglob(f"{PARTIAL_PREFIX}*"):

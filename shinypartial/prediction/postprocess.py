@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import blur_latlong, latlong_directions, latlong_solid_angles, sample_latlong
-from shinypartial.io.files import copy_or_link, folder_lock
+from shinypartial.io.files import folder_lock, link_or_copy
 from shinypartial.prediction.format import (
     DESCRIPTION,
     ENVIRONMENT,
@@ -113,7 +113,7 @@ def postprocess(prediction: Path, output: Path, options: BlurOptions = BlurOptio
         for path in sorted(prediction.rglob("*")):
             place = path.relative_to(prediction)
             if path.is_file() and str(place) not in NOT_TAKEN_OVER and place.parts[0] not in FOLDERS_NOT_TAKEN_OVER:
-                _take_over(path, output / place)
+                link_or_copy(path, output / place)
         write_environment_map(output, blurred.radiance)
         if not (prediction / TEST_VIEWS).is_dir():
             shutil.rmtree(output / TEST_VIEWS)  # Where that folder is, an evaluation asks for every test view.
@@ -133,13 +133,6 @@ def _describe(
         config={**info.config, "postprocess": asdict(options)},
         seconds={**info.seconds, "postprocess": round(seconds, 3)},
     )
-
-
-def _take_over(old: Path, new: Path) -> None:
-    try:
-        copy_or_link(old, new, link=True)
-    except InputError:  # Another file system, or one without links.
-        copy_or_link(old, new, link=False)
 
 
 def _check(prediction: Path, output: Path, options: BlurOptions) -> None:

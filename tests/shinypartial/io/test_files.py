@@ -1,5 +1,6 @@
 """Files appear whole or not at all."""
 
+import errno
 import json
 import os
 import signal
@@ -11,7 +12,17 @@ from pathlib import Path
 import pytest
 
 from shinypartial.core.errors import InputError
-from shinypartial.io.files import atomic_write, folder_lock, newest_folder, read_json, sha256_of, write_json, write_text
+from shinypartial.io.files import (
+    atomic_write,
+    copy_or_link,
+    folder_lock,
+    link_or_copy,
+    newest_folder,
+    read_json,
+    sha256_of,
+    write_json,
+    write_text,
+)
 
 
 def test_a_finished_file_replaces_the_old_one_and_leaves_nothing_else(tmp_path: Path) -> None:
@@ -21,6 +32,21 @@ def test_a_finished_file_replaces_the_old_one_and_leaves_nothing_else(tmp_path: 
     assert path.read_text(encoding="utf-8") == "größer"
     assert list(path.parent.iterdir()) == [path]
     assert path.stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.parametrize("can_link", [True, False])
+def test_a_file_is_linked_or_else_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, can_link: bool) -> None:
+    def refuse(old: Path, new: Path) -> None:
+        raise OSError(errno.EPERM, "no links here")
+
+    if not can_link:
+        monkeypatch.setattr(os, "link", refuse)
+        with pytest.raises(InputError, match="Leave out --link"):
+            copy_or_link(tmp_path / "old", tmp_path / "new", link=True)
+    (tmp_path / "old").write_bytes(b"same")
+    link_or_copy(tmp_path / "old", tmp_path / "new")
+    assert (tmp_path / "new").read_bytes() == b"same"
+    assert (tmp_path / "new").samefile(tmp_path / "old") == can_link
 
 
 @pytest.mark.parametrize("failure", [RuntimeError("stop"), KeyboardInterrupt()])
