@@ -17,6 +17,7 @@ from shinypartial.blender.runtime import choose_device, import_blender, quiet, s
 from shinypartial.core.camera import front_view, look_at, opencv_to_opengl
 from shinypartial.core.errors import InputError
 from shinypartial.io.images import read_exr, stack_channels
+from shinypartial.io.records import Count
 from shinypartial.scene import Material, Part, Sphere
 
 #: Field of view of the camera of an object that has none.
@@ -33,9 +34,9 @@ BALLS = (
 class PictureOptions:
     """How pictures are rendered."""
 
-    resolution: int = 512
+    resolution: Count = 512
     """Pixels along the width."""
-    samples: int = 64
+    samples: Count = 64
     """Paths a pixel."""
     seed: int = 0
     threads: int | None = None

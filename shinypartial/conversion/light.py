@@ -4,14 +4,19 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import scipy.sparse as sparse
 from jaxtyping import Bool, Float
 from scipy.sparse.linalg import splu
 
 from shinypartial.core.conventions import Y_UP_TO_WORLD
 from shinypartial.core.errors import InputError
 from shinypartial.core.harmonics import project_latlong
-from shinypartial.core.sphere import blur_latlong, cube_directions, latlong_directions, sample_latlong
+from shinypartial.core.sphere import (
+    blur_latlong,
+    cube_directions,
+    latlong_directions,
+    latlong_laplacian,
+    sample_latlong,
+)
 from shinypartial.prediction.format import VISIBILITY, read_environment_map, read_visibility
 
 Confidence = Literal["keep", "darken", "fill"]
@@ -64,9 +69,8 @@ def _visibility(prediction: Path, needed_for: str, remedy: str) -> Float[np.ndar
 def filled(radiance: Float[np.ndarray, "H W 3"], seen: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W 3"]:
     """A harmonic fill: Δ_S² u = 0 where nothing was seen and u = E elsewhere, which keeps its value to the bit.
 
-    On a lat-long grid of equal steps the neighbors of a texel weigh 1/sin θ to either side and sin θ at the edge above
-    and below, so that nothing passes through the poles. It is solved on at most `FILL_ROWS` rows, of means of what was
-    seen. A map of which all or nothing was seen is left as it is.
+    It is solved on at most `FILL_ROWS` rows, of means of what was seen. A map of which all or nothing was seen is left
+    as it is.
     """
     if seen.all() or not seen.any():
         return radiance
@@ -79,22 +83,10 @@ def filled(radiance: Float[np.ndarray, "H W 3"], seen: Bool[np.ndarray, "H W"]) 
     coarse = (np.stack(colors, -1) / np.maximum(number, 1)[..., None]).reshape(-1, 3)
     known = number.ravel() > 0
     if not known.all():
-        hidden = _laplacian(rows)[~known]
+        hidden = latlong_laplacian(rows)[~known]
         coarse[~known] = splu(hidden[:, ~known].tocsc()).solve(-(hidden[:, known] @ coarse[known]))
     smooth = sample_latlong(coarse.reshape(rows, 2 * rows, 3), latlong_directions(len(radiance)))
     return np.where(seen[..., None], radiance, smooth).astype(radiance.dtype)
-
-
-def _laplacian(rows: int) -> sparse.csr_matrix:
-    """The graph Laplacian of the texels of a lat-long map with the weights of the sphere."""
-    index = np.arange(rows * 2 * rows).reshape(rows, 2 * rows)
-    beside = np.broadcast_to(1 / np.sin(np.pi * (np.arange(rows) + 0.5) / rows)[:, None], index.shape)
-    below = np.broadcast_to(np.sin(np.pi * np.arange(1, rows) / rows)[:, None], index[1:].shape)
-    first = np.concatenate([index.ravel(), index[:-1].ravel()])
-    second = np.concatenate([np.roll(index, -1, 1).ravel(), index[1:].ravel()])
-    weights = sparse.coo_matrix((np.concatenate([beside.ravel(), below.ravel()]), (first, second)), (index.size,) * 2)
-    both = (weights + weights.T).tocsr()
-    return (sparse.diags(np.asarray(both.sum(1)).ravel()) - both).tocsr()
 
 
 def cube_faces(latlong: Float[np.ndarray, "H W 3"], layout: Layout) -> Float[np.ndarray, "6 L L 3"]:

@@ -8,11 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from shinypartial.conversion.light import Confidence, light_of
-from shinypartial.core.color import linear_to_srgb, to_display
+from shinypartial.core.color import linear_to_srgb
 from shinypartial.core.conventions import SOLID_ALPHA
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import open_dataset, read_environment
+from shinypartial.dataset.write import display_rgba
 from shinypartial.io.images import write_exr_rgb, write_png
+from shinypartial.io.records import check_record
 from shinypartial.metrics import image
 from shinypartial.prediction.format import read_info
 
@@ -25,7 +27,7 @@ class Relit:
 
     pictures: dict[str, Path]
     psnr_srgb: float | None
-    """Over pixels that lie wholly on the object, of sRGB colors clipped to [0, 1]."""
+    """Over pixels that lie wholly on the object, of sRGB colors clipped to [0, 1]; None also where there are none."""
 
 
 def relight(
@@ -42,7 +44,8 @@ def relight(
     """Render an object in the light of a prediction: recovered.png; before.png in the light of its own file, for a
     .blend; truth.png in that of a dataset. Pictures have straight alpha.
 
-    Raises InputError for files that can't be read, and when Blender can't be loaded.
+    Raises InputError for files that can't be read, for pictures without a pixel or a sample, and when Blender can't be
+    loaded.
     """
     from shinypartial.blender.relight import PictureOptions, render_in_lights
 
@@ -52,6 +55,8 @@ def relight(
             found=str(source),
             remedy="Export the object from your program as .glb.",
         )
+    options = PictureOptions(resolution, samples, threads=threads)
+    check_record(options, "the options", place=lambda name: f"--{name}", remedy="Choose at least 1.")
     read_info(prediction)
     with tempfile.TemporaryDirectory() as scratch:
         lights: dict[str, Path | None] = {"before": None} if source and source.suffix == ".blend" else {}
@@ -60,22 +65,17 @@ def relight(
         if dataset is not None:
             lights["truth"] = Path(scratch) / "truth.exr"
             write_exr_rgb(Path(scratch) / "truth.exr", np.maximum(read_environment(open_dataset(dataset)), 0))
-        found = render_in_lights(source, lights, PictureOptions(resolution, samples, threads=threads))
+        found = render_in_lights(source, lights, options)
     pictures = {name: output / f"{name}.png" for name in found}
     for name, picture in found.items():
-        write_png(pictures[name], displayed(picture))
+        write_png(pictures[name], display_rgba(picture[..., :3], picture[..., 3].clip(0, 1)))
     return Relit(pictures, psnr(found["recovered"], found["truth"]) if dataset is not None else None)
 
 
-def displayed(picture: Float[np.ndarray, "H W 4"]) -> np.ndarray:
-    """8-bit sRGB with straight alpha of linear premultiplied colors."""
-    alpha = picture[..., 3:].clip(0, 1)
-    straight = picture[..., :3] / np.maximum(alpha, 1e-6)
-    return np.concatenate([to_display(straight), np.rint(255 * alpha).astype(np.uint8)], -1)
-
-
-def psnr(picture: Float[np.ndarray, "H W 4"], truth: Float[np.ndarray, "H W 4"]) -> float:
-    """Of sRGB colors in [0, 1], over pixels wholly on the object (dB); not a number where there are none."""
+def psnr(picture: Float[np.ndarray, "H W 4"], truth: Float[np.ndarray, "H W 4"]) -> float | None:
+    """Of sRGB colors in [0, 1], over pixels wholly on the object (dB); None where there are none."""
     solid = (picture[..., 3] > SOLID_ALPHA) & (truth[..., 3] > SOLID_ALPHA)
+    if not solid.any():
+        return None
     one, other = (linear_to_srgb(each[solid][None, :, :3].clip(0, 1)) for each in (picture, truth))
-    return image.psnr(one, other, data_range=1.0) if solid.any() else float("nan")
+    return image.psnr(one, other, data_range=1.0)

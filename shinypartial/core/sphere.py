@@ -4,10 +4,15 @@ Lat-long: u = ½ − atan2(y, x)/2π grows to the right, v = acos(z)/π grows do
 texel centers lie at (i + ½)/N. Cubemap: texel centers at 2(i + ½)/L − 1 on faces oriented as OpenGL 4.6 table 8.19.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from shinypartial.core.conventions import FACE_AXES
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 #: Side (rad) of what a pixel sees when no neighbor tells: such a lone pixel is given hardly any weight.
 UNKNOWN_SPREAD = 1.0
@@ -42,6 +47,24 @@ def latlong_solid_angles(height: int) -> Float[np.ndarray, "H 2*H"]:
     edges = np.cos(np.linspace(0, np.pi, height + 1))
     row = (edges[:-1] - edges[1:]) * (np.pi / height)
     return np.repeat(row[:, None], 2 * height, 1)
+
+
+def latlong_laplacian(height: int) -> "csr_matrix":
+    """The matrix L of ∫‖∇E‖² ≈ Σ E·(L E) over the texels of a lat-long map, row by row: a graph Laplacian.
+
+    On a grid of equal steps the neighbors of a texel weigh 1/sin θ to either side, with θ of its row, and sin θ at the
+    edge above and below, so that nothing passes through the poles.
+    """
+    from scipy.sparse import coo_matrix, diags
+
+    texel = np.arange(2 * height**2).reshape(height, 2 * height)
+    beside = np.repeat(1 / np.sin(np.pi * (np.arange(height) + 0.5) / height), 2 * height)
+    below = np.repeat(np.sin(np.pi * np.arange(1, height) / height), 2 * height)
+    first = np.concatenate([texel.ravel(), texel[:-1].ravel()])
+    second = np.concatenate([np.roll(texel, -1, 1).ravel(), texel[1:].ravel()])
+    weights = coo_matrix((np.concatenate([beside, below]), (first, second)), (texel.size,) * 2).tocsr()
+    both = weights + weights.T
+    return (diags(np.asarray(both.sum(1)).ravel()) - both).tocsr()
 
 
 def cube_to_directions(face: Int[np.ndarray, "..."], st: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "... 3"]:

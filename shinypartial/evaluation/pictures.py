@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from shinypartial.core.color import to_display
 from shinypartial.dataset.schema import View
+from shinypartial.dataset.write import encode_normals
 from shinypartial.evaluation.masks import solid_mask
 from shinypartial.io.images import write_png
 from shinypartial.metrics.angular import normal_errors_deg
@@ -96,9 +97,8 @@ def radiance_picture(radiance: Float[np.ndarray, "H W 3"]) -> Picture:
 
 def normal_picture(normals_world: Float[np.ndarray, "H W 3"]) -> Picture:
     """World normals as (n + 1)/2; gray where there is none."""
-    picture = np.rint(np.clip((normals_world + 1) / 2, 0, 1) * 255).astype(np.uint8)
     present = np.linalg.norm(normals_world, axis=-1, keepdims=True) > 0.5
-    return np.where(present, picture, np.uint8(NEUTRAL_GRAY))
+    return np.where(present, encode_normals(normals_world), np.uint8(NEUTRAL_GRAY))
 
 
 def observed_picture(observed: Bool[np.ndarray, "H W"], resolved: Bool[np.ndarray, "H W"]) -> Picture:

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int
 
-from shinypartial.core.sphere import directions_to_latlong, latlong_directions, latlong_solid_angles, sample_latlong
+from shinypartial.core.sphere import (
+    directions_to_latlong,
+    latlong_directions,
+    latlong_laplacian,
+    latlong_solid_angles,
+    sample_latlong,
+)
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -80,7 +86,7 @@ def solve_latlong(rays: Rays, height: int, after_round: Callable[[], None] = lam
     """
     if not len(rays.directions):
         raise ValueError("expected at least one ray")
-    cells, laplacian = _sort_into_cells(rays, height), _laplacian(height)
+    cells, laplacian = _sort_into_cells(rays, height), SMOOTHNESS * latlong_laplacian(height)
     clipped = [np.clip(channel, 0, 1) for channel in cells.radiance]
     solution: Float[np.ndarray, "T 3"] | None = None
     averaged: Float[np.ndarray, "T 3"] | None = None
@@ -164,22 +170,6 @@ def _normal_matrix(cells: _Cells, weights: Float[np.ndarray, "P"]) -> "csr_matri
     rows, columns = np.repeat(cells.corners, 4, 1), np.tile(cells.corners, (1, 4))
     texels = 2 * cells.height**2
     return coo_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(texels, texels)).tocsr()
-
-
-def _laplacian(height: int) -> "csr_matrix":
-    """λ times the matrix of ∫‖∇E‖² on the sphere: neighbors in azimuth bind as 1/sin θ."""
-    from scipy.sparse import coo_matrix, diags
-
-    width = 2 * height
-    texel = np.arange(height * width).reshape(height, width)
-    polar = (np.arange(height) + 0.5) * math.pi / height
-    between_rows = np.arange(1, height) * math.pi / height
-    first = np.concatenate([texel.ravel(), texel[:-1].ravel()])
-    second = np.concatenate([np.roll(texel, -1, 1).ravel(), texel[1:].ravel()])
-    strength = np.concatenate([np.repeat(1 / np.sin(polar), width), np.repeat(np.sin(between_rows), width)])
-    upper = coo_matrix((strength * SMOOTHNESS, (first, second)), shape=(texel.size, texel.size)).tocsr()
-    both = upper + upper.T
-    return (diags(np.asarray(both.sum(1)).ravel()) - both).tocsr()
 
 
 def _conjugate_gradients(

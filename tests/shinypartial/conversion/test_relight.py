@@ -93,6 +93,7 @@ def test_a_known_difference_has_its_decibels() -> None:
     one[..., :3], other[..., :3] = srgb_to_linear(np.array(0.5)), srgb_to_linear(np.array(0.6))
     one[0], other[0] = 0, 0
     assert psnr(one, other) == pytest.approx(20, abs=1e-6)
+    assert psnr(one, np.zeros_like(one)) is None
 
 
 def test_what_is_no_object_is_refused(tmp_path: Path, sphere_dataset) -> None:
@@ -101,3 +102,6 @@ def test_what_is_no_object_is_refused(tmp_path: Path, sphere_dataset) -> None:
     prediction = write_truth_prediction(tmp_path / "p", sphere_dataset)
     with pytest.raises(InputError, match=r"\.blend, \.glb, \.gltf that exists"):
         relight(prediction, tmp_path / "o", source=tmp_path / "none.glb")
+    for option in ("resolution", "samples"):
+        with pytest.raises(InputError, match=f"--{option}: a whole number of at least 1"):
+            relight(prediction, tmp_path / "o", **{option: 0})
