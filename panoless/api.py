@@ -139,7 +139,7 @@ def fit(
     config = PRESETS[preset] if config is None else config
     config = with_overrides(config, set if model is None else (f"model={model}", *set))
     prepare_threads()
-    from panoless.export.prediction import export_prediction
+    from panoless.export.prediction import export_prediction, is_exported
     from panoless.reconstruct.fit import find_device
     from panoless.reconstruct.fit import fit as reconstruct
     from panoless.reconstruct.snapshots import snapshot_schedule
@@ -154,7 +154,8 @@ def fit(
     with folder_lock(prediction):
         acquire_prediction(prediction)
         state = reconstruct(data, config, run_folder, schedule, place)
-        export_prediction(data, state, config, prediction)
+        if not is_exported(prediction, state, config, data):
+            export_prediction(data, state, config, prediction)
     return Reconstruction(prediction)
 
 

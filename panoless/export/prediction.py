@@ -4,6 +4,7 @@ import json
 import math
 import os
 import platform
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -39,10 +40,11 @@ from shinypartial.io.picture_sheet import write_picture_sheet
 from shinypartial.io.progress import Progress
 from shinypartial.prediction.format import (
     DECOMPOSITION,
-    DESCRIPTION,
     ENVIRONMENT,
     INVERSE_DISTANCE,
     SNAPSHOTS,
+    TEST_VIEWS,
+    VISIBILITY,
     Candidate,
     FoundCamera,
     FoundFloor,
@@ -50,7 +52,9 @@ from shinypartial.prediction.format import (
     NearSurroundings,
     PredictionInfo,
     acquire_prediction,
+    begin_prediction,
     dataset_hash,
+    prediction_frame,
     read_info,
     write_environment_map,
     write_info,
@@ -72,13 +76,17 @@ def export_prediction(
     """Write environment, visibility, test views, pictures, PLY and, last, prediction.json.
 
     `snapshot` says that the state is not the end of its fit, and states its iteration. An earlier prediction.json is
-    removed first, so that it never describes a mixture; `test` marks the folder as begun.
+    removed first, so that it never describes a mixture, and so are scores; all that another fit left is removed, too.
     """
     if state.environment is None or state.visibility is None:
         raise ValueError("only a finished fit can be exported")
-    (folder / "test").mkdir(parents=True, exist_ok=True)
-    (folder / DESCRIPTION).unlink(missing_ok=True)
+    of_this_fit = _is_of(folder, state, config, dataset)
+    begin_prediction(folder)
     remove_partial_files(folder)
+    if not of_this_fit:
+        for left in (folder / SNAPSHOTS, folder / PICTURES, *(folder / TEST_VIEWS).iterdir()):
+            shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
+        (folder / DECOMPOSITION).unlink(missing_ok=True)
     height = 2 * state.environment.shape[-1]
     around, viewpoint = state.geometry.surroundings, viewpoint_of(state.frame, state.geometry.surroundings)
     write_environment_map(folder, cube_to_latlong(state.environment, height, around, viewpoint))
@@ -94,7 +102,7 @@ def export_prediction(
     write_ply(folder / mesh_file, state.geometry.mesh(state.frame))
     _write_test_views(dataset, state, config, folder)
     info = PredictionInfo(
-        method=f"panoless {__version__} ({config.preset})",
+        method=_method(config),
         dataset=str(dataset.root.resolve()),
         dataset_hash=dataset_hash(dataset),
         config=asdict(config),
@@ -147,7 +155,7 @@ def export_snapshots(dataset: Dataset, run: Path, config: FitConfig, prediction:
     views, configured = None, config
     for source in found:
         state, target = read_snapshot(source), prediction / SNAPSHOTS / source.name
-        if _is_exported(target, state, config, dataset):
+        if is_exported(target, state, config, dataset, snapshot=True):
             continue
         if views is None:
             loaded, configured = configured_views(dataset, config)
@@ -159,13 +167,30 @@ def export_snapshots(dataset: Dataset, run: Path, config: FitConfig, prediction:
     return [prediction / SNAPSHOTS / source.name for source in found]
 
 
-def _is_exported(folder: Path, state: FitState, config: FitConfig, dataset: Dataset) -> bool:
-    """Whether the folder describes this very snapshot; equal seconds to the millisecond tell fits apart."""
-    if not (folder / DESCRIPTION).exists():
+def is_exported(folder: Path, state: FitState, config: FitConfig, dataset: Dataset, *, snapshot: bool = False) -> bool:
+    """Whether the folder holds the whole prediction of this very state, by this version."""
+    mesh = folder / f"{state.geometry.kind}.ply"
+    views = (prediction_frame(folder, frame).exr for frame in dataset.test)
+    if not all(path.exists() for path in (folder / ENVIRONMENT, folder / VISIBILITY, mesh, *views)):
+        return False
+    if not _is_of(folder, state, config, dataset):
         return False
     info = read_info(folder)
+    return info.method == _method(config) and info.iteration == (state.iteration if snapshot else None)
+
+
+def _is_of(folder: Path, state: FitState, config: FitConfig, dataset: Dataset) -> bool:
+    """Whether the folder describes a moment of this fit; equal seconds to the millisecond tell fits apart."""
+    try:
+        info = read_info(folder)
+    except InputError:  # There is none, or it can't be read.
+        return False
     same_fit = info.config == json.loads(json.dumps(asdict(config))) and info.dataset_hash == dataset_hash(dataset)
-    return same_fit and info.iteration == state.iteration and _stated_seconds(state).items() <= info.seconds.items()
+    return same_fit and _stated_seconds(state).items() <= info.seconds.items()
+
+
+def _method(config: FitConfig) -> str:
+    return f"panoless {__version__} ({config.preset})"
 
 
 def _stated_seconds(state: FitState) -> dict[str, float]:

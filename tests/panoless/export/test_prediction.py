@@ -18,7 +18,7 @@ from panoless.capture.views import TrainView
 from panoless.environment.surroundings import Floor, Surroundings
 from panoless.export.mesh_files import write_ply
 from panoless.export.pictures import crop_to_object
-from panoless.export.prediction import PICTURES, cube_to_latlong, export_prediction, viewpoint_of
+from panoless.export.prediction import PICTURES, cube_to_latlong, export_prediction, is_exported, viewpoint_of
 from panoless.export.render import render
 from panoless.geometry.base import Geometry
 from panoless.geometry.height_field.kind import HeightFieldMirror
@@ -140,6 +140,36 @@ def test_an_export_that_fails_claims_nothing(tmp_path: Path, finished: FinishedF
     acquire_prediction(tmp_path)
     export_prediction(finished.dataset, finished.state, finished.config, tmp_path)
     read_info(tmp_path)
+
+
+def test_a_whole_prediction_is_not_made_again(tmp_path: Path, finished: FinishedFit) -> None:
+    """Of this fit, with all of its files."""
+    dataset, state, config = finished.dataset, finished.state, finished.config
+    assert not is_exported(tmp_path, state, config, dataset)
+    export_prediction(dataset, state, config, tmp_path)
+    assert is_exported(tmp_path, state, config, dataset)
+    other = replace(state, seconds={**state.seconds, "optimize": 1e3})
+    assert not is_exported(tmp_path, other, config, dataset)
+    assert not is_exported(tmp_path, state, replace(config, seed=config.seed + 1), dataset)
+    (tmp_path / "test/r_000.exr").unlink()
+    assert not is_exported(tmp_path, state, config, dataset)
+    (tmp_path / "prediction.json").write_text("{")
+    export_prediction(dataset, state, config, tmp_path)
+    assert is_exported(tmp_path, state, config, dataset)
+
+
+def test_nothing_of_another_fit_stays(tmp_path: Path, finished: FinishedFit) -> None:
+    """Snapshots, pictures, test views and scores; those of the same fit stay, but for the scores."""
+    dataset, state, config = finished.dataset, finished.state, finished.config
+    export_prediction(dataset, state, config, tmp_path)
+    snapshot, view, scores = (tmp_path / each for each in ("snapshots/000001/x", "test/r_999.exr", "scores.json"))
+    snapshot.parent.mkdir(parents=True)
+    for path in (snapshot, view, scores):
+        path.touch()
+    export_prediction(dataset, state, config, tmp_path)
+    assert [path.exists() for path in (snapshot, view, scores)] == [True, True, False]
+    export_prediction(dataset, replace(state, seconds={"optimize": 1e3}), config, tmp_path)
+    assert [path.exists() for path in (snapshot, view)] == [False, False]
 
 
 def test_an_export_killed_at_its_first_file_may_be_repeated(tmp_path: Path, finished: FinishedFit, monkeypatch) -> None:
@@ -360,6 +390,8 @@ def test_surfels_say_why_they_were_taken(prediction: Path, finished: FinishedFit
     assert read_info(prediction).model == finished.state.selection.sentence == "surfels (asked for)"
     refused = Candidate("plane", Verdict.REFUSED_BY_SILHOUETTES, "misses the silhouettes", 7.0, 0.8)
     chosen = Candidate("surfels", Verdict.CHOSEN, "no simpler kind explains the views")
+    acquire_prediction(tmp_path)
+    (tmp_path / "test").mkdir()
     for name in ("plane.ply", "revolution.ply"):
         (tmp_path / name).write_text("of an earlier fit")
     selection = Selection("surfels", (refused, chosen))
