@@ -67,8 +67,3 @@ def exposed(views: Views, exposure: float) -> Views:
     if exposure == 1:
         return views
     return replace(views, train=tuple(replace(view, radiance=exposure * view.radiance) for view in views.train))
-
-
-def contrasted(views: Views, options: ContrastOptions) -> Views:
-    """The views with the contrast that they ask for."""
-    return Contrast.of(views, options).applied(views)

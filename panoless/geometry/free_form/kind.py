@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
-from panoless.capture.contrast import contrasted
+from panoless.capture.contrast import Contrast
 from panoless.capture.lens import LensChange
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.poses import Poses, StatedCameras, with_pose_covariances
@@ -77,6 +77,8 @@ class FreeFormMirror(ExactGeometry):
     occlusion_test: bool = True
     """Whether pixels that see the object again are left out."""
     options: FreeFormOptions = DEFAULTS
+    contrast: Contrast = Contrast()
+    """Of the photographs that it was fitted to, and in which a fit goes on; a state does not keep it."""
 
     @property
     def surroundings(self) -> Surroundings:
@@ -231,17 +233,17 @@ class FreeFormFamily(ExactFamily):
     ) -> tuple[Geometry, LensChange] | None:
         """On from a fit, in rounds with these unknowns, at the poses that it found."""
         start = replace(_stage(fitted), poses=None, lens=unknown)
-        stage = follow_views(fitted.corrected(views), start, config.free_form)
+        stage = follow_views(fitted.contrast.applied(fitted.corrected(views)), start, config.free_form)
         assert stage.lens is not None, "the lens was unknown"
         factor = float(np.exp(-(stage.lens.focal or 0.0)))
         surface, trust = stage.surface.scaled(factor), stage.trust.scaled(factor)
-        return _mirror(surface, trust, fitted.poses, config), stage.lens
+        return replace(_mirror(surface, trust, fitted.poses, config), contrast=fitted.contrast), stage.lens
 
     def after_as_many_steps(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:
         """On from a fit, in a round as long as with that unknown."""
         start = replace(_stage(fitted), poses=None)
-        stage = follow_views(fitted.corrected(views), start, config.free_form, longer=True)
-        return _mirror(stage.surface, stage.trust, fitted.poses, config)
+        stage = follow_views(fitted.contrast.applied(fitted.corrected(views)), start, config.free_form, longer=True)
+        return replace(_mirror(stage.surface, stage.trust, fitted.poses, config), contrast=fitted.contrast)
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """All coefficients by outlines and photographs together; by logarithms of radiance where this leaves what is
@@ -250,14 +252,16 @@ class FreeFormFamily(ExactFamily):
         told = proposal.told
         if proposal.fitted is not None:
             posed = views if told is None else with_pose_covariances(views, told.covariances)
-            found = follow_views(posed, _stage(proposal.fitted), config.free_form)
-            return _mirror(found.surface, found.trust, found.poses, config)
-        shown = contrasted(views, config.contrast)
+            contrast = proposal.fitted.contrast
+            found = follow_views(contrast.applied(posed), _stage(proposal.fitted), config.free_form)
+            return replace(_mirror(found.surface, found.trust, found.poses, config), contrast=contrast)
+        contrast = Contrast.of(views, config.contrast)
+        shown = contrast.applied(views)
         fitted = _fitted(views, proposal.shape, told, config)
         if shown is views or (left := _unexplained(shown, fitted, config)) < config.contrast.explained:
             return fitted
         first = replace(first_surfaces(shown, config), surroundings=proposal.shape.surroundings)
-        again = _fitted(shown, first, told, config)
+        again = replace(_fitted(shown, first, told, config), contrast=contrast)
         return again if _unexplained(shown, again, config) < left else fitted
 
 

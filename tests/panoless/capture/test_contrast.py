@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from panoless.capture.contrast import Contrast, contrasted
+from panoless.capture.contrast import Contrast
 from panoless.capture.options import ContrastOptions
 from panoless.capture.views import Views
 from tests.support.mirror_body import body_views, sphere
@@ -24,7 +24,7 @@ def exposed(views: Views, power: float, gain: float = 1.0) -> Views:
 
 
 def test_views_of_usual_brightness_stay_as_they_are(bright: Views) -> None:
-    assert contrasted(bright, OPTIONS) is bright
+    assert Contrast.of(bright, OPTIONS).applied(bright) is bright
 
 
 def test_dark_views_keep_black_white_and_the_order_between() -> None:

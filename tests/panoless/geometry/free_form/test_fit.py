@@ -8,6 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from panoless.alignment.search import PosedProposal, align_proposal, fit_with_poses
+from panoless.capture.contrast import Contrast
 from panoless.capture.lens import LensChange, with_focal_factor
 from panoless.capture.options import ContrastOptions
 from panoless.capture.poses import Poses, StatedCameras, with_pose_covariances
@@ -547,6 +548,22 @@ def test_flat_faces_that_mirror_a_dark_ground_are_found() -> None:
 
     assert error_deg(config) < 1.0
     assert error_deg(replace(config, contrast=ContrastOptions(dark_share=0.0))) < 1.0
+
+
+def test_a_fit_goes_on_in_the_contrast_of_its_photographs() -> None:
+    """From a surface that was fitted to logarithms, by these and not by radiance."""
+    views, family, contrast = body_views(ellipsoid(), 8, 32), FreeFormFamily(), Contrast(0.05)
+    start = family.propose(views, CONFIG, asked=True)
+    plain = family.as_proposed(start, CONFIG)
+
+    def onward(views: Views, contrast: Contrast) -> FreeFormMirror:
+        return family.fit(views, replace(start, fitted=replace(plain, contrast=contrast)), CONFIG)
+
+    by_radiance, by_logarithms = onward(views, Contrast()), onward(views, contrast)
+    assert by_logarithms.contrast == contrast
+    expected = onward(contrast.applied(views), Contrast())
+    assert np.array_equal(by_logarithms.surface.coefficients, expected.surface.coefficients)
+    assert not np.array_equal(by_logarithms.surface.coefficients, by_radiance.surface.coefficients)
 
 
 def test_what_all_cameras_share_is_taken_back() -> None:
