@@ -166,10 +166,10 @@ def poses_from_board(board: Board, frames: Frames, folder: Path, options: Captur
         near = {
             sighting.name: known.get(sighting.name, _rough_pose(board, sighting, adjusted.lens)) for sighting in seen
         }
-        sightings = _located(board, near, adjusted.lens, pictures, blur_px, options)
-        if len(sightings) < options.least_views:
+        located = _located(board, near, adjusted.lens, pictures, blur_px, options)
+        if len(located) < options.least_views:
             break
-        sightings, adjusted = _robust(board, sightings, adjusted.lens, options, 1)
+        sightings, adjusted = _robust(board, located, adjusted.lens, options, 1)
     if not adjusted.focal_error < options.most_focal_error:
         raise InputError(
             expected=f"frames that tell the focal length to {options.most_focal_error:.0%}",

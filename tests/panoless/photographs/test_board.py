@@ -162,6 +162,13 @@ def test_the_measured_square_scales_the_world(photographed) -> None:
     np.testing.assert_allclose(position, 2 * cameras[0].position_world, atol=0.004 * DISTANCE_M)
 
 
+def test_corners_that_no_print_explains_stay_as_they_were_detected(photographed) -> None:
+    """No window has all of its variance explained: a refinement that keeps too few frames changes nothing."""
+    folder, frames, _ = photographed
+    detected = poses_from_board(BOARD, frames, folder, CaptureOptions(corner_blurs_px=()))
+    assert poses_from_board(BOARD, frames, folder, CaptureOptions(least_match=1.0)) == detected
+
+
 def test_a_board_that_is_hardly_seen_is_refused(photographed, tmp_path: Path) -> None:
     folder, frames, _ = photographed
     for one in frames.photographs:
