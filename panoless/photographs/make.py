@@ -155,7 +155,7 @@ def _poses(request: Request, frames: Frames, pictures: Path, work: Path) -> tupl
         "board": write_record(board) if board else None,
         "model": [[str(path), path.stat().st_mtime_ns] for path in _model_files(model)] if model else None,
         "transforms": sha256_of(transforms) if transforms else None,
-        "masks": sorted(masks),
+        "masks": {name: sha256_of(path) for name, path in masks.items()},
     }
 
     def work_on() -> Poses:

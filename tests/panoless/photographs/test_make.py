@@ -72,6 +72,16 @@ def test_stages_that_are_done_are_not_done_again(photographs: Path, tmp_path: Pa
     assert "hints in p_4" in records[2].read_text()
 
 
+def test_other_masks_of_the_same_names_ask_for_poses_anew(photographs: Path, tmp_path: Path) -> None:
+    given = Request(photographs, tmp_path / "dataset", masks=photographs / "masks", options=OPTIONS)
+    capture(given)
+    found = tmp_path / "dataset" / "capture" / "poses.json"
+    before = found.stat().st_mtime_ns
+    write_png(photographs / "masks" / "p_4.png", np.roll(TRUTH[4], 1, 0).astype(np.uint8) * 255)
+    capture(given)
+    assert found.stat().st_mtime_ns != before
+
+
 def test_pictures_without_any_mask_are_refused(photographs: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--box"):
         capture(Request(photographs, tmp_path / "dataset", options=OPTIONS))
