@@ -86,8 +86,10 @@ class Captured:
 def capture(request: Request) -> Captured:
     """Make the dataset folder; stages that were done with the same input are not done again.
 
-    Raises InputError for whatever photographs, poses or masks lack, and for an output folder that holds other things.
+    Raises InputError for options that exclude each other, for whatever photographs, poses or masks lack, and for an
+    output folder that holds other things.
     """
+    _check_alternatives(request)
     files = source_files(request.source)
     _check_output(request.output)
     with folder_lock(request.output):
@@ -103,6 +105,23 @@ def capture(request: Request) -> Captured:
         ]
         write_transforms(request.output, "train", listed)
     return Captured(frames, poses, masks)
+
+
+def _check_alternatives(request: Request) -> None:
+    """InputError where two options each say how poses, or how masks, are found."""
+    board = None if request.board == "none" else request.board
+    hints = request.hints and "--box or --clicks"
+    for what, options in (
+        ("poses", (request.colmap and "--colmap", board and "--board")),
+        ("masks", (request.masks and "--masks", request.segmenter and "--segmenter", hints)),
+    ):
+        named = [option for option in options if option]
+        if len(named) > 1:
+            raise InputError(
+                expected=f"one option that says where {what} come from",
+                found=" beside ".join(named),
+                remedy="Leave out all but one of them.",
+            )
 
 
 def _check_output(output: Path) -> None:
@@ -130,22 +149,21 @@ def _frames(request: Request, files: list[Path], pictures: Path, work: Path) -> 
 
 
 def _poses(request: Request, frames: Frames, pictures: Path, work: Path) -> tuple[Poses, dict[str, Path]]:
-    """Poses, and the masks that come with the source, in the size of the frames: by `--masks` or by transforms.json."""
+    """Poses, and the masks that are given, in the size of the frames: those that options name come first, then those of
+    transforms.json, then a folder beside the source.
+    """
     drawn = None if request.board is None or request.board == "none" else BOARDS[request.board]
     model = request.colmap or (None if drawn else find_model(request.source))
     transforms = None if drawn or model else find_transforms(request.source)
     if not (request.board or model or transforms):
         drawn = recognized_board(frames, pictures, request.options)
     board = drawn and replace(drawn, square_mm=request.square_mm or drawn.square_mm)
-    named: dict[str, Path] = {}
-    read = None
+    read, named = read_transforms(transforms, frames) if transforms else (None, {})
     names = [one.name for one in frames.photographs]
-    told = request.hints or request.segmenter or transforms
-    folder = request.masks or (None if told else masks_beside(request.source, names))
-    if folder:
+    if request.segmenter or request.hints:
+        named = {}
+    elif folder := request.masks or (None if named else masks_beside(request.source, names)):
         named = {name: given_mask(folder, name) for name in names}
-    elif transforms:
-        read, named = read_transforms(transforms, frames)
     if request.segmenter:
         masks = _segmented(request.segmenter, request, frames, pictures, work)
     else:
@@ -164,9 +182,8 @@ def _poses(request: Request, frames: Frames, pictures: Path, work: Path) -> tupl
         elif model:
             found = read_colmap(model, frames, request.options)
             remedy = "Names of pictures must be those that the model knows."
-        elif transforms:
-            found = read or read_transforms(transforms, frames)[0]
-            remedy = "Names of pictures must be those of file_path."
+        elif read:
+            found, remedy = read, "Names of pictures must be those of file_path."
         else:
             found, remedy = poses_from_structure(frames, pictures, masks, work / "structure", request.options), REMEDY
         poses = without_the_rest(found, frames, request.options, remedy)

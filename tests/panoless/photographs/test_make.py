@@ -2,6 +2,7 @@
 
 import builtins
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -82,7 +83,30 @@ def test_other_masks_of_the_same_names_ask_for_poses_anew(photographs: Path, tmp
     assert found.stat().st_mtime_ns != before
 
 
+def test_masks_beside_pictures_are_found_where_a_file_of_cameras_names_none(photographs: Path, tmp_path: Path) -> None:
+    found = capture(Request(photographs, tmp_path / "found", options=OPTIONS))
+    named = capture(Request(photographs, tmp_path / "named", masks=photographs / "masks", options=OPTIONS))
+    assert found.masks == named.masks
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--colmap", "sparse", "--board", "A4"],
+        ["--masks", "masks", "--segmenter", "model.onnx"],
+        ["--masks", "masks", "--box", "1,2,3,4", "--box-in", "p_4"],
+    ],
+)
+def test_options_that_exclude_each_other_are_named(
+    options: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main(["capture", str(tmp_path), "--output", str(tmp_path / "out"), *options]) == 2
+    said = capsys.readouterr().err
+    assert all(option in said for option in options if option in ("--colmap", "--board", "--masks", "--segmenter"))
+
+
 def test_pictures_without_any_mask_are_refused(photographs: Path, tmp_path: Path) -> None:
+    shutil.rmtree(photographs / "masks")
     with pytest.raises(InputError, match="--box"):
         capture(Request(photographs, tmp_path / "dataset", options=OPTIONS))
 
