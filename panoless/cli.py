@@ -1,5 +1,6 @@
 """The `panoless` command: make a dataset of photographs, fit it, export or view a finished fit."""
 
+import math
 import sys
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -241,6 +242,8 @@ class Capture:
     def _boxes(self) -> dict[str, tuple[float, float, float, float]]:
         try:
             boxes = [tuple(float(value) for value in box.split(",")) for box in self.box]
+            if not all(map(math.isfinite, chain(*boxes))):
+                raise ValueError("a side that is nowhere")
             return {name: (x0, y0, x1, y1) for name, (x0, y0, x1, y1) in zip(self.box_in, boxes, strict=True)}
         except ValueError:
             raise InputError(

@@ -89,7 +89,7 @@ def capture(request: Request) -> Captured:
     Raises InputError for options that exclude each other, for whatever photographs, poses or masks lack, and for an
     output folder that holds other things.
     """
-    _check_alternatives(request)
+    _check_options(request)
     files = source_files(request.source)
     _check_output(request.output)
     with folder_lock(request.output):
@@ -107,8 +107,14 @@ def capture(request: Request) -> Captured:
     return Captured(frames, poses, masks)
 
 
-def _check_alternatives(request: Request) -> None:
-    """InputError where two options each say how poses, or how masks, are found."""
+def _check_options(request: Request) -> None:
+    """InputError where two options each say how poses, or how masks, are found, and for a square without a side."""
+    if request.square_mm is not None and not 0 < request.square_mm < float("inf"):
+        raise InputError(
+            expected="--square-mm above 0",
+            found=f"{request.square_mm:g}",
+            remedy="Measure five squares of the print and give a fifth of that, in millimeters.",
+        )
     board = None if request.board == "none" else request.board
     hints = request.hints and "--box or --clicks"
     for what, options in (
@@ -157,7 +163,7 @@ def _poses(request: Request, frames: Frames, pictures: Path, work: Path) -> tupl
     transforms = None if drawn or model else find_transforms(request.source)
     if not (request.board or model or transforms):
         drawn = recognized_board(frames, pictures, request.options)
-    board = drawn and replace(drawn, square_mm=request.square_mm or drawn.square_mm)
+    board = drawn and replace(drawn, square_mm=drawn.square_mm if request.square_mm is None else request.square_mm)
     read, named = read_transforms(transforms, frames) if transforms else (None, {})
     names = [one.name for one in frames.photographs]
     if request.segmenter or request.hints:

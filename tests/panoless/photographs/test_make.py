@@ -120,7 +120,14 @@ def test_rectangles_and_their_photographs_come_in_pairs(capsys: pytest.CaptureFi
     command = ["capture", str(tmp_path), "--output", str(tmp_path / "out"), "--box", "1,2,3"]
     assert main([*command, "--box-in", "a"]) == 2
     assert main([*command[:-1], "1,2,3,4"]) == 2
-    assert capsys.readouterr().err.count("--box X0,Y0,X1,Y1") == 2
+    assert main([*command[:-1], "nan,0,9,9", "--box-in", "a"]) == 2
+    assert capsys.readouterr().err.count("--box X0,Y0,X1,Y1") == 3
+
+
+@pytest.mark.parametrize("side", ["0", "-27", "nan", "inf"])
+def test_a_square_without_a_side_is_refused(side: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["capture", str(tmp_path), "--output", str(tmp_path / "out"), "--square-mm", side]) == 2
+    assert "--square-mm above 0" in capsys.readouterr().err
 
 
 def test_a_missing_library_names_the_extra(
