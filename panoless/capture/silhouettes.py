@@ -97,7 +97,9 @@ def mask_distance_px(mask: Float[np.ndarray, "H W"], band_px: float = EXACT_BAND
     lines = padded[:, 0], padded[0], padded[:, -1], padded[-1]
     for line, cut in zip(lines, cut_sides(mask), strict=True):
         line *= cut
-    points = np.concatenate([_refined(curve - 1) for curve in find_contours(padded, MASK_LEVEL)])
+    # Of a mask that reaches one half and nothing more, the curve is where it does.
+    curves = find_contours(padded, MASK_LEVEL) or find_contours(padded, np.nextafter(MASK_LEVEL, 0))
+    points = np.concatenate([_refined(curve - 1) for curve in curves])
     near = np.nonzero(np.abs(distance) < band_px)
     to_curve, _ = cKDTree(points).query(np.stack(near, 1).astype(np.float64))
     distance[near] = np.where(inside[near], -to_curve, to_curve)

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from panoless.capture.masks import MASK_LEVEL
 from panoless.capture.rays import camera_rays, pose_of
 from panoless.capture.silhouettes import MaskContours, mask_contours
 from panoless.capture.views import Views
@@ -84,7 +85,7 @@ def axis_starts(views: Views, options: SilhouetteOptions = DEFAULTS.silhouette) 
     centers = []
     for view in chosen:
         mask, camera = view.mask.cpu().numpy(), view.camera
-        row, column = np.nonzero(mask > 0.5)
+        row, column = np.nonzero(mask >= MASK_LEVEL)
         points = camera_rays(camera, column + PIXEL_CENTER, row + PIXEL_CENTER)[:, :2]
         middle = points.mean(0)
         _, vectors = np.linalg.eigh(np.cov((points - middle).T))

@@ -165,3 +165,11 @@ def test_outline_distances_are_those_of_the_curve_between_pixels() -> None:
         distance = mask_distance_px(mask)[4:8]
         near = np.abs(columns - edge) < 2.5
         assert np.abs(distance - (columns - edge))[:, near].max() < 0.09
+
+
+def test_a_mask_that_reaches_one_half_and_nothing_more_has_its_curve_there() -> None:
+    mask = np.zeros((12, 20))
+    mask[4:8, 5:9] = 0.5
+    distance = mask_distance_px(mask)
+    assert (distance[mask > 0] <= 0).all()
+    np.testing.assert_allclose(distance[6, 9:12], [1, 2, 3], atol=1e-6)

@@ -17,10 +17,16 @@ from panoless.geometry.revolution.photometric import Photometry, photometric_equ
 from panoless.geometry.revolution.pixels import CENTER, PixelBundles, evenly
 from panoless.geometry.revolution.placement import surfels_on_revolution
 from panoless.geometry.revolution.profile import ProfileSplines, apply_step, resample_profile
-from panoless.geometry.revolution.silhouette import EXTENTS, contour_rays, outer_surface, silhouette_residuals
+from panoless.geometry.revolution.silhouette import (
+    EXTENTS,
+    axis_starts,
+    contour_rays,
+    outer_surface,
+    silhouette_residuals,
+)
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.kernels.reference.rasterize import rotation_matrices
-from tests.support.mirror_revolution import TILTED, around, funnel, goblet, rays_of, revolution_views
+from tests.support.mirror_revolution import TILTED, around, funnel, goblet, pillar_views, rays_of, revolution_views
 from tests.support.synthetic_dataset import environment_radiance
 
 
@@ -263,3 +269,10 @@ def test_closed_contours_touch_the_true_body() -> None:
     found = silhouette_residuals(contour_rays(views), goblet(), 0.02)
     assert len(found.pixels) == len(mask_contours(views).view)
     assert float(np.median(np.abs(found.pixels))) < 0.15
+
+
+def test_pixels_of_one_half_propose_an_axis_as_whole_ones_do() -> None:
+    views = pillar_views(around(4, 24))
+    halves = replace(views, train=tuple(replace(view, mask=view.mask / 2) for view in views.train))
+    for start, other in zip(axis_starts(views), axis_starts(halves), strict=True):
+        np.testing.assert_array_equal(start.axis, other.axis)
