@@ -4,6 +4,7 @@ A kind that is not needed costs accuracy, too: tilting a flat mirror and turning
 every picture as it was, so surfels drift.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -31,6 +32,7 @@ ANY = "auto"
 LEAST = "leaves much unexplained, and nothing explains more"
 BENT = "a bend explains more than near surroundings do"
 OTHER = "another kind is preferred"
+NONE_HELD_OUT = "too few views to hold one out"
 
 
 def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefly) -> tuple[Geometry, Selection]:
@@ -135,7 +137,8 @@ def least_unexplained(
     if not waiting:
         return None
     enough = min(map(error_of, waiting)) / (1 - config.selection.least_gain)
-    surfels = min(candidate.surfels_error for candidate, _ in fitted if candidate.surfels_error is not None)
+    asked = (candidate.surfels_error for candidate, _ in fitted if candidate.surfels_error is not None)
+    surfels = min(asked, default=math.inf)
     simplest = next(each for each in waiting if error_of(each) <= enough)
     return None if surfels < (1 - config.selection.least_gain) * error_of(simplest) else simplest
 
@@ -331,7 +334,11 @@ def _examine(
     options, evidence = config.selection, (start.proposal.silhouette_px, start.proposal.overlap)
     views = fitted.corrections.applied(views, config)
     asked_from = 0.0 if is_refined(family.kind) else options.explained_error
-    own, free = held_out_errors(usable_views(views, geometry), config, geometry, trial, asked_from)
+    measured = held_out_errors(usable_views(views, geometry), config, geometry, trial, asked_from)
+    found = {"corrections": fitted.corrections, **_found_cameras(geometry, views, config)}
+    if measured is None:
+        return Candidate(family.kind, Verdict.CHOSEN, NONE_HELD_OUT, *evidence, **found), geometry
+    own, free = measured
     unexplained = float(own.mean()) > options.largest_error
     better = free is not None and is_clearly_lower(free, own, options)
     if better:
@@ -342,9 +349,7 @@ def _examine(
         no_more = "leaves next to nothing unexplained" if free is None else "surfels are no better"
         verdict, reason = Verdict.CHOSEN, no_more
     errors = float(own.mean()), None if free is None else float(free.mean())
-    cameras = _found_cameras(geometry, views, config)
-    figures = (*evidence, *errors)
-    return Candidate(family.kind, verdict, reason, *figures, corrections=fitted.corrections, **cameras), geometry
+    return Candidate(family.kind, verdict, reason, *evidence, *errors, **found), geometry
 
 
 def _found_cameras(geometry: Geometry, views: Views, config: FitConfig) -> dict[str, Any]:

@@ -41,15 +41,15 @@ def train_briefly(views: Views, config: FitConfig, start: Geometry) -> Geometry:
 
 def held_out_errors(
     views: Views, config: FitConfig, candidate: Geometry, trial: Trial, least: float = 0.0
-) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"] | None]:
+) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"] | None] | None:
     """Mean ‖e‖²/(‖e‖² + s²) of each held-out view, for a candidate and for surfels that started on it; None of these
-    where the candidate leaves less than `least`.
+    where the candidate leaves less than `least`, and nothing at all where there are too few views.
 
-    Every fifth view is held out from the map and from the surfels. Both arrays are [0] where there are too few views.
+    Every fifth view is held out from the map and from the surfels.
     """
     parts = held_out_parts(views)
     if parts is None:
-        return np.zeros(1), np.zeros(1)
+        return None
     options = config.selection
 
     def errors(geometry: Geometry) -> Float[np.ndarray, "V"]:

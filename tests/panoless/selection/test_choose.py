@@ -208,7 +208,7 @@ def test_what_leaves_too_much_waits_for_kinds_that_explain_more() -> None:
     """The simplest of those that explain most stays, unless surfels explain clearly more."""
 
     def left(
-        kind: str, error: float, surfels: float, verdict: Verdict = Verdict.LEFT_TOO_MUCH
+        kind: str, error: float, surfels: float | None, verdict: Verdict = Verdict.LEFT_TOO_MUCH
     ) -> tuple[Candidate, Geometry]:
         geometry = PlaneMirror(plane_of(RECTANGLE))
         return Candidate(kind, verdict, "", None, None, error, surfels), geometry
@@ -223,6 +223,7 @@ def test_what_leaves_too_much_waits_for_kinds_that_explain_more() -> None:
     assert kept(plane, bend, left("free_form", 0.32, 0.5)) == "free_form"
     assert kept(plane, bend, left("free_form", 0.32, 0.2)) is None
     assert kept(plane, left("free_form", 0.2, 0.1, Verdict.REFUSED_BY_HELD_OUT_VIEWS)) is None
+    assert kept(left("free_form", 0.32, None)) == "free_form", "surfels that nobody asked explain nothing more"
 
 
 def test_what_is_doubted_stays_unless_another_leaves_much_less() -> None:

@@ -201,6 +201,14 @@ def test_model_selection_takes_the_sphere() -> None:
     assert [each.verdict for each in selection.candidates] == [Verdict.CHOSEN]
 
 
+def test_of_two_views_none_is_held_out_and_no_error_is_stated() -> None:
+    _, selection = choose_geometry(ball_views(2), CONFIG, as_started)
+    (candidate,) = selection.candidates
+    assert candidate.verdict == Verdict.CHOSEN
+    assert candidate.held_out_error is candidate.surfels_error is None
+    assert candidate.reason == "too few views to hold one out"
+
+
 def test_noise_raises_no_doubt_of_a_sphere() -> None:
     """Outlines tell it, so no other kind is asked where photographs leave more than right ones do of another."""
     views, noise = ball_views(12), torch.Generator().manual_seed(3)
