@@ -1,7 +1,7 @@
 """The height field as a kind of geometry."""
 
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.surroundings import Surroundings
-from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers
+from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, poses_from_plain, to_plain
 from panoless.geometry.exact import ExactFamily, SeenByCenters
 from panoless.geometry.height_field.fit import best_dome, fit_height_field
 from panoless.geometry.height_field.model import (
@@ -21,10 +21,12 @@ from panoless.geometry.height_field.model import (
     height_field_buffers,
     visible_reflections,
 )
+from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.geometry.surfels.placement import places_within, surfels_at
 from panoless.kernels.rasterize import RasterCamera
 from shinypartial.core.errors import InputError
+from shinypartial.io.records import read_record, write_record
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,7 @@ class HeightFieldMirror(SeenByCenters):
 
     kind: ClassVar[str] = "height_field"
     height_field: HeightField
+    options: HeightFieldOptions = field(default_factory=HeightFieldOptions)
 
     @property
     def surroundings(self) -> Surroundings:
@@ -51,11 +54,11 @@ class HeightFieldMirror(SeenByCenters):
 
     def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
         """Solid pixels whose reflected rays pass the frame."""
-        return visible_reflections(self.height_field, view, view.solid).pixels
+        return visible_reflections(self.height_field, view, view.solid, self.options).pixels
 
     def seen(self, view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Int[Tensor, "Q"], Float[Tensor, "Q 3"]]:
         """Those of the pixels whose reflected rays pass the frame."""
-        visible = visible_reflections(self.height_field, view, pixels)
+        visible = visible_reflections(self.height_field, view, pixels, self.options)
         return visible.pixels, torch.from_numpy(visible.outgoing).to(view.radiance)
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
@@ -83,6 +86,17 @@ class HeightFieldMirror(SeenByCenters):
         points, faces = self.height_field.quadrilaterals()
         return Mesh.smooth(frame.to_world(points), faces, self.height_field.normals_at(points))
 
+    def state_dict(self) -> dict[str, Any]:
+        """All numbers as lists and plain values."""
+        height_field, options = to_plain(self.height_field), write_record(self.options)
+        return {"height_field": height_field, "options": options, "poses": to_plain(self.poses)}
+
+    @classmethod
+    def from_state_dict(cls, content: dict[str, Any]) -> "HeightFieldMirror":
+        """The geometry that `state_dict` was taken from; a version before kept no options."""
+        options = read_record(HeightFieldOptions, content.get("options", {}), "the options of a height field")
+        return cls(from_plain(HeightField, content["height_field"]), options, poses=poses_from_plain(content))
+
 
 class HeightFieldFamily(ExactFamily):
     """Heights over a plane that explains the silhouettes, but not what it mirrors."""
@@ -104,14 +118,14 @@ class HeightFieldFamily(ExactFamily):
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The plane that it bends, flat as yet."""
-        return HeightFieldMirror(flat_height_field(proposal.shape, config.height_field.cells))
+        return HeightFieldMirror(flat_height_field(proposal.shape, config.height_field.cells), config.height_field)
 
     def before_steps(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """The dome or bowl over the plane that photographs agree on best, or the plane."""
         flat = flat_height_field(proposal.shape, config.height_field.cells)
-        return HeightFieldMirror(best_dome(views, flat, config.height_field))
+        return HeightFieldMirror(best_dome(views, flat, config.height_field), config.height_field)
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """Heights, plane and boundary by silhouettes and photographs together."""
-        fitted = None if proposal.fitted is None else proposal.fitted.height_field
-        return HeightFieldMirror(fit_height_field(views, proposal.shape, config.height_field, fitted))
+        options, fitted = config.height_field, None if proposal.fitted is None else proposal.fitted.height_field
+        return HeightFieldMirror(fit_height_field(views, proposal.shape, options, fitted), options)

@@ -14,6 +14,7 @@ from panoless.capture.poses import Poses
 from panoless.environment.reflectance import Reflectance
 from panoless.geometry.base import Geometry, Training
 from panoless.geometry.height_field.kind import HeightFieldMirror
+from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.revolution.kind import RevolutionMirror
 from panoless.geometry.surfels.mirror import SurfelMirror
@@ -109,7 +110,7 @@ def exact_kinds() -> list[Geometry]:
     plane = plane_of(L_SHAPE, frame_height=0.1 / 3, offset=1 / 7)
     return [
         PlaneMirror(plane, occlusion_test=False),
-        HeightFieldMirror(bumpy(plane, 0.02)),
+        HeightFieldMirror(bumpy(plane, 0.02), HeightFieldOptions(clear_px=2.0)),
         RevolutionMirror(funnel(1 / 3)),
     ]
 
@@ -141,6 +142,9 @@ def test_what_an_earlier_version_did_not_know_has_its_default() -> None:
         content = kind.state_dict()
         assert content.pop("poses") is None
         assert type(kind).from_state_dict(content).poses is None
+    before = HeightFieldMirror(bumpy(plane_of(L_SHAPE), 0.02)).state_dict()
+    del before["options"]
+    assert HeightFieldMirror.from_state_dict(before).options == HeightFieldOptions()
 
 
 def test_a_surface_of_revolution_that_was_used_is_saved_like_a_new_one(tmp_path: Path) -> None:
