@@ -50,7 +50,8 @@ def fit(
             if state.training is not None:
                 require_snapshots(folder, schedule)
             return state
-        seconds: dict[str, float] = {}
+        seconds: dict[str, float] = {} if state is None else state.seconds
+        before = sum(seconds.values())
         with timed(seconds, "read views"):
             views, config = configured_views(dataset, config)
             views = views.to(device)
@@ -64,7 +65,7 @@ def fit(
         photographs = state.selection.corrections.applied(views, config)
         if state.training is not None:
             views = usable_views(photographs, state.geometry)
-            family, recorder = FAMILIES[state.geometry.kind], Recorder(folder, schedule, state)
+            family, recorder = FAMILIES[state.geometry.kind], Recorder(folder, schedule, state, before)
             state.geometry, state.training = family.train(views, state.geometry, state.training, config, recorder)
         with timed(state.seconds, "solve environment"):
             photographs, shown = complete(state, photographs, config)

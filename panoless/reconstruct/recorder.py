@@ -25,9 +25,13 @@ class Recorder:
 
     title = "fitting"
 
-    def __init__(self, run: Path, schedule: SnapshotSchedule, state: FitState) -> None:
-        """Begin or continue at `state`, whose seconds and curves are kept up to date."""
-        self._run, self._schedule, self._state = run, schedule, state
+    def __init__(self, run: Path, schedule: SnapshotSchedule, state: FitState, before: float) -> None:
+        """Begin or continue at `state`, whose seconds and curves are kept up to date.
+
+        Marks up to `before`, the seconds of the checkpoint, have been passed; reading and initialization since then may
+        have passed others.
+        """
+        self._run, self._schedule, self._state, self._before = run, schedule, state, before
         self._saved = time.monotonic()
         for folder in snapshot_folders(run):
             if int(folder.name) > state.iteration:
@@ -35,10 +39,10 @@ class Recorder:
 
     def after_step(self, iteration: int, seconds: float, current: Callable[[], tuple[Geometry, Training]]) -> None:
         """Count the step, and save what is due."""
-        stages = self._state.seconds
-        before = sum(stages.values())
+        stages, before = self._state.seconds, self._before
         stages["optimize"] = stages.get("optimize", 0.0) + seconds
-        if self._schedule.is_due(iteration, before, sum(stages.values())):
+        self._before = sum(stages.values())
+        if self._schedule.is_due(iteration, before, self._before):
             geometry, training = current()
             kept = replace(self._state, geometry=geometry, training=replace(training, optimizer={}))
             save_state(self._run / SNAPSHOTS / f"{iteration:06d}", kept)

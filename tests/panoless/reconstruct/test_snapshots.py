@@ -210,25 +210,48 @@ def state_at(iteration: int, seconds: float) -> FitState:
 
 
 def test_marks_in_seconds_come_once_however_often_the_fit_is_killed(tmp_path: Path) -> None:
-    """A step may pass several marks, and a resumed fit passes them again, at other iterations."""
-    marks = SnapshotSchedule(seconds=(2.0, 4.0, 4.5, 20.0))
+    """A step may pass several marks, and a resumed fit passes them again, at other iterations. What reading anew passes
+    is taken at the first step.
+    """
+    marks = SnapshotSchedule(seconds=(0.4, 2.0, 4.0, 4.5, 20.0))
 
-    def go(begin: tuple[int, float], steps: list[tuple[int, float]]) -> None:
+    def go(begin: tuple[int, float], steps: list[tuple[int, float]], before: float) -> None:
         state = state_at(*begin)
-        recorder = Recorder(tmp_path, marks, state)
+        recorder = Recorder(tmp_path, marks, state, before)
         for iteration, seconds in steps:
             after = state_at(iteration, seconds)
             took = seconds - sum(state.seconds.values())
             recorder.after_step(iteration, took, lambda after=after: (after.geometry, after.training))
 
-    go((0, 0.6), [(1, 1.5), (2, 2.0), (3, 3.9), (4, 5.0), (5, 6.0)])
-    assert moments(tmp_path) == [2, 4]
+    go((0, 0.6), [(1, 1.5), (2, 2.0), (3, 3.8), (4, 5.0), (5, 6.0)], before=0.0)
+    assert moments(tmp_path) == [1, 2, 4]
     # The checkpoint was at the third step, and the fourth is faster this time.
-    go((3, 3.9), [(4, 3.95), (5, 4.7), (6, 5.0)])
-    assert moments(tmp_path) == [2, 5]
+    go((3, 3.9), [(4, 3.95), (5, 4.7), (6, 5.0)], before=3.8)
+    assert moments(tmp_path) == [1, 2, 5]
     # A checkpoint after the last snapshot leaves all of them.
-    go((6, 5.0), [(7, 6.0)])
-    assert moments(tmp_path) == [2, 5]
+    go((6, 5.1), [(7, 6.0)], before=5.0)
+    assert moments(tmp_path) == [1, 2, 5]
+    # Reading took from 3.8 to 4.2 seconds.
+    go((3, 4.2), [(4, 4.3)], before=3.8)
+    assert moments(tmp_path) == [1, 2, 4]
+
+
+def test_a_resumed_fit_counts_reading_each_time(tmp_path: Path, sphere_dataset: Dataset, monkeypatch) -> None:
+    config, step = tiny_config(iterations=4, count=40), SurfelTrainer._step
+
+    def step_until(self: SurfelTrainer, iteration: int) -> LossTerms:
+        if iteration == 2:
+            raise Killed
+        return step(self, iteration)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(recorder_module, "CHECKPOINT_INTERVAL_S", -1.0)
+        patch.setattr(SurfelTrainer, "_step", step_until)
+        with pytest.raises(Killed):
+            fit(sphere_dataset, config, tmp_path / "run")
+    killed = load_state(tmp_path / "run")
+    assert killed is not None
+    assert fit(sphere_dataset, config, tmp_path / "run").seconds["read views"] > killed.seconds["read views"]
 
 
 def test_a_finished_run_without_snapshots_says_so(tmp_path: Path, sphere_dataset: Dataset) -> None:
