@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from panoless.kernels.backend import ArrayBackend, array_kernels
 from panoless.kernels.constants import SUB_PIXELS
 
-VALUE, GRADIENT, HESSIAN = 0, slice(1, 4), slice(4, 10)
+VALUE, GRADIENT = 0, slice(1, 4)
 """Columns of derivatives: φ; φ_x, φ_y, φ_z; φ_xx, φ_xy, φ_xz, φ_yy, φ_yz, φ_zz."""
 
 DIFFERENCE_ORDERS = tuple((i, j, 3 - i - j) for i in range(4) for j in range(4 - i))
