@@ -338,7 +338,7 @@ def from_plain(cls: type[Numbers], content: dict[str, Any]) -> Numbers:
     """The dataclass of that class from `to_plain`; lists become arrays, and what is missing has its default."""
     values: dict[str, Any] = {}
     for item in fields(cls):  # type: ignore[arg-type]
-        if item.name not in content and item.default is not MISSING:
+        if item.name not in content and not (item.default is item.default_factory is MISSING):
             continue
         value = content[item.name]
         nested = [kind for kind in (item.type, *get_args(item.type)) if is_dataclass(kind)]

@@ -12,7 +12,7 @@ import torch
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.poses import Poses
 from panoless.environment.reflectance import Reflectance
-from panoless.geometry.base import Geometry, Training
+from panoless.geometry.base import Geometry, Training, from_plain
 from panoless.geometry.height_field.kind import HeightFieldMirror
 from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.kind import PlaneMirror
@@ -145,6 +145,12 @@ def test_what_an_earlier_version_did_not_know_has_its_default() -> None:
     before = HeightFieldMirror(bumpy(plane_of(L_SHAPE), 0.02)).state_dict()
     del before["options"]
     assert HeightFieldMirror.from_state_dict(before).options == HeightFieldOptions()
+
+
+def test_what_is_missing_has_its_default_also_where_each_has_its_own() -> None:
+    plain = from_plain(Reflectance, {"at_normal": [1.0, 0.77, 1 / 3]})
+    assert np.array_equal(plain.at_normal, [1.0, 0.77, 1 / 3])
+    assert not plain.albedo.any()
 
 
 def test_a_surface_of_revolution_that_was_used_is_saved_like_a_new_one(tmp_path: Path) -> None:
