@@ -82,7 +82,8 @@ class EnvironmentConfig:
     """Leave pixels out of the closed-form map whose mirrored ray meets a plane's frame, or a surface of revolution
     again; a bent plane always does, surfels can't tell."""
     solve_resolution: Annotated[int, Meta(ge=0)] = 0
-    """Texels along a face side of the closed-form map that is exported; 0 lets held-out views choose 64, 128 or 256."""
+    """Texels along a face side of the closed-form map that is exported. 0: 64, 128 or 256, which held-out views choose
+    for surfels, held-out pixels for kinds whose pixels are areas, and the density of rays for others."""
 
 
 @dataclass(frozen=True)

@@ -86,8 +86,9 @@ def estimate_object_frame(
     The center is the point nearest, in least squares, to the rays through the middles of the masks' boxes. Of a box
     that the picture cuts at one side or two opposite ones, the plane through the other two sides' middle counts instead
     of the ray, and of one that is cut both ways nothing, unless too little is left.
-    The radius is the median of (largest distance of a mask pixel from the projected center) · depth / focal length over
-    the uncut views, or all if there are none, with a tenth to spare; the reach is a high quantile over all views.
+    The radius is the median of d sin(arctan(r)) over the uncut views, or all if there are none, with a tenth to spare:
+    d is the distance of the center, and r that of the farthest mask pixel from the projected center over the focal
+    length. The reach is a high quantile over all views.
     When all cameras look along one line, the depth is open: it is that at which the masks have a `known_radius`, or,
     for zero, that of the point of the line nearest to the world's origin, at least one unit.
     """

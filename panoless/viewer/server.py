@@ -30,8 +30,8 @@ from shinypartial.dataset.schema import Dataset, Frame
 from shinypartial.prediction.format import DESCRIPTION, read_info
 from shinypartial.prediction.surface import triangles_of
 
-FRUSTUM_RADII = 0.25
-"""Length of a camera in the picture, in radii of the surface."""
+FRUSTUM_SHARE = 1 / 12
+"""Length of a camera in the picture, as a share of the cameras' median distance from the world's origin."""
 THUMBNAIL_PX = 128
 POLL_SECONDS = 2.0
 RAY_COLORS = np.array([[[255, 210, 60]] * 2, [[255, 120, 40]] * 2], np.uint8)
@@ -163,7 +163,7 @@ class Viewer:
         from scipy.spatial.transform import Rotation
 
         distances = [np.linalg.norm(frame.camera.position_world) for frame in self._frames]
-        scale = FRUSTUM_RADII * float(np.median(distances)) / 3 if distances else 1.0
+        scale = FRUSTUM_SHARE * float(np.median(distances)) if distances else 1.0
         self._cameras: list[Any] = []
         for frame in self._frames:
             camera = frame.camera

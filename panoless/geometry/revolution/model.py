@@ -26,7 +26,7 @@ CREASE_RAD = math.radians(35.0)
 """A turn of the profile above this is an edge: normals are not interpolated across it."""
 BOX_AROUND = 64
 RAY_EPSILON = 1e-4
-"""A mirrored ray starts this far from the surface, in scene units."""
+"""A mirrored ray starts this far from the surface, in radii of the object frame."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ class Surfels:
 
     `quats` (wxyz, any length) rotate the axes (1,0,0), (0,1,0), (0,0,1) into tangent_u, tangent_v and the normal.
     `curvatures` (a, b, c) is the shape operator of the fragment normal
-    n(u, v) ∝ n₀ − (a s_u u + b s_v v) t_u − (b s_u u + c s_v v) t_v, in inverse scene units.
+    n(u, v) ∝ n₀ − (a s_u u + b s_v v) t_u − (b s_u u + c s_v v) t_v, in inverse units of that frame.
     `albedo` is unshaded diffuse radiance, not a reflectance.
     """
 
