@@ -15,7 +15,14 @@ from msgspec import Meta
 
 from panoless.alignment.options import PoseOptions
 from panoless.capture.options import ContrastOptions, MaskRepairOptions
-from panoless.environment.options import ConfidenceOptions, FootprintMapOptions, MaterialOptions, SurroundingsOptions
+from panoless.environment.options import (
+    COARSEST,
+    ConfidenceOptions,
+    FootprintMapOptions,
+    MaterialOptions,
+    SurroundingsOptions,
+    halves_whole,
+)
 from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.geometry.free_form.options import FreeFormOptions
 from panoless.geometry.height_field.options import HeightFieldOptions
@@ -31,6 +38,8 @@ from shinypartial.io.records import Count, NonNegative, Positive, Share, check_r
 Options = TypeVar("Options")
 Tuned = Annotated[Options, tyro.conf.Suppress]
 """Tuned numbers of a stage, which `--set` changes: too many for the help of a command."""
+SPLIT_SUM = ("gaussian-shader", "ref-gaussian", "material-refgs")
+"""The shadings that blur the map for rough parts."""
 Model = Literal["auto", "sphere", "plane", "height_field", "revolution", "free_form", "surfels"]
 #: Values of --model that an earlier version had, and today's.
 RENAMED_MODELS = {"bent": "height_field"}
@@ -61,7 +70,7 @@ class EnvironmentConfig:
     """The learnable cubemap."""
 
     resolution: Annotated[int, Meta(ge=2)] = 128
-    """Texels along a face side during the optimization."""
+    """Texels along a face side during the optimization; 2ⁿ or 3 · 2ⁿ where a shading blurs the map for rough parts."""
     activation: Literal["clamp", "sigmoid"] = "clamp"
     """`sigmoid`: Eq. 7 of the paper, started at random logits; `clamp`: radiance itself, kept in [0, 1]."""
     gray: Share = 0.5
@@ -83,7 +92,8 @@ class EnvironmentConfig:
     again; a bent plane always does, surfels can't tell."""
     solve_resolution: Annotated[int, Meta(ge=0)] = 0
     """Texels along a face side of the closed-form map that is exported. 0: 64, 128 or 256, which held-out views choose
-    for surfels, held-out pixels for kinds whose pixels are areas, and the density of rays for others."""
+    for surfels, held-out pixels for kinds whose pixels are areas, and the density of rays for others. Where the mirror
+    may be rough, 2ⁿ or 3 · 2ⁿ."""
 
 
 @dataclass(frozen=True)
@@ -312,6 +322,25 @@ def check_config(config: FitConfig) -> None:
             found=f"--config.exposure {config.exposure:g} with such options of the preset {config.preset}",
             remedy="Use --preset fast, default or best, or leave --config.exposure out.",
         )
+    _check_blurred_maps(config)
+
+
+def _check_blurred_maps(config: FitConfig) -> None:
+    """InputError for maps that don't halve whole where a lobe may blur them: of rough mirrors and of the split sum."""
+    environment, material = config.environment, config.material
+    exact = environment.range == "ldr" and config.model != "surfels"
+    rough, soft = exact and material.roughness == "auto", exact and "auto" in (material.roughness, material.blur)
+    for option, resolution, blurred in (
+        ("--config.environment.resolution", environment.resolution, config.surfels.shading in SPLIT_SUM),
+        ("--config.environment.solve-resolution", environment.solve_resolution, rough),
+        ("--set material.judged_resolution", material.judged_resolution, soft),
+    ):
+        if blurred and not halves_whole(resolution):
+            raise InputError(
+                expected=f"{option}: texels that are halved until they are {COARSEST} or fewer, where maps are blurred",
+                found=str(resolution),
+                remedy="Take 64, 96, 128 or another such number.",
+            )
 
 
 def can_be_exposed(config: FitConfig) -> bool:

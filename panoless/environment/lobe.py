@@ -22,12 +22,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from panoless.environment.options import COARSEST, halves_whole
 from panoless.kernels.cubemap import cubemap_directions, cubemap_solid_angles, sample_cubemap, scatter_cubemap
 
 WIDTHS_RAD = tuple(0.005 * 2.0**level for level in range(9))
 """Standard deviations of the blurs. Their sum meets lobes of any α up to 0.25 to 1 % of the light within any angle."""
-COARSEST = 4
-"""Texels along a face side on which the widest blur works."""
 TEXELS_PER_WIDTH = 0.88
 """A blur works on the coarsest map whose mean texels are no wider than its standard deviation over this."""
 CUT = 3.0
@@ -134,8 +133,8 @@ class Lobe:
 
     @classmethod
     def of(cls, roughness: float | None, resolution: int) -> "Lobe":
-        """Of a roughness in (0, 0.5] and maps with so many texels along a face side, four times a power of two or
-        fewer than 8; None is a smooth mirror, whose lobe is a point.
+        """Of a roughness in (0, 0.5] and maps with so many texels along a face side, which `halves_whole`; None is a
+        smooth mirror, whose lobe is a point.
         """
         if roughness is None:
             return cls((_Blur(resolution, resolution, None),), (1.0,))
@@ -223,6 +222,7 @@ def _blur(width_rad: float, resolution: int) -> _Blur:
     from scipy import sparse
     from scipy.spatial import cKDTree
 
+    assert halves_whole(resolution), "blurs work on halves, quarters and so on of the texels"
     coarse = resolution
     while coarse > COARSEST and width_rad > TEXELS_PER_WIDTH * _texel_rad(coarse // 2):
         coarse //= 2

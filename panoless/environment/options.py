@@ -7,6 +7,16 @@ from msgspec import Meta
 
 from shinypartial.io.records import Count, NonEmpty, NonNegative, Positive
 
+COARSEST = 4
+"""Texels along a face side on which the widest blur of a lobe works."""
+
+
+def halves_whole(resolution: int) -> bool:
+    """Whether a map of so many texels along a face side is halved without a rest until it is as coarse as blurs ask."""
+    while resolution > COARSEST and resolution % 2 == 0:
+        resolution //= 2
+    return resolution <= COARSEST
+
 
 @dataclass(frozen=True)
 class LampOptions:

@@ -40,7 +40,7 @@ class Prefiltered:
 
 
 def prefiltered(environment: Float[Tensor, "6 3 L L"]) -> Prefiltered:
-    """A map of radiance, blurred; L is 4 times a power of two or below 8. Gradient: to the map."""
+    """A map of radiance, blurred; L `halves_whole`. Gradient: to the map."""
     lobes = _lobes(environment.shape[-1])
     return Prefiltered(lobes.pyramid(environment), torch.from_numpy(lobes.weights).to(environment))
 

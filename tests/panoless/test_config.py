@@ -117,6 +117,25 @@ def test_a_map_of_mirrors_is_not_solved_for_other_shading() -> None:
         check_config(with_value(PRESETS["default"], "surfels.shading", "3dgs-dr"))
 
 
+@pytest.mark.parametrize(
+    ("preset", "name"),
+    [
+        ("default", "environment.solve_resolution"),
+        ("default", "material.judged_resolution"),
+        ("gaussian-shader", "environment.resolution"),
+        ("material-refgs", "environment.resolution"),
+        ("ref-gaussian", "environment.resolution"),
+    ],
+)
+def test_maps_that_are_blurred_halve_whole(preset: str, name: str) -> None:
+    """100 texels halve to 25, and 5 to no whole number; 96 halve to 3. What is not blurred has any size."""
+    check_config(with_value(PRESETS[preset], name, 96))
+    for texels in (5, 100):
+        with pytest.raises(InputError, match=name.rpartition(".")[2].replace("_", "[_-]")):
+            check_config(with_value(PRESETS[preset], name, texels))
+    check_config(with_value(PRESETS["paper"], name, 100))
+
+
 @pytest.mark.parametrize(("name", "value"), [("loss.lambda_distortion", 1000.0), ("crop_margin_px", -1), ("seed", -5)])
 def test_unusual_values_are_allowed(name: str, value: float) -> None:
     check_config(with_value(PRESETS["default"], name, value))

@@ -9,10 +9,10 @@ from panoless.environment.lobe import Lobe, Lobes, _torch_matrix, lobe_weights
 from panoless.kernels.cubemap import cubemap_directions
 
 
-@pytest.mark.parametrize("roughness", [None, 0.1, 0.35])
-def test_gathering_is_the_adjoint_of_blurring(roughness: float | None) -> None:
-    lobe, generator = Lobe.of(roughness, 32), torch.Generator().manual_seed(1)
-    first, second = (torch.rand(6, 2, 32, 32, generator=generator) for _ in range(2))
+@pytest.mark.parametrize(("roughness", "texels"), [(None, 32), (0.1, 32), (0.35, 32), (0.35, 24)])
+def test_gathering_is_the_adjoint_of_blurring(roughness: float | None, texels: int) -> None:
+    lobe, generator = Lobe.of(roughness, texels), torch.Generator().manual_seed(1)
+    first, second = (torch.rand(6, 2, texels, texels, generator=generator) for _ in range(2))
     blurred, gathered = (lobe.blurred(first) * second).double(), (first * lobe.gathered(second)).double()
     assert float(blurred.sum()) == pytest.approx(float(gathered.sum()), rel=1e-5)
 
