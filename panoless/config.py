@@ -194,7 +194,7 @@ class FitConfig:
     """Name of the preset that the values started from."""
     iterations: Count = 1000
     """Number of optimization steps (one view each)."""
-    seed: int = 0
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     """Seed of the initial surfels and of the order of views."""
     model: Annotated[Model, tyro.conf.arg(prefix_name=False)] = "auto"
     """`auto`: the simplest that explains held-out views; `sphere`: center and radius; `plane`: three numbers and a

@@ -105,6 +105,8 @@ def test_presets_are_in_range(preset: str) -> None:
         ("loss.robust_scale", -0.1),
         ("rates.square_memory", 1.0),
         ("environment.rays", 7),
+        ("seed", -1),
+        ("seed", 2**63),
     ],
 )
 def test_a_value_out_of_range_is_named_as_the_command_line_names_it(name: str, value: float) -> None:
@@ -136,7 +138,7 @@ def test_maps_that_are_blurred_halve_whole(preset: str, name: str) -> None:
     check_config(with_value(PRESETS["paper"], name, 100))
 
 
-@pytest.mark.parametrize(("name", "value"), [("loss.lambda_distortion", 1000.0), ("crop_margin_px", -1), ("seed", -5)])
+@pytest.mark.parametrize(("name", "value"), [("loss.lambda_distortion", 1000.0), ("crop_margin_px", -1), ("seed", 2**63 - 1)])
 def test_unusual_values_are_allowed(name: str, value: float) -> None:
     check_config(with_value(PRESETS["default"], name, value))
 
