@@ -75,6 +75,14 @@ def write_derived(
 
 def licenses_of(source: Dataset) -> list[dict[str, str]]:
     """A row for each asset of a dataset, also of one that states none."""
-    if (source.root / LICENSES).exists():
-        return read_json(source.root / LICENSES, "the licenses")  # type: ignore[no-any-return]
+    path = source.root / LICENSES
+    if path.exists():
+        rows = read_json(path, "the licenses")
+        if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+            raise InputError(
+                expected=f"a list with a row for each asset in {path}",
+                found="something else",
+                remedy="Restore the file, or delete it: the copy then says that its license is that of the source.",
+            )
+        return rows
     return [{"asset": "images", "license": "that of the source", "source": f"dataset {source.name}"}]

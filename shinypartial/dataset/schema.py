@@ -129,25 +129,39 @@ class Dataset:
         return self.root.resolve().name
 
     @property
+    def recipe(self) -> dict[str, Any]:
+        """What determines the content, by the manifest; empty where it states nothing."""
+        return self._table("recipe")
+
+    @property
+    def statistics(self) -> dict[str, Any]:
+        """What the manifest states of the content; empty where it states nothing."""
+        return self._table("statistics")
+
+    def _table(self, key: str) -> dict[str, Any]:
+        stated = self.manifest.get(key)
+        return stated if isinstance(stated, dict) else {}
+
+    @property
     def scene_split(self) -> str:
         """`development` or `held-out`, as the recipe of the scene declares it; `unknown` where nothing does."""
-        recipe = self.manifest.get("recipe")
-        return str(recipe.get("split", "unknown")) if isinstance(recipe, dict) else "unknown"
+        return str(self.recipe.get("split", "unknown"))
 
     @property
     def object_radius(self) -> float | None:
         """Distance from the origin that the object does not exceed; None where the manifest doesn't state it."""
-        statistics = self.manifest.get("statistics")
-        radius = statistics.get("object_radius") if isinstance(statistics, dict) else None
+        radius = self.statistics.get("object_radius")
         return float(radius) if isinstance(radius, int | float) and 0 < radius < math.inf else None
 
     @property
     def board_corner(self) -> tuple[float, float, float] | None:
         """Where the world of the scene's board has its origin; its axes are parallel. None where there is no board."""
-        statistics = self.manifest.get("statistics")
-        corner = statistics.get("board_corner") if isinstance(statistics, dict) else None
-        numbers = corner if isinstance(corner, list) and len(corner) == 3 else None
-        return (float(numbers[0]), float(numbers[1]), float(numbers[2])) if numbers else None
+        corner = self.statistics.get("board_corner")
+        if not isinstance(corner, list) or len(corner) != 3:
+            return None
+        if not all(isinstance(each, int | float) and math.isfinite(each) for each in corner):
+            return None
+        return float(corner[0]), float(corner[1]), float(corner[2])
 
     def split(self, split: str) -> tuple[Frame, ...]:
         """Frames of `train` or `test`."""

@@ -32,7 +32,7 @@ from shinypartial.dataset.schema import (
     Frame,
     View,
 )
-from shinypartial.io.files import PARTIAL_PREFIX, read_json, sha256_of, write_json, write_text
+from shinypartial.io.files import PARTIAL_PREFIX, read_table, sha256_of, write_json, write_text
 from shinypartial.io.images import read_exr_rgb, write_exr, write_exr_rgb, write_png
 
 
@@ -51,13 +51,10 @@ def claim_folder(root: Path, recipe: dict[str, Any], generator: dict[str, Any], 
     """
     manifest_path = root / MANIFEST
     if manifest_path.exists():
-        manifest = read_json(manifest_path, "the manifest")
-        if manifest.get("recipe") != recipe:
-            different = sorted(
-                key
-                for key in {*recipe, *manifest.get("recipe", {})}
-                if recipe.get(key) != manifest.get("recipe", {}).get(key)
-            )
+        begun = read_table(manifest_path, "the manifest").get("recipe")
+        if begun != recipe:
+            known = begun if isinstance(begun, dict) else {}
+            different = sorted(key for key in {*recipe, *known} if recipe.get(key) != known.get(key))
             raise InputError(
                 expected=f"an output folder that is new or belongs to the same recipe, at {root}",
                 found=f"a dataset of another recipe (different: {', '.join(different)})",
@@ -210,7 +207,7 @@ def latlong_to_y_up(latlong: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H
 def complete_dataset(root: Path, licenses: list[dict[str, str]], statistics: dict[str, Any]) -> None:
     """Write licenses, mark the manifest complete and list every file's SHA-256."""
     write_json(root / LICENSES, licenses)
-    manifest = read_json(root / MANIFEST, "the manifest")
+    manifest = read_table(root / MANIFEST, "the manifest")
     write_json(root / MANIFEST, {**manifest, "complete": True, "statistics": statistics})
     files = sorted(path for path in root.rglob("*") if path.is_file() and path.name != CHECKSUMS)
     lines = [f"{sha256_of(path)}  {path.relative_to(root).as_posix()}" for path in files]

@@ -40,7 +40,7 @@ from shinypartial.dataset.write import (
     write_transforms,
     write_view,
 )
-from shinypartial.io.files import folder_lock, read_json, remove_partial_files
+from shinypartial.io.files import folder_lock, read_table, remove_partial_files
 from shinypartial.io.images import read_exr_rgb
 from shinypartial.io.progress import Progress
 from shinypartial.release.contact_sheet import write_contact_sheet
@@ -127,8 +127,7 @@ def _generator() -> dict[str, Any]:
 
 def _as_begun(root: Path, recipe: dict[str, Any]) -> dict[str, Any]:
     """The recipe in the words of the version that began the folder, where they mean the same scene."""
-    manifest = read_json(root / MANIFEST, "the manifest") if (root / MANIFEST).exists() else None
-    begun = manifest.get("recipe") if isinstance(manifest, dict) else None
+    begun = read_table(root / MANIFEST, "the manifest").get("recipe") if (root / MANIFEST).exists() else None
     if not isinstance(begun, dict) or begun.get("split", recipe["split"]) != recipe["split"]:
         return recipe
     return begun if older_recipe(begun) == older_recipe(recipe) else recipe

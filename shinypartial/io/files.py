@@ -153,6 +153,18 @@ def read_json(path: Path, what: str) -> Any:
         ) from None
 
 
+def read_table(path: Path, what: str) -> dict[str, Any]:
+    """Read a JSON file that holds a table; raises InputError, as `read_json` does, also for anything else in it."""
+    content = read_json(path, what)
+    if not isinstance(content, dict):
+        raise InputError(
+            expected=f"{what} in {path} to be a table",
+            found="something else",
+            remedy="Restore the file, or make the folder again.",
+        )
+    return content
+
+
 def sha256_of(path: Path) -> str:
     """SHA-256 of a file's bytes, as lower-case hexadecimal."""
     with path.open("rb") as stream:

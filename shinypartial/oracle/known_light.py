@@ -142,12 +142,12 @@ def find_light(
     jobs.append(Job(tuple(root / each for each in ENVIRONMENT_FILES), lambda: write_environment(root, world)))
     recipe = {
         "hemisphere_axis": None,
-        **dataset.manifest.get("recipe", {}),
+        **dataset.recipe,
         "lit_copy_of": {"name": dataset.name, **{path.name: sha256_of(path) for path in transforms}},
         "light": {"name": match.name, "sha256": sha256_of(worlds[match.name]), "strength": strength},
     }
     asset = {"asset": f"environment {match.name}", "license": "that of the map", "source": worlds[match.name].name}
-    statistics = {**dataset.manifest.get("statistics", {}), "lights_tried": [asdict(each) for each in matches]}
+    statistics = {**dataset.statistics, "lights_tried": [asdict(each) for each in matches]}
     write_derived(root, [*licenses_of(dataset), asset], recipe, jobs, "Copying", lambda: statistics)
     return LitDataset(root, match, tuple(each for each in matches if each is not match))
 

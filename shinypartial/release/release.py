@@ -23,7 +23,7 @@ from shinypartial.dataset.violations import Violation
 from shinypartial.io.files import (
     PARTIAL_PREFIX,
     atomic_write,
-    read_json,
+    read_table,
     remove_partial_files,
     sha256_of,
     write_json,
@@ -111,7 +111,8 @@ def is_release(root: Path) -> bool:
 
 def recorded_date(root: Path) -> str | None:
     """The date of the release that was begun in a folder, so that finishing it on another day changes nothing."""
-    return read_json(root / RELEASE, "the release").get("date") if is_release(root) else None
+    date = read_table(root / RELEASE, "the release").get("date") if is_release(root) else None
+    return date if isinstance(date, str) else None
 
 
 def validate_release(root: Path, progress: bool = False) -> list[Violation]:
@@ -180,7 +181,7 @@ def _claim(output: Path, publication: Publication, archive_suffix: str, sources:
         "datasets": [{"name": source.dataset.name, "sha256": source.files[-1].sha256} for source in sources],
     }
     if is_release(output):
-        earlier = read_json(output / RELEASE, "the release")
+        earlier = read_table(output / RELEASE, "the release")
         different = [key for key, value in content.items() if earlier.get(key) != value]
         if different:
             raise InputError(

@@ -121,6 +121,19 @@ def test_the_test_split_may_be_missing(damaged_dataset: Path) -> None:
     assert open_dataset(damaged_dataset).test == ()
 
 
+@pytest.mark.parametrize("corner", [[None, 0, 0], [0, 0], ["1", "2", "3"], [float("nan"), 0, 0], 3, {}])
+def test_a_corner_that_is_no_place_is_unknown(tmp_path: Path, corner: object) -> None:
+    assert Dataset(tmp_path, {"statistics": {"board_corner": [1, 2.5, 0]}}, (), ()).board_corner == (1.0, 2.5, 0.0)
+    assert Dataset(tmp_path, {"statistics": {"board_corner": corner}}, (), ()).board_corner is None
+
+
+@pytest.mark.parametrize("stated", [None, [], "text"])
+def test_a_manifest_whose_tables_are_none_states_nothing(tmp_path: Path, stated: object) -> None:
+    dataset = Dataset(tmp_path, {"recipe": stated, "statistics": stated}, (), ())
+    assert dataset.recipe == dataset.statistics == {}
+    assert (dataset.scene_split, dataset.object_radius) == ("unknown", None)
+
+
 def test_the_newest_dataset_is_found(tmp_path: Path, sphere_dataset: Dataset) -> None:
     with pytest.raises(InputError, match="shinypartial generate"):
         newest_dataset(tmp_path)

@@ -16,7 +16,7 @@ from shinypartial.core.errors import InputError
 from shinypartial.dataset import derived
 from shinypartial.dataset.camera_plot import CAMERA_PLOT
 from shinypartial.dataset.read import open_dataset, read_view
-from shinypartial.dataset.schema import CHECKSUMS, MANIFEST, SPLITS, Dataset
+from shinypartial.dataset.schema import CHECKSUMS, LICENSES, MANIFEST, SPLITS, Dataset
 from shinypartial.dataset.subset import SubsetOptions, make_subset, select, train_count
 from shinypartial.io.files import PARTIAL_PREFIX, read_json, sha256_of, write_json
 from tests.support.shiny_blender import make_shiny_blender_dataset
@@ -207,6 +207,14 @@ def test_a_missing_image_is_refused_before_anything_is_written(copied: Path, tmp
     name = select(open_dataset(copied), SubsetOptions()).train[3].name
     (copied / f"{name}.png").unlink()
     with pytest.raises(InputError, match="no such file"):
+        make_subset(copied, tmp_path / "partial", SubsetOptions())
+    assert not (tmp_path / "partial").exists()
+
+
+@pytest.mark.parametrize("licenses", [{"license": "CC0-1.0"}, ["CC0-1.0"], None])
+def test_licenses_that_are_no_rows_are_refused(copied: Path, tmp_path: Path, licenses: object) -> None:
+    write_json(copied / LICENSES, licenses)
+    with pytest.raises(InputError, match="a row for each asset"):
         make_subset(copied, tmp_path / "partial", SubsetOptions())
     assert not (tmp_path / "partial").exists()
 

@@ -15,6 +15,7 @@ from shinypartial.dataset.schema import (
     ENVIRONMENT_CUBE,
     ENVIRONMENT_LATLONG,
     ENVIRONMENT_LATLONG_Y_UP,
+    MANIFEST,
     Dataset,
 )
 from shinypartial.dataset.transforms import read_frames
@@ -110,6 +111,14 @@ def test_another_recipe_is_refused_with_what_differs(tmp_path: Path) -> None:
     claim_folder(tmp_path, RECIPE, {})
     with pytest.raises(InputError, match=r"different: seed, suns\)"):
         claim_folder(tmp_path, {"scene": "vase", "seed": 2, "suns": 3}, {})
+
+
+@pytest.mark.parametrize("manifest", ["[]", "null", "{}", '{"recipe": null}', '{"recipe": ["vase"]}'])
+def test_a_manifest_without_a_recipe_is_of_another_one(tmp_path: Path, manifest: str) -> None:
+    (tmp_path / MANIFEST).write_text(manifest)
+    with pytest.raises(InputError, match=r"a table|different: scene, seed\)"):
+        claim_folder(tmp_path, RECIPE, {})
+    assert (tmp_path / MANIFEST).read_text() == manifest
 
 
 def test_foreign_files_are_not_written_over(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from shinypartial.io.files import (
     link_or_copy,
     newest_folder,
     read_json,
+    read_table,
     sha256_of,
     write_json,
     write_text,
@@ -188,6 +189,15 @@ def test_broken_json_is_an_input_error(tmp_path: Path, content: bytes) -> None:
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"the cameras in .*transforms_train\.json to be JSON"):
         read_json(path, "the cameras")
+
+
+@pytest.mark.parametrize("content", [[], None, 3, "text"])
+def test_a_table_is_no_other_json(tmp_path: Path, content: object) -> None:
+    write_json(tmp_path / "a.json", {"a": content})
+    assert read_table(tmp_path / "a.json", "a file") == {"a": content}
+    write_json(tmp_path / "a.json", content)
+    with pytest.raises(InputError, match=r"a file in .*a\.json to be a table"):
+        read_table(tmp_path / "a.json", "a file")
 
 
 def test_missing_json_is_an_input_error(tmp_path: Path) -> None:

@@ -244,6 +244,16 @@ def test_a_folder_of_something_else_is_refused(datasets: tuple[Path, ...], copy:
     assert (other / "README.md").read_text() == "mine"
 
 
+@pytest.mark.parametrize("content", ["[]", "null", '{"date": 3}'])
+def test_a_damaged_claim_is_told(
+    datasets: tuple[Path, ...], tmp_path: Path, content: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "release.json").write_text(content)
+    assert main(["release", str(datasets[0]), "--output", str(tmp_path)]) == 2
+    assert str(tmp_path) in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["release.json"]
+
+
 def test_bad_datasets_and_places_are_refused(damaged_dataset: Path, datasets: tuple[Path, ...], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="lies in it"):
         release(datasets, datasets[0] / "release", PUBLICATION)
