@@ -1,4 +1,7 @@
-"""Ground truth turned with the world: normals and the environment. Cameras are turned where they are planned."""
+"""Ground truth turned with the world: normals, the environment and how far it is.
+
+Cameras are turned where they are planned.
+"""
 
 from pathlib import Path
 
@@ -6,16 +9,22 @@ import numpy as np
 from jaxtyping import Float
 
 from shinypartial.core.sphere import latlong_directions, sample_latlong
-from shinypartial.dataset.schema import ENVIRONMENT_CUBE, ENVIRONMENT_LATLONG, NORMAL_CHANNELS
-from shinypartial.dataset.write import encode_normals, write_environment
+from shinypartial.dataset.read import read_inverse_distance_map
+from shinypartial.dataset.schema import (
+    ENVIRONMENT_CUBE,
+    ENVIRONMENT_INVERSE_DISTANCE,
+    ENVIRONMENT_LATLONG,
+    NORMAL_CHANNELS,
+)
+from shinypartial.dataset.write import encode_normals, write_environment, write_inverse_distance
 from shinypartial.io.files import read_json, write_json
 from shinypartial.io.images import EXR, read_exr, read_exr_rgb, read_png, write_exr, write_png
 
 Turn = Float[np.ndarray, "3 3"]
 
 
-def turned_latlong(latlong: Float[np.ndarray, "H W 3"], turn: Turn) -> Float[np.ndarray, "H W 3"]:
-    """The map whose radiance from T d is that of the given map from d."""
+def turned_latlong(latlong: Float[np.ndarray, "H W C"], turn: Turn) -> Float[np.ndarray, "H W C"]:
+    """The map whose values at T d are those of the given map at d."""
     return sample_latlong(latlong, latlong_directions(latlong.shape[0]) @ turn).astype(latlong.dtype)
 
 
@@ -24,6 +33,12 @@ def write_turned_environment(source: Path, root: Path, turn: Turn) -> None:
     faces = sorted((source / ENVIRONMENT_CUBE).glob("*.exr"))
     resolution = {"cube_resolution": len(read_exr_rgb(faces[0]))} if faces else {}
     write_environment(root, turned_latlong(read_exr_rgb(source / ENVIRONMENT_LATLONG), turn), **resolution)
+
+
+def write_turned_inverse_distance(source: Path, root: Path, turn: Turn) -> None:
+    """How far the surroundings of a dataset are, turned about the origin."""
+    inverse = read_inverse_distance_map(source / ENVIRONMENT_INVERSE_DISTANCE)
+    write_inverse_distance(root, turned_latlong(inverse[..., None], turn)[..., 0])
 
 
 def write_turned_normals(old: Path, new: Path, turn: Turn) -> None:

@@ -20,9 +20,15 @@ from shinypartial.dataset.derived import Job, licenses_of, open_source, write_de
 from shinypartial.dataset.perturb import picture as pictures
 from shinypartial.dataset.perturb.options import Perturbation, changed_options
 from shinypartial.dataset.perturb.plan import Plan, PlannedView, generator, make_plan
-from shinypartial.dataset.perturb.turned import write_turned_environment, write_turned_normals, write_turned_transforms
+from shinypartial.dataset.perturb.turned import (
+    write_turned_environment,
+    write_turned_inverse_distance,
+    write_turned_normals,
+    write_turned_transforms,
+)
 from shinypartial.dataset.schema import (
     CHECKSUMS,
+    ENVIRONMENT_INVERSE_DISTANCE,
     ENVIRONMENT_LATLONG,
     Dataset,
     Frame,
@@ -122,6 +128,9 @@ def _jobs(copy: _Copy) -> Iterator[Job]:
         yield Job((copy.root / TEST,), partial(write_turned_transforms, source / TEST, copy.root / TEST, plan.turn))
     if (source / ENVIRONMENT_LATLONG).exists():
         yield Job(environment_files(copy.root), partial(write_turned_environment, source, copy.root, plan.turn))
+    if (source / ENVIRONMENT_INVERSE_DISTANCE).exists():
+        far = copy.root / ENVIRONMENT_INVERSE_DISTANCE
+        yield Job((far,), partial(write_turned_inverse_distance, source, copy.root, plan.turn))
 
 
 def _suffix(frame: Frame, options: Perturbation) -> str:
@@ -221,8 +230,12 @@ def _recipe(dataset: Dataset, options: Perturbation) -> dict[str, Any]:
 
 
 def _statistics(plan: Plan, dataset: Dataset) -> dict[str, Any]:
-    """Counts, what was drawn for each training view, and which ones were left out."""
+    """Counts, what was drawn for each training view, which ones were left out, and what scores need of the source.
+
+    A world that is turned is no longer parallel to that of its board, whose place is then left out.
+    """
     kept = {view.index for view in plan.views}
+    radius, corner = dataset.object_radius, dataset.board_corner if plan.turn is None else None
     return {
         "train": len(plan.views),
         "test": len(dataset.test),
@@ -230,4 +243,6 @@ def _statistics(plan: Plan, dataset: Dataset) -> dict[str, Any]:
         "drawn": {view.source.name: view.drawn for view in plan.views if view.drawn},
         **({} if plan.turn is None else {"world_turn": plan.turn.tolist()}),
         **({"crop_px": plan.crop_px} if plan.crop_px else {}),
+        **({} if radius is None else {"object_radius": radius}),
+        **({} if corner is None else {"board_corner": list(corner)}),
     }

@@ -15,14 +15,15 @@ from shinypartial.core.errors import InputError
 from shinypartial.dataset.perturb import worse_copy
 from shinypartial.dataset.perturb.options import CameraErrors, MaskErrors, Perturbation, SensorErrors, ViewChoice, World
 from shinypartial.dataset.perturb.worse_copy import perturb
-from shinypartial.dataset.read import open_dataset, read_view
+from shinypartial.dataset.read import open_dataset, read_inverse_distance, read_view
 from shinypartial.dataset.schema import CHECKSUMS, LICENSES, MANIFEST, Dataset
 from shinypartial.dataset.validate import validate
+from shinypartial.dataset.write import write_inverse_distance
 from shinypartial.evaluation.evaluate import evaluate
 from shinypartial.io.files import read_json, sha256_of, write_json
 from shinypartial.io.images import write_png
 from tests.support.shiny_blender import make_shiny_blender_dataset
-from tests.support.synthetic_dataset import make_sphere_dataset
+from tests.support.synthetic_dataset import MAP_HEIGHT, make_sphere_dataset
 from tests.support.truth_prediction import write_truth_prediction
 
 EVERYTHING = Perturbation(
@@ -202,6 +203,27 @@ def test_copies_validate(source: Dataset, tmp_path: Path, options: Perturbation)
     assert [each for each in validate(tmp_path / "copy") if not each.warning] == []
     next((tmp_path / "copy/train").glob("r_*[0-9].*")).write_bytes(b"damaged")
     assert [each for each in validate(tmp_path / "copy") if not each.warning]
+
+
+@pytest.mark.parametrize("turn_deg", [(0.0, 0.0, 0.0), (0.0, 0.0, 90.0)], ids=["upright", "turned"])
+def test_near_surroundings_keep_their_distance(
+    damaged_dataset: Path, tmp_path: Path, turn_deg: tuple[float, float, float]
+) -> None:
+    """A quarter turn about +Z moves a map by a quarter of its columns, texel on texel."""
+    inverse = (np.arange(2 * MAP_HEIGHT) / 100 + np.ones((MAP_HEIGHT, 1))).astype(np.float32)
+    write_inverse_distance(damaged_dataset, inverse)
+    manifest = read_json(damaged_dataset / MANIFEST, "the manifest")
+    statistics = {"object_radius": 1.25, "board_corner": [0.5, 0.0, -1.0]}
+    write_json(damaged_dataset / MANIFEST, manifest | {"statistics": statistics})
+    copy = perturb(damaged_dataset, tmp_path / "copy", Perturbation(world=World(turn_deg))).root
+    assert [each for each in validate(copy) if not each.warning] == []
+    dataset, turned = open_dataset(copy), any(turn_deg)
+    assert dataset.object_radius == 1.25
+    assert dataset.board_corner == (None if turned else (0.5, 0.0, -1.0))
+    found = read_inverse_distance(dataset)
+    assert found is not None
+    # Counterclockwise from above is to the left on the map.
+    np.testing.assert_allclose(found, np.roll(inverse, -MAP_HEIGHT // 2 if turned else 0, axis=1), atol=1e-5)
 
 
 def test_truth_scores_as_before(tmp_path: Path) -> None:
