@@ -13,7 +13,7 @@ from shinypartial import __version__
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import open_dataset
 from shinypartial.dataset.schema import CHECKSUMS, LICENSES, Dataset
-from shinypartial.dataset.write import claim_folder, complete_dataset
+from shinypartial.dataset.write import claim_folder, complete_dataset, is_complete
 from shinypartial.io.files import copy_or_link, folder_lock, read_json, remove_partial_files
 from shinypartial.io.progress import Progress
 
@@ -61,7 +61,7 @@ def write_derived(
     with folder_lock(root):
         claim_folder(root, recipe, {"shinypartial": __version__})
         missing = [job for job in every if not job.done]
-        if (root / CHECKSUMS).exists() and not missing:
+        if is_complete(root) and not missing:
             return 0
         (root / CHECKSUMS).unlink(missing_ok=True)
         remove_partial_files(root)

@@ -204,6 +204,15 @@ def latlong_to_y_up(latlong: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H
     return sample_latlong(latlong, np.stack([left, -forward, up], -1)).astype(latlong.dtype)
 
 
+def is_complete(root: Path) -> bool:
+    """Whether the dataset was completed and every file that its list of checksums names is still there."""
+    listing = root / CHECKSUMS
+    if not listing.is_file():
+        return False
+    lines = listing.read_text(encoding="utf-8", errors="replace").removesuffix("\n").split("\n")
+    return all((root / line.partition("  ")[2]).is_file() for line in lines)
+
+
 def complete_dataset(root: Path, licenses: list[dict[str, str]], statistics: dict[str, Any]) -> None:
     """Write licenses, mark the manifest complete and list every file's SHA-256."""
     write_json(root / LICENSES, licenses)

@@ -23,7 +23,6 @@ from shinypartial.dataset.schema import (
     CHECKSUMS,
     ENVIRONMENT_INVERSE_DISTANCE,
     ENVIRONMENT_LATLONG,
-    ENVIRONMENT_LATLONG_Y_UP,
     FORMAT_MINOR,
     MANIFEST,
     SPLITS,
@@ -33,6 +32,8 @@ from shinypartial.dataset.schema import (
 from shinypartial.dataset.write import (
     claim_folder,
     complete_dataset,
+    environment_files,
+    is_complete,
     is_rendered,
     make_frames,
     write_environment,
@@ -134,8 +135,12 @@ def _as_begun(root: Path, recipe: dict[str, Any]) -> dict[str, Any]:
 
 
 def _is_complete(root: Path, frames: Sequence[Frame]) -> bool:
-    """The checksum list is written last of all; a frame that was deleted since is made again."""
-    return (root / CHECKSUMS).exists() and all(map(is_rendered, frames))
+    """Whether nothing is left to make; a file that was deleted since is made again."""
+    return is_complete(root) and _has_environment(root) and all(map(is_rendered, frames))
+
+
+def _has_environment(root: Path) -> bool:
+    return all(path.exists() for path in environment_files(root))
 
 
 def render_frames(
@@ -186,10 +191,10 @@ def _closing(make: Callable[[WorkerPool, Frame], None], pool: WorkerPool, frame:
 
 
 def _write_ground_truth(spec: SceneSpec, root: Path) -> None:
-    """The environment, whose last file stands for all, and how far its room is, unless an earlier run wrote them."""
+    """The environment and how far its room is, unless an earlier run wrote them."""
     from shinypartial.blender.assemble import world_radiance
 
-    if not (root / ENVIRONMENT_LATLONG_Y_UP).exists():
+    if not _has_environment(root):
         write_environment(root, _environment(spec, world_radiance(spec.world, spec.render.exposure)))
     if (spec.room or spec.ground) and not (root / ENVIRONMENT_INVERSE_DISTANCE).exists():
         height = read_exr_rgb(root / ENVIRONMENT_LATLONG).shape[0]

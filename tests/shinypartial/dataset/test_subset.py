@@ -253,6 +253,16 @@ def test_a_finished_subset_is_left_alone_and_a_deleted_file_is_copied_again(sour
     assert (root / CHECKSUMS).read_text() == checksums
 
 
+@pytest.mark.parametrize("name", ["transforms_train.json", CAMERA_PLOT, LICENSES])
+def test_a_deleted_file_that_is_no_copy_is_made_again(source: Dataset, tmp_path: Path, name: str) -> None:
+    root = make_subset(source.root, tmp_path / "partial", SubsetOptions()).root
+    checksums = (root / CHECKSUMS).read_text()
+    (root / name).unlink()
+    make_subset(source.root, root, SubsetOptions())
+    assert (root / name).exists()
+    assert (root / CHECKSUMS).read_text() == checksums
+
+
 @pytest.mark.parametrize("link", [False, True])
 def test_a_run_that_was_stopped_continues(
     source: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, link: bool

@@ -17,7 +17,7 @@ from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import latlong_directions
 from shinypartial.dataset.camera_plot import CAMERA_PLOT
 from shinypartial.dataset.read import open_dataset, read_environment, read_inverse_distance, read_view
-from shinypartial.dataset.schema import CHECKSUMS, CONTACT_SHEET, LICENSES, MANIFEST
+from shinypartial.dataset.schema import CHECKSUMS, CONTACT_SHEET, ENVIRONMENT_LATLONG, LICENSES, MANIFEST
 from shinypartial.dataset.validate import validate
 from shinypartial.generate.dataset import generate
 from shinypartial.io.files import PARTIAL_PREFIX
@@ -166,6 +166,16 @@ def test_a_deleted_frame_alone_is_made_again(made: Path, tmp_path: Path, spec: S
     changed = {name for name, when in modification_times(root).items() if before[name] != when}
     assert changed == {f"train/r_001{end}" for end in (".exr", ".png", "_alpha.png", "_normal.png", "_self.png")}
     assert [each for each in validate(root) if not each.warning] == []
+
+
+def test_deleted_files_are_made_again_and_nothing_is_rendered(made: Path, tmp_path: Path, spec: SceneSpec) -> None:
+    root = Path(shutil.copytree(made, tmp_path / "tiny"))
+    frames = modification_times(root)
+    for name in (ENVIRONMENT_LATLONG, "environment/cube/px.exr", "transforms_test.json", CAMERA_PLOT, LICENSES):
+        (root / name).unlink()
+    assert generate(spec, root).rendered == 0
+    assert modification_times(root) == frames
+    assert (root / CHECKSUMS).read_bytes() == (made / CHECKSUMS).read_bytes()
 
 
 @pytest.mark.skipif(os.name != "posix", reason="SIGKILL is a POSIX signal.")
