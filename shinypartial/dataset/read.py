@@ -1,6 +1,5 @@
 """Open a dataset folder, ours or a plain NeRF-synthetic one, and read its views."""
 
-import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +27,7 @@ from shinypartial.dataset.schema import (
     View,
 )
 from shinypartial.dataset.transforms import read_frames
-from shinypartial.io.files import newest_folder, read_json, sha256_of
+from shinypartial.io.files import newest_folder, read_json, sha256_of_files
 from shinypartial.io.images import (
     EXR,
     read_exr,
@@ -188,11 +187,8 @@ def _view_of(frame: Frame, photograph: _Photograph) -> View:
 
 def photographs_hash(dataset: Dataset) -> str:
     """SHA-256 of the training cameras and of every file that training views are read from."""
-    digest = hashlib.sha256()
-    for path in (dataset.root / "transforms_train.json", *_training_files(dataset)):
-        if path.is_file():
-            digest.update(f"{path.name} {sha256_of(path)}\n".encode())
-    return digest.hexdigest()
+    files = (dataset.root / "transforms_train.json", *_training_files(dataset))
+    return sha256_of_files(path for path in files if path.is_file())
 
 
 def _training_files(dataset: Dataset) -> Iterator[Path]:

@@ -14,8 +14,9 @@ from shinypartial.conversion.layouts import AxisName, CaptureLayout
 from shinypartial.core.color import to_display
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.derived import Job, write_derived
-from shinypartial.dataset.schema import SPLITS, Frame
+from shinypartial.dataset.schema import MANIFEST, SPLITS, Frame
 from shinypartial.dataset.write import encode_normals, environment_files, write_environment, write_transforms
+from shinypartial.io.files import read_table, sha256_of_files
 from shinypartial.io.images import EXR, read_png, write_png
 
 
@@ -72,13 +73,23 @@ def import_capture(
     if found.environment is not None:
         light = found.environment
         jobs.append(Job(environment_files(output), lambda: write_environment(output, light())))
-    recipe = {
-        "import_of": {"layout": layout, "name": folder.resolve().name},
-        "map_axes": axes and list(map(list, axes)),
+    source = {
+        "layout": layout,
+        "name": folder.resolve().name,
+        "cameras": sha256_of_files(found.cameras),
+        "pictures": sorted({shot.picture.suffix for split in SPLITS for shot in views[split]}),
     }
+    recipe = _as_begun(output, {"import_of": source, "map_axes": axes and list(map(list, axes))})
     licenses = [{"asset": "images and ground truth", "license": "that of the source", "source": layout}]
     write_derived(output, licenses, recipe, jobs, "Importing", finish)
     return ImportedCapture(len(found.train), len(found.test), found.left_out)
+
+
+def _as_begun(output: Path, recipe: dict[str, Any]) -> dict[str, Any]:
+    """The recipe without what tells sources of one name apart, where the version that began the folder stated none."""
+    begun = read_table(output / MANIFEST, "the manifest").get("recipe") if (output / MANIFEST).exists() else None
+    earlier = recipe | {"import_of": {key: recipe["import_of"][key] for key in ("layout", "name")}}
+    return earlier if begun == earlier else recipe
 
 
 def _frame(output: Path, split: str, shot: Shot) -> Frame:

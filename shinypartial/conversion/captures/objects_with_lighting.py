@@ -33,23 +33,24 @@ def read_objects_with_lighting(folder: Path, axes: MapAxes | None) -> Found:
             found="none",
             remedy="Name the folder of an object that holds `inputs`.",
         )
-    shots = [_shot(inputs, number) for number in numbers]
+    cameras = tuple(inputs / f"camera_{number}.txt" for number in numbers)
+    shots = [_shot(inputs, number, path) for number, path in zip(numbers, cameras, strict=True)]
     train = tuple(shot for index, shot in enumerate(shots) if index % TEST_EVERY)
     left_out = ["normals: the layout has none"]
     turn = _map_rotation(inputs.parent)
     if turn is None:
         left_out.append(f"environment: neither {TURNED_MAP} nor {STORED_MAP} with {WORLD_TO_MAP} in {inputs.parent}")
-        return Found(train, tuple(shots[::TEST_EVERY]), None, tuple(left_out))
+        return Found(train, tuple(shots[::TEST_EVERY]), None, cameras, tuple(left_out))
     environment = partial(_environment, *turn, axes or MAP_AXES)
-    return Found(train, tuple(shots[::TEST_EVERY]), environment, tuple(left_out))
+    return Found(train, tuple(shots[::TEST_EVERY]), environment, cameras, tuple(left_out))
 
 
-def _shot(inputs: Path, number: str) -> Shot:
+def _shot(inputs: Path, number: str, camera: Path) -> Shot:
     picture, mask = (inputs / f"{kind}_{number}.png" for kind in ("image", "mask"))
     for path in (picture, mask):
         if not path.is_file():
             raise InputError(expected=f"a picture at {path}", found="no such file", remedy="Download the object again.")
-    return Shot(f"image_{number}", _camera(inputs / f"camera_{number}.txt"), picture, mask, GAMMA)
+    return Shot(f"image_{number}", _camera(camera), picture, mask, GAMMA)
 
 
 def _camera(path: Path) -> Camera:

@@ -17,7 +17,7 @@ from shinypartial.core.camera import ray_directions_world
 from shinypartial.core.conventions import OPENGL_OPENCV
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.plain import TOLERATED_SHARE
-from shinypartial.dataset.schema import Frame
+from shinypartial.dataset.schema import SPLITS, Frame
 from shinypartial.dataset.transforms import read_frames
 from shinypartial.io.images import EXR, read_exr_rgb
 
@@ -29,7 +29,7 @@ MAP_AXES: MapAxes = ((0, 0, -1), (1, 0, 0), (0, 1, 0))
 def read_stanford_orb(folder: Path, axes: MapAxes | None) -> Found:
     """Views of a capture, its light as the median over the maps of its test views, and normals of these views."""
     truth = folder.resolve().parent.parent / GROUND_TRUTH / folder.resolve().name
-    train, test = (_shots(folder, split) for split in ("train", "test"))
+    train, test = (_shots(folder, split) for split in SPLITS)
     left_out = []
     maps = [(shot, path) for shot in test if (path := truth / MAPS / f"{shot.name}{EXR}").is_file()]
     if not maps:
@@ -48,7 +48,8 @@ def read_stanford_orb(folder: Path, axes: MapAxes | None) -> Found:
                 for path, shot, rotation in zip(files, test, rotations, strict=True)
             )
     environment = partial(_environment, maps, axes or MAP_AXES) if maps else None
-    return Found(train, test, environment, tuple(left_out))
+    cameras = tuple(path for split in SPLITS if (path := folder / f"transforms_{split}.json").exists())
+    return Found(train, test, environment, cameras, tuple(left_out))
 
 
 def _shots(folder: Path, split: str) -> tuple[Shot, ...]:

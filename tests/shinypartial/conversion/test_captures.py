@@ -1,5 +1,6 @@
 """Folders of Stanford-ORB and Objects with Lighting, made of a traced sphere, come back in our frame and encoding."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from shinypartial.dataset.read import open_dataset, read_environment, read_view
 from shinypartial.dataset.schema import View
 from shinypartial.dataset.validate import unscored, validate
 from shinypartial.evaluation.evaluate import evaluate
-from shinypartial.io.files import write_json
+from shinypartial.io.files import read_json, sha256_of, write_json
 from shinypartial.io.images import write_exr, write_exr_rgb, write_hdr, write_png
 from tests.support.synthetic_dataset import FIELD_OF_VIEW_RAD, environment_radiance, render_sphere, sphere_cameras
 from tests.support.truth_prediction import write_truth_prediction
@@ -171,6 +172,45 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
     made = import_capture("stanford-orb", capture, tmp_path / "dataset")
     assert [reason.partition(":")[0] for reason in made.left_out] == ["environment", "normals"]
     assert not (tmp_path / "dataset/environment").exists()
+
+
+def as_pictures(capture: Path) -> None:
+    """What `blender_LDR` has: PNG in place of EXR."""
+    for path in capture.glob("*/*.exr"):
+        write_png(path.with_suffix(".png"), np.zeros((SIZE, SIZE, 3), np.uint8))
+        path.unlink()
+
+
+def turn_a_camera(capture: Path) -> None:
+    """The same pictures, taken elsewhere."""
+    content = read_json(capture / "transforms_train.json", "cameras")
+    content["frames"][0]["transform_matrix"] = np.eye(4).tolist()
+    write_json(capture / "transforms_train.json", content)
+
+
+@pytest.mark.parametrize("change", [as_pictures, turn_a_camera])
+def test_another_capture_of_the_same_name_is_refused(tmp_path: Path, change: Callable[[Path], None]) -> None:
+    capture, output = write_orb(tmp_path, NORMAL_AXES["world"]), tmp_path / "dataset"
+    other = Path(shutil.copytree(capture, tmp_path / "other" / capture.name))
+    change(other)
+    import_capture("stanford-orb", capture, output)
+    before = {path: sha256_of(path) for path in output.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match="different: import_of"):
+        import_capture("stanford-orb", other, output)
+    import_capture("stanford-orb", capture, output)
+    assert {path: sha256_of(path) for path in output.rglob("*") if path.is_file()} == before
+
+
+def test_an_import_goes_on_that_was_begun_before_sources_were_told_apart(tmp_path: Path) -> None:
+    capture, output = write_owl(tmp_path / "object"), tmp_path / "dataset"
+    import_capture("objects-with-lighting", capture, output)
+    manifest = read_json(output / "dataset.json", "the manifest")
+    for key in ("cameras", "pictures"):
+        del manifest["recipe"]["import_of"][key]
+    write_json(output / "dataset.json", manifest | {"complete": False})
+    (output / "train/image_0001.png").unlink()
+    import_capture("objects-with-lighting", capture, output)
+    assert validate(output) == []
 
 
 @pytest.mark.parametrize(
