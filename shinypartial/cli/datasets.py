@@ -71,6 +71,12 @@ class FindLight:
         from shinypartial.scene import STUDIO_LIGHTS
 
         known = {path.stem: path for path in self.worlds} or {name: studio_light(name) for name in STUDIO_LIGHTS}
+        if self.worlds and len(known) < len(self.worlds):
+            raise InputError(
+                expected="--worlds of different file names, by which maps are told apart",
+                found=", ".join(map(str, self.worlds)),
+                remedy="Rename files, or name each map once.",
+            )
         root = self.output or DEFAULT_FOLDER / f"{self.source.resolve().name}-lit"
         found = find_light(self.source, root, known, strength=self.strength, link=self.link)
         match = found.match

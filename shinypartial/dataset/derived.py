@@ -3,6 +3,7 @@
 A run that is killed continues when it is started again, and a folder that holds anything else is refused.
 """
 
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -43,6 +44,18 @@ def open_source(source: Path, root: Path) -> Dataset:
             expected=f"an output folder apart from the source {source}", found=str(root), remedy="Change --output."
         )
     return open_dataset(source)
+
+
+def place_of(path: Path, source: Dataset, root: Path) -> Path:
+    """Where a file of the source has its counterpart in the new folder; InputError for one that lies elsewhere."""
+    below = Path(os.path.relpath(path, source.root))
+    if ".." in below.parts:
+        raise InputError(
+            expected=f"all pictures of {source.root} within that folder",
+            found=str(path),
+            remedy="Move it there and correct the transforms.",
+        )
+    return root / below
 
 
 def write_derived(

@@ -25,7 +25,7 @@ from shinypartial.core.sphere import (
     sample_latlong,
 )
 from shinypartial.dataset.camera_plot import CAMERA_PLOT
-from shinypartial.dataset.derived import Job, licenses_of, open_source, write_derived
+from shinypartial.dataset.derived import Job, licenses_of, open_source, place_of, write_derived
 from shinypartial.dataset.perturb.turned import Turn, turned_latlong
 from shinypartial.dataset.read import read_view
 from shinypartial.dataset.schema import (
@@ -117,7 +117,7 @@ def find_light(
     """Copy a dataset to `root` with the map of `worlds` (name to linear 2:1 EXR) that lights it as its environment.
 
     The map is multiplied by `strength`, which photographs of anything but a mirror don't tell. Raises InputError where
-    the dataset has an environment or no normals, or where no map is clearly the one.
+    the dataset has an environment or no normals, or pictures outside of its folder, or where no map is clearly the one.
     """
     dataset = open_source(source, root)
     if (dataset.root / ENVIRONMENT_LATLONG).exists():
@@ -130,15 +130,15 @@ def find_light(
         raise InputError(
             expected="a --strength above 0", found=f"{strength}", remedy="Give what the scene multiplies its map by."
         )
-    maps = {name: read_light(path) for name, path in worlds.items()}
-    matches = match_worlds(mirrored_rays(dataset), maps, options)
-    match = clear_winner(matches, options)
-    world = turned_latlong(maps[match.name], _about_z(match.turn_deg)) * np.float32(strength)
     files = [path for split in SPLITS for frame in dataset.split(split) for path in all_files_of(frame)]
     transforms = [path for split in SPLITS if (path := dataset.root / f"transforms_{split}.json").exists()]
     plot = dataset.root / CAMERA_PLOT
     copies = [*files, *transforms, *([plot] if plot.exists() else [])]
-    jobs = [Job.copy(old, root / old.relative_to(dataset.root), link) for old in dict.fromkeys(copies)]
+    jobs = [Job.copy(old, place_of(old, dataset, root), link) for old in dict.fromkeys(copies)]
+    maps = {name: read_light(path) for name, path in worlds.items()}
+    matches = match_worlds(mirrored_rays(dataset), maps, options)
+    match = clear_winner(matches, options)
+    world = turned_latlong(maps[match.name], _about_z(match.turn_deg)) * np.float32(strength)
     jobs.append(Job(tuple(root / each for each in ENVIRONMENT_FILES), lambda: write_environment(root, world)))
     recipe = {
         "hemisphere_axis": None,
@@ -155,7 +155,7 @@ def find_light(
 def mirrored_rays(dataset: Dataset) -> Seen:
     """Where pixels that lie wholly on the object mirror to by ground-truth normals, in views of both splits."""
     frames = [frame for split in SPLITS for frame in dataset.split(split) if _normals_known(frame)]
-    frames = frames[:: max(1, len(frames) // MOST_VIEWS)]
+    frames = frames[:: max(1, -(-len(frames) // MOST_VIEWS))]
     parts, progress = [], Progress("reading views", len(frames))
     for frame in frames:
         view = read_view(frame)

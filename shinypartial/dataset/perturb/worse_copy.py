@@ -3,7 +3,6 @@
 A run that is killed continues when it is started again, and a folder that holds anything else is refused.
 """
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,8 +14,7 @@ from jaxtyping import UInt8
 
 from shinypartial.core.camera import opencv_to_opengl
 from shinypartial.core.color import to_display
-from shinypartial.core.errors import InputError
-from shinypartial.dataset.derived import Job, licenses_of, open_source, write_derived
+from shinypartial.dataset.derived import Job, licenses_of, open_source, place_of, write_derived
 from shinypartial.dataset.perturb import picture as pictures
 from shinypartial.dataset.perturb.options import Perturbation, changed_options
 from shinypartial.dataset.perturb.plan import Plan, PlannedView, generator, make_plan
@@ -90,14 +88,7 @@ class _Copy:
 
     def place(self, path: Path) -> Path:
         """Where a file of the source has its counterpart."""
-        below = Path(os.path.relpath(path, self.dataset.root))
-        if ".." in below.parts:
-            raise InputError(
-                expected=f"all pictures of {self.dataset.root} within that folder",
-                found=str(path),
-                remedy="Move it there and correct the transforms.",
-            )
-        return self.root / below
+        return place_of(path, self.dataset, self.root)
 
     def kept(self, path: Path) -> Job:
         """A file that stays the same."""

@@ -1,5 +1,6 @@
 """A light is recognized among others, turned and brighter as it is; where none is the right one, none is taken."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,13 @@ from jaxtyping import Float
 from shinypartial.cli import main
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import latlong_directions
-from shinypartial.dataset.read import open_dataset, read_environment
+from shinypartial.dataset.read import open_dataset, read_environment, read_view
 from shinypartial.dataset.schema import Dataset
 from shinypartial.dataset.subset import SubsetOptions, make_subset
 from shinypartial.dataset.validate import unscored, validate
+from shinypartial.io.files import read_json, write_json
 from shinypartial.io.images import read_exr_rgb, write_exr_rgb
+from shinypartial.oracle import known_light
 from shinypartial.oracle.known_light import find_light
 from tests.support import synthetic_dataset
 from tests.support.shiny_blender import make_shiny_blender_dataset
@@ -122,6 +125,41 @@ def test_what_can_tell_no_light_is_refused(worlds: dict[str, Path], tmp_path: Pa
     for dataset, named in ((known, "environment"), (bare, "normals")):
         with pytest.raises(InputError, match=named):
             find_light(dataset.root, tmp_path / "lit", worlds)
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+def test_pictures_outside_of_the_folder_are_refused(
+    source: Dataset, worlds: dict[str, Path], tmp_path: Path, absolute: bool
+) -> None:
+    root = Path(shutil.copytree(source.root, tmp_path / "sets/ball"))
+    (root / "train").rename(tmp_path / "train")
+    content = read_json(root / "transforms_train.json", "cameras")
+    for entry in content["frames"]:
+        name = Path(entry["file_path"]).name
+        entry["file_path"] = str(tmp_path / "train" / name) if absolute else f"../../train/{name}"
+    write_json(root / "transforms_train.json", content)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(InputError, match="within that folder"):
+        find_light(root, tmp_path / "deeper/lit", worlds)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_no_more_views_are_read_than_stated(source: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every second of 24 where 13 are the most: with all, there would be too many."""
+    read: list[str] = []
+    monkeypatch.setattr(known_light, "MOST_VIEWS", 13)
+    monkeypatch.setattr(known_light, "read_view", lambda frame: (read.append(frame.name), read_view(frame))[1])
+    known_light.mirrored_rays(source)
+    assert read == [frame.name for frame in (*source.train, *source.test)][::2]
+
+
+def test_maps_of_one_name_are_refused(
+    source: Dataset, worlds: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other/right.exr"
+    words = ["find-light", str(source.root), "--output", str(tmp_path / "lit"), "--worlds"]
+    assert main([*words, str(worlds["right"]), str(other)]) == 2
+    assert "different file names" in capsys.readouterr().err
 
 
 def test_the_command_says_which_light_it_is(
