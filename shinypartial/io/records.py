@@ -102,9 +102,16 @@ class _Reader:
             found = msgspec.convert(content, hint, dec_hook=_path)
         except (msgspec.ValidationError, TypeError):
             raise self._error(path, _description(hint), repr(content)) from None
-        if isinstance(found, float) and not math.isfinite(found):
-            raise self._error(path, _description(hint), repr(content))
+        self._require_finite(found, _description(hint), path)
         return found
+
+    def _require_finite(self, found: Any, expected: str, path: str) -> None:
+        """Also within lists and dictionaries, which msgspec judges as a whole and with infinity in their ranges."""
+        if isinstance(found, float) and not math.isfinite(found):
+            raise self._error(path, expected, repr(found))
+        entries = found.items() if isinstance(found, dict) else enumerate(found) if isinstance(found, list) else ()
+        for key, entry in entries:
+            self._require_finite(entry, "a finite number", _below(path, str(key)))
 
     def _choose(self, records: list[Any], content: Any, path: str) -> Any:
         if len(records) == 1 or not isinstance(content, dict):

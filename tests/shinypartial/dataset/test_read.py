@@ -181,7 +181,7 @@ BAD_FOLDERS: dict[str, tuple[Callable[[Path], object], str]] = {
         _transforms(frames=[{"file_path": "./train/r_000", "transform_matrix": np.eye(4)[:3].tolist()}]),
         "train/r_000",
     ),
-    "NaN in a pose": (_first_pose((0, 3), float("nan")), "NaN"),
+    "NaN in a pose": (_first_pose((0, 3), float("nan")), "transform_matrix.0.3"),
     "a pose that is not invertible": (_first_pose((2, 2), 0.0), "rigid"),
     "a scaled pose": (_first_pose((0, 0), 3.0), "rigid"),
     "a negative focal length": (_transforms(fl_x=-1.0), "focal"),

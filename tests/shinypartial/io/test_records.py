@@ -45,6 +45,9 @@ class Recipe:
     loud: bool = False
     gain: Share | None = None
     steps: tuple[NonNegative, ...] = ()
+    seconds: dict[str, NonNegative] = field(default_factory=dict)
+    curves: dict[str, list[float]] = field(default_factory=dict)
+    config: dict[str, Any] = field(default_factory=dict)
     outline: NonEmpty[tuple[float, float]] = ((0.0, 1.0),)
     shape: Ball | Box = Ball()
     parts: tuple[Ball | Box, ...] = ()
@@ -61,6 +64,7 @@ recipes = st.builds(
     loud=st.booleans(),
     gain=st.none() | shares,
     steps=st.lists(st.floats(0, 1e300)).map(tuple),
+    curves=st.dictionaries(st.text(), st.lists(st.floats(allow_nan=False, allow_infinity=False))),
     outline=st.lists(st.tuples(shares, shares), min_size=1).map(tuple),
     shape=st.builds(Ball, radius=shares) | st.builds(Box, size=st.tuples(shares, shares)),
     parts=st.lists(st.builds(Ball, radius=shares) | st.just(Box())).map(tuple),
@@ -86,6 +90,9 @@ REFUSED: dict[str, tuple[dict[str, Any], str, str, str]] = {
     "fraction": ({"count": 1.5}, "`count`", "a whole number", "1.5"),
     "not a number": ({"gain": math.nan}, "`gain`", "a number from 0 to 1 or none", "nan"),
     "infinite": ({"steps": [1, math.inf]}, "`steps.1`", "a number of at least 0", "inf"),
+    "infinite in a dictionary": ({"seconds": {"fit": math.inf}}, "`seconds.fit`", "a finite number", "inf"),
+    "no number in lists": ({"curves": {"l1": [0.1, math.nan]}}, "`curves.l1.1`", "a finite number", "nan"),
+    "infinite in anything": ({"config": {"a": [{"b": -math.inf}]}}, "`config.a.0.b`", "a finite number", "-inf"),
     "choice": ({"mode": "slow"}, "`mode`", "one of fast, best", "'slow'"),
     "blank": ({"name": " "}, "`name`", "a text that is not empty", "' '"),
     "no path": ({"folder": 3}, "`folder`", "a path", "3"),
