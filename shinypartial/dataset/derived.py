@@ -37,13 +37,13 @@ class Job:
         return all(path.exists() for path in self.files)
 
 
-def open_source(source: Path, root: Path) -> Dataset:
-    """The dataset to derive from; InputError where the new folder is that one or lies in it."""
+def open_source(source: Path, root: Path, *, shared_names: bool = False) -> Dataset:
+    """The dataset to derive from, as `open_dataset` opens it; InputError where the new folder is that or lies in it."""
     if source.resolve() in (root.resolve(), *root.resolve().parents):
         raise InputError(
             expected=f"an output folder apart from the source {source}", found=str(root), remedy="Change --output."
         )
-    return open_dataset(source)
+    return open_dataset(source, shared_names=shared_names)
 
 
 def place_of(path: Path, source: Dataset, root: Path) -> Path:

@@ -1,5 +1,6 @@
 """Open a dataset folder, ours or a plain NeRF-synthetic one, and read its views."""
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,9 +53,10 @@ def newest_dataset(parent: Path = DEFAULT_FOLDER) -> Path:
     )
 
 
-def open_dataset(root: Path) -> Dataset:
+def open_dataset(root: Path, *, shared_names: bool = False) -> Dataset:
     """Read manifest and cameras; images are read one by one with `read_view`.
 
+    Predictions of test views are told apart by file name, which two may have in common only with `shared_names`.
     Raises InputError for a missing folder, transforms that are missing or broken, and poses that are not rigid.
     """
     require_dataset_folder(root)
@@ -71,7 +73,21 @@ def open_dataset(root: Path) -> Dataset:
         if errors:
             raise errors[0]
         splits.append(tuple(frames))
-    return Dataset(root, manifest, *splits)
+    dataset = Dataset(root, manifest, *splits)
+    if not shared_names:
+        _require_own_names(dataset)
+    return dataset
+
+
+def _require_own_names(dataset: Dataset) -> None:
+    names = Counter(frame.name for frame in dataset.test)
+    shared = [name for name, count in names.items() if count > 1]
+    if shared:
+        raise InputError(
+            expected=f"test views of different file names in {dataset.root}, by which predictions are told apart",
+            found=f"{names[shared[0]]} views named {shared[0]}",
+            remedy="Rename the pictures and correct transforms_test.json; `shinypartial subset` names views anew, too.",
+        )
 
 
 def require_dataset_folder(root: Path) -> None:

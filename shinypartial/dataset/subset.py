@@ -159,7 +159,7 @@ def make_subset(source: Path, root: Path, options: SubsetOptions, *, link: bool 
     `link` makes hard links in place of copies. Raises InputError when the path doesn't cross itself, when the source
     can't be read or when the folder holds something else.
     """
-    dataset = open_source(source, root)
+    dataset = open_source(source, root, shared_names=True)
     selection = select(dataset, options)
     contents = {split: _renamed(dataset, split, getattr(selection, split)) for split in SPLITS}
     without_normals = tuple(split for split in SPLITS if _has_some_normals(getattr(selection, split)))

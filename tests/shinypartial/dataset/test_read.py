@@ -134,6 +134,25 @@ def test_a_manifest_whose_tables_are_none_states_nothing(tmp_path: Path, stated:
     assert (dataset.scene_split, dataset.object_radius) == ("unknown", None)
 
 
+def test_test_views_of_one_file_name_are_refused(tmp_path: Path) -> None:
+    """Their predictions would be one file; training views have none."""
+    root = make_plain_sphere_dataset(tmp_path / "plain", 12, train=2, test=2).root
+
+    def move(transforms: dict[str, Any]) -> None:
+        for folder, entry in zip("ab", transforms["frames"], strict=True):
+            picture = root / f"{entry['file_path']}.png"
+            entry["file_path"] = f"./{folder}/{picture.parent.name}"
+            (root / folder).mkdir(exist_ok=True)
+            picture.rename(root / f"{entry['file_path']}.png")
+
+    edit_json(root / TRAIN, move)
+    assert len(open_dataset(root).train) == 2
+    edit_json(root / "transforms_test.json", move)
+    with pytest.raises(InputError, match="2 views named test/test"):
+        open_dataset(root)
+    assert len(open_dataset(root, shared_names=True).test) == 2
+
+
 def test_the_newest_dataset_is_found(tmp_path: Path, sphere_dataset: Dataset) -> None:
     with pytest.raises(InputError, match="shinypartial generate"):
         newest_dataset(tmp_path)
