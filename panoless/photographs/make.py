@@ -100,7 +100,7 @@ def capture(request: Request) -> Captured:
         masks = _masks(request, frames, poses, masks_of_frames, work)
         train = request.output / "train"
         listed = [
-            Frame(f"train/{view.name}", view.camera, train / view.name, ".png", pose_covariance=view.pose_covariance)
+            Frame(f"train/{view.name}", view.camera, train / view.name, pose_covariance=view.pose_covariance)
             for view in poses.views
         ]
         write_transforms(request.output, "train", listed)

@@ -4,7 +4,7 @@ What photographs tell has a gauge: cameras that structure from motion finds are 
 board in the board's own world. Poses are moved, pictures and masks stay as they are.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -17,6 +17,7 @@ from shinypartial.core.conventions import PIXEL_CENTER
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import open_dataset, read_view
 from shinypartial.dataset.schema import SPLITS, Dataset, Frame
+from shinypartial.dataset.subset import files_of
 from shinypartial.dataset.write import write_transforms
 from shinypartial.io.files import copy_or_link, folder_lock, write_json
 from shinypartial.io.records import write_record
@@ -93,15 +94,17 @@ def align(captured: Path, truth: Path, output: Path, gauge: GaugeKind | None = N
     nothing; `similarity` is estimated from the poses of all cameras; with `same` the captured world is the truth's.
     When not given, it is `board` where the truth has a board, else `similarity`. The test views have cameras and no
     pictures.
-    Raises InputError for frames that the truth doesn't know.
+    Raises InputError for frames that the truth doesn't know or that have no picture.
     """
     ours, theirs = open_dataset(captured), open_dataset(truth)
     pairs = _pairs(ours, theirs)
     kind = gauge or ("similarity" if theirs.board_corner is None else "board")
     found = _gauge(kind, pairs, theirs)
-    output.mkdir(parents=True, exist_ok=True)
+    moved = [_moved(frame, output, found) for frame, _ in pairs]
+    copies = [files for (frame, _), new in zip(pairs, moved, strict=True) for files in _copies(frame, new)]
     with folder_lock(output):
-        moved = [_moved(frame, output, found) for frame, _ in pairs]
+        for old, new in copies:
+            copy_or_link(old, new, False)
         result = _compare(kind, found.scale, [(new, true) for new, (_, true) in zip(moved, pairs, strict=True)])
         write_transforms(output, SPLITS[0], moved)
         if theirs.test:
@@ -138,17 +141,23 @@ def _gauge(kind: GaugeKind, pairs: Sequence[tuple[Frame, Frame]], truth: Dataset
 
 
 def _moved(frame: Frame, output: Path, gauge: Similarity) -> Frame:
-    """The frame in the new folder, with links to its files."""
+    """The frame in the new folder, beside whose picture its mask lies."""
     stem = output / SPLITS[0] / frame.stem.name
-    for old in frame.stem.parent.glob(f"{frame.stem.name}*"):
-        if old.name.removeprefix(frame.stem.name)[:1] in (".", "_"):
-            copy_or_link(old, stem.parent / old.name, False)
+    mask = None if frame.mask is None else stem.with_name(f"{stem.name}_mask_path{frame.mask.suffix}")
     camera = frame.camera
     pose = gauge.pose(camera.camera_to_world)
     there = Camera(pose, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
     stated = frame.pose_covariance
     moved = None if stated is None else gauge.pose_covariance(stated)
-    return Frame(f"{SPLITS[0]}/{stem.name}", there, stem, pose_covariance=moved)
+    return Frame(f"{SPLITS[0]}/{stem.name}", there, stem, frame.suffix, mask, moved)
+
+
+def _copies(frame: Frame, new: Frame) -> Iterator[tuple[Path, Path]]:
+    """Source and destination of all files of a frame."""
+    for path in files_of(frame):
+        yield path, new.stem.parent / path.name
+    if frame.mask is not None and new.mask is not None:
+        yield frame.mask, new.mask
 
 
 def _compare(kind: GaugeKind, scale: float, pairs: Sequence[tuple[Frame, Frame]]) -> Alignment:

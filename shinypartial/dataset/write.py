@@ -134,15 +134,15 @@ def encode_normals(normals: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H 
 def write_transforms(root: Path, split: str, frames: Sequence[Frame]) -> None:
     """Write `transforms_SPLIT.json` with OpenGL poses, as NeRF-synthetic and nerfstudio readers expect.
 
-    Intrinsics of the first frame stand for all; frames that differ from it have their own. Masks that are files of
-    their own are named, and covariances of poses stated, where frames have them.
+    Intrinsics of the first frame stand for all; frames that differ from it have their own. Extensions of pictures and
+    masks that are files of their own are named, and covariances of poses stated, where frames have them.
     """
     shared = intrinsics_of(frames[0].camera)
     entries = []
     for frame in frames:
         own = intrinsics_of(frame.camera)
         entry: dict[str, Any] = {
-            "file_path": f"./{split}/{frame.stem.name}",
+            "file_path": f"./{split}/{frame.stem.name}{frame.suffix}",
             "transform_matrix": opencv_to_opengl(frame.camera.camera_to_world).tolist(),
         }
         if frame.pose_covariance is not None:

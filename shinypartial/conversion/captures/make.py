@@ -95,7 +95,7 @@ def _as_begun(output: Path, recipe: dict[str, Any]) -> dict[str, Any]:
 def _frame(output: Path, split: str, shot: Shot) -> Frame:
     stem = output / split / shot.name
     mask = stem.with_name(f"{shot.name}_mask{shot.mask.suffix}")
-    return Frame(f"{split}/{shot.name}", shot.camera, stem, shot.picture.suffix, mask)
+    return Frame(f"{split}/{shot.name}", shot.camera, stem, mask=mask)
 
 
 def _jobs(shot: Shot, frame: Frame, link: bool) -> Iterator[Job]:

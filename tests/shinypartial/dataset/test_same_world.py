@@ -9,11 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from shinypartial.core.camera import Camera, Similarity
 from shinypartial.core.errors import InputError
-from shinypartial.dataset.read import open_dataset
+from shinypartial.dataset.read import open_dataset, read_view
 from shinypartial.dataset.same_world import align, similarity
 from shinypartial.dataset.schema import MANIFEST, Frame
 from shinypartial.dataset.write import write_transforms
 from shinypartial.io.files import read_json, write_json
+from shinypartial.io.images import read_png, write_jpeg, write_png
 from tests.support.synthetic_dataset import make_sphere_dataset
 
 RANDOM = np.random.default_rng(4)
@@ -133,6 +134,39 @@ def test_a_board_is_believed_and_no_world_estimated(truth: Path, tmp_path: Path)
     np.testing.assert_allclose(wrong.distance_share, 0.01, rtol=1e-6)  # Of the distance 4.
     with pytest.raises(InputError, match="a board"):
         align(tmp_path / "right", truth, tmp_path / "three", "board")
+
+
+@pytest.mark.parametrize("kind", ["jpg", "png"])
+def test_masks_in_files_of_their_own_come_along(truth: Path, tmp_path: Path, kind: str) -> None:
+    """Of JPEGs, which have no other, and of PNGs whose alpha is something else; both lie there, and frames name one."""
+    root = captured(truth, tmp_path / "captured", WORLD)
+    content = read_json(root / "transforms_train.json", "cameras")
+    for frame, entry in zip(open_dataset(root).train, content["frames"], strict=True):
+        picture = read_png(frame.png)
+        write_png(root / f"masks/{frame.stem.name}.png", picture[..., 3])
+        for path in (*frame.files, frame.self_png):
+            path.unlink(missing_ok=True)
+        write_png(frame.png, np.concatenate([picture[..., :3], np.full_like(picture[..., 3:], 255)], -1))
+        write_jpeg(frame.stem.with_name(f"{frame.stem.name}.jpg"), np.ascontiguousarray(picture[..., :3]), 95)
+        entry["file_path"] += f".{kind}"
+        entry["mask_path"] = f"masks/{frame.stem.name}.png"
+    write_json(root / "transforms_train.json", content)
+    made = align(root, truth, tmp_path / "aligned")
+    assert min(made.mask_overlap) == 1.0
+    for old, new in zip(open_dataset(root).train, open_dataset(tmp_path / "aligned").train, strict=True):
+        assert new.photograph.suffix == f".{kind}"
+        before, after = read_view(old), read_view(new)
+        np.testing.assert_array_equal(after.alpha, before.alpha)
+        np.testing.assert_array_equal(after.radiance, before.radiance)
+
+
+def test_a_missing_picture_is_told_before_anything_is_written(truth: Path, tmp_path: Path) -> None:
+    root = captured(truth, tmp_path / "captured", WORLD)
+    for path in (root / "train").glob("r_003.*"):
+        path.unlink()
+    with pytest.raises(InputError, match="no such file"):
+        align(root, truth, tmp_path / "aligned")
+    assert not (tmp_path / "aligned").exists()
 
 
 def test_frames_of_another_film_are_refused(truth: Path, tmp_path: Path) -> None:
