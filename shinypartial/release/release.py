@@ -23,6 +23,7 @@ from shinypartial.dataset.violations import Violation
 from shinypartial.io.files import (
     PARTIAL_PREFIX,
     atomic_write,
+    folder_lock,
     read_table,
     remove_partial_files,
     sha256_of,
@@ -76,11 +77,19 @@ def release(
     """Make the release folder `output`, or finish what an earlier run began there.
 
     Raises InputError when a dataset is incomplete or breaks a promise of its format, when two have one name, or when
-    `output` holds something else.
+    `output` holds something else or another run writes there.
     """
     sources = tuple(_open(root, output, progress) for root in roots)
     _check_names([source.dataset.name for source in sources])
-    _claim(output, publication, archive_suffix, sources)
+    with folder_lock(output):
+        _claim(output, publication, archive_suffix, sources)
+        return _make(sources, output, publication, archive_suffix, progress)
+
+
+def _make(
+    sources: tuple[_Source, ...], output: Path, publication: Publication, archive_suffix: str, progress: bool
+) -> Released:
+    """All but the claim, which says what the folder is for."""
     remove_partial_files(output)
     _refuse_strangers(output, archive_suffix, sources)
     (output / CHECKSUMS).unlink(missing_ok=True)
@@ -190,8 +199,7 @@ def _claim(output: Path, publication: Publication, archive_suffix: str, sources:
                 remedy="Choose another --output, or delete that folder.",
             )
         return
-    begun = output.is_dir() and all(path.name.startswith(PARTIAL_PREFIX) for path in output.iterdir())
-    if output.exists() and not begun:
+    if not all(path.name.startswith(PARTIAL_PREFIX) for path in output.iterdir()):
         raise InputError(
             expected=f"a new or empty output folder at {output}",
             found="files that are not a release",

@@ -20,7 +20,7 @@ from shinypartial.cli import main
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import CHECKSUMS
 from shinypartial.dataset.validate import validate
-from shinypartial.io.files import sha256_of
+from shinypartial.io.files import folder_lock, sha256_of
 from shinypartial.release import release as release_module
 from shinypartial.release.archive import write_archive
 from shinypartial.release.checksums import list_files
@@ -242,6 +242,15 @@ def test_a_folder_of_something_else_is_refused(datasets: tuple[Path, ...], copy:
     with pytest.raises(InputError, match=r"notes\.txt"):
         release(datasets, copy, PUBLICATION)
     assert (other / "README.md").read_text() == "mine"
+
+
+def test_only_one_run_writes_to_a_release(datasets: tuple[Path, ...], tmp_path: Path) -> None:
+    output = tmp_path / "balls"
+    with folder_lock(output):
+        (output / ".partial-other").write_text("half")
+        with pytest.raises(InputError, match="another run"):
+            release(datasets, output, PUBLICATION)
+        assert [path.name for path in output.iterdir()] == [".partial-other"]
 
 
 @pytest.mark.parametrize("content", ["[]", "null", '{"date": 3}'])
