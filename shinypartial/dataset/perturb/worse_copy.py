@@ -132,14 +132,18 @@ def _suffix(frame: Frame, options: Perturbation) -> str:
 
 
 def _rewritten(copy: _Copy, view: PlannedView) -> Iterator[Job]:
-    """A training view made anew; what lies beside it is copied unless its pixels have moved or turned."""
+    """A training view made anew; what lies beside it is copied unless its pixels have moved or turned.
+
+    Then normals and self-reflection are made anew, the latter where it is known, which is in an EXR alone.
+    """
     options, frame = copy.plan.options, view.source
     sensor, views = options.sensor, options.views
     moved = bool(views.object_scale < 1 or views.cut or sensor.k1 or sensor.k2 or copy.plan.turn is not None)
     beside = [
         path for path in files_of(frame) if path.name.startswith(f"{frame.stem.name}_") and path != frame.alpha_png
     ]
-    truth = [path for path in (frame.normal_png, frame.self_png) if moved and path in beside]
+    known = [frame.normal_png, *([frame.self_png] if frame.exr.exists() else [])]
+    truth = [path for path in known if moved and path in beside]
     if not moved:
         yield from map(copy.kept, beside)
     new = Frame(frame.name, view.camera, copy.place(frame.stem))
@@ -177,11 +181,16 @@ def _write_frame(plan: Plan, planned: PlannedView, files: tuple[Path, ...]) -> N
 
 def _png(ending: str, view: View) -> UInt8[np.ndarray, "H W *C"]:
     """What the PNG of a view with that ending shows."""
-    if ending == "_normal" and view.normals_world is not None:
-        return encode_normals(view.normals_world)
-    if ending == "_self" and view.self_reflection is not None:
-        return encode_unit(view.self_reflection)
-    return encode_unit(view.alpha) if ending else display_rgba(view.radiance, view.alpha)
+    match ending:
+        case "_normal" if view.normals_world is not None:
+            return encode_normals(view.normals_world)
+        case "_self" if view.self_reflection is not None:
+            return encode_unit(view.self_reflection)
+        case "_alpha":
+            return encode_unit(view.alpha)
+        case "":
+            return display_rgba(view.radiance, view.alpha)
+    raise ValueError(f"the view has nothing to show in a picture that ends in {ending}")
 
 
 def _transforms(plan: Plan, dataset: Dataset) -> dict[str, Any]:

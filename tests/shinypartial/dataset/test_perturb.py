@@ -18,10 +18,10 @@ from shinypartial.dataset.perturb.worse_copy import perturb
 from shinypartial.dataset.read import open_dataset, read_inverse_distance, read_view
 from shinypartial.dataset.schema import CHECKSUMS, LICENSES, MANIFEST, Dataset
 from shinypartial.dataset.validate import validate
-from shinypartial.dataset.write import write_inverse_distance
+from shinypartial.dataset.write import encode_unit, write_inverse_distance
 from shinypartial.evaluation.evaluate import evaluate
 from shinypartial.io.files import read_json, sha256_of, write_json
-from shinypartial.io.images import write_png
+from shinypartial.io.images import read_exr, read_png, write_exr, write_png
 from tests.support.shiny_blender import make_shiny_blender_dataset
 from tests.support.synthetic_dataset import MAP_HEIGHT, make_sphere_dataset
 from tests.support.truth_prediction import write_truth_prediction
@@ -340,6 +340,26 @@ def test_what_lies_beside_a_picture_is_kept_while_its_pixels_stay(shiny: Dataset
         assert sha256_of(tmp_path / "same/train" / name) == sha256_of(shiny.root / "train" / name)
     assert (tmp_path / "moved/train/r_1_normal.png").exists()
     assert not (tmp_path / "moved/train/r_1_disp.tiff").exists()
+
+
+def test_self_reflection_moves_with_the_object_and_is_left_out_where_no_exr_knows_it(
+    damaged_dataset: Path, tmp_path: Path
+) -> None:
+    """A copy of 8 bits keeps the pictures of it, which a move of that copy can't make anew."""
+    for frame in open_dataset(damaged_dataset).train:
+        channels = read_exr(frame.exr)
+        left = np.arange(frame.camera.width) < frame.camera.width / 2
+        reflected = (left & (channels["A"] > 0)).astype(np.float16)
+        write_exr(frame.exr, channels | {"self_reflection.V": reflected})
+        write_png(frame.self_png, encode_unit(reflected))
+    smaller = Perturbation(views=ViewChoice(object_scale=0.5))
+    for frame in open_dataset(perturb(damaged_dataset, tmp_path / "moved", smaller).root).train:
+        np.testing.assert_array_equal(read_png(frame.self_png)[..., 0], encode_unit(read_view(frame).self_reflection))
+    coded = perturb(damaged_dataset, tmp_path / "coded", Perturbation(sensor=SensorErrors(srgb8=True))).root
+    assert len(list(coded.glob("train/*_self.png"))) == 6
+    again = perturb(coded, tmp_path / "again", smaller).root
+    assert not list(again.glob("train/*_self.png"))
+    assert len(list(again.glob("train/*_normal.png"))) == 6
 
 
 def test_distortion_is_stated_only_when_asked_for(sphere_dataset: Dataset, tmp_path: Path) -> None:
