@@ -174,7 +174,7 @@ def _looks_like_a_focal_length(views: Views, geometry: Geometry, options: Correc
     return (
         geometry.surroundings.floor is None
         and len(coefficients) > 0
-        and bool(coefficients[0] * np.median(cameras) < 3 * options.focal.prior)
+        and bool(coefficients[0] * np.median(cameras) < options.farthest_lens * options.focal.prior)
     )
 
 

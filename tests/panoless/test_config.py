@@ -138,7 +138,9 @@ def test_maps_that_are_blurred_halve_whole(preset: str, name: str) -> None:
     check_config(with_value(PRESETS["paper"], name, 100))
 
 
-@pytest.mark.parametrize(("name", "value"), [("loss.lambda_distortion", 1000.0), ("crop_margin_px", -1), ("seed", 2**63 - 1)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("loss.lambda_distortion", 1000.0), ("crop_margin_px", -1), ("seed", 2**63 - 1)]
+)
 def test_unusual_values_are_allowed(name: str, value: float) -> None:
     check_config(with_value(PRESETS["default"], name, value))
 

@@ -58,21 +58,21 @@ class Cones:
     """
 
     @classmethod
-    def of(cls, rays: OutlineRays, rounds: int) -> "Cones":
+    def of(cls, rays: OutlineRays, options: SphereOptions) -> "Cones":
         """By robust linear least squares: m·r = 1 for all rays r of the cone with m = a/cos α."""
         found = []
         for view in np.unique(rays.view):
             own = rays.view == view
             directions, scale = rays.directions[own], rays.pixels_per_rad[own]
             weights = np.ones(len(directions))
-            for _ in range(rounds):
+            for _ in range(options.cone_rounds):
                 weighted = directions * weights[:, None]
                 moment = weighted.T @ directions + 1e-12 * np.eye(3)
                 m = np.linalg.solve(moment, weighted.sum(0))
                 cosine = min(1 / float(np.linalg.norm(m)), WIDEST_COSINE)
                 # m·r = cos β/cos α, and the angle β − α is what the pixels are off by.
                 off_px = (np.arccos(np.clip(directions @ m * cosine, -1, 1)) - np.arccos(cosine)) * scale
-                weights = robust_weight(off_px, robust_scale(off_px, 0.5, 3.0))
+                weights = robust_weight(off_px, robust_scale(off_px, options.scales_px[-1], options.noise_scale))
             median_px = float(np.median(np.abs(off_px)))
             axis, sine = m / np.linalg.norm(m), np.sqrt(1 - cosine**2)
             oval = _second_harmonic(directions, axis, off_px / scale, weights) / np.arccos(cosine)
@@ -176,7 +176,7 @@ class SphereFit:
 def fit_sphere(views: Views, options: SphereOptions, *, asked: bool) -> SphereFit | None:
     """The sphere that explains the masks best; None where their outlines are no cones, unless it was `asked` for."""
     rays = OutlineRays.of(views)
-    cones = Cones.of(rays, options.cone_rounds)
+    cones = Cones.of(rays, options)
     if not len(cones.sines) or not (asked or cones.are_of_a_sphere(options)):
         return None
     known = options.radius / views.object_frame.radius

@@ -91,7 +91,7 @@ def test_exact_cones_give_the_sphere(seed: int, count: int) -> None:
     center, radius, away = rng.uniform(-1, 1, 3), rng.uniform(0.1, 1.0), rng.normal(size=(count, 3))
     away *= radius * rng.uniform(2.0, 5.0, (count, 1)) / np.linalg.norm(away, axis=1, keepdims=True)
     rays = tangent_rays(center, np.full(3, radius), center + away)
-    cones = Cones.of(rays, 3)
+    cones = Cones.of(rays, OPTIONS)
     found = cones.sphere(0.0)
     # Lines that are nearly parallel amplify rounding.
     np.testing.assert_allclose(np.append(found.center, found.radius), np.append(center, radius), atol=1e-4)
@@ -112,7 +112,7 @@ def test_an_egg_is_no_sphere_whatever_the_noise_of_masks(
     rng = np.random.default_rng(1)
     shaken = rays.directions + rng.normal(size=rays.directions.shape) * noise_px / rays.pixels_per_rad[:, None]
     shaken /= np.linalg.norm(shaken, axis=1, keepdims=True)
-    assert Cones.of(replace(rays, directions=shaken), 6).are_of_a_sphere(OPTIONS) == is_sphere
+    assert Cones.of(replace(rays, directions=shaken), OPTIONS).are_of_a_sphere(OPTIONS) == is_sphere
 
 
 @pytest.mark.parametrize("count", [2, 3, 9])
