@@ -14,7 +14,7 @@ from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import PosedView, Poses, as_rows, find_ground, lens_for, with_covariances
 from shinypartial.core.conventions import PIXEL_CENTER
 from shinypartial.core.errors import InputError
-from shinypartial.dataset.transforms import DISTORTION_FIELDS, frames_of
+from shinypartial.dataset.transforms import CAMERA_MODELS, DISTORTION_FIELDS, frames_of
 from shinypartial.io.files import read_json
 from shinypartial.io.images import PICTURE_SUFFIXES
 
@@ -140,12 +140,12 @@ def read_transforms(path: Path, frames: Frames) -> tuple[Poses, dict[str, Path]]
 
 
 def _pinhole(fields: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in fields.items() if name not in DISTORTION_FIELDS}
+    return {name: value for name, value in fields.items() if name not in (*DISTORTION_FIELDS, "camera_model")}
 
 
 def _distortion(fields: Mapping[str, Any], path: Path) -> dict[str, float]:
     model = fields.get("camera_model", "OPENCV")
-    if fields.get("k4") or model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
+    if fields.get("k4") or model not in CAMERA_MODELS:
         raise InputError(
             expected=f"a lens with k1, k2, k3, p1 and p2 at most in {path}",
             found=f"camera_model {model}" + (" with k4" if fields.get("k4") else ""),

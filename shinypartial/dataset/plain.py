@@ -29,19 +29,30 @@ UNIT_TOLERANCE = 0.05
 FACING_TOLERANCE = 0.1
 #: Creases and outlines are a small share; normals in another frame or encoding are wrong nearly everywhere.
 TOLERATED_SHARE = 0.1
-#: What the recipe of a folder names that was made of another one.
-DERIVED = ("subset_of", "perturbation_of", "import_of", "lit_copy_of")
+#: What the recipe of a folder names that was made of another one, and the command that made it. A lit copy also keeps
+#: what the recipe of its source names, so the first that is there counts.
+DERIVED = {
+    "lit_copy_of": "find-light",
+    "perturbation_of": "perturb",
+    "import_of": "import-dataset",
+    "subset_of": "subset",
+}
 
 
 def is_plain(root: Path, manifest: dict[str, Any]) -> bool:
     """Whether a folder promises no more than the plain layout does.
 
-    By its manifest a subset, a perturbed copy or an imported capture; else a folder without any file of a rendered set.
+    By its manifest one that was made of another folder; else a folder without any file of a rendered set.
     """
     if (root / MANIFEST).exists():
-        return any(_has_recipe(manifest, word) for word in DERIVED)
+        return made_by(manifest) is not None
     rendered = (CHECKSUMS, LICENSES, ENVIRONMENT_LATLONG.parent)
     return (root / "transforms_train.json").exists() and not any((root / name).exists() for name in rendered)
+
+
+def made_by(manifest: dict[str, Any]) -> str | None:
+    """The command that made a folder of another one, and so makes it again; None for any other folder."""
+    return next((command for word, command in DERIVED.items() if _has_recipe(manifest, word)), None)
 
 
 def is_perturbed(manifest: dict[str, Any]) -> bool:

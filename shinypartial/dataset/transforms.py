@@ -19,6 +19,8 @@ from shinypartial.io.images import EXR, PICTURE_SUFFIXES, picture_size
 from shinypartial.io.records import Positive, Text, read_record
 
 DISTORTION_FIELDS = ("k1", "k2", "k3", "k4", "p1", "p2")
+#: nerfstudio's names of cameras that are pinholes where nothing is distorted.
+CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 UNITS = "(focal lengths, centers and sizes in pixels, angles in radians)"
 
 
@@ -94,6 +96,13 @@ def _read_intrinsics(fields: dict[str, Any], where: str) -> _Intrinsics:
             expected=f"undistorted pinhole images in {where}",
             found=f"lens distortion ({', '.join(distorted)} not zero)",
             remedy="Undistort the images (`panoless capture` and COLMAP's image_undistorter do); remove these fields.",
+        )
+    model = fields.get("camera_model")
+    if model is not None and model not in CAMERA_MODELS:
+        raise InputError(
+            expected=f"a pinhole as camera_model in {where}: {', '.join(CAMERA_MODELS)}",
+            found=str(model),
+            remedy="Undistort the images with the program that found the poses, and state its pinhole.",
         )
     return read_record(_Intrinsics, fields, where, allow_unknown=True)
 

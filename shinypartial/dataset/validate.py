@@ -20,6 +20,7 @@ from shinypartial.dataset.plain import (
     is_imported,
     is_perturbed,
     is_plain,
+    made_by,
     read_plain_frames,
     what_is_absent,
 )
@@ -47,9 +48,6 @@ from shinypartial.io.progress import Progress
 
 RESTORE = "Restore the file from the released dataset, or generate the dataset again."
 CONTINUE = "Run the `shinypartial generate` that began the folder again: it continues where it stopped."
-SUBSET = "`shinypartial subset`"
-PERTURB = "`shinypartial perturb`"
-IMPORT = "`shinypartial import-dataset`"
 ANGLE_TOLERANCE_RAD = 1e-6
 #: The lat-long and the cube are each rounded to half precision (relative 5e-4).
 RADIANCE_TOLERANCE = 2e-3
@@ -86,10 +84,10 @@ def validate(root: Path, progress: bool = False) -> list[Violation]:
         violations += [*_check_environment(root), *_check_inverse_distance(root, manifest)]
     if not original:
         violations += [*_check_licenses(root), *_check_checksums(root)]
-    if plain:  # What made it, and so what makes it again.
-        maker = PERTURB if is_perturbed(manifest) else IMPORT if is_imported(manifest) else SUBSET
+    if maker := made_by(manifest):
+        again = f"`shinypartial {maker}`"
         violations = [
-            replace(each, remedy=each.remedy.replace("`shinypartial generate`", maker)) for each in violations
+            replace(each, remedy=each.remedy.replace("`shinypartial generate`", again)) for each in violations
         ]
     return sorted(violations, key=lambda each: each.warning)
 

@@ -118,8 +118,10 @@ def write_transforms_json(folder: Path, **changes: object) -> Path:
     return folder / "transforms.json"
 
 
-def test_every_frame_of_transforms_json_has_its_own_lens(tmp_path: Path) -> None:
-    poses, masks = read_transforms(write_transforms_json(tmp_path), frames_of_size())
+@pytest.mark.parametrize("model", [None, "OPENCV", "SIMPLE_RADIAL"])
+def test_every_frame_of_transforms_json_has_its_own_lens(tmp_path: Path, model: str | None) -> None:
+    named = {} if model is None else {"camera_model": model}
+    poses, masks = read_transforms(write_transforms_json(tmp_path, **named), frames_of_size())
     lenses = [view.lens for view in poses.views]
     assert [lens.fx for lens in lenses] == [70, 71, 72]
     assert [lens.k1 for lens in lenses] == [0.02, -0.1, 0.02]

@@ -122,6 +122,10 @@ QUIRKS: dict[str, Damage] = {
         TRAIN, lambda t: [e.update(file_path=e["file_path"] + ".png") for e in t["frames"]]
     ),
     "paths without dot": edit_json(TRAIN, lambda t: [e.update(file_path=e["file_path"][2:]) for e in t["frames"]]),
+    "a pinhole by its name": lambda root: [
+        edit_json(f"transforms_{split}.json", lambda t: t.update(camera_model="OPENCV", k1=0.0))(root)
+        for split in SPLITS
+    ],
     "another field in one split": edit_json(TRAIN, lambda t: t.update(aabb_scale=2)),
 }
 
@@ -187,6 +191,7 @@ DAMAGES: dict[str, tuple[Damage, str, str]] = {
     "angle in degrees": (edit_json(TRAIN, lambda t: t.update(camera_angle_x=40.0)), TRAIN, "radians"),
     "angle of text": (edit_json(TRAIN, lambda t: t.update(camera_angle_x="wide")), TRAIN, "camera_angle_x"),
     "distortion": (edit_json(TRAIN, lambda t: t.update(k1=0.1)), TRAIN, "distortion"),
+    "another lens": (edit_json(TRAIN, lambda t: t.update(camera_model="EQUIRECTANGULAR")), TRAIN, "pinhole"),
     "no frames": (edit_json(TRAIN, lambda t: t.update(frames=[])), TRAIN, "frames"),
     "frame of text": (edit_json(TRAIN, lambda t: t["frames"].append("a")), TRAIN, "file_path"),
     "twice": (edit_json(TRAIN, lambda t: t["frames"].append(t["frames"][0])), TRAIN, "listed twice"),

@@ -207,6 +207,12 @@ BAD_FOLDERS: dict[str, tuple[Callable[[Path], object], str]] = {
     "a focal length in words": (_transforms(fl_x="long"), "fl_x"),
     "an image size in words": (_transforms(w="wide"), "wide"),
     "lens distortion": (_transforms(k1=0.1), "k1"),
+    "another lens": (_transforms(camera_model="EQUIRECTANGULAR"), "EQUIRECTANGULAR"),
+    "another lens of a frame": (
+        lambda root: edit_json(root / TRAIN, lambda t: t["frames"][1].update(camera_model="OPENCV_FISHEYE", k1=0.0)),
+        "OPENCV_FISHEYE",
+    ),
+    "a lens that is no name": (_transforms(camera_model=["OPENCV"]), "camera_model"),
     "another format": (_manifest(format="something"), "something"),
     "another version": (_manifest(format_version=99), "version 99"),
     "a manifest that is a list": (lambda root: (root / "dataset.json").write_text("[1]"), "version"),

@@ -102,6 +102,8 @@ def test_a_subset_keeps_what_it_states(source: Dataset, worlds: dict[str, Path],
     recipe = open_dataset(tmp_path / "lit").manifest["recipe"]
     assert recipe["subset_of"]["name"] == "ball"
     assert recipe["light"]["name"] == "right"
+    (tmp_path / "lit/environment/cube/px.exr").unlink()
+    assert all("`shinypartial find-light` that made" in each.remedy for each in validate(tmp_path / "lit"))
 
 
 def test_what_compression_left_below_zero_is_no_light(source: Dataset, worlds: dict[str, Path], tmp_path: Path) -> None:
