@@ -33,7 +33,16 @@ from panoless.geometry.surfels.options import SurfelOptions
 from panoless.selection.options import CorrectionOptions, SelectionOptions
 from panoless.trust.options import TrustOptions
 from shinypartial.core.errors import InputError
-from shinypartial.io.records import Count, NonNegative, Positive, Share, check_record, read_record, write_record
+from shinypartial.io.records import (
+    Count,
+    Natural,
+    NonNegative,
+    Positive,
+    Share,
+    check_record,
+    read_record,
+    write_record,
+)
 
 Options = TypeVar("Options")
 Tuned = Annotated[Options, tyro.conf.Suppress]
@@ -90,7 +99,7 @@ class EnvironmentConfig:
     trace: bool = True
     """Leave pixels out of the closed-form map whose mirrored ray meets a plane's frame, or a surface of revolution
     again; a bent plane always does, surfels can't tell."""
-    solve_resolution: Annotated[int, Meta(ge=0)] = 0
+    solve_resolution: Natural = 0
     """Texels along a face side of the closed-form map that is exported. 0: 64, 128 or 256, which held-out views choose
     for surfels, held-out pixels for kinds whose pixels are areas, and the density of rays for others. Where the mirror
     may be rough, 2ⁿ or 3 · 2ⁿ."""
@@ -289,7 +298,7 @@ def with_overrides(config: FitConfig, overrides: Sequence[str]) -> FitConfig:
             place[name] = json.loads(text)
         except ValueError:
             place[name] = text
-    return read_record(FitConfig, content, "the configuration", remedy="The reference of options gives every range.")
+    return read_record(FitConfig, content, "the configuration", remedy="The reference of options says what it means.")
 
 
 def config_from_dict(content: Any) -> FitConfig:

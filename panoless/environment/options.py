@@ -5,8 +5,10 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from shinypartial.io.records import Count, NonEmpty, NonNegative, Positive
+from shinypartial.io.records import Count, Natural, NonEmpty, NonNegative, Positive, Share
 
+Roughness = Annotated[float, Meta(gt=0, le=0.5)]
+"""Of a mirror, in units of Blender's principled shader."""
 COARSEST = 4
 """Texels along a face side on which the widest blur of a lobe works."""
 
@@ -41,29 +43,29 @@ class FootprintMapOptions:
     up to 2 dB where a fifth of the pixels is wrong."""
     hard: LampOptions = LampOptions(0.25, (0.16, 0.16, 0.16, 0.16))
     """Where they are much brighter, and saturate pixels that they hardly touch. Half as much loses small lamps."""
-    least_hard_gain: float = 0.02
+    least_hard_gain: Share = 0.02
     """Share of the error of unsaturated held-out pixels that hard lamps have to lower: they lower it by 0.04 to 0.32
     on four of those, and by 0.00 or not at all on the others."""
-    robust_scale: float = 0.16
+    robust_scale: Positive = 0.16
     """Of errors of held-out pixels, and where the scales of lamps end. Chosen by the true maps of Vase and Cola;
     held-out views would take 0.3."""
-    smoothness: NonEmpty[float] = (0.01, 0.05, 0.25)
+    smoothness: NonEmpty[NonNegative] = (0.01, 0.05, 0.25)
     """Weights λ of differences between neighboring texels, in pixels, among which held-out pixels choose, from the
     middle one on. On Sculpture and Vase they take that where pixels have no noise, and the largest where it is 0.02."""
     held_out: Annotated[int, Meta(ge=2)] = 5
     """Of so many pixels one is held out. Not tuned."""
-    least_gain: float = 0.002
+    least_gain: Share = 0.002
     """Share of the error of held-out pixels by which a map of twice the resolution has to lower it. Not tuned."""
-    least_unsaturated_gain: float = 0.005
+    least_unsaturated_gain: Share = 0.005
     """The same of unsaturated pixels alone, where all together are explained no worse: 0.012 on a copy of sculpture
     with an operator of 10°, whom no map shows. Not tuned."""
     least_told: Positive = 1.0
     """Pixels on a texel of the coarsest map from which their footprints tell where the map starts. Not tuned."""
-    pull: float = 0.002
+    pull: Positive = 0.002
     """Weight ε of the start, in pixels. Not tuned."""
-    steps: int = 6
+    steps: Count = 6
     """Conjugate-gradient steps of a round."""
-    trial_steps: int = 2
+    trial_steps: Count = 2
     """The same in maps that only choose resolution and smoothness: on seven shapes they choose as six do."""
     trial_pixels: Count = 500_000
     """From about so many pixels at most these maps are made: those that look at some patches of the sky. A quarter of
@@ -71,23 +73,23 @@ class FootprintMapOptions:
     always a half of 300,000."""
     trial_patches: Count = 8
     """Patches along a face side, of which some are chosen. Not tuned."""
-    saturated: float = 0.998
+    saturated: NonNegative = 0.998
     """Share of the largest value from which a pixel is saturated."""
-    lit: float = 0.95
+    lit: NonNegative = 0.95
     """Share of the largest value from which a texel of the start is saturated."""
-    ceiling: float = 4.0
+    ceiling: Positive = 4.0
     """Largest radiance of the map, in those of views. Eight changes nothing on Vase and Cola."""
     coarse_pixels: Count = 200_000
     """About so many pixels at most tell how bright the inside of saturated regions is. Not tuned."""
-    coarse_resolution: int = 8
+    coarse_resolution: Count = 8
     """Texels along a face side of what is added there."""
-    coarse_rounds: int = 2
+    coarse_rounds: Natural = 2
     """Rounds of it."""
-    coarse_steps: int = 6
+    coarse_steps: Count = 6
     """Conjugate-gradient steps of such a round."""
-    coarse_pull: float = 0.2
+    coarse_pull: Positive = 0.2
     """Weight of what is added, in pixels."""
-    coarse_scale: float = 1.0
+    coarse_scale: Positive = 1.0
     """Robust scale there: while a lamp is far too dark, pixels that see it in part must keep their votes."""
 
     @property
@@ -105,11 +107,11 @@ class ConfidenceOptions:
     of Vase and Cola.
     """
 
-    vote_scale: float = 0.05
+    vote_scale: Positive = 0.05
     """Residual (linear radiance) beyond which a ray does not agree with the map."""
-    halving_disagreement: float = 0.05
+    halving_disagreement: Positive = 0.05
     """Mean difference of rays from the map (sRGB, 0 to 1) that halves it."""
-    halving_contrast: float = 0.1
+    halving_contrast: Positive = 0.1
     """Difference of a texel's neighbors (linear radiance) that halves it."""
 
 
@@ -126,53 +128,53 @@ class SurroundingsOptions:
     degree: Literal[0, 1, 2] = 0
     """Of the harmonics that 1/D is made of where it is near: 0 is a sphere, 1 one about another point, 2 walls that
     differ."""
-    checked_views: int = 10
+    checked_views: Count = 10
     """So many views tell whether to look closer…"""
-    checked_rays: int = 20_000
+    checked_rays: Count = 20_000
     """…by about so many pixels. Not tuned."""
-    rays: int = 60_000
+    rays: Count = 60_000
     """About so many pixels of all views tell how near they are."""
-    robust_scale: float = 0.15
+    robust_scale: Positive = 0.15
     """Residual (linear radiance) beyond which a ray loses its vote. Not tuned."""
-    checked_resolution: int = 8
+    checked_resolution: Count = 8
     """Texels along a face side of the map under which a first step tells whether to look closer."""
-    least_pull: float = 0.0003
+    least_pull: NonNegative = 0.0003
     """Share of the cost that this step has to promise. It is 0.024 and 0.017 in rooms of vase at 5 and 10 radii, 0.063
     and 0.028 in those of sculpture, 0.0005 in one of mirror at 20 radii, and up to 0.0001 in their far worlds."""
     first_inverse_distance: Positive = 0.1
     """1/D, in inverse radii of the object, in which a fit is tried first that a far world leaves pulled like that. The
     fit of a brick in a room at 5 radii, no scene of the benchmark, is pulled by 0.002; in a far world by 0.00005."""
-    resolutions: NonEmpty[int] = (8, 8, 16, 16, 16, 32, 32, 32, 64, 64, 64)
+    resolutions: NonEmpty[Count] = (8, 8, 16, 16, 16, 32, 32, 32, 64, 64, 64)
     """Texels along a face side of the maps of all steps."""
-    stretch: float = 1.7
+    stretch: Positive = 1.7
     """Factor of a step: it lets each texel follow by the mean of its rays, as a map does not quite."""
-    least_share: float = 1e-3
+    least_share: Positive = 1e-3
     """Share of the mean diagonal that is added to the diagonal, for walls that no ray tells. Not tuned."""
     floor: Literal["auto", "off"] = "auto"
     """Whether what the object stands on is taken for a level disk before the walls, where held-out views gain by it."""
-    floor_depths: NonEmpty[float] = (0.45, 0.55, 0.65, 0.8, 1.0)
+    floor_depths: NonEmpty[Positive] = (0.45, 0.55, 0.65, 0.8, 1.0)
     """Of what the object may stand on below its center, in radii of the object: those that are tried first."""
-    floor_reaches: NonEmpty[float] = (2.5, 4.0, 8.0)
+    floor_reaches: NonEmpty[Positive] = (2.5, 4.0, 8.0)
     """How far that may reach, in radii of the object."""
-    floor_resolution: int = 16
+    floor_resolution: Count = 16
     """Texels along a face side of the maps that tell which of these explains most."""
-    largest_floor_cost: float = 0.99
+    largest_floor_cost: NonNegative = 0.99
     """Share of the cost in a far world that a floor has to leave, for anyone to look closer: it leaves 0.85 to 0.98
     below vase, sculpture and the pot of a film, and 1.004 and more of far worlds of seven scenes."""
-    least_floor_gain: float = 0.02
+    least_floor_gain: Share = 0.02
     """Share by which a floor has to lower the held-out error of a shape from silhouettes. That of *sculpture* filmed on
     a board falls by 0.034: most of it is the shape's."""
-    refined_floor_resolutions: NonEmpty[int] = (64, 64, 128, 128, 128)
+    refined_floor_resolutions: NonEmpty[Count] = (64, 64, 128, 128, 128)
     """Texels along a face side of the maps of all steps by which a fit tells its floor anew. Under coarser maps that of
     a filmed ball comes out 4 % too deep and leans by 1.4°; under these 1.2 % and 0.5°."""
-    refined_floor_rays: int = 200_000
+    refined_floor_rays: Count = 200_000
     """About so many pixels of all views tell it: three of them a texel."""
-    least_refined_floor_gain: float = 0.005
+    least_refined_floor_gain: Share = 0.005
     """Share by which that has to lower the held-out error: it falls by 0.011 on the filmed ball, and not at all where a
     filmed sculpture is bent to the floor that silhouettes told."""
-    judged_rays: int = 400_000
+    judged_rays: Count = 400_000
     """About so many pixels of all views tell whether a fit in near surroundings explains more than a far one."""
-    judged_resolution: int = 64
+    judged_resolution: Count = 64
     """Texels along a face side of the map that predicts held-out views."""
 
 
@@ -186,19 +188,19 @@ class MaterialOptions:
     reflectance: Literal["auto", "off"] = "auto"
     """Whether the share of the light that is mirrored may depend on color and angle, as that of a metal does; not where
     a tint is given, and never in a high dynamic range."""
-    rays: int = 100_000
+    rays: Count = 100_000
     """About so many pixels of all views tell it. Not tuned."""
-    resolution: int = 64
+    resolution: Count = 64
     """Texels along a face side of the map that follows it. Not tuned."""
-    robust_scale: float = 0.1
+    robust_scale: Positive = 0.1
     """Residual (linear radiance) beyond which a ray loses its vote. With 0.03 the rays of a golden vase, all far off at
     first, lose so many votes that its blue comes out at 0.77 instead of 0.34."""
-    rounds: int = 12
+    rounds: Count = 12
     """Gauss–Newton steps. Not tuned."""
-    largest_reflectance: float = 0.97
+    largest_reflectance: Share = 0.97
     """Of the channel that is mirrored least, above which nobody asks held-out views: it is 0.34 on golden copies of
     vase and sculpture and 0.9997 on vase itself."""
-    least_gain: float = 0.02
+    least_gain: Share = 0.02
     """Share by which the held-out error has to fall. It falls by 0.045 and 0.065 on golden copies of vase and
     sculpture; texels as wide as pixels leave much of it in any case."""
     least_albedo: Positive = 0.02
@@ -221,42 +223,42 @@ class MaterialOptions:
     """Among these it is searched for. Not tuned."""
     known_roughness: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.0
     """Where it is known, in units of Blender's principled shader and in [0, 0.5]; 0: held-out views tell it."""
-    first_roughness: float = 0.085
+    first_roughness: Roughness = 0.085
     """That of which held-out views are asked first: it lowers their error by 0.04 and 0.03 of it on copies of sculpture
     and vase with 0.1, and raises it by 0.06, 0.22 and 0.15 on sculpture, vase and mirror themselves."""
-    least_roughness_gain: float = 0.01
+    least_roughness_gain: Share = 0.01
     """Share by which that has to lower the held-out error, also that of a sharp map which its lobe smooths afterwards:
     there 0.06 on sculpture with a roughness of 0.1, 0.005 with JPEG of quality 40 and 0.008 with noise."""
-    least_unexplained: float = 0.01
+    least_unexplained: NonNegative = 0.01
     """Held-out error of a sharp map from which anything softer is asked for: 0.10 on a copy of vase with a roughness of
     0.1, and 0.003 on a smooth trial shape in a world without detail, of which a lobe explains 7 % all the same."""
-    roughnesses: tuple[float, float] = (0.06, 0.3)
+    roughnesses: tuple[Roughness, Roughness] = (0.06, 0.3)
     """Among these it is searched for. Not tuned."""
-    roughness_trials: int = 6
+    roughness_trials: Count = 6
     """So many are tried in the search, which tells it to 15 %, and in that of a blur. Not tuned."""
-    judged_pixels: int = 60_000
+    judged_pixels: Count = 60_000
     """About so many pixels at most make a map under which roughness is judged: two or three a texel. With fewer, the
     map of a smooth mirror fits noise, and sculpture itself is taken for rough; with many, a smooth mirror in a blurred
     world explains the copy of vase better."""
-    judged_resolution: int = 64
+    judged_resolution: Count = 64
     """Texels along a face side of it. With 128, a roughness of 0.1 comes out as 0.07 to 0.09."""
-    judged_rounds: int = 8
+    judged_rounds: Natural = 8
     """Steps that sharpen it for the first question; the search takes those of the exported map."""
-    sharpening_rounds: int = 20
+    sharpening_rounds: Natural = 20
     """Steps that sharpen the exported map of a rough mirror. Further ones amplify noise."""
-    step_power: float = 1.5
+    step_power: Positive = 1.5
     """Exponent of a step: 1 is the method's, more goes faster. Not tuned."""
-    sharpening_scale: float = 0.16
+    sharpening_scale: Positive = 0.16
     """Robust scale of radiance errors, as that of footprints."""
-    lit: float = 0.95
+    lit: NonNegative = 0.95
     """Share of the largest value from which a texel of the start is saturated."""
-    lamp_border_rad: float = 0.0123
+    lamp_border_rad: NonNegative = 0.0123
     """By so much lamps are smaller at the start than what they saturate: a texel of 128. Twice as much costs 1 dB on a
     copy of mirror with 0.1."""
-    lamp_light: float = 3.0
+    lamp_light: Positive = 3.0
     """Their radiance at the start, in largest values of views. Chosen among 2, 3 and 10 on copies of vase, mirror and
     sculpture with 0.1: with 10, sculpture loses 2.6 dB."""
-    inertia: float = 1e-4
+    inertia: Positive = 1e-4
     """Added above and below the bar of a step, in rays times radiance, so that what no pixel sees stays. Not tuned."""
-    least_light: float = 1e-3
+    least_light: Positive = 1e-3
     """Radiance at the start of what is darker: zero would stay zero. Not tuned."""

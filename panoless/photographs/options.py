@@ -5,7 +5,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from shinypartial.io.records import Count, NonNegative, Positive, Share
+from shinypartial.io.records import Count, Finite, NonNegative, Positive, Share
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class CaptureOptions:
     segmenter_side_px: Count = 1024
     """Side of the square picture that a segmentation model is given. This and the two below are those of IS-Net (Qin et
     al. 2022)."""
-    segmenter_mean: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    segmenter_mean: tuple[Finite, Finite, Finite] = (0.5, 0.5, 0.5)
     """What is subtracted from red, green and blue in [0, 1] before…"""
     segmenter_deviation: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
     """…they are divided by this."""

@@ -21,9 +21,12 @@ from shinypartial.core.errors import InputError
 Record = TypeVar("Record")
 
 Count = Annotated[int, Meta(ge=1)]
+Natural = Annotated[int, Meta(ge=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
 Positive = Annotated[float, Meta(gt=0)]
 Share = Annotated[float, Meta(ge=0, le=1)]
+Finite = Annotated[float, Meta(description="any finite number")]
+"""For numbers that may be negative, which says that no range was forgotten."""
 Text = Annotated[str, Meta(pattern=r"\S")]
 Item = TypeVar("Item")
 NonEmpty = Annotated[tuple[Item, ...], Meta(min_length=1)]

@@ -2,17 +2,27 @@
 
 import ast
 import json
+from collections.abc import Iterator
 from dataclasses import asdict, fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import pytest
+from msgspec import Meta
 
 import panoless
 from panoless.cli import main
-from panoless.config import FitConfig, RateConfig, check_config, config_from_dict, renamed_arguments
+from panoless.config import (
+    FitConfig,
+    RateConfig,
+    check_config,
+    config_from_dict,
+    renamed_arguments,
+    with_overrides,
+)
 from panoless.geometry.surfels.model import ShadedSurfels
+from panoless.photographs.options import CaptureOptions
 from panoless.presets import PRESETS
 from shinypartial.core.errors import InputError
 from shinypartial.io.records import write_record
@@ -117,6 +127,31 @@ def test_a_value_out_of_range_is_named_as_the_command_line_names_it(name: str, v
 def test_a_map_of_mirrors_is_not_solved_for_other_shading() -> None:
     with pytest.raises(InputError, match=r"no-solve"):
         check_config(with_value(PRESETS["default"], "surfels.shading", "3dgs-dr"))
+
+
+def numbers_without_a_range(hint: Any, path: str) -> Iterator[str]:
+    """Paths of the plain numbers in an annotation: neither bounded nor said to be any finite number."""
+    if isinstance(hint, type) and is_dataclass(hint):
+        for name, each in get_type_hints(hint, include_extras=True).items():
+            yield from numbers_without_a_range(each, f"{path}.{name}")
+    elif hint in (int, float):
+        yield path
+    elif not any(isinstance(each, Meta) and each.min_length is None for each in getattr(hint, "__metadata__", ())):
+        for each in () if get_origin(hint) is Literal else get_args(hint):
+            yield from numbers_without_a_range(each, path)
+
+
+@pytest.mark.parametrize("options", [FitConfig, CaptureOptions])
+def test_every_number_has_a_range_at_its_field(options: type) -> None:
+    assert list(numbers_without_a_range(options, options.__name__)) == []
+
+
+@pytest.mark.parametrize(
+    "override", ["surroundings.checked_views=0", "material.rays=0", "plane.start_grid=1", "height_field.cells=-1"]
+)
+def test_a_tuned_number_out_of_range_is_refused(override: str) -> None:
+    with pytest.raises(InputError, match=override.partition("=")[0]):
+        with_overrides(PRESETS["default"], [override])
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,11 @@
 """The tuned numbers of a free-form surface's fit."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from shinypartial.io.records import Count, NonEmpty, NonNegative, Positive
+from msgspec import Meta
+
+from shinypartial.io.records import Count, Natural, NonEmpty, NonNegative, Positive, Share
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class FreeFormRound:
     """Weight λ of the integral of |D³φ|² in the normalized frame, against `counted_rays` pixels."""
     steps: Count
     """Most steps."""
-    photon_share: float = 0.75
+    photon_share: Annotated[float, Meta(ge=0, lt=1)] = 0.75
     """Share of a pixel's variance that grows with what it shows, in [0, 1). It takes normals from 0.43° to 0.22° on
     chrome-block over a ground darkened to a tenth, and from 0.11° to 0.09° on sculpture. Where poses are free it
     is 0: on sculpture with cameras turned by 0.5° it would take the mean from 3.8° to 6.4°."""
@@ -53,67 +55,67 @@ class ConcaveOptions:
 
     search: bool = True
     """Whether hollows are looked for at all."""
-    rays: int = 40_000
+    rays: Count = 40_000
     """About so many pixels of all views are traced against the surface that is searched."""
-    pixels: int = 2_500
+    pixels: Count = 2_500
     """Most of them under one hollow that score a candidate."""
-    least_pixels: int = 300
+    least_pixels: Count = 300
     """Patches that fewer see are left alone. Not tuned."""
-    cells: int = 40
+    cells: Count = 40
     """Cells along the longest side of the box on which candidates are traced."""
-    bounces: int = 3
+    bounces: Count = 3
     """Reflections that a ray is followed through. Half the pixels of a deep bowl need two or more."""
-    scale: float = 0.3
+    scale: Positive = 0.3
     """Color (linear radiance) beyond which disagreement counts no more: wide, so that the score falls early."""
-    resolutions: NonEmpty[int] = (6, 8, 12)
+    resolutions: NonEmpty[Count] = (6, 8, 12)
     """Cells along a face side in which directions are compared, from coarse to fine."""
-    evaluations: NonEmpty[int] = (160, 200, 260)
+    evaluations: NonEmpty[Count] = (160, 200, 260)
     """Candidates of the descent at each of them."""
-    descents: int = 3
+    descents: Count = 3
     """Best first guesses that are followed at the first resolution."""
-    neighborhood: float = 0.12
+    neighborhood: Positive = 0.12
     """Radius, in the normalized frame, over which the disagreement of pixels is averaged…"""
-    least_disagreement: float = 0.95
+    least_disagreement: NonNegative = 0.95
     """…and from which they count as unexplained, in what pixels of any direction have: convex parts of a visual hull
     have 0.7, beside a socket 0.83, and a lid 1.0."""
-    settled_disagreement: float = 0.35
+    settled_disagreement: NonNegative = 0.35
     """Mean disagreement of a patch, after the first rounds, from which it may be a lid though no part of it is
     unexplained: under a bright sky, pixels of a shallow dish agree with most others. On the trial shape tray it is 0.43
     under a lid; on flat faces of twist, brick and drum 0.2 to 0.4, on sculpture there is no such patch."""
-    least_part: int = 60
+    least_part: Count = 60
     """Parts of fewer unexplained pixels are left alone. Not tuned."""
-    whole_share: float = 0.6
+    whole_share: Share = 0.6
     """A patch of which at least this share is unexplained is the lid of one hollow; else each part of it may be."""
-    lid_angle_deg: float = 40.0
+    lid_angle_deg: Positive = 40.0
     """A patch is what lies within so much of its mean normal."""
-    insets: NonEmpty[float] = (1.1, 1.0, 0.93, 0.86, 0.79)
+    insets: NonEmpty[Positive] = (1.1, 1.0, 0.93, 0.86, 0.79)
     """Sizes of the first guesses, in those of the patch. The lip of tray lies beyond the patch."""
-    depths: NonEmpty[float] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.3)
+    depths: NonEmpty[Positive] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.3)
     """Depths of the first guesses, in mean radii of the patch: right ones are told from wrong ones within a tenth."""
-    exponents: NonEmpty[float] = (1.3, 1.7, 2.0, 2.5, 4.0)
+    exponents: NonEmpty[Positive] = (1.3, 1.7, 2.0, 2.5, 4.0)
     """Exponents p of their profiles ρᵖ + δᵖ = 1: from nearly a cone to nearly a box."""
-    farthest_guess: float = 1.2
+    farthest_guess: Positive = 1.2
     """First guesses that disagree by more than so many times what the patch does are not followed: on tray, the best
     one disagrees as much as the lid does, and what it leads to by half of that."""
-    rounding_cells: float = 0.7
+    rounding_cells: Positive = 0.7
     """Width over which hollow and surface melt together at the rim."""
-    rim_share: float = 0.08
+    rim_share: Positive = 0.08
     """The lid is fitted to the surface within so much of the rim, in ways to it. Not tuned."""
-    lid_stiffness: float = 0.02
+    lid_stiffness: Positive = 0.02
     """Weight of a lid's squared curvatures, in heights. Not tuned."""
-    least_facing: float = 0.1
+    least_facing: Share = 0.1
     """Cosine between a patch's mean normal and that of a pixel in it. Not tuned."""
-    step_middle: float = 0.08
+    step_middle: Positive = 0.08
     """First standard deviations of a descent, in the patch's radii: of the rim's middle…"""
-    step_size: float = 0.06
+    step_size: Positive = 0.06
     """…of the logarithm of its size…"""
-    step_waves: float = 0.05
+    step_waves: Positive = 0.05
     """…of the waves of its outline…"""
-    step_depth: float = 0.08
+    step_depth: Positive = 0.08
     """…of its depth, of the reach at its knots and of its lean. Not tuned."""
-    least_gain: float = 0.1
+    least_gain: Share = 0.1
     """A hollow is kept if it lowers the disagreement under it by this share…"""
-    standard_errors: float = 4.0
+    standard_errors: NonNegative = 4.0
     """…and by so many standard errors of the views' differences."""
     rounds: NonEmpty[FreeFormRound] = (
         FreeFormRound(28, 16, 0.30, 1, 40_000, 30.0, 5),
@@ -122,7 +124,7 @@ class ConcaveOptions:
         FreeFormRound(36, 64, 0.15, 4, 80_000, 30.0, 4),
     )
     """What is taken from a surface with hollows, instead of the first rounds: these would smooth a socket away."""
-    least_held_out_gain: float = 0.02
+    least_held_out_gain: Share = 0.02
     """Share of the held-out error, after these rounds, by which hollows have to lower it."""
 
 
@@ -144,23 +146,23 @@ class DescentOptions:
     )
     """None: the first surface with the least disagreement is the start. Half the pixels take normals of the block from
     0.7° to 1.0°; λ of 300 and 10,000 from 0.7° to 0.9° and 1.4°; beginning with 4 texels from 0.8° to 1.8°."""
-    followed: int = 3
+    followed: Count = 3
     """Of the first surfaces, each held by outlines and not, so many go on after the first round: those with the least
     disagreement. The best one then is not always the best one in the end: after one round and after all and the first
     of the fit, chair held has 0.778 and 0.465, not held 0.753 and 0.571. It is among the first two on chair, pawn,
     crate, bust, drum, die, ingot, eight and horseshoe; on jug and twist others come within 0.014 of it."""
-    outline_points: int = 4000
+    outline_points: Count = 4000
     """Most outline points of all views."""
     least_disagreement: NonNegative = 0.15
     """Of pixels under the plain surface, after the first round of the fit, from which all first surfaces descend; below
     it the plain one does. It is 0.10, 0.12 and 0.14 on sculpture, chrome-block and ellipsoid, and 0.17 to 0.60 on die,
     horseshoe, twist, drum, jug, crate and bust, where others may start better."""
-    judged_pixels: int = 40_000
+    judged_pixels: Count = 40_000
     """Of all views, by which what descended is compared…"""
-    judged_resolution: int = 24
+    judged_resolution: Count = 24
     """…with directions in so many cells along a face side: finer than those that choose the ways, as surfaces that end
     well and badly differ by little then."""
-    least_gain: float = 0.02
+    least_gain: Share = 0.02
     """Share of the disagreement, after the first round of the fit, by which what descended has to lower it."""
 
 
@@ -201,12 +203,12 @@ class FreeFormOptions:
     Chosen on the trial shape jug."""
     most_mendings: Count = 3
     """Taken so often at most. Not tuned."""
-    distrusted: float = 0.2
+    distrusted: Share = 0.2
     """Trust below which a pixel distrusts what it sees. Not tuned."""
-    least_distrusted: float = 0.01
+    least_distrusted: Share = 0.01
     """Share of such pixels among those that see the surroundings, from which mending is tried: 0.07 and 0.24 on the
     trial shapes jug and bust, 0.0007 on sculpture."""
-    least_mending_gain: float = 0.02
+    least_mending_gain: Share = 0.02
     """Share of the held-out error by which mending has to lower it. Not tuned."""
     detailing: tuple[FreeFormRound, ...] = (
         FreeFormRound(36, 4, 0.80, 1, 20_000, 30.0, 10),
@@ -222,42 +224,42 @@ class FreeFormOptions:
     """What is taken from the first surface in place of the rounds above, where much is left unexplained after them: a
     head with eyes and ears has details that turn by far more than the texels of their maps, and are narrower than their
     cells. Chosen on such a head: 10.7° in the median after the rounds, 9.3° mended, 1.7° after these."""
-    detailed_error: float = 0.11
+    detailed_error: NonNegative = 0.11
     """Held-out error from which that is tried. Jug has 0.108, where it does not help, bust 0.13, where it does."""
-    least_detailing_gain: float = 0.02
+    least_detailing_gain: Share = 0.02
     """Share of the held-out error by which it has to lower it. Not tuned."""
     concave: ConcaveOptions = ConcaveOptions()
     """How hollows are looked for."""
-    least_views: int = 5
+    least_views: Count = 5
     """With fewer views none is held out, and model selection leaves the kind out. Not tuned."""
-    start_cells: int = 40
+    start_cells: Count = 40
     """Cells along the longest side of the first surface, before its first round. Not tuned."""
-    start_tensions: NonEmpty[float] = (0.0, 10.0, 30.0, 100.0)
+    start_tensions: NonEmpty[NonNegative] = (0.0, 10.0, 30.0, 100.0)
     """Tensions τ of the plate between contacts (1/length² in the normalized frame) among which the pixels choose. On
     chrome-block over a dark ground the normals of the start are wrong by 9.6°, 6.5°, 3.0° and 4.5° in the median, and
     by 9.1°, 3.8°, 0.5° and 1.1° after the first rounds; sculpture ends within 0.02° from all of them."""
-    start_pixels: int = 8000
+    start_pixels: Count = 8000
     """Of all views, by which they choose…"""
-    start_resolution: int = 12
+    start_resolution: Count = 12
     """…with directions compared in so many cells along a face side."""
     descent: DescentOptions = DescentOptions()
     """How the start comes near where its steps from there lead to the true surface."""
-    margin: float = 0.175
+    margin: Positive = 0.175
     """Between the start and the sides of its box, in its longest side: the support of a spline on the first grid, and
     some room to move. Not tuned."""
-    band_cells: float = 3.5
+    band_cells: Positive = 3.5
     """Coefficients within so many cells of the surface are unknowns: all whose support meets it. Not tuned."""
-    counted_rays: float = 100_000.0
+    counted_rays: Positive = 100_000.0
     """The photographs weigh as much as so many pixels, however many take part."""
     photograph_curvature: Positive = 0.5
     """Factor of the photographs' part of the Gauss–Newton matrix. Along steps on the trial shape twist, their cost has
     0.6 times the curvature that the matrix says where the map stays, and less where it follows. 0.3 is no better.
     It is 1 where cameras or surroundings are unknown, too: there it was not measured."""
-    radiance_sigma: float = 0.02
+    radiance_sigma: Positive = 0.02
     """Standard deviation of a pixel of mean brightness (linear radiance)."""
-    outline_sigma_px: float = 0.15
+    outline_sigma_px: Positive = 0.15
     """Standard deviation of an outline's point."""
-    outline_scale_px: float = 2.0
+    outline_scale_px: Positive = 2.0
     """Robust scale of outlines."""
     agreed_outline_gain: Positive = 9.0
     """Factor of the outlines' weight in the last round of all, where photographs agree with the masks. After the rounds
@@ -269,135 +271,135 @@ class FreeFormOptions:
     agreed_pull_px: Positive = 0.01
     """…and pulled no more than this: by up to 0.006 px under right masks and shapes, by 0.05 and 0.09 px on
     chrome-block and sculpture under masks that are 1 px too small."""
-    outline_points: int = 30_000
+    outline_points: Count = 30_000
     """Most outline points of all views. Not tuned."""
-    miss_weight: float = 3.0
+    miss_weight: NonNegative = 3.0
     """Weight of a pixel on the object that misses the surface, against an outline's point where those count once. With
     0.3 Sculpture ends at 1.19° under masks that are 1 px too large, and Pawn loses 6 % of its pixels in the rounds of
     `fast`; with 3 at 0.15° and 4 %, with 10 at 3 %. Without missed pixels nothing depends on it."""
-    miss_scale_px: float = 20.0
+    miss_scale_px: Positive = 20.0
     """Its robust scale."""
-    gauge: float = 10.0
+    gauge: NonNegative = 10.0
     """Weight of (|∇φ| − 1)² at each node within `gauge_cells`."""
-    gauge_cells: float = 2.0
+    gauge_cells: NonNegative = 2.0
     """From the surface."""
-    inner_px: float = 1.5
+    inner_px: NonNegative = 1.5
     """Pixels nearer to the outline of their mask have no say: they mix two things. Not tuned."""
-    least_cosine: float = 0.12
+    least_cosine: Share = 0.12
     """Between the ray and the surface's normal, for a pixel to have a say in the shape."""
-    least_map_cosine: float = 0.03
+    least_map_cosine: Share = 0.03
     """The same for the final map."""
-    map_inner_px: float = 1.0
+    map_inner_px: NonNegative = 1.0
     """Pixels of the final map lie farther inside their mask. Not tuned."""
-    footprints: int = 2_000_000
+    footprints: Count = 2_000_000
     """Pixels whose areas sharpen the final map, for memory."""
-    widest_footprint_rad: float = 0.15
+    widest_footprint_rad: Positive = 0.15
     """Pixels that mirror more in one direction take no part in that. On sculpture at 200 px 0.05, 0.15 and 0.5 give
     32.8, 33.8 and 33.6 dB."""
-    least_footprint_trust: float = 0.3
+    least_footprint_trust: Share = 0.3
     """Nor do pixels that are trusted less; 0.7 costs 0.04 dB there."""
-    render_samples: int = 4
+    render_samples: Count = 4
     """Rays along a side of a pixel at an outline, and where mirrored rays turn far or meet the surface again."""
     render_directions: Literal[1, 4] = 4
     """Mirrored rays over the other pixels. Not tuned."""
-    widest_render_turn_rad: float = 0.15
+    widest_render_turn_rad: NonNegative = 0.15
     """Mirrored rays turn far that turn by more over a pixel. On sculpture at 160 px, 0.05 gains 0.1 dB more, for 1.6
     times the time."""
-    render_bounces: int = 8
+    render_bounces: Count = 8
     """A ray that has not left after so many reflections shows where it goes then. Not tuned."""
-    surfel_pixel: float = 0.2
+    surfel_pixel: Positive = 0.2
     """The sag of surfels that start on the surface is told in pixels of so many cells. Not tuned."""
-    wide_texels: float = 4.0
+    wide_texels: Positive = 4.0
     """A pixel that mirrors so many texels has half a vote."""
-    map_smoothness: float = 0.05
+    map_smoothness: Positive = 0.05
     """Weight of squared differences of neighboring texels, in rays."""
-    map_rounds: int = 2
+    map_rounds: Natural = 2
     """Robust rounds of the map after each step."""
-    first_map_rounds: int = 3
+    first_map_rounds: Count = 3
     """The same at the start of a round of steps."""
-    map_steps: int = 6
+    map_steps: Count = 6
     """Conjugate-gradient steps of each of them."""
-    texel_prior: float = 0.5
+    texel_prior: NonNegative = 0.5
     """Rays that ask for nothing in the mean of a texel."""
-    trust_cells: int = 40
+    trust_cells: Count = 40
     """Cells along the longest side in which trust is measured."""
-    trust_scale: float = 2.0
+    trust_scale: Positive = 2.0
     """Robust scale of trust, in medians of the residuals…"""
-    least_trust_scale: float = 0.02
+    least_trust_scale: Positive = 0.02
     """…but at least this (linear radiance)."""
-    trust_prior: float = 1e-5
+    trust_prior: Positive = 1e-5
     """Share of all rays that each cell of trust has beside its own, of trust `trust_floor`."""
-    trust_floor: float = 0.1
+    trust_floor: NonNegative = 0.1
     """Trust where no ray tells, in means."""
-    trust_power: float = 2.0
+    trust_power: NonNegative = 2.0
     """Trust is raised to this power."""
-    damping: float = 1e-3
+    damping: Positive = 1e-3
     """First μ of Marquardt's damping μ diag(H)."""
-    damping_less: float = 0.3
+    damping_less: Positive = 0.3
     """Factor of μ after a whole step."""
-    damping_more: float = 4.0
+    damping_more: Positive = 4.0
     """Factor of μ for each time that one was shortened."""
-    damping_range: tuple[float, float] = (1e-5, 1.0)
+    damping_range: tuple[Positive, Positive] = (1e-5, 1.0)
     """Bounds of μ."""
-    shortening: float = 0.35
+    shortening: Share = 0.35
     """Factor of a step that raises the cost."""
-    trials: int = 4
+    trials: Count = 4
     """Lengths that are tried."""
-    solver_tolerance: float = 1e-5
+    solver_tolerance: NonNegative = 1e-5
     """Conjugate-gradient steps end when the preconditioned residual's energy has fallen to this share."""
-    largest_step_cells: float = 1.0
+    largest_step_cells: Positive = 1.0
     """No coefficient moves by more in one step."""
-    least_surroundings_share: float = 1e-3
+    least_surroundings_share: Positive = 1e-3
     """Share of the trace of the surroundings' matrix that is added to its diagonal. Not tuned."""
-    focal_prior: float = 0.02
+    focal_prior: Positive = 0.02
     """Expected error of the logarithm of the focal length, where it is unknown."""
-    k1_prior: float = 0.1
+    k1_prior: Positive = 0.1
     """Expected radial distortion, where that is. Not tuned: lenses of phones have about 0.06."""
-    shared_steps: int = 8
+    shared_steps: Count = 8
     """Most steps in which these, or how near the surroundings are, are found on from a fit."""
-    lens_glance_steps: int = 2
+    lens_glance_steps: Count = 2
     """Steps by which is told whether they are looked for at all…"""
-    lens_glance_rays: int = 60_000
+    lens_glance_rays: Count = 60_000
     """…by so many pixels at most…"""
-    least_k1_change: float = 0.01
+    least_k1_change: NonNegative = 0.01
     """…which have to change the distortion by this, half of what is told of it…"""
-    least_focal_change: float = 0.002
+    least_focal_change: NonNegative = 0.002
     """…or log focal length by this. On sculpture, by 40,000 pixels, one step changes it by 0.0003 where
     it is right, and by 0.0055 and more where it is off by 0.5 % or 2 %."""
-    least_shared_gain: float = 3e-4
+    least_shared_gain: Share = 3e-4
     """Steps end, where that is unknown, when one lowers the cost by less than this share."""
     outline_round: FreeFormRound = FreeFormRound(20, 4, 0.3, 1, 2_000, 1.0, 12, outlines_alone=True)
     """By which outlines alone tell poses. On the trial shape brick with cameras turned by 0.5° they leave 0.08°; λ of
     10 and 100 leave 0.33° and 0.90°, because poses make up for edges that such a surface is too smooth for."""
-    pose_outline_scale_px: float = 10.0
+    pose_outline_scale_px: Positive = 10.0
     """Robust scale of outlines in these: they are this far off where cameras are by 2°."""
-    largest_cost_left: float = 0.8
+    largest_cost_left: NonNegative = 0.8
     """Poses are found where free ones leave no more than this share of the cost that believed ones do in it. With true
     cameras it is 0.94 to 0.99 on sculpture, horseshoe, chrome-block and five trial shapes, and 0.75 on the trial shape
     tray. With cameras turned by 0.1° it is 0.26 to 0.47 on the first three, and by 0.5° 0.72 on the trial shape crown,
     whose points this surface is too coarse for. Held-out views refuse what is not needed."""
     pose_glance_points: Count = 8000
     """Most outline points by which is told whether that is so."""
-    outline_trust: float = 10.0
+    outline_trust: Positive = 10.0
     """Photographs find poses under a prior of so many times the precision that outlines tell them with. On sculpture,
     horseshoe and chrome-block with cameras turned by 0.5°, normals end with medians of 0.13°, 0.18° and 0.44°; 100
     leaves less of the turns, and normals of 0.13°, 0.21° and 0.47°."""
-    pose_prior_rounds: int = 2
+    pose_prior_rounds: Natural = 2
     """Times that outlines are asked again under a prior of turns and shifts as large as these turned out to be. With
     cameras turned by 0.5° it takes what is left of turns from 0.041° to 0.019° on sculpture, from 0.150° to 0.084° on
     chrome-block, and from 0.037° to 0.024° on horseshoe; with cameras shifted by 0.3 % of their distance from 0.177° to
     0.090° on chrome-block, and by little on the others. With both it takes 0.039° to 0.054° on sculpture."""
-    least_pose_share: float = 0.1
+    least_pose_share: Positive = 0.1
     """Share of the stated standard deviations below which such a prior never goes. Not tuned."""
-    pose_steps: int = 6
+    pose_steps: Count = 6
     """Most steps of finding poses of views that took no part in a fit."""
-    least_held_out_gain: float = 0.002
+    least_held_out_gain: Share = 0.002
     """Share of the held-out error by which a finer round has to lower it."""
-    held_out_rays: int = 200_000
+    held_out_rays: Count = 200_000
     """Pixels of held-out views, and of the others, that tell it. Not tuned."""
-    held_out_resolution: int = 128
+    held_out_resolution: Count = 128
     """Texels along a face side of the map that predicts them."""
-    least_gain: float = 3e-3
+    least_gain: Share = 3e-3
     """A round ends when a step lowers the cost by less than this share."""
 
 

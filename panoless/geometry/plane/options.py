@@ -1,21 +1,24 @@
 """The tuned numbers of a plane's fit."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
-from shinypartial.io.records import NonEmpty
+from msgspec import Meta
+
+from shinypartial.io.records import Count, Finite, Natural, NonEmpty, NonNegative, Positive, Share
 
 
 @dataclass(frozen=True)
 class BoundaryRound:
     """A boundary by vote of the masks on a grid, then one Gauss–Newton step on plane and boundary for each scale."""
 
-    grid: int
+    grid: Annotated[int, Meta(ge=2)]
     """Points along a side of the grid."""
-    level: float
+    level: Share
     """The boundary runs where this share of the largest vote is; later rounds see sharper edges. Not tuned."""
-    tolerance_cells: float
+    tolerance_cells: Positive
     """The voted boundary is simplified by at most this many cells. Not tuned."""
-    scales_px: tuple[float, ...]
+    scales_px: NonEmpty[Positive]
     """Robust scales of the steps, in pixels: from coarse to fine. Not tuned."""
 
 
@@ -27,32 +30,32 @@ class PlaneOptions:
     or small enough.
     """
 
-    min_views: int = 3
+    min_views: Annotated[int, Meta(ge=2)] = 3
     """Fewest distinct views that determine a plane. Not tuned."""
-    min_baseline: float = 0.02
+    min_baseline: NonNegative = 0.02
     """Distance between two cameras, as a share of their distance from the object, that makes them distinct. Not tuned.
     """
 
-    start_directions: int = 200
+    start_directions: Count = 200
     """Normals that are tried, evenly over the sphere. Not tuned."""
-    start_offsets: NonEmpty[float] = (-0.2, 0.0, 0.2)
+    start_offsets: NonEmpty[Finite] = (-0.2, 0.0, 0.2)
     """Offsets that are tried with each, in radii of the object. Not tuned."""
-    start_cosine: float = 0.15
+    start_cosine: Share = 0.15
     """A plane faces a camera if the cosine between its normal and the direction to it is above this. Not tuned."""
-    start_grid: int = 32
+    start_grid: Annotated[int, Meta(ge=2)] = 32
     """Points along a side of the grid on which masks are compared at the start. Not tuned."""
-    start_views: int = 16
+    start_views: Count = 16
     """Views that are compared at the start. Not tuned."""
-    start_half_side: float = 1.2
+    start_half_side: Positive = 1.2
     """Half a side of that grid, in radii of the object. Not tuned."""
-    starts: int = 3
+    starts: Count = 3
     """So many of the best starts go through the first round. Not tuned."""
 
-    max_points: int = 40_000
+    max_points: Count = 40_000
     """Most contour points of all views. Not tuned."""
-    max_vertices: int = 128
+    max_vertices: Annotated[int, Meta(ge=3)] = 128
     """Most vertices of the boundary. Not tuned."""
-    voting_views: int = 32
+    voting_views: Count = 32
     """Views whose masks vote for the boundary. Not tuned."""
     first_round: BoundaryRound = BoundaryRound(96, 0.5, 1.0, (16.0, 8.0, 8.0))
     """From each start."""
@@ -61,38 +64,38 @@ class PlaneOptions:
         BoundaryRound(256, 0.4, 0.7, (1.0, 1.0, 0.5, 0.5, 0.5)),
     )
     """From the best of them."""
-    hopeless_px: float = 2.0
+    hopeless_px: NonNegative = 2.0
     """A start whose median contour point is further from the boundary than this, and than a cell of its grid, is no
     plane. Chosen on the development scenes: planes were within a tenth of a cell, vase and can two to four cells away.
     """
-    largest_step: float = 0.2
+    largest_step: Positive = 0.2
     """Most by which a step may move any parameter, in radii of the object or radians. Not tuned."""
-    final_scale_px: float = 0.5
+    final_scale_px: Positive = 0.5
     """Robust scale of the last steps, in pixels. Not tuned."""
-    final_steps: int = 3
+    final_steps: Natural = 3
     """Steps after each simplification. Not tuned."""
-    simplifications: int = 2
+    simplifications: Natural = 2
     """How often the boundary is simplified. Not tuned."""
-    simple_px: float = 0.25
+    simple_px: Positive = 0.25
     """A vertex goes if the boundary without it is nowhere further away than this, in pixels. Not tuned."""
-    chamfer_px: float = 6.0
+    chamfer_px: NonNegative = 6.0
     """Shorter sides, in pixels, that cut the corner of longer ones are removed: votes round corners. Chosen on the
     development scenes.
     """
-    frame_sigmas: float = 3.0
+    frame_sigmas: NonNegative = 3.0
     """A frame is kept if its height is this many standard deviations above zero. Not tuned."""
 
-    corner_deg: float = 20.0
+    corner_deg: Annotated[float, Meta(ge=0, le=180)] = 20.0
     """Sides that turn by more than this, in degrees, meet in a corner. Not tuned."""
-    corner_px: float = 1.5
+    corner_px: NonNegative = 1.5
     """Contour points nearer to a corner than this, in pixels, do not count: the level set of pixel averages is round
     there. Not tuned.
     """
-    noise_scale: float = 3.0
+    noise_scale: NonNegative = 3.0
     """The robust scale is at least this times the median distance, so that wrong poses leave all views a say. Not
     tuned.
     """
-    vertex_pull: float = 1e-3
+    vertex_pull: NonNegative = 1e-3
     """Weight of a vertex's place against the contour points of its side: along a straight side nothing else holds it.
     Not tuned.
     """

@@ -7,54 +7,54 @@ number was chosen on the development scenes Vase (open, smooth) and Cola (closed
 import math
 from dataclasses import dataclass
 
-from shinypartial.io.records import NonEmpty
+from shinypartial.io.records import Count, Natural, NonEmpty, NonNegative, Positive, Share
 
 
 @dataclass(frozen=True)
 class SilhouetteOptions:
     """Axis and outside from masks alone."""
 
-    start_views: int = 24
+    start_views: Count = 24
     """Views whose principal axes propose an axis."""
-    start_points: int = 1500
+    start_points: Count = 1500
     """Contour points of a coarse fit."""
-    start_cell_px: float = 3.0
+    start_cell_px: Positive = 3.0
     """Spacing of the profile in a coarse fit."""
-    start_scales_px: NonEmpty[float] = (16.0, 16.0, 16.0, 16.0)
+    start_scales_px: NonEmpty[Positive] = (16.0, 16.0, 16.0, 16.0)
     """Robust scales of the steps of a coarse fit."""
-    points: int = 30_000
+    points: Count = 30_000
     """Contour points of the final fit."""
-    scales_px: NonEmpty[float] = (4.0, 2.0, 1.0, 1.0, 0.5, 0.5)
+    scales_px: NonEmpty[Positive] = (4.0, 2.0, 1.0, 1.0, 0.5, 0.5)
     """Robust scales of its steps."""
-    noise_multiple: float = 3.0
+    noise_multiple: NonNegative = 3.0
     """Robust scales are at least this many medians of the distances."""
-    rank_share: float = 0.02
+    rank_share: Share = 0.02
     """Share of the rays at a height that may cut into the body by noise."""
-    tip_cells: float = 1.5
+    tip_cells: NonNegative = 1.5
     """A profile narrower than this ends in a tip."""
-    blunt_cells: float = 4.0
+    blunt_cells: NonNegative = 4.0
     """A profile wider than this may end flat, where silhouettes stop telling its slope."""
-    widest_within: float = 0.6
+    widest_within: Positive = 0.6
     """The widest place of the body has a height below this, in radii of the object frame."""
-    least_cells: int = 5
+    least_cells: Count = 5
     """Fewer cells make no profile."""
-    grazing_rad: float = math.radians(10.0)
+    grazing_rad: Positive = math.radians(10.0)
     """Silhouettes don't tell slopes within this angle of the lowest camera's line of sight over an end."""
-    bending: float = 1e-3
+    bending: NonNegative = 1e-3
     """Penalty on second differences of a step, in mean diagonals of the normal matrix."""
-    largest_turn_rad: float = 0.1
+    largest_turn_rad: Positive = 0.1
     """Most that a step turns the axis, and shifts it in radii of the object frame."""
-    damping: float = 1e-6
+    damping: Positive = 1e-6
     """Of every step, in mean diagonals."""
-    judged_scale_px: float = 2.0
+    judged_scale_px: Positive = 2.0
     """Scale s of the errors e²/(e² + s²) by which coarse fits are compared. Not tuned."""
-    largest_start_cost: float = 0.6
+    largest_start_cost: Share = 0.6
     """Mean of them over a coarse fit above which no axis is near."""
-    least_views: int = 6
+    least_views: Count = 6
     """Fewer views with a contour propose nothing."""
-    believed_overlap: float = 0.98
+    believed_overlap: Share = 0.98
     """Of the closed body with the masks, from which no stem is looked for: what model selection asks for."""
-    scored_views: int = 16
+    scored_views: Count = 16
     """Views over which the overlap of a proposal is measured."""
 
 
@@ -62,11 +62,11 @@ class SilhouetteOptions:
 class Round:
     """Steps under one map: its resolution, the robust scale of radiance, spacing of the splines, penalty on bending."""
 
-    resolution: int
-    robust: float
-    knot_px: float
-    steps: int
-    bending: float = 1e-4
+    resolution: Count
+    robust: Positive
+    knot_px: Positive
+    steps: Natural
+    bending: NonNegative = 1e-4
 
 
 @dataclass(frozen=True)
@@ -82,23 +82,23 @@ class PhotometricOptions:
         Round(256, 0.1, 1.0, 2),
     )
     """Rounds after."""
-    map_rays: int = 600_000
+    map_rays: Count = 600_000
     """Rays that a round's map is solved from."""
-    pixels: int = 120_000
+    pixels: Count = 120_000
     """Pixels of a step."""
-    contour_points: int = 20_000
+    contour_points: Count = 20_000
     """Contour points of a step."""
-    contour_scale_px: float = 1.0
+    contour_scale_px: Positive = 1.0
     """Robust scale of the contours."""
-    contour_sigma_px: float = 0.15
+    contour_sigma_px: Positive = 0.15
     """Standard deviation of contours, which weighs them against radiance."""
-    radiance_sigma: float = 0.05
+    radiance_sigma: Positive = 0.05
     """Standard deviation of radiance under a right map."""
-    least_cosine: float = 0.05
+    least_cosine: Share = 0.05
     """Rays that graze the surface more than this have no vote: they amplify every error."""
-    least_radius_px: float = 1.0
+    least_radius_px: NonNegative = 1.0
     """Nearer to the axis, azimuth is not determined."""
-    least_fall: float = 1e-3
+    least_fall: Share = 1e-3
     """A round ends with a step that lowers its cost by a smaller share."""
 
 
@@ -106,41 +106,41 @@ class PhotometricOptions:
 class MouthOptions:
     """Which end of the axis is open, and what is inside."""
 
-    pixels: int = 100_000
+    pixels: Count = 100_000
     """Pixels among which those are counted that see an end of the closed surface."""
-    unclear_share: float = 0.1
+    unclear_share: Share = 0.1
     """Both ends are tried if the one that fewer pixels see is seen by more than this share of the other's. Chosen so
     that cameras between −10° and 50° of elevation leave no doubt."""
     thin_walls: bool = True
     """Whether a wall without thickness, which mirrors on both faces, is among the candidates."""
-    judged_pixels: int = 120_000
+    judged_pixels: Count = 120_000
     """Pixels of the held-out views among which those that see an end judge the candidates."""
-    searched_resolution: int = 128
+    searched_resolution: Count = 128
     """Texels along a face side of the map under which an interior is searched again."""
-    slopes: int = 48
+    slopes: Count = 48
     """Directions of the profile that the search tells apart."""
-    cell_px: float = 0.75
+    cell_px: Positive = 0.75
     """Size of the search's cells."""
-    cells: int = 128
+    cells: Count = 128
     """Most cells along the radius; wider mouths have larger cells."""
-    depth: float = 0.8
+    depth: Positive = 0.8
     """Of the search, in radii of the mouth."""
-    rows_above: int = 3
+    rows_above: Natural = 3
     """Cells above the lip: a rolled lip rises on where silhouettes end."""
-    searched_pixels: int = 60_000
+    searched_pixels: Count = 60_000
     """Most pixels that vote."""
-    error_scale: float = 0.15
+    error_scale: Positive = 0.15
     """Scale s of a vote ‖e‖²/(‖e‖² + s²)."""
-    few_pixels: float = 4.0
+    few_pixels: Positive = 4.0
     """Votes' worth of the cost of an unseen cell that every cell starts with."""
-    unseen_cost: float = 0.7
+    unseen_cost: NonNegative = 0.7
     """Cost of a cell and slope that no pixel sees: worse than a fair one, better than a wrong one."""
-    reach: int = 3
+    reach: Count = 3
     """Cells that an edge of the path spans at most."""
-    settled_share: float = 0.05
+    settled_share: Share = 0.05
     """Share of all pixels that the ends may leave unexplained, the held-out error times the share that sees them. Where
     it is more, candidates descend by steps under coarse maps…"""
-    descending: float = 1.25
+    descending: NonNegative = 1.25
     """…whose error is within so many times the least. Chosen on a plate and a bowl with thick walls, whose right
     inside is the best at first, too."""
     descent: tuple[Round, ...] = (
@@ -150,9 +150,9 @@ class MouthOptions:
         Round(64, 0.3, 2.0, 4),
     )
     """Rounds of that descent."""
-    descent_pixels: int = 30_000
+    descent_pixels: Count = 30_000
     """Pixels of its steps."""
-    descent_rays: int = 150_000
+    descent_rays: Count = 150_000
     """Rays of its maps."""
 
 
@@ -160,19 +160,19 @@ class MouthOptions:
 class FloorOptions:
     """The floor of a vessel, seen by way of its walls: the height of a cubic in the middle."""
 
-    pixels: int = 2500
+    pixels: Count = 2500
     """Pixels whose paths meet the floor that judge heights."""
-    least_pixels: int = 200
+    least_pixels: Count = 200
     """Fewer tell nothing."""
-    searched_pixels: int = 400_000
+    searched_pixels: Count = 400_000
     """Pixels of all views among which those are searched."""
-    heights: int = 16
+    heights: Count = 16
     """Tried to either side of a flat floor, in steps of a 64th of its radius."""
-    halvings: int = 6
+    halvings: Natural = 6
     """Of the step around the best height."""
-    sides: int = 24
+    sides: Count = 24
     """Of the profile's polyline along the floor."""
-    wall_px: float = 9.0
+    wall_px: NonNegative = 9.0
     """Length of the wall from which its slope is found where the floor begins."""
 
 
@@ -180,47 +180,47 @@ class FloorOptions:
 class LipOptions:
     """The lip: by silhouettes, then by pixels that mix it with what lies around it."""
 
-    least_rays: int = 20
+    least_rays: Count = 20
     """Fewer contour rays over the lip leave it where it is."""
-    farthest_px: float = 6.0
+    farthest_px: Positive = 6.0
     """Contour rays that pass the lip farther away touch something else."""
-    steps: int = 6
+    steps: Natural = 6
     """Of placing the lip by silhouettes."""
-    tip_damping: float = 2e-3
+    tip_damping: Positive = 2e-3
     """Of each of them, in mean diagonals. Not tuned."""
-    spoiled_px: float = 7.0
+    spoiled_px: NonNegative = 7.0
     """Length of the wall below a flat lid that the lid's corner bends."""
-    fitted_px: float = 16.0
+    fitted_px: Positive = 16.0
     """Length of the wall from which a cubic is led on to the lip."""
-    tip_weight: float = 4.0
+    tip_weight: NonNegative = 4.0
     """Of the lip in that cubic, in vertices of the wall."""
-    end_px: float = 4.0
+    end_px: NonNegative = 4.0
     """Length of a thin wall below its lip that no pixel sees alone."""
-    clearance_px: int = 2
+    clearance_px: Natural = 2
     """Pixels nearer to the image of a thin wall's lip may show what lies before and behind it."""
-    length_px: float = 20.0
+    length_px: Positive = 20.0
     """Length of the wall that is refined by mixed pixels."""
-    knot_px: float = 3.0
+    knot_px: Positive = 3.0
     """Of its B-splines."""
-    reach_px: int = 5
+    reach_px: Natural = 5
     """Mixed pixels are nearer to the image of the lip than this, or mirrored more than once."""
-    pixels: int = 8_000
+    pixels: Count = 8_000
     """Mixed pixels of the refinement."""
-    least_pixels: int = 500
+    least_pixels: Count = 500
     """Fewer tell nothing."""
-    judged_pixels: int = 30_000
+    judged_pixels: Count = 30_000
     """Pixels of the held-out views, all over the vessel, that a moved lip must not explain worse. Not tuned."""
-    refined_steps: int = 3
+    refined_steps: Natural = 3
     """Gauss–Newton steps of the refinement."""
-    lengths: NonEmpty[float] = (4.0, 2.0, 1.0, 0.5)
+    lengths: NonEmpty[Positive] = (4.0, 2.0, 1.0, 0.5)
     """Of a step, tried in turn: radiance that changes by leaps makes steps too short."""
-    difference_px: float = 0.05
+    difference_px: Positive = 0.05
     """Of the derivatives."""
-    largest_step_px: float = 0.5
+    largest_step_px: Positive = 0.5
     """Most that a parameter changes in a step of length one."""
-    parameter_sigma_px: float = 0.05
+    parameter_sigma_px: NonNegative = 0.05
     """Standard deviation of what is not fitted: pixels that change much with the parameters count less."""
-    damping: float = 1e-3
+    damping: Positive = 1e-3
     """In mean diagonals."""
 
 
@@ -228,7 +228,7 @@ class LipOptions:
 class FootprintOptions:
     """Grooves and edges no wider than some pixels: pixels as areas, coarse to fine."""
 
-    spacing_px: float = 1 / 3
+    spacing_px: Positive = 1 / 3
     """Of the vertices: an edge is as sharp as they are dense."""
     rounds: NonEmpty[Round] = (
         Round(32, 0.5, 1.5, 4),
@@ -237,23 +237,23 @@ class FootprintOptions:
         Round(256, 0.2, 0.7, 4, 1e-5),
     )
     """Blurred maps first: their basins are as wide as the normals are wrong."""
-    map_rays: int = 2_000_000
+    map_rays: Count = 2_000_000
     """Rays of the map, which has the resolution of the last round."""
-    pixels: int = 60_000
+    pixels: Count = 60_000
     """Pixels of a step."""
-    largest_share: float = 1 / 3
+    largest_share: Share = 1 / 3
     """Of all pixels that are taken."""
-    searched_pixels: int = 2_000_000
+    searched_pixels: Count = 2_000_000
     """Pixels among which those are searched that see the profile turn."""
-    curved_rad: float = math.radians(2.0)
+    curved_rad: NonNegative = math.radians(2.0)
     """Where the profile turns by more within two pixels, single rays tell less than areas."""
-    curved_share: float = 0.75
+    curved_share: Share = 0.75
     """Of the pixels taken that see such a place."""
-    edge_rad: float = math.radians(8.0)
+    edge_rad: NonNegative = math.radians(8.0)
     """Where the profile turns by more within two pixels, there is an edge or a groove."""
-    least_edge_share: float = 0.01
+    least_edge_share: Share = 0.01
     """Of the pixels that see one: with fewer, areas are not worth their time. It is 0 on Vase and 0.21 on Cola."""
-    counted_pixels: int = 100_000
+    counted_pixels: Count = 100_000
     """Pixels among which those are counted."""
 
 
@@ -261,11 +261,11 @@ class FootprintOptions:
 class MapOptions:
     """The pixels of the final map of a surface of revolution."""
 
-    confidence_texel_rad: float = math.pi / 2 / 128
+    confidence_texel_rad: Positive = math.pi / 2 / 128
     """A pixel that spans a wider angle says little about any texel: confidence 1/(1 + a/t) with t its square."""
-    pixels: int = 3_500_000
+    pixels: Count = 3_500_000
     """Most pixels with a footprint."""
-    traced: int = 60_000
+    traced: Count = 60_000
     """Pixels without a smooth footprint that tell how bright saturated regions are."""
 
 
@@ -273,11 +273,11 @@ class MapOptions:
 class RenderingOptions:
     """How a picture is made of a surface and a map."""
 
-    max_bounces: int = 16
+    max_bounces: Count = 16
     """Reflections after which a ray is black. As many as the renderer of the data sets follows."""
-    samples: int = 4
+    samples: Count = 4
     """Rays along either side of a pixel: a box filter, as in the data sets."""
-    largest_bend: float = 0.05
+    largest_bend: NonNegative = 0.05
     """Second differences of directions (rad per pixel²) up to which they are interpolated between pixels."""
 
 
@@ -293,11 +293,11 @@ class RevolutionOptions:
     footprints: FootprintOptions = FootprintOptions()
     map: MapOptions = MapOptions()
     rendering: RenderingOptions = RenderingOptions()
-    max_bounces: int = 6
+    max_bounces: Count = 6
     """Reflections that a fit follows."""
-    judged_scale: float = 0.1
+    judged_scale: Positive = 0.1
     """Scale s of the errors ‖e‖²/(‖e‖² + s²) by which held-out views judge."""
-    least_gain: float = 0.02
+    least_gain: Share = 0.02
     """Share of the held-out error by which a refinement has to be better to be kept."""
 
 
