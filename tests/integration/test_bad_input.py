@@ -124,7 +124,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     "empty mask": (change_view(np.zeros_like, "alpha"), ("masks empty", "train/r_001")),
     "NaN": (change_view(put_nan, "radiance"), ("finite radiance", "train/r_001")),
     "pose that can't be inverted": (set_pose(0.0, 0, 0), ("rigid", "train/r_001")),
-    "pose that is not finite": (set_pose(float("nan"), 0, 3), ("finite pose", "train/r_001")),
+    "pose that is not finite": (set_pose(float("nan"), 0, 3), ("finite number", "transform_matrix")),
     "image that is missing": (lambda root: (root / "train" / "r_001.exr").unlink(), ()),
     "no frames": (lambda root: edit_transforms(root, lambda content: content["frames"].clear()), ("frames",)),
     "transforms that are no JSON": (lambda root: (root / "transforms_train.json").write_text("{"), ("JSON",)),

@@ -85,7 +85,8 @@ def axis_starts(views: Views, options: SilhouetteOptions = DEFAULTS.silhouette) 
     centers = []
     for view in chosen:
         mask, camera = view.mask.cpu().numpy(), view.camera
-        row, column = np.nonzero(mask >= MASK_LEVEL)
+        inside = mask > MASK_LEVEL
+        row, column = np.nonzero(inside if inside.any() else mask >= MASK_LEVEL)
         points = camera_rays(camera, column + PIXEL_CENTER, row + PIXEL_CENTER)[:, :2]
         middle = points.mean(0)
         _, vectors = np.linalg.eigh(np.cov((points - middle).T))
