@@ -97,7 +97,7 @@ def _read_intrinsics(fields: dict[str, Any], where: str) -> _Intrinsics:
             found=f"lens distortion ({', '.join(distorted)} not zero)",
             remedy="Undistort the images (`panoless capture` and COLMAP's image_undistorter do); remove these fields.",
         )
-    model = fields.get("camera_model")
+    model = "fisheye" if fields.get("is_fisheye") else fields.get("camera_model")  # instant-ngp states the former.
     if model is not None and model not in CAMERA_MODELS:
         raise InputError(
             expected=f"a pinhole as camera_model in {where}: {', '.join(CAMERA_MODELS)}",

@@ -208,6 +208,7 @@ BAD_FOLDERS: dict[str, tuple[Callable[[Path], object], str]] = {
     "an image size in words": (_transforms(w="wide"), "wide"),
     "lens distortion": (_transforms(k1=0.1), "k1"),
     "another lens": (_transforms(camera_model="EQUIRECTANGULAR"), "EQUIRECTANGULAR"),
+    "a lens of instant-ngp": (_transforms(is_fisheye=True), "fisheye"),
     "another lens of a frame": (
         lambda root: edit_json(root / TRAIN, lambda t: t["frames"][1].update(camera_model="OPENCV_FISHEYE", k1=0.0)),
         "OPENCV_FISHEYE",
