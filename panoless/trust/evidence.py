@@ -75,6 +75,8 @@ class Evidence:
     """Number of views in which the object is seen."""
     viewed: float
     """Share of all directions from which, or from near which, one of them sees it."""
+    surplus: float = 0.0
+    """Pixels well outside the masks that the fitted surface covers, over those of the masks: mean over views."""
     mask_offset_px: float = 0.0
     """By which the fit moved the outlines of all masks outward."""
     exposure_stops: float = 0.0
@@ -114,7 +116,7 @@ def gather_evidence(
     surfaces = [[(view, geometry.buffers(view.camera)) for view in part] for part in looked_at]
     light = _light(usable, surfaces, geometry, visibility, config)
     silhouettes = [_silhouette(*each, options) for part in surfaces for each in part]
-    distance, shift, overlap, missed = (np.array([each[i] for each in silhouettes]) for i in range(4))
+    distance, shift, overlap, missed, surplus = (np.array([each[i] for each in silhouettes]) for i in range(5))
     focal = np.array([view.camera.fx for part in looked_at for view in part])
     return Evidence(
         **light,
@@ -123,6 +125,7 @@ def gather_evidence(
         view_shift_deg=float(np.degrees(np.sqrt(np.mean((shift / focal) ** 2)))) if len(shift) else 0.0,
         overlap=_median(overlap),
         missed=float(missed.mean()) if len(missed) else 0.0,
+        surplus=float(surplus.mean()) if len(surplus) else 0.0,
         left_out=1 - kept / solid,
         saturated=_saturated(seen, encoding_of(config).saturation, options),
         coverage=float((visibility > 0).float().mean()),
@@ -296,30 +299,39 @@ class _Cells:
         return (grid[0] * self.side + grid[1]) * self.side + grid[2]
 
 
-def _silhouette(view: TrainView, surface: SurfaceBuffers, options: TrustOptions) -> tuple[float, float, float, float]:
-    """Median distance (px) of the two contours, the shift (px) that explains most of it, intersection over union, and
-    the share of the pixels well inside the mask that are not covered.
+def _silhouette(
+    view: TrainView, surface: SurfaceBuffers, options: TrustOptions
+) -> tuple[float, float, float, float, float]:
+    """Median distance (px) of the two contours, the shift (px) that explains most of it, intersection over union, the
+    share of the pixels well inside the mask that are not covered, and the covered ones well outside over the mask's.
 
     A pixel near the fitted contour has the mask's signed distance less the fitted one; a shift t changes it by n·t.
     Where both fill the picture there is no contour to compare; where one fills it, or is not in it, all is wrong.
     """
     mask, alpha, shared = view.mask.cpu().numpy(), surface.alpha.cpu().numpy(), overlap(surface.alpha, view.mask)
     if min(mask.min(), alpha.min()) > MASK_LEVEL:
-        return 0.0, 0.0, shared, 0.0
+        return 0.0, 0.0, shared, 0.0, 0.0
     if min(mask.max(), alpha.max()) < MASK_LEVEL or max(mask.min(), alpha.min()) > MASK_LEVEL:
         solid = mask > MASK_LEVEL
         missed = float((alpha[solid] < MASK_LEVEL).mean()) if solid.any() else 0.0
-        return float(max(mask.shape)), float(max(mask.shape)), shared, missed
+        return float(max(mask.shape)), float(max(mask.shape)), shared, missed, 0.0
     of_mask, of_fit = silhouette_distance_px(view.mask).cpu().numpy(), mask_distance_px(alpha)
-    inside = of_mask < -options.missed_inside_px
+    inside, outside = of_mask < -options.missed_inside_px, of_mask > options.missed_inside_px
     missed = float((alpha[inside] < MASK_LEVEL).mean()) if inside.any() else 0.0
+    surplus = float((alpha[outside] >= MASK_LEVEL).sum() / (mask >= MASK_LEVEL).sum())
     rows, columns = np.gradient(of_fit)
     near = np.abs(of_fit) < 1
     near[[0, -1]], near[:, [0, -1]] = False, False
     if not near.any():
-        return float(max(mask.shape)), float(max(mask.shape)), shared, missed
+        return float(max(mask.shape)), float(max(mask.shape)), shared, missed, surplus
     normals, away = np.stack([columns[near], rows[near]], 1), (of_mask - of_fit)[near]
-    return float(np.median(np.abs(away))), float(np.linalg.norm(_shift(normals, away, options))), shared, missed
+    return (
+        float(np.median(np.abs(away))),
+        float(np.linalg.norm(_shift(normals, away, options))),
+        shared,
+        missed,
+        surplus,
+    )
 
 
 def _shift(

@@ -98,6 +98,30 @@ def test_what_the_shape_leaves_bare_is_measured_and_named(views: Views) -> None:
     assert "bare" in verdict.reason
 
 
+def test_what_the_shape_has_too_much_is_measured_and_named(views: Views) -> None:
+    """A quarter of each mask that is cut off, far from which the shape goes on; but not the edge of masks too small."""
+
+    def cut(index: int, view: TrainView) -> TrainView:
+        mask = view.mask.clone()
+        columns = torch.nonzero((mask > 0.5).any(0))[:, 0]
+        mask[:, columns[-len(columns) // 4] :] = 0
+        return replace(view, mask=mask)
+
+    def narrower(index: int, view: TrainView) -> TrainView:
+        return replace(view, mask=1 - max_pool2d(1 - view.mask[None], 3, 1, 1)[0])
+
+    grown = evidence(each(views, cut))
+    assert evidence(views).surplus == evidence(each(views, narrower)).surplus == 0
+    covered = [
+        float((turn.mask > 0.5).sum() / (view.mask > 0.5).sum())
+        for turn, view in zip(views.train, each(views, cut).train, strict=True)
+    ]
+    assert OPTIONS.largest_surplus < grown.surplus < np.mean(covered) - 1
+    verdict = judge(grown, replace(OPTIONS, largest_silhouette_px=100.0, largest_view_shift_px=100.0))
+    assert verdict.verdict != "trust"
+    assert "outside the masks" in verdict.reason
+
+
 def test_a_mirror_that_fills_all_pictures_misses_no_outline() -> None:
     """Its outline lies outside of them; what a smaller one leaves bare of them is still missed."""
     wide = plane_of(10 * RECTANGLE)
