@@ -51,7 +51,6 @@ from shinypartial.prediction.format import (
     ModelSelection,
     NearSurroundings,
     PredictionInfo,
-    acquire_prediction,
     begin_prediction,
     dataset_hash,
     prediction_frame,
@@ -80,10 +79,10 @@ def export_prediction(
     """
     if state.environment is None or state.visibility is None:
         raise ValueError("only a finished fit can be exported")
-    of_this_fit = _is_of(folder, state, config, dataset)
+    earlier = _description(folder, state, config, dataset)
     begin_prediction(folder)
     remove_partial_files(folder)
-    if not of_this_fit:
+    if earlier is None:
         for left in (folder / SNAPSHOTS, folder / PICTURES, *(folder / TEST_VIEWS).iterdir()):
             shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
         (folder / DECOMPOSITION).unlink(missing_ok=True)
@@ -162,7 +161,6 @@ def export_snapshots(dataset: Dataset, run: Path, config: FitConfig, prediction:
             views = state.selection.corrections.applied(loaded, configured)
         with timed(state.seconds, "solve environment"):
             complete(state, views, configured)
-        acquire_prediction(target)
         export_prediction(dataset, state, config, target, snapshot=True)
     return [prediction / SNAPSHOTS / source.name for source in found]
 
@@ -173,20 +171,20 @@ def is_exported(folder: Path, state: FitState, config: FitConfig, dataset: Datas
     views = (prediction_frame(folder, frame).exr for frame in dataset.test)
     if not all(path.exists() for path in (folder / ENVIRONMENT, folder / VISIBILITY, mesh, *views)):
         return False
-    if not _is_of(folder, state, config, dataset):
-        return False
-    info = read_info(folder)
-    return info.method == _method(config) and info.iteration == (state.iteration if snapshot else None)
+    info, iteration = _description(folder, state, config, dataset), state.iteration if snapshot else None
+    return info is not None and (info.method, info.iteration) == (_method(config), iteration)
 
 
-def _is_of(folder: Path, state: FitState, config: FitConfig, dataset: Dataset) -> bool:
-    """Whether the folder describes a moment of this fit; equal seconds to the millisecond tell fits apart."""
+def _description(folder: Path, state: FitState, config: FitConfig, dataset: Dataset) -> PredictionInfo | None:
+    """What the folder says of a moment of this fit, None where it says nothing or is of another one; equal seconds to
+    the millisecond tell fits apart.
+    """
     try:
         info = read_info(folder)
     except InputError:  # There is none, or it can't be read.
-        return False
+        return None
     same_fit = info.config == json.loads(json.dumps(asdict(config))) and info.dataset_hash == dataset_hash(dataset)
-    return same_fit and _stated_seconds(state).items() <= info.seconds.items()
+    return info if same_fit and _stated_seconds(state).items() <= info.seconds.items() else None
 
 
 def _method(config: FitConfig) -> str:

@@ -9,6 +9,7 @@ most of what the object shows is dark, errors are those of the logarithms of rad
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -116,7 +117,7 @@ def gather_evidence(
     surfaces = [[(view, geometry.buffers(view.camera)) for view in part] for part in looked_at]
     light = _light(usable, surfaces, geometry, visibility, config)
     silhouettes = [_silhouette(*each, options) for part in surfaces for each in part]
-    distance, shift, overlap, missed, surplus = (np.array([each[i] for each in silhouettes]) for i in range(5))
+    distance, shift, overlap, missed, surplus = np.array(silhouettes).reshape(-1, 5).T
     focal = np.array([view.camera.fx for part in looked_at for view in part])
     return Evidence(
         **light,
@@ -299,22 +300,35 @@ class _Cells:
         return (grid[0] * self.side + grid[1]) * self.side + grid[2]
 
 
-def _silhouette(
-    view: TrainView, surface: SurfaceBuffers, options: TrustOptions
-) -> tuple[float, float, float, float, float]:
-    """Median distance (px) of the two contours, the shift (px) that explains most of it, intersection over union, the
-    share of the pixels well inside the mask that are not covered, and the covered ones well outside over the mask's.
+class _Silhouette(NamedTuple):
+    """How far the outlines of fit and mask differ in a view."""
+
+    distance_px: float
+    """Median of the contours' distances."""
+    shift_px: float
+    """That explains most of it."""
+    overlap: float
+    """Intersection over union."""
+    missed: float = 0.0
+    """Share of the pixels well inside the mask that are not covered."""
+    surplus: float = 0.0
+    """Covered pixels well outside, over those of the mask."""
+
+
+def _silhouette(view: TrainView, surface: SurfaceBuffers, options: TrustOptions) -> _Silhouette:
+    """What the outlines of fit and mask have in common.
 
     A pixel near the fitted contour has the mask's signed distance less the fitted one; a shift t changes it by n·t.
     Where both fill the picture there is no contour to compare; where one fills it, or is not in it, all is wrong.
     """
     mask, alpha, shared = view.mask.cpu().numpy(), surface.alpha.cpu().numpy(), overlap(surface.alpha, view.mask)
     if min(mask.min(), alpha.min()) > MASK_LEVEL:
-        return 0.0, 0.0, shared, 0.0, 0.0
+        return _Silhouette(0.0, 0.0, shared)
+    farthest = float(max(mask.shape))
     if min(mask.max(), alpha.max()) < MASK_LEVEL or max(mask.min(), alpha.min()) > MASK_LEVEL:
         solid = mask > MASK_LEVEL
         missed = float((alpha[solid] < MASK_LEVEL).mean()) if solid.any() else 0.0
-        return float(max(mask.shape)), float(max(mask.shape)), shared, missed, 0.0
+        return _Silhouette(farthest, farthest, shared, missed)
     of_mask, of_fit = silhouette_distance_px(view.mask).cpu().numpy(), mask_distance_px(alpha)
     inside, outside = of_mask < -options.missed_inside_px, of_mask > options.missed_inside_px
     missed = float((alpha[inside] < MASK_LEVEL).mean()) if inside.any() else 0.0
@@ -323,15 +337,10 @@ def _silhouette(
     near = np.abs(of_fit) < 1
     near[[0, -1]], near[:, [0, -1]] = False, False
     if not near.any():
-        return float(max(mask.shape)), float(max(mask.shape)), shared, missed, surplus
+        return _Silhouette(farthest, farthest, shared, missed, surplus)
     normals, away = np.stack([columns[near], rows[near]], 1), (of_mask - of_fit)[near]
-    return (
-        float(np.median(np.abs(away))),
-        float(np.linalg.norm(_shift(normals, away, options))),
-        shared,
-        missed,
-        surplus,
-    )
+    distance, shift = float(np.median(np.abs(away))), float(np.linalg.norm(_shift(normals, away, options)))
+    return _Silhouette(distance, shift, shared, missed, surplus)
 
 
 def _shift(

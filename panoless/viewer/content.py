@@ -21,7 +21,7 @@ from shinypartial.prediction.format import (
     read_environment_map,
     read_visibility,
 )
-from shinypartial.prediction.surface import surface_of, triangles_of
+from shinypartial.prediction.surface import surface_of
 
 Shown = Literal["light", "visibility", "light that was seen"]
 Picture = Literal["photograph", "prediction", "error", "normals"]
@@ -109,7 +109,7 @@ class Surface:
 def read_surface(folder: Path) -> Surface | None:
     """The surface of a prediction folder, from its PLY; None where it has none."""
     found = surface_of(folder, clouds=True)
-    return None if found is None else Surface(found.vertices, found.normals, triangles_of(found))
+    return None if found is None else Surface(found.vertices, found.normals, found.triangles)
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,12 @@ def make_frames(root: Path, split: str, cameras: Sequence[Camera], name: str = "
     return tuple(Frame(f"{split}/{stem.name}", camera, stem) for stem, camera in zip(stems, cameras, strict=True))
 
 
+def begun_recipe(root: Path) -> Any:
+    """The recipe that the manifest of a folder states, as it stands there; None where there is none."""
+    manifest = root / MANIFEST
+    return read_table(manifest, "the manifest").get("recipe") if manifest.exists() else None
+
+
 def claim_folder(root: Path, recipe: dict[str, Any], generator: dict[str, Any], format_minor: int = 0) -> bool:
     """Make `root` the folder of this recipe; return whether an earlier run had begun it.
 
@@ -51,7 +57,7 @@ def claim_folder(root: Path, recipe: dict[str, Any], generator: dict[str, Any], 
     """
     manifest_path = root / MANIFEST
     if manifest_path.exists():
-        begun = read_table(manifest_path, "the manifest").get("recipe")
+        begun = begun_recipe(root)
         if begun != recipe:
             known = begun if isinstance(begun, dict) else {}
             different = sorted(key for key in {*recipe, *known} if recipe.get(key) != known.get(key))

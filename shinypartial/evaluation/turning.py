@@ -14,7 +14,7 @@ from shinypartial.evaluation.masks import solid_mask
 from shinypartial.evaluation.pictures import VISIBILITY, Scale, normal_picture, scalar_picture
 from shinypartial.io.files import atomic_write
 from shinypartial.metrics.angular import normal_errors_deg
-from shinypartial.prediction.surface import PredictedSurface, surface_of, triangles_of
+from shinypartial.prediction.surface import PredictedSurface, surface_of
 
 TURNING = "surface.webp"
 #: Points on the surface, and pixels along the sides of a panel: enough that no gap shows.
@@ -45,7 +45,7 @@ class SurfacePoints:
     @classmethod
     def spread(cls, surface: PredictedSurface, count: int = POINTS) -> "SurfacePoints":
         """Points drawn by area, with the values of the corners mixed; the same ones in every run."""
-        triangles, confidence = triangles_of(surface), surface.confidence
+        triangles, confidence = surface.triangles, surface.confidence
         corners = surface.vertices[triangles]
         areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         generator = np.random.default_rng(0)

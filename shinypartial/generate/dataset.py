@@ -24,12 +24,12 @@ from shinypartial.dataset.schema import (
     ENVIRONMENT_INVERSE_DISTANCE,
     ENVIRONMENT_LATLONG,
     FORMAT_MINOR,
-    MANIFEST,
     SPLITS,
     Frame,
     View,
 )
 from shinypartial.dataset.write import (
+    begun_recipe,
     claim_folder,
     complete_dataset,
     environment_files,
@@ -41,7 +41,7 @@ from shinypartial.dataset.write import (
     write_transforms,
     write_view,
 )
-from shinypartial.io.files import folder_lock, read_table, remove_partial_files
+from shinypartial.io.files import folder_lock, remove_partial_files
 from shinypartial.io.images import read_exr_rgb
 from shinypartial.io.progress import Progress
 from shinypartial.release.contact_sheet import write_contact_sheet
@@ -128,7 +128,7 @@ def _generator() -> dict[str, Any]:
 
 def _as_begun(root: Path, recipe: dict[str, Any]) -> dict[str, Any]:
     """The recipe in the words of the version that began the folder, where they mean the same scene."""
-    begun = read_table(root / MANIFEST, "the manifest").get("recipe") if (root / MANIFEST).exists() else None
+    begun = begun_recipe(root)
     if not isinstance(begun, dict) or begun.get("split", recipe["split"]) != recipe["split"]:
         return recipe
     return begun if older_recipe(begun) == older_recipe(recipe) else recipe

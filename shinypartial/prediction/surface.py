@@ -1,6 +1,7 @@
 """The surface of a prediction, read from its PLY, in polygons or triangles."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,11 @@ class PredictedSurface(Mesh):
     """Polygons in world units, and how far the method trusts each vertex, in [0, 1]; None where it does not say."""
 
     confidence: Float[np.ndarray, "P"] | None = None
+
+    @cached_property
+    def triangles(self) -> Int[np.ndarray, "T 3"]:
+        """Its faces, as `triangles_of` cuts them."""
+        return triangles_of(self)
 
 
 def surface_of(prediction: Path, *, clouds: bool = False) -> PredictedSurface | None:
@@ -50,7 +56,7 @@ def surface_of(prediction: Path, *, clouds: bool = False) -> PredictedSurface | 
         normals = polygon_normals(vertices, faces)
     confidence = table["confidence"].astype(np.float64) if "confidence" in table.dtype.names else None
     surface = PredictedSurface(vertices, normals, faces, confidence)
-    if faces and not len(triangles_of(surface)):
+    if faces and not len(surface.triangles):
         raise _unusable(paths[0], "no face with an area")
     return surface
 

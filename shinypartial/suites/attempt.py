@@ -18,7 +18,7 @@ from pathlib import Path
 
 from shinypartial.core.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, InputError
 from shinypartial.io.files import read_json, write_json
-from shinypartial.io.records import read_record as read_table
+from shinypartial.io.records import read_record as record_of
 from shinypartial.suites.jobs import Job, Plan, read_jobs, require_commands
 
 RECORDS, LOGS = Path("records"), Path("logs")
@@ -50,7 +50,7 @@ def read_record(folder: Path, job: str) -> Record | None:
     if not path.exists():
         return None
     content = read_json(path, "the record of a job")
-    return read_table(Record, content, str(path), remedy="Restore that file, or choose another --output.")
+    return record_of(Record, content, str(path), remedy="Restore that file, or choose another --output.")
 
 
 def _record_path(folder: Path, job: str) -> Path:

@@ -14,9 +14,15 @@ from shinypartial.conversion.layouts import AxisName, CaptureLayout
 from shinypartial.core.color import to_display
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.derived import Job, write_derived
-from shinypartial.dataset.schema import MANIFEST, SPLITS, Frame
-from shinypartial.dataset.write import encode_normals, environment_files, write_environment, write_transforms
-from shinypartial.io.files import read_table, sha256_of_files
+from shinypartial.dataset.schema import SPLITS, Frame
+from shinypartial.dataset.write import (
+    begun_recipe,
+    encode_normals,
+    environment_files,
+    write_environment,
+    write_transforms,
+)
+from shinypartial.io.files import sha256_of_files
 from shinypartial.io.images import EXR, read_png, write_png
 
 
@@ -87,9 +93,8 @@ def import_capture(
 
 def _as_begun(output: Path, recipe: dict[str, Any]) -> dict[str, Any]:
     """The recipe without what tells sources of one name apart, where the version that began the folder stated none."""
-    begun = read_table(output / MANIFEST, "the manifest").get("recipe") if (output / MANIFEST).exists() else None
     earlier = recipe | {"import_of": {key: recipe["import_of"][key] for key in ("layout", "name")}}
-    return earlier if begun == earlier else recipe
+    return earlier if begun_recipe(output) == earlier else recipe
 
 
 def _frame(output: Path, split: str, shot: Shot) -> Frame:

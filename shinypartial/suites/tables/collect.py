@@ -7,7 +7,7 @@ from pathlib import Path
 from shinypartial.core.errors import InputError
 from shinypartial.evaluation.scores import read_scores, score_rows
 from shinypartial.io.files import read_json, write_json
-from shinypartial.io.records import read_record as read_table
+from shinypartial.io.records import read_record as record_of
 from shinypartial.prediction.format import read_info
 from shinypartial.suites.attempt import read_record
 from shinypartial.suites.jobs import Size
@@ -103,4 +103,4 @@ def read_results(path: Path) -> Results:
     if (fields.get("format"), fields.get("format_version")) != (FORMAT, FORMAT_VERSION):
         raise InputError(expected=f"{FORMAT} {FORMAT_VERSION} in {path}", found="another format", remedy="Delete it.")
     plain = {name: value for name, value in fields.items() if name not in ("format", "format_version")}
-    return read_table(Results, plain, str(path))
+    return record_of(Results, plain, str(path))
