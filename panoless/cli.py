@@ -5,6 +5,7 @@ import sys
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
@@ -185,10 +186,15 @@ class Capture:
     Run again to continue where an earlier run stopped.
     """
 
-    source: Annotated[Path, tyro.conf.Positional]
-    """Folder of photographs, or a video."""
+    sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folder of photographs, a video, or photographs."""
     output: Path
     """Dataset folder to write."""
+    object: Literal["auto", "ball", "any"] = "auto"
+    """`ball`: a mirror ball, from one photograph on, without masks and poses; `auto`: that, where less than eight
+    photographs show one."""
+    focal_mm: float | None = None
+    """Focal length on 35 mm film, for a ball; None for what EXIF states."""
     colmap: Path | None = None
     """Folder of a COLMAP model, text or binary, for these photographs; found where it is SOURCE/sparse/0."""
     board: Literal["A4", "Letter", "A3", "none"] | None = None
@@ -218,8 +224,17 @@ class Capture:
         from panoless.photographs.make import Request, capture
 
         check_record(self.options, "--options", remedy="Correct that value.")
+        if self._shows_a_ball():
+            self._capture_ball()
+            return
+        if len(self.sources) != 1:
+            raise InputError(
+                expected="one folder of photographs, or one video",
+                found=f"{len(self.sources)} files without a mirror ball",
+                remedy="Name the folder; or add --object ball.",
+            )
         request = Request(
-            self.source,
+            self.sources[0],
             self.output,
             colmap=self.colmap,
             board=self.board,
@@ -232,6 +247,44 @@ class Capture:
         )
         print("\n".join(capture(request).summary()))
         print(f"Look at {self.output}/capture/masks.jpg. Next: panoless fit {self.output}")
+
+    def _files(self) -> tuple[Path, ...]:
+        from panoless.photographs.frames import source_files
+
+        return tuple(file for each in self.sources for file in ([each] if each.is_file() else source_files(each)))
+
+    def _shows_a_ball(self) -> bool:
+        """Whether that is stated, or less than eight photographs are given with nothing else about them."""
+        if self.object != "auto":
+            return self.object == "ball"
+        from panoless.photographs.ball.find import find_ball
+        from panoless.photographs.shot import read_shot
+        from panoless.photographs.video import VIDEO_SUFFIXES
+
+        named = self.colmap or self.masks or self.segmenter or self.board not in (None, "none")
+        files = self._files()
+        if named or any(file.suffix.lower() in VIDEO_SUFFIXES for file in files):
+            return False
+        few = len(files) < self.options.least_views
+        try:
+            for file in {files[0], files[len(files) // 2], files[-1]}:
+                find_ball(read_shot(file))
+        except InputError:
+            if few:
+                raise
+            return False
+        if not few:
+            print("Note: these photographs show a round thing. If it is a mirror ball, --object ball is simpler.")
+        return few
+
+    def _capture_ball(self) -> None:
+        from panoless.photographs.ball.make import BallRequest, capture_ball
+
+        request = BallRequest(self._files(), self.output, self.focal_mm, self._hints())
+        captured = capture_ball(request)
+        print("\n".join(captured.summary()))
+        light = " --config.environment.range hdr" if captured.high_dynamic_range else ""
+        print(f"Look at {self.output}/capture/ball.jpg. Next: panoless fit {quote(str(self.output))}{light}")
 
     def _hints(self) -> "dict[str, Hint]":
         from panoless.photographs.masks import Hint, read_clicks

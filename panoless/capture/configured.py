@@ -7,15 +7,25 @@ from panoless.capture.encoding import encoding_of
 from panoless.capture.repair import with_repaired_masks
 from panoless.capture.views import Views, load_views
 from panoless.config import FitConfig, can_be_exposed
+from shinypartial.dataset.read import read_ball_evidence
 from shinypartial.dataset.schema import Dataset
+
+
+def of_ball(config: FitConfig) -> FitConfig:
+    """The configuration of a fit to a capture of a ball."""
+    corrections = replace(config.corrections, masks="off", lens="off")
+    return replace(config, model="sphere", poses=replace(config.poses, mode="off"), corrections=corrections)
 
 
 def configured_views(dataset: Dataset, config: FitConfig) -> tuple[Views, FitConfig]:
     """The training split as a configuration wants to see it, its masks repaired, and that configuration with the
     exposure that it left open.
 
-    Photographs stay as they are where options don't bear another exposure.
+    Photographs stay as they are where options don't bear another exposure. A capture of a ball knows its shape and its
+    cameras, by its rim and what it mirrors: nothing of that is chosen.
     """
+    if config.model in ("auto", "sphere") and read_ball_evidence(dataset) is not None:
+        config = of_ball(config)
     views = load_views(
         dataset,
         config.crop_margin_px,

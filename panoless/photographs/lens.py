@@ -60,6 +60,26 @@ class Lens:
         fx, fy, cx, cy = (value / side for value in (self.fx, self.fy, self.cx, self.cy))
         return Lens(fx, fy, cx, cy, self.width // side, self.height // side, *self.distortion)
 
+    def rays(self, pixels: Float[np.ndarray, "*P 2"]) -> Float[np.ndarray, "*P 3"]:
+        """Unit rays of pixels, in the camera's frame."""
+        if any(self.distortion):
+            flat = np.ascontiguousarray(pixels.reshape(-1, 1, 2) - PIXEL_CENTER)
+            plane = opencv().undistortPoints(flat, self.matrix, np.array(self.distortion)).reshape(pixels.shape)
+        else:
+            plane = (pixels - [self.cx, self.cy]) / [self.fx, self.fy]
+        rays = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], -1)
+        unit: np.ndarray = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        return unit
+
+    def project(self, rays: Float[np.ndarray, "*P 3"]) -> Float[np.ndarray, "*P 2"]:
+        """Pixels of rays that point forward; others are put at its edge, far outside."""
+        x, y = (rays[..., k] / np.maximum(rays[..., 2], 1e-3) for k in (0, 1))
+        square = x**2 + y**2
+        radial = 1 + square * (self.k1 + square * (self.k2 + square * self.k3))
+        moved_x = x * radial + 2 * self.p1 * x * y + self.p2 * (square + 2 * x**2)
+        moved_y = y * radial + self.p1 * (square + 2 * y**2) + 2 * self.p2 * x * y
+        return np.stack([self.fx * moved_x + self.cx, self.fy * moved_y + self.cy], -1)
+
     def pinhole(self, camera_to_world: Float[np.ndarray, "4 4"]) -> Camera:
         """The camera of the undistorted picture: it keeps focal length, center and size."""
         return Camera(camera_to_world, self.fx, self.fy, self.cx, self.cy, self.width, self.height)

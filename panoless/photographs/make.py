@@ -91,7 +91,7 @@ def capture(request: Request) -> Captured:
     """
     _check_options(request)
     files = source_files(request.source)
-    _check_output(request.output)
+    check_output(request.output)
     with folder_lock(request.output):
         work = request.output / WORK
         pictures = work / "frames"
@@ -130,7 +130,8 @@ def _check_options(request: Request) -> None:
             )
 
 
-def _check_output(output: Path) -> None:
+def check_output(output: Path) -> None:
+    """Raise InputError unless the folder is new or empty, or of an earlier capture."""
     if output.exists() and (not output.is_dir() or any(output.iterdir())) and not (output / WORK).is_dir():
         raise InputError(
             expected=f"a new or empty output folder at {output}, or one of an earlier capture",

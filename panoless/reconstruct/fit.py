@@ -21,8 +21,8 @@ from panoless.selection.material import without_scattered_light
 from panoless.trust.evidence import gather_evidence
 from panoless.trust.verdict import judge
 from shinypartial.core.errors import InputError
-from shinypartial.dataset.read import photographs_hash
-from shinypartial.dataset.schema import Dataset
+from shinypartial.dataset.read import photographs_hash, read_ball_evidence
+from shinypartial.dataset.schema import BallEvidence, Dataset
 from shinypartial.io.files import folder_lock
 from shinypartial.prediction.format import Trust, dataset_hash
 
@@ -70,7 +70,7 @@ def fit(
         with timed(state.seconds, "solve environment"):
             photographs, shown = complete(state, photographs, config)
         with timed(state.seconds, "judge"):
-            state.verdict = assess(state, photographs, shown)
+            state.verdict = assess(state, photographs, shown, read_ball_evidence(dataset))
             if state.geometry.poses is not None:
                 with torch.no_grad():
                     found = Alignment(photographs, config.poses).uncertainty(state.geometry)
@@ -106,12 +106,14 @@ def begin(views: Views, config: FitConfig) -> FitState:
     return FitState(geometry, views.object_frame, selection, training)
 
 
-def assess(state: FitState, views: Views, config: FitConfig) -> Trust:
-    """How far a finished state is to be trusted, by the corrected views that it was fitted to."""
+def assess(state: FitState, views: Views, config: FitConfig, ball: BallEvidence | None = None) -> Trust:
+    """How far a finished state is to be trusted, by the corrected views that it was fitted to, and by what the capture
+    of a ball knows of itself.
+    """
     assert state.visibility is not None
     corrections = state.selection.corrections
     with torch.no_grad():
-        found = gather_evidence(views, state.geometry, state.visibility, config, corrections, state.roughness)
+        found = gather_evidence(views, state.geometry, state.visibility, config, corrections, state.roughness, ball)
     return judge(found, config.trust)
 
 

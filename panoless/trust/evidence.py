@@ -31,6 +31,7 @@ from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, over
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.robust import NORMAL_MEDIAN, bounded_error, robust_scale, robust_weight
 from panoless.trust.options import TrustOptions
+from shinypartial.dataset.schema import BallEvidence
 
 LIGHT_FIGURES = ("unexplained", "one_color", "matte", "unexplained_part", "noise", "error_in_noise", "rank_correlation")
 """What comes from held-out light."""
@@ -94,6 +95,10 @@ class Evidence:
     """Of the pictures, as the fit found it: standard deviation of a Gaussian."""
     repaired_views: int = 0
     """Number of views whose masks had holes or stray pieces that the others contradict."""
+    rim_px: float | None = None
+    """Of the capture of a ball: median distance of its rim from a cone…"""
+    agreement: float | None = None
+    """…and correlation of what lies beside the ball with what it mirrors."""
 
 
 def gather_evidence(
@@ -103,9 +108,13 @@ def gather_evidence(
     config: FitConfig,
     corrections: Corrections = NO_CORRECTIONS,
     roughness: float | None = None,
+    ball: BallEvidence | None = None,
 ) -> Evidence:
     """The evidence for a geometry in the views that it was fitted to, after their corrections, which are told along as
     the roughness is; `visibility` is that of the final map.
+
+    The shape and the cameras of a `ball` that was captured are known before. So held-out light counts as far as the map
+    is sure of its direction: what stands near the ball, and who photographs it, is left to the visibility.
     """
     options = config.trust
     found = usable_views(views, geometry).train
@@ -115,7 +124,7 @@ def gather_evidence(
     solid, kept = (max(each.num_solid, 1) for each in (views, usable))
     looked_at = [_evenly(part, options.views) for part in split_held_out(usable.train)]
     surfaces = [[(view, geometry.buffers(view.camera)) for view in part] for part in looked_at]
-    light = _light(usable, surfaces, geometry, visibility, config)
+    light = _light(usable, surfaces, geometry, visibility, config, by_confidence=ball is not None)
     silhouettes = [_silhouette(*each, options) for part in surfaces for each in part]
     distance, shift, overlap, missed, surplus = np.array(silhouettes).reshape(-1, 5).T
     focal = np.array([view.camera.fx for part in looked_at for view in part])
@@ -141,6 +150,8 @@ def gather_evidence(
         roughness=roughness or 0.0,
         blur_px=views.blur_px,
         repaired_views=views.repairs.views,
+        rim_px=None if ball is None else ball.rim_px,
+        agreement=None if ball is None else ball.agreement,
     )
 
 
@@ -176,6 +187,8 @@ def _light(
     geometry: Geometry,
     visibility: Float[Tensor, "6 L L"],
     config: FitConfig,
+    *,
+    by_confidence: bool,
 ) -> dict[str, float | None]:
     """The figures that come from held-out light; None where there are too few views."""
     nothing, options = dict.fromkeys(LIGHT_FIGURES), config.trust
@@ -194,9 +207,10 @@ def _light(
     for areas in _seen_areas(tested, geometry, config):
         rays, seen = areas.rays(), areas.seen(environment).minimum(saturation)
         error = contrast.shown(seen) - contrast.shown(areas.radiance)
-        explained.add(bounded_error(error, options.scale), rays.initial_weight())
-        errors.append(error)
         confidence.append(sample_cubemap(visibility[:, None], rays.directions)[:, 0])
+        weight = rays.initial_weight() * (confidence[-1] if by_confidence else 1)
+        explained.add(bounded_error(error, options.scale), weight)
+        errors.append(error)
     for (view, surface), (_, pixels) in zip(held_out, at_most_pixels(tested, options.rays), strict=True):
         radiance = contrast.shown(view.radiance_at(pixels))
         normals = surface.normals_camera.flatten(1)[:, pixels]

@@ -32,3 +32,7 @@ FACE_AXES = np.array(
 
 #: Alpha above which a pixel counts as lying wholly on the object: its normal and color are not mixed with another.
 SOLID_ALPHA = 0.99
+
+#: 8-bit alpha of pixels on the object whose light is not known: something hides them, or they are clipped. They belong
+#: to its silhouette, and lie below SOLID_ALPHA.
+HIDDEN_ALPHA = 250

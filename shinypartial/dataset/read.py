@@ -23,12 +23,13 @@ from shinypartial.dataset.schema import (
     NORMAL_CHANNELS,
     SELF_REFLECTION_CHANNEL,
     SPLITS,
+    BallEvidence,
     Dataset,
     Frame,
     View,
 )
 from shinypartial.dataset.transforms import read_frames
-from shinypartial.io.files import newest_folder, read_json, sha256_of_files
+from shinypartial.io.files import newest_folder, read_json, read_table, sha256_of_files
 from shinypartial.io.images import (
     EXR,
     read_exr,
@@ -39,6 +40,7 @@ from shinypartial.io.images import (
     stack_channels,
     unit_values,
 )
+from shinypartial.io.records import read_record
 
 DEFAULT_FOLDER = Path("datasets")
 
@@ -282,6 +284,13 @@ def _missing_mask(frame: Frame, path: Path) -> InputError:
         found="none of them",
         remedy="Segment the object and save RGBA images with straight alpha.",
     )
+
+
+def read_ball_evidence(dataset: Dataset) -> BallEvidence | None:
+    """What a capture of a mirror ball knows of itself; None where the dataset is none."""
+    path = dataset.root / "transforms_train.json"
+    stated = read_table(path, "the cameras of the train split").get("ball")
+    return None if stated is None else read_record(BallEvidence, stated, f"`ball` of {path}", allow_unknown=True)
 
 
 def read_environment(dataset: Dataset) -> Float[np.ndarray, "H W 3"]:

@@ -3,13 +3,15 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
+from msgspec import Meta
 
 from shinypartial.core.camera import Camera
 from shinypartial.io.images import EXR, PICTURE_SUFFIXES
+from shinypartial.io.records import NonNegative, Share
 
 FORMAT = "shinypartial-dataset"
 FORMAT_VERSION = 1
@@ -112,6 +114,24 @@ class Frame:
         Frames of rendered datasets also have `self_png`.
         """
         return (self.png, self.alpha_png, self.normal_png, self.exr)
+
+
+@dataclass(frozen=True)
+class BallEvidence:
+    """What a capture of a mirror ball knows of itself: `ball` of `transforms_train.json`."""
+
+    rim_px: NonNegative
+    """Median distance of the rim's points from its cone."""
+    rim_seen: Share
+    """Share of the rim at which an edge was seen: median over views."""
+    focal_sigma: NonNegative
+    """Standard deviation of the focal length, as a share of it."""
+    reflection_deg: NonNegative
+    """Median angle between what views mirror and where it lies; 0 of a single view."""
+    turn_deg: NonNegative
+    """Standard deviation of a camera's turn: median over views; 0 of a single view."""
+    agreement: Annotated[float, Meta(ge=-1, le=1)] | None = None
+    """Correlation of what lies beside the ball with what it mirrors; None where too little does."""
 
 
 @dataclass(frozen=True)

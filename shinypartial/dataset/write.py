@@ -29,11 +29,13 @@ from shinypartial.dataset.schema import (
     MANIFEST,
     NORMAL_CHANNELS,
     SELF_REFLECTION_CHANNEL,
+    BallEvidence,
     Frame,
     View,
 )
 from shinypartial.io.files import PARTIAL_PREFIX, read_table, sha256_of, write_json, write_text
 from shinypartial.io.images import read_exr_rgb, write_exr, write_exr_rgb, write_png
+from shinypartial.io.records import write_record
 
 
 def make_frames(root: Path, split: str, cameras: Sequence[Camera], name: str = "r_{:03d}") -> tuple[Frame, ...]:
@@ -137,7 +139,7 @@ def encode_normals(normals: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H 
     return encode_unit((normals + 1) / 2)
 
 
-def write_transforms(root: Path, split: str, frames: Sequence[Frame]) -> None:
+def write_transforms(root: Path, split: str, frames: Sequence[Frame], ball: BallEvidence | None = None) -> None:
     """Write `transforms_SPLIT.json` with OpenGL poses, as NeRF-synthetic and nerfstudio readers expect.
 
     Intrinsics of the first frame stand for all; frames that differ from it have their own. Extensions of pictures and
@@ -156,7 +158,8 @@ def write_transforms(root: Path, split: str, frames: Sequence[Frame]) -> None:
         if frame.mask is not None:
             entry["mask_path"] = Path(os.path.relpath(frame.mask, root)).as_posix()
         entries.append(entry if own == shared else {**entry, **own})
-    write_json(root / f"transforms_{split}.json", {**shared, "frames": entries})
+    stated = {} if ball is None else {"ball": write_record(ball)}
+    write_json(root / f"transforms_{split}.json", {**shared, **stated, "frames": entries})
 
 
 def intrinsics_of(camera: Camera) -> dict[str, float]:

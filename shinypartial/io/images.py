@@ -223,6 +223,12 @@ def picture_size(path: Path) -> tuple[int, int]:
         return spec.width, spec.height
 
 
+def picture_attributes(path: Path) -> dict[str, Any]:
+    """What the file states beside its pixels, by OpenImageIO's names: `ExposureTime` (s), `Exif:FocalLength` (mm) …"""
+    with _open_picture(path) as (_, spec):
+        return {attribute.name: attribute.value for attribute in spec.extra_attribs}
+
+
 def read_picture(path: Path) -> Num[np.ndarray, "H W C"]:
     """Read a picture with its numbers as stored: gray (C = 1), RGB (3) or RGBA (4).
 

@@ -1,0 +1,107 @@
+"""Photographs of different exposure: brackets from one place become one picture, and all are brought to one exposure.
+
+A pixel that shows c < 1 of a photograph with the exposure g has the radiance c/g, and the surer the more light it got:
+L = Σ g c/Σ g² over the photographs in which it is not clipped; where all clip, the shortest says what it is at least.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from panoless.photographs.ball.rim import Circle
+from panoless.photographs.lens import opencv
+from panoless.photographs.shot import Shot
+
+SAME_CIRCLE_PX = 3.0
+"""Of a bracket, whose circles differ by no more…"""
+SAME_PICTURE = 0.8
+"""…and where so large a share of pixels lie on the same side of the median (Ward 2003)."""
+EQUAL_STOPS = 0.07
+"""Exposures that differ by less are equal."""
+DARKEST = 0.004
+"""Linear light below which a code is mostly noise."""
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """A view's light at the exposure that all views share."""
+
+    radiance: Float[np.ndarray, "H W 3"]
+    unknown: Bool[np.ndarray, "H W"]
+    """Where it is clipped though another view was exposed less."""
+    high_dynamic_range: bool
+
+
+def same_pose(shots: Sequence[Shot], circles: Sequence[Circle]) -> list[list[int]]:
+    """Groups of photographs from one place that differ in exposure."""
+    groups: list[list[int]] = []
+    for number, (shot, circle) in enumerate(zip(shots, circles, strict=True)):
+        for group in groups:
+            first = group[0]
+            if shot.size == shots[first].size and _is_bracket(shot, circle, shots[first], circles[first]):
+                group.append(number)
+                break
+        else:
+            groups.append([number])
+    return groups
+
+
+def _is_bracket(one: Shot, circle: Circle, two: Shot, other: Circle) -> bool:
+    apart = np.hypot(circle.x - other.x, circle.y - other.y) + abs(circle.radius - other.radius)
+    if apart > SAME_CIRCLE_PX or abs(_stops(one, two)) < EQUAL_STOPS:
+        return False
+    align = opencv().createAlignMTB()
+    sides = []
+    for shot in (one, two):
+        gray = opencv().cvtColor(shot.codes(), opencv().COLOR_RGB2GRAY)
+        bitmap, sure = align.computeBitmaps(gray)
+        sides.append((bitmap > 0, sure > 0))
+    both = sides[0][1] & sides[1][1]
+    return bool(both.any()) and float((sides[0][0] == sides[1][0])[both].mean()) > SAME_PICTURE
+
+
+def _stops(one: Shot, two: Shot) -> float:
+    """By how much the first was exposed more: as EXIF has it, else as pixels that neither clips have it."""
+    if one.exposure and two.exposure:
+        return float(np.log2(one.exposure / two.exposure))
+    return float(np.log2(_ratio(one, two)))
+
+
+def _ratio(one: Shot, two: Shot) -> float:
+    first, second = (shot.radiance()[::4, ::4] for shot in (one, two))
+    good = (first < one.clips_at) & (second < two.clips_at) & (first > DARKEST) & (second > DARKEST)
+    return float(np.median(first[good] / second[good])) if good.sum() > 100 else 1.0
+
+
+def exposed(groups: Sequence[Sequence[Shot]]) -> list[Exposed]:
+    """The light of each group at the exposure of the median photograph."""
+    shots = [shot for group in groups for shot in group]
+    if all(shot.exposure for shot in shots):
+        gains = {id(shot): float(shot.exposure or 1) for shot in shots}
+    else:
+        gains = {id(shot): _ratio(shot, group[0]) for group in groups for shot in group}
+    middle = float(np.median(list(gains.values())))
+    gains = {key: gain / middle for key, gain in gains.items()}
+    equal = max(gains.values()) / min(gains.values()) < 2**EQUAL_STOPS
+    codes = all(shot.pixels.dtype == np.uint8 for shot in shots)
+    shortest = min(gains.values())
+    found = []
+    for group in groups:
+        if equal and codes:
+            shape = group[0].pixels.shape
+            found.append(Exposed(np.zeros(shape, np.float32), np.zeros(shape[:2], bool), False))
+            continue
+        total = np.zeros(group[0].pixels.shape, np.float32)
+        weight = np.zeros(total.shape[:2], np.float32)
+        least = min(group, key=lambda shot: gains[id(shot)])
+        for shot in group:
+            gain, light = gains[id(shot)], shot.radiance()
+            good = (light < shot.clips_at).all(-1) | (shot is least)
+            total += np.where(good[..., None], gain * light, 0)
+            weight += np.where(good, gain**2, 0)
+        clipped = (least.radiance() >= least.clips_at).any(-1)
+        unknown = clipped & (gains[id(least)] > shortest * 2**EQUAL_STOPS)
+        found.append(Exposed(total / weight[..., None], unknown, True))
+    return found
