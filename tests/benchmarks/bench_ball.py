@@ -13,6 +13,7 @@ that is there. Without `--resolution` both films take about eight minutes of the
 """
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -33,6 +34,7 @@ from shinypartial.dataset.schema import Dataset
 from shinypartial.generate.film import FRAMES, TRUTH
 from shinypartial.io.files import link_or_copy, read_json, write_json
 
+REPOSITORY = Path(__file__).resolve().parents[2]
 RECIPES = ("chrome-ball-cans", "chrome-ball-brackets")
 SCORES = {
     "environment_psnr": "environment.as_predicted.full.psnr_srgb",
@@ -87,7 +89,7 @@ class Found:
     rotation_deg: Spread
     position_radii: Spread
     focal_share: float
-    mask_overlap: Spread
+    mask_error: Spread
     """One less intersection over union."""
     scores: dict[str, float | None] | None
 
@@ -174,21 +176,22 @@ def outline_errors(aligned: Dataset, truth: Dataset) -> tuple[list[float], list[
 def _filmed(recipe: str, options: Options) -> tuple[str, Path]:
     name, _, folder = recipe.partition("=")
     if folder:
-        return name, Path(folder)
-    root = options.output / "films" / Path(name).stem
+        return name, Path(folder).resolve()
+    name = str(Path(name).resolve()) if name.endswith(".toml") else name
+    root = (options.output / "films" / Path(name).stem).resolve()
     varied = [f"--{key}={value}" for key in ("resolution", "samples") if (value := getattr(options, key)) is not None]
-    _run("shinypartial", "film", f"--scene={name}", f"--output={root}", *varied)
+    _run(options.output, "shinypartial", "film", f"--scene={name}", f"--output={root}", *varied)
     return Path(name).stem, root
 
 
 def _compared(name: str, folder: Path, poses: list[list[Path]], count: int, options: Options) -> Found:
-    root = options.output / f"{name}-{count}"
+    root = (options.output / f"{name}-{count}").resolve()
     shutil.rmtree(root, ignore_errors=True)
     photographs, captured, aligned = root / "photographs", root / "captured", root / "aligned"
     for path in chosen(poses, count):
         link_or_copy(path, photographs / path.name)
     begin = time.perf_counter()
-    _run("panoless", "capture", *map(str, sorted(photographs.iterdir())), "--object=ball", f"--output={captured}")
+    _run(root, "panoless", "capture", *map(str, sorted(photographs.iterdir())), "--object=ball", f"--output={captured}")
     seconds = time.perf_counter() - begin
     try:
         found = align(captured, folder / TRUTH, aligned, "ball")
@@ -220,8 +223,11 @@ def _compared(name: str, folder: Path, poses: list[list[Path]], count: int, opti
 def _scores(root: Path, folder: Path, preset: str) -> dict[str, float | None]:
     """Of a fit of the aligned dataset."""
     prediction = root / "prediction"
-    _run("panoless", "fit", str(root / "aligned"), f"--preset={preset}", f"--output={prediction}")
-    _run("shinypartial", "evaluate", str(prediction), f"--dataset={folder / TRUTH}")
+    exposures_merged = any((root / "aligned" / "train").glob("*.exr"))
+    light = ["--config.environment.range=hdr"] if exposures_merged else []
+    fit = [str(root / "aligned"), "--model=sphere", f"--preset={preset}", f"--output={prediction}", *light]
+    _run(root, "panoless", "fit", *fit)
+    _run(root, "shinypartial", "evaluate", str(prediction), f"--dataset={folder / TRUTH}")
     scores = read_json(prediction / "scores.json", "the scores")
     return {key: _at(scores, path) for key, path in SCORES.items()}
 
@@ -232,9 +238,12 @@ def _at(scores: Any, path: str) -> float | None:
     return scores
 
 
-def _run(program: str, *arguments: str) -> None:
-    """Run a command of this checkout; CommandError with the end of its messages where it fails."""
-    done = subprocess.run([sys.executable, "-m", f"{program}.cli", *arguments], capture_output=True, text=True)
+def _run(place: Path, program: str, *arguments: str) -> None:
+    """Run a command of this checkout in a folder; CommandError with the end of its messages where it fails."""
+    place.mkdir(parents=True, exist_ok=True)
+    paths = os.pathsep.join([str(REPOSITORY), *filter(None, [os.environ.get("PYTHONPATH")])])
+    command = [sys.executable, "-m", f"{program}.cli", *arguments]
+    done = subprocess.run(command, cwd=place, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": paths})
     if done.returncode:
         raise CommandError(f"{program} {arguments[0]}", done.stderr.strip()[-500:])
 
