@@ -168,9 +168,10 @@ class Align:
     """Folder `truth` of that film."""
     output: Path
     """Folder to write."""
-    gauge: Literal["board", "similarity", "same"] | None = None
-    """By the board's known place, which estimates nothing; by the similarity that brings all poses nearest; or
-    not at all, where cameras are in the truth's world. By the board, where the film has one, when not given."""
+    gauge: Literal["board", "ball", "similarity", "same"] | None = None
+    """By the board's known place, which estimates nothing; by a rotation alone, where the captured world is that of a
+    ball; by the similarity that brings all poses nearest; or not at all, where cameras are in the truth's world. By the
+    board, where the film has one, when not given."""
 
     def run(self) -> None:
         """Write the copy and say what was measured."""

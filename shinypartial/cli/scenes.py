@@ -119,16 +119,19 @@ class Generate:
 
 @dataclass(frozen=True)
 class Film:
-    """Render what a phone would record of a scene, with the truth beside it; run again to continue."""
+    """Render the film or the photographs that a phone would take of a scene, with the truth beside them.
+
+    Run again to continue.
+    """
 
     scene: str | None = None
     """Name of a film in blender_scenes/films, or the path of its .toml file; all films there when not given."""
     output: Path | None = None
     """Folder to write, or the parent of the folders of all films; below films/ when not given."""
     resolution: int | None = None
-    """Width of the film in pixels; the recipe's when not given."""
+    """Width of the pictures in pixels; the recipe's when not given."""
     frames: int | None = None
-    """Frames of the film; the recipe's when not given."""
+    """Frames of the film, or poses from which photographs are taken; the recipe's when not given."""
     test: int | None = None
     """Views by a steady pinhole for scores; the recipe's when not given."""
     samples: int | None = None
@@ -148,8 +151,8 @@ class Film:
     def _film(self, name: str, output: Path | None) -> None:
         from dataclasses import replace
 
-        from shinypartial.generate.film import DEFAULT_FOLDER, MASKS, TRUTH, VIDEO, film
-        from shinypartial.scene import load_film, override
+        from shinypartial.generate.film import DEFAULT_FOLDER, FRAMES, MASKS, TRUTH, VIDEO, film
+        from shinypartial.scene import Sphere, load_film, override
 
         spec = load_film(name)
         scene = override(
@@ -159,7 +162,13 @@ class Film:
         root = output or DEFAULT_FOLDER / Path(name).stem
         made = film(varied, root)
         kept = f" (and kept {made.kept} that were there)" if made.kept else ""
-        print(f"Recorded {made.recorded} frames{kept} into {root / VIDEO}; truth in {root / TRUTH}")
-        board = varied.scene.ground.board if varied.scene.ground else None
-        words = [f"panoless capture {root / VIDEO} --output datasets/{root.name} --masks {root / MASKS}"]
-        print("Next:", " ".join([*words, *([f"--board {board}"] if board else [])]))
+        pictures, noun = (root / FRAMES, "photographs") if varied.photographs else (root / VIDEO, "frames")
+        print(f"Recorded {made.recorded} {noun}{kept} into {pictures}; truth in {root / TRUTH}")
+        words = [f"panoless capture {pictures} --output datasets/{root.name}"]
+        if varied.photographs and isinstance(scene.object, Sphere):
+            words.append("--object ball")
+        else:
+            words.append(f"--masks {root / MASKS}")
+        if scene.ground and scene.ground.board:
+            words.append(f"--board {scene.ground.board}")
+        print("Next:", " ".join(words))

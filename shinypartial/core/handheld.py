@@ -7,7 +7,15 @@ import numpy as np
 from jaxtyping import Float
 
 from shinypartial.core.camera import look_at
-from shinypartial.core.trajectory import CameraPath, Seed, check_hemisphere, hemisphere_axis, limits, path_offsets
+from shinypartial.core.trajectory import (
+    AROUND,
+    CameraPath,
+    Seed,
+    check_hemisphere,
+    hemisphere_axis,
+    limits,
+    path_offsets,
+)
 
 DegreesOfHand = Annotated[float, limits(0.0, 20.0)]
 
@@ -39,7 +47,8 @@ def handheld_poses(path: CameraPath, hand: Hand, count: int) -> Float[np.ndarray
     sway, aim = _smooth(random, count, hand.smooth_frames), _smooth(random, count, hand.smooth_frames)
     target = np.array(path.target)
     offsets = path_offsets(path, count) + hand.sway * path.radius * sway
-    check_hemisphere(offsets, hemisphere_axis(path))
+    if path.path != AROUND:
+        check_hemisphere(offsets, hemisphere_axis(path))
     angles = np.radians(aim * [hand.aim_deg, hand.aim_deg, hand.lean_deg])
     angles[:, :2] += np.radians(hand.tremor_deg) * random.normal(size=(count, 2))
     poses = np.stack([look_at(target + offset, target) for offset in offsets])

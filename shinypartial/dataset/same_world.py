@@ -1,7 +1,8 @@
 """A captured dataset beside its truth: both in one world, and how far cameras and masks are off.
 
 What photographs tell has a gauge: cameras that structure from motion finds are right up to a similarity, those from a
-board in the board's own world. Poses are moved, pictures and masks stay as they are.
+board in the board's own world, and those about a ball of radius 1 up to a rotation about its center.
+Poses are moved, pictures and masks stay as they are.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,13 +17,13 @@ from shinypartial.core.camera import Camera, Similarity
 from shinypartial.core.conventions import PIXEL_CENTER
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import open_dataset, read_view
-from shinypartial.dataset.schema import SPLITS, Dataset, Frame
+from shinypartial.dataset.schema import MANIFEST, SPLITS, Dataset, Frame
 from shinypartial.dataset.subset import files_of
 from shinypartial.dataset.write import write_transforms
 from shinypartial.io.files import copy_or_link, folder_lock, write_json
 from shinypartial.io.records import write_record
 
-GaugeKind = Literal["board", "similarity", "same"]
+GaugeKind = Literal["board", "ball", "similarity", "same"]
 ALIGNMENT = "alignment.json"
 #: Camera centers that span less than this share of their distance from the world's origin tell no scale.
 LEAST_SPREAD = 1e-6
@@ -77,21 +78,43 @@ def similarity(captured: Float[np.ndarray, "V 4 4"], true: Float[np.ndarray, "V 
             found=f"{len(captured)}" + (" in one place" if len(captured) >= FEWEST_CAMERAS else ""),
             remedy="Capture frames from several sides.",
         )
-    by_turns = np.einsum("vij,vkj->ik", true[:, :3, :3], captured[:, :3, :3])
+    by_turns = _common_turn(captured, true)
     by_centers = theirs.T @ ours / distance**2
     scale = float(np.linalg.norm(theirs) / np.linalg.norm(ours))
     for _ in range(ROUNDS):
-        left, _, right = np.linalg.svd(by_turns + 2 * scale * by_centers)
-        rotation = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
+        rotation = _nearest_rotation(by_turns + 2 * scale * by_centers)
         scale = float(np.sum(theirs * (ours @ rotation.T)) / np.sum(ours**2))
     return Similarity(scale, rotation, true[:, :3, 3].mean(0) - scale * rotation @ captured[:, :3, 3].mean(0))
+
+
+def about_ball(captured: Float[np.ndarray, "V 4 4"], true: Float[np.ndarray, "V 4 4"], radius: float) -> Similarity:
+    """From a world with the ball's center at its origin and radius 1: the scale is the true radius, nothing shifts.
+
+    The rotation leaves least of the turns: Σ ‖R Aᵢ − Bᵢ‖² over the poses' rotations, A captured and B true. One view is
+    enough.
+    """
+    return Similarity(radius, _nearest_rotation(_common_turn(captured, true)), np.zeros(3))
+
+
+def _common_turn(captured: Float[np.ndarray, "V 4 4"], true: Float[np.ndarray, "V 4 4"]) -> Float[np.ndarray, "3 3"]:
+    """Σ Bᵢ Aᵢᵀ of the rotations, captured A and true B."""
+    common: np.ndarray = np.einsum("vij,vkj->ik", true[:, :3, :3], captured[:, :3, :3])
+    return common
+
+
+def _nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation R of largest tr(RᵀM)."""
+    left, _, right = np.linalg.svd(matrix)
+    nearest: np.ndarray = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
+    return nearest
 
 
 def align(captured: Path, truth: Path, output: Path, gauge: GaugeKind | None = None) -> Alignment:
     """Write a copy of a captured dataset whose cameras are in the truth's world, with the truth's test cameras.
 
     Frames of the same name belong together. `board` shifts by the known place of the board's corner and estimates
-    nothing; `similarity` is estimated from the poses of all cameras; with `same` the captured world is the truth's.
+    nothing; `ball` is for a world about a ball of radius 1; `similarity` is estimated from the poses of all cameras;
+    with `same` the captured world is the truth's.
     When not given, it is `board` where the truth has a board, else `similarity`. The test views have cameras and no
     pictures.
     Raises InputError for frames that the truth doesn't know or that have no picture.
@@ -126,9 +149,17 @@ def _pairs(ours: Dataset, theirs: Dataset) -> list[tuple[Frame, Frame]]:
 
 
 def _gauge(kind: GaugeKind, pairs: Sequence[tuple[Frame, Frame]], truth: Dataset) -> Similarity:
+    poses = np.array([[frame.camera.camera_to_world for frame in pair] for pair in pairs])
     if kind == "similarity":
-        poses = np.array([[frame.camera.camera_to_world for frame in pair] for pair in pairs])
         return similarity(poses[:, 0], poses[:, 1])
+    if kind == "ball":
+        if truth.object_radius is None:
+            raise InputError(
+                expected=f"the object's radius in {truth.root / MANIFEST}",
+                found="none",
+                remedy="Use the truth that shinypartial film made.",
+            )
+        return about_ball(poses[:, 0], poses[:, 1], truth.object_radius)
     if kind == "same":
         return Similarity(1.0, np.eye(3), np.zeros(3))
     if truth.board_corner is None:

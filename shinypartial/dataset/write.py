@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +38,11 @@ from shinypartial.io.images import read_exr_rgb, write_exr, write_exr_rgb, write
 from shinypartial.io.records import write_record
 
 
-def make_frames(root: Path, split: str, cameras: Sequence[Camera], name: str = "r_{:03d}") -> tuple[Frame, ...]:
+def make_frames(
+    root: Path, split: str, cameras: Sequence[Camera], name: Callable[[int], str] = "r_{:03d}".format
+) -> tuple[Frame, ...]:
     """Frames of a split of a dataset at `root`, named by their numbers."""
-    stems = [root / split / name.format(i) for i in range(len(cameras))]
+    stems = [root / split / name(i) for i in range(len(cameras))]
     return tuple(Frame(f"{split}/{stem.name}", camera, stem) for stem, camera in zip(stems, cameras, strict=True))
 
 

@@ -48,7 +48,7 @@ from shinypartial.release.contact_sheet import write_contact_sheet
 from shinypartial.release.statistics import dataset_statistics
 from shinypartial.scene import FileWorld, SceneSpec, older_recipe
 
-FRAME_NAME = "r_{:03d}"
+FRAME_NAME = "r_{:03d}".format
 #: Directions along each side of a texel of the map for what a near sheet shows there.
 GROUND_SAMPLES = 4
 STUDIO_LIGHT_SOURCE = "Blender's studio lights, by Greg Zaal (Poly Haven, https://polyhaven.com)"
@@ -68,7 +68,8 @@ class Shots:
     """Cameras of another origin than the recipe's path, how the training views are named, and what the recipe adds."""
 
     trajectory: Trajectory
-    train_name: str
+    train_name: Callable[[int], str]
+    """Of a training view's number."""
     recipe: dict[str, Any]
 
 

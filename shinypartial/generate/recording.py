@@ -1,6 +1,8 @@
 """From radiance to the picture of a phone: shake, focus, lens, vignette, exposure, noise, eight bits."""
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -9,7 +11,13 @@ from shinypartial.core.camera import Camera
 from shinypartial.core.color import to_display
 from shinypartial.dataset.perturb.sensor import add_noise, blur, undistorted_pixels, vignette_gain, warp
 from shinypartial.dataset.write import encode_unit
-from shinypartial.scene import FilmSpec, Phone
+from shinypartial.scene import FilmSpec, Phone, Photographs
+
+#: Of a picture whose gain is 1; the ISO speed and the aperture are the same in all of them.
+EXPOSURE_S = 1 / 60
+SENSITIVITY, F_NUMBER = 100, 1.8
+DIAGONAL_OF_35MM_FILM_MM = math.hypot(36, 24)
+MM_PER_INCH, INCHES = 25.4, 2
 
 
 @dataclass(frozen=True)
@@ -27,17 +35,22 @@ class Moment:
 
 
 def moments(spec: FilmSpec) -> tuple[Moment, ...]:
-    """Of every frame. The focus rolls as |sin|; the exposure wanders as slowly as the hand; shakes are independent."""
-    phone, count = spec.phone, spec.scene.camera.train
+    """Of every picture, those from one pose in the order of `shot_stops`.
+
+    The focus rolls as |sin|; the exposure wanders as slowly as the hand; both are the same all through a bracket.
+    Shakes are independent.
+    """
+    phone, count, shots = spec.phone, spec.scene.camera.train, spec.shot_stops
     random = np.random.default_rng(phone.seed)
     window = np.hanning(2 * int(spec.hand.smooth_frames) + 3)
     noise = random.normal(size=count + len(window) - 1)
     drift = phone.drift_stops * np.convolve(noise, window / np.linalg.norm(window), mode="valid")
     focus = phone.focus_px * np.abs(np.sin(np.pi * np.arange(count) / phone.focus_frames))
-    shakes = phone.shake_px / np.sqrt(2) * random.normal(size=(count, 2))
+    shakes = phone.shake_px / np.sqrt(2) * random.normal(size=(count * len(shots), 2))
+    stops = (drift[:, None] + np.array(shots)).ravel()
     return tuple(
         Moment(float(2.0**stops), float(px), (float(shake[0]), float(shake[1])), phone.seed + index)
-        for index, (stops, px, shake) in enumerate(zip(drift, focus, shakes, strict=True))
+        for index, (stops, px, shake) in enumerate(zip(stops, np.repeat(focus, len(shots)), shakes, strict=True))
     )
 
 
@@ -52,6 +65,30 @@ def recorded_picture(
     random = np.random.default_rng(moment.seed)
     light = add_noise(bent * gain[..., None].astype(np.float32), phone.shot_noise, phone.read_noise, 1.0, random)
     return to_display(light)
+
+
+def exif_tags(camera: Camera, photographs: Photographs, moment: Moment) -> dict[str, Any]:
+    """What a phone writes beside a photograph, by OpenImageIO's names.
+
+    f₃₅ = f · d₃₅/d, a whole number, d the diagonals (CIPA DCG-001); the exposure is t = t₁ · gain.
+    """
+    diagonal = math.hypot(camera.width, camera.height)
+    px_per_mm = camera.width / photographs.sensor_width_mm
+    tags = {
+        "Make": "Rendered",
+        "Model": "Rendered",
+        "Orientation": 1,
+        "ExposureTime": EXPOSURE_S * moment.gain,
+        "FNumber": F_NUMBER,
+        "Exif:PhotographicSensitivity": SENSITIVITY,
+        "Exif:FocalLength": camera.fx / px_per_mm,
+        "Exif:FocalLengthIn35mmFilm": round(camera.fx * DIAGONAL_OF_35MM_FILM_MM / diagonal),
+    }
+    if photographs.focal_plane:
+        px_per_inch = px_per_mm * MM_PER_INCH
+        tags |= {f"Exif:FocalPlane{axis}Resolution": px_per_inch for axis in "XY"}
+        tags["Exif:FocalPlaneResolutionUnit"] = INCHES
+    return tags
 
 
 def recorded_mask(alpha: Float[np.ndarray, "H W"], camera: Camera, phone: Phone) -> UInt8[np.ndarray, "H W"]:

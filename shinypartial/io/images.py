@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -158,9 +159,14 @@ def write_png(path: Path, image: UInt8[np.ndarray, "H W *C"]) -> None:
     _write_picture(path, image, "png", {"oiio:UnassociatedAlpha": 1})
 
 
-def write_jpeg(path: Path, image: UInt8[np.ndarray, "H W 3"], quality: int) -> None:
-    """Write an 8-bit RGB image as JPEG of a quality from 1 to 100, its chroma at half the resolution."""
-    _write_picture(path, image, "jpeg", {"Compression": f"jpeg:{quality}"})
+def write_jpeg(
+    path: Path, image: UInt8[np.ndarray, "H W 3"], quality: int, exif: Mapping[str, Any] = MappingProxyType({})
+) -> None:
+    """Write an 8-bit RGB image as JPEG of a quality from 1 to 100, its chroma at half the resolution.
+
+    `exif` are tags by the names that OpenImageIO gives them.
+    """
+    _write_picture(path, image, "jpeg", {"Compression": f"jpeg:{quality}", **exif})
 
 
 def write_hdr(path: Path, radiance: Float[np.ndarray, "H W 3"]) -> None:

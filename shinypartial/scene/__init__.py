@@ -6,7 +6,7 @@ line overrides.
 Imports io and core; never dataset, blender or bpy.
 """
 
-from shinypartial.scene.film import FilmSpec, Phone
+from shinypartial.scene.film import FilmSpec, Phone, Photographs
 from shinypartial.scene.ground import Ground
 from shinypartial.scene.recipes import (
     FILMS,
@@ -72,6 +72,7 @@ __all__ = [
     "Operator",
     "Part",
     "Phone",
+    "Photographs",
     "Plane",
     "RadialHarmonics",
     "Render",

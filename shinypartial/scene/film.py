@@ -1,11 +1,11 @@
-"""What a film holds besides its scene: the hand that carries the phone, and what the phone makes of light."""
+"""What a film or a few photographs hold besides their scene: the hand with the phone, and what this makes of light."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from shinypartial.core.handheld import Hand
 from shinypartial.core.trajectory import Seed, limits
-from shinypartial.io.records import NonNegative, write_record
+from shinypartial.io.records import NonEmpty, NonNegative, write_record
 from shinypartial.scene.spec import SceneSpec
 
 Compression = Literal["HIGH", "MEDIUM", "LOW"]
@@ -44,15 +44,38 @@ class Phone:
 
 
 @dataclass(frozen=True)
+class Photographs:
+    """Still pictures in place of a video, with the EXIF tags that a phone writes beside them."""
+
+    bracket_stops: NonEmpty[Annotated[float, limits(-12.0, 12.0)]] = (0.0,)
+    """Every pose is photographed once at each of these exposures."""
+    bracket_sway: Annotated[float, limits(0.0, 0.2)] = 0.0
+    """Root mean square along each axis of how far the camera moves between the shots of a bracket, as a share of the
+    distance from the target."""
+    sensor_width_mm: Annotated[float, limits(1.0, 100.0)] = 7.0
+    """The focal length in millimeters is that before a sensor of this width."""
+    focal_plane: bool = False
+    """Whether the tags state the sensor's pixels per inch; most phones state the focal length in 35 mm film alone."""
+
+
+@dataclass(frozen=True)
 class FilmSpec:
     """Everything that determines a film; `scene.camera` holds the path that the hand follows, and what is tested.
 
-    The film has `scene.camera.train` frames; `scene.camera.test` further views are taken by a steady pinhole.
+    The film has `scene.camera.train` frames, or photographs are taken from as many poses; `scene.camera.test` further
+    views are taken by a steady pinhole.
     """
 
     scene: SceneSpec
     hand: Hand = Hand()
     phone: Phone = Phone()
+    photographs: Photographs | None = None
+    """None: a video."""
+
+    @property
+    def shot_stops(self) -> tuple[float, ...]:
+        """Exposures of the pictures from one pose."""
+        return self.photographs.bracket_stops if self.photographs else (0.0,)
 
     @property
     def size(self) -> tuple[int, int]:

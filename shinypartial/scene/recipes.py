@@ -31,6 +31,7 @@ ADDED_KEYS = {
     "f_number": None,
     "focus_distance": None,
     "motion_deg": 0.0,
+    "photographs": None,
 }
 
 
@@ -79,7 +80,7 @@ def film_names() -> list[str]:
 
 
 def load_film(film: str) -> FilmSpec:
-    """Read a film by name, or by the path of its TOML file; its tables are `scene`, `hand` and `phone`.
+    """Read a film by name, or by the path of its TOML file; its tables are `scene`, `hand`, `phone` and `photographs`.
 
     Raises InputError as `load_scene` does, and for a hand or a phone that is wrong.
     """

@@ -33,3 +33,8 @@ def test_motions_have_their_sizes() -> None:
     trembles = handheld_poses(PATH, replace(STEADY, tremor_deg=0.5), count)
     jumps = np.degrees((np.swapaxes(steady[:, :3, :3], 1, 2) @ trembles[:, :3, :3])[:, 2, 1])
     np.testing.assert_allclose(np.diff(jumps).std(), 0.5 * np.sqrt(2), rtol=0.1)
+
+
+def test_a_hand_goes_all_around() -> None:
+    poses = handheld_poses(replace(PATH, path="around"), Hand(), 12)
+    assert min((poses[:, :3, 3] - PATH.target)[:, 0]) < 0 < max((poses[:, :3, 3] - PATH.target)[:, 0])

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from shinypartial.core.camera import Camera, Similarity
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import open_dataset, read_view
-from shinypartial.dataset.same_world import align, similarity
+from shinypartial.dataset.same_world import about_ball, align, similarity
 from shinypartial.dataset.schema import MANIFEST, Frame
 from shinypartial.dataset.write import write_transforms
 from shinypartial.io.files import read_json, write_json
@@ -46,6 +46,21 @@ def test_a_similarity_is_found_again(number: int, along: tuple[float, float, flo
     assert found.scale == pytest.approx(WORLD.scale)
     np.testing.assert_allclose(found.rotation, WORLD.rotation, atol=1e-9)
     np.testing.assert_allclose(found.shift, WORLD.shift, atol=1e-9)
+
+
+@pytest.mark.parametrize("number", [1, 2, 7])
+def test_a_rotation_about_a_ball_is_found_again(number: int) -> None:
+    """From one camera on. A view that turns by 0.2 against n − 1 others keeps (n − 1)/n of it."""
+    poses = cameras(number)
+    world = Similarity(0.06, WORLD.rotation, np.zeros(3))
+    true = np.array([world.pose(each) for each in poses])
+    found = about_ball(poses, true, 0.06)
+    np.testing.assert_allclose(found.rotation, WORLD.rotation, atol=1e-9)
+    np.testing.assert_allclose(found(poses[:, :3, 3]), true[:, :3, 3], atol=1e-9)
+    true[0, :3, :3] = Rotation.from_rotvec([0.0, 0.0, 0.2]).as_matrix() @ true[0, :3, :3]
+    moved = about_ball(poses, true, 0.06).rotation @ poses[:, :3, :3]
+    left = Rotation.from_matrix(np.swapaxes(true[:, :3, :3], 1, 2) @ moved)
+    assert left.magnitude().max() == pytest.approx(0.2 * (number - 1) / number, rel=1e-2, abs=1e-9)
 
 
 def test_no_other_similarity_leaves_less() -> None:
@@ -117,6 +132,21 @@ def test_turned_cameras_are_told(truth: Path, tmp_path: Path) -> None:
     made = align(captured(truth, tmp_path / "captured", WORLD, 0.7), truth, tmp_path / "aligned", "similarity")
     assert 0.2 < np.median(made.rotation_deg) < 0.7
     assert f"turned by {np.median(made.rotation_deg):.3f}°" in made.summary()
+
+
+def test_the_world_of_a_ball_has_its_radius(truth: Path, tmp_path: Path) -> None:
+    with_radius = tmp_path / "truth"
+    shutil.copytree(truth, with_radius)
+    manifest = read_json(with_radius / MANIFEST, "the manifest")
+    write_json(with_radius / MANIFEST, manifest | {"statistics": {"object_radius": 0.5}})
+    world = Similarity(2.0, WORLD.rotation, np.zeros(3))
+    made = align(captured(truth, tmp_path / "captured", world), with_radius, tmp_path / "one", "ball")
+    assert (made.gauge, made.scale) == ("ball", 0.5)
+    assert max(*made.rotation_deg, *made.distance_share) < 1e-6
+    shifted = captured(truth, tmp_path / "shifted", Similarity(2.0, WORLD.rotation, np.array([0.0, 0.0, 0.8])))
+    made = align(shifted, with_radius, tmp_path / "two", "ball")  # No shift of the world is estimated.
+    radii = [np.linalg.norm(frame.camera.position_world) for frame in open_dataset(truth).train]
+    np.testing.assert_allclose(made.distance_share, 0.4 / np.array(radii), rtol=1e-6)
 
 
 def test_a_board_is_believed_and_no_world_estimated(truth: Path, tmp_path: Path) -> None:

@@ -6,16 +6,17 @@ import pytest
 from shinypartial.core.board import BOARDS, CELLS_OF_SQUARE
 from shinypartial.core.errors import InputError
 from shinypartial.core.trajectory import unit_vectors
-from shinypartial.scene import DEVELOPMENT, Ground, film_names, load_film
+from shinypartial.scene import DEVELOPMENT, HELD_OUT, Ground, film_names, load_film
 from shinypartial.scene.ground import BLACK
 
 SHEET = Ground(height=-0.3, side=1.0, board="A4", radiance=0.8)
 
 
-def test_four_films_come_with_the_repository() -> None:
+def test_films_come_with_the_repository() -> None:
     films = [load_film(name) for name in film_names()]
-    assert len(films) == 4
-    assert {film.scene.split for film in films} == {DEVELOPMENT}
+    assert len(films) == 6
+    assert {film.scene.split for film in films if film.photographs is None} == {DEVELOPMENT}
+    assert {film.scene.split for film in films if film.photographs} == {DEVELOPMENT, HELD_OUT}
     assert sum(film.scene.ground.board is not None for film in films if film.scene.ground) == 2
     assert all(film.scene.operator and film.scene.room and film.size[1] % 2 == 0 for film in films)
 
