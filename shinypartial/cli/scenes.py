@@ -6,6 +6,8 @@ from typing import Literal
 
 import tyro
 
+from shinypartial.core.command_line import command_line
+
 
 @dataclass(frozen=True)
 class CameraOptions:
@@ -161,5 +163,5 @@ class Film:
         kept = f" (and kept {made.kept} that were there)" if made.kept else ""
         print(f"Recorded {made.recorded} frames{kept} into {root / VIDEO}; truth in {root / TRUTH}")
         board = varied.scene.ground.board if varied.scene.ground else None
-        words = [f"panoless capture {root / VIDEO} --output datasets/{root.name} --masks {root / MASKS}"]
-        print("Next:", " ".join([*words, *([f"--board {board}"] if board else [])]))
+        words = ["panoless", "capture", root / VIDEO, "--output", Path("datasets", root.name), "--masks", root / MASKS]
+        print("Next:", command_line(*words, *(["--board", board] if board else [])))
