@@ -163,5 +163,5 @@ class Film:
         kept = f" (and kept {made.kept} that were there)" if made.kept else ""
         print(f"Recorded {made.recorded} frames{kept} into {root / VIDEO}; truth in {root / TRUTH}")
         board = varied.scene.ground.board if varied.scene.ground else None
-        words = ["panoless", "capture", root / VIDEO, "--output", Path("datasets", root.name), "--masks", root / MASKS]
-        print("Next:", command_line(*words, *(["--board", board] if board else [])))
+        capture = "panoless", "capture", root / VIDEO, "--output", Path("datasets", root.name), "--masks", root / MASKS
+        print("Next:", command_line(*capture, *(("--board", board) if board else ())))
