@@ -13,6 +13,7 @@ import tyro
 from panoless.config import FitConfig, renamed_arguments, with_overrides
 from panoless.photographs.options import CaptureOptions
 from panoless.presets import PRESETS
+from shinypartial.core.command_line import command_line
 from shinypartial.core.errors import InputError, parse_and_run
 from shinypartial.io.records import check_record
 
@@ -62,15 +63,17 @@ class Fit:
             device=self.device,
             config=config,
         )
-        print(f"Prediction written to {result.folder}\nNext: shinypartial evaluate {result.folder}")
-        print(f"For Blender and others: shinypartial convert {result.folder} --to blender")
+        print(f"Prediction written to {result.folder}")
+        print("Next:", command_line("shinypartial", "evaluate", result.folder))
+        print("For Blender and others:", command_line("shinypartial", "convert", result.folder, "--to", "blender"))
         if self.snapshots or self.snapshot_seconds:
             from panoless.geometry.registry import FAMILIES
             from panoless.reconstruct.snapshots import snapshot_folders
 
             run_folder = RUNS / result.folder.resolve().name
             if snapshot_folders(run_folder):
-                print(f"Snapshots: panoless export {run_folder} --output {result.folder} --snapshots")
+                words = "panoless", "export", run_folder, "--output", result.folder, "--snapshots"
+                print("Snapshots:", command_line(*words))
             else:
                 label = FAMILIES[result.model].label
                 print(f"No snapshots: this run took {label}, whose map is solved without steps.")
@@ -149,9 +152,10 @@ class Export:
             if self.snapshots:
                 written = export_snapshots(dataset, folder, description.config, prediction)
                 print(f"{len(written)} snapshots below {prediction}")
-        print(f"Prediction written to {prediction}\nNext: shinypartial evaluate {prediction}")
+        print(f"Prediction written to {prediction}")
+        print("Next:", command_line("shinypartial", "evaluate", prediction))
         if self.snapshots:
-            print(f"Then: shinypartial evaluate {prediction} --snapshots")
+            print("Then:", command_line("shinypartial", "evaluate", prediction, "--snapshots"))
 
 
 @dataclass(frozen=True)
@@ -246,7 +250,7 @@ class Capture:
             options=self.options,
         )
         print("\n".join(capture(request).summary()))
-        print(f"Look at {self.output}/capture/masks.jpg. Next: panoless fit {self.output}")
+        print(f"Look at {self.output}/capture/masks.jpg. Next:", command_line("panoless", "fit", self.output))
 
     def _files(self) -> tuple[Path, ...]:
         from panoless.photographs.frames import source_files

@@ -296,7 +296,7 @@ def with_overrides(config: FitConfig, overrides: Sequence[str]) -> FitConfig:
             )
         try:
             place[name] = json.loads(text)
-        except ValueError:
+        except (ValueError, RecursionError):
             place[name] = text
     return read_record(FitConfig, content, "the configuration", remedy="The reference of options says what it means.")
 

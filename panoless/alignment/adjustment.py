@@ -12,6 +12,7 @@ from jaxtyping import Float
 from panoless.alignment.equations import PoseRows
 from panoless.alignment.options import PoseOptions
 from panoless.environment.following import FollowingMap
+from panoless.numeric.factorize import regularize
 from panoless.numeric.robust import robust_weight
 
 
@@ -41,7 +42,6 @@ def adjusting_step(
     by_light, of_light = FollowingMap.of(directions, weights, resolution).sparse_equations(
         np.concatenate([rows.rows for rows in light]), 6 * view[:, None] + np.arange(6), 6 * views, residual
     )
-    step: np.ndarray = -np.linalg.solve(
-        matrix.reshape(6 * views, 6 * views) + of_light, gradient.reshape(-1) + by_light
-    )
+    whole = regularize(matrix.reshape(6 * views, 6 * views) + of_light, "the poses")
+    step: np.ndarray = -np.linalg.solve(whole, gradient.reshape(-1) + by_light)
     return step.reshape(views, 6)

@@ -19,6 +19,7 @@ from panoless.capture.silhouettes import silhouette_distance_px
 from panoless.capture.views import TrainView, Views
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, observe_views, usable_views
+from panoless.numeric.factorize import regularize
 from panoless.numeric.gauss_newton import damped_step
 from panoless.numeric.robust import NORMAL_MEDIAN, robust_scale
 
@@ -110,7 +111,7 @@ class Alignment:
         for each, prior in zip(rows, self.prior, strict=True):
             parts = zip(each, noise, strict=True)
             known = sum((part.equations(self.options.noise_multiple * sigma, sigma)[1] for part, sigma in parts), prior)
-            found.append(np.sqrt(np.diag(np.linalg.inv(known))))
+            found.append(np.sqrt(np.diag(np.linalg.inv(regularize(known, "the poses")))))
         return self.options.uncertainty_factor * np.array(found)
 
     def without_motion_of_object(self, turns: Poses) -> Poses:
@@ -183,7 +184,7 @@ class _SeenView:
                 gradient = sum((part[0] for part in parts), prior @ pose.stacked[0])
                 matrix = sum((part[1] for part in parts), prior)
                 best, least = pose, cost
-                step[0, free] = -np.linalg.solve(matrix[free, free], gradient[free])
+                step[0, free] = -np.linalg.solve(regularize(matrix[free, free], "a pose"), gradient[free])
             else:
                 step *= self.options.shortening
         return best.stacked[0]

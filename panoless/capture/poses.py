@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from panoless.capture.rays import pose_of
 from panoless.capture.views import TrainView, Views
+from panoless.numeric.factorize import regularize
 from shinypartial.core.camera import Similarity
 
 #: A principal point is taken for wrong where what turns and shifts leave to it and to common motions together is less
@@ -41,7 +42,7 @@ class StatedCameras:
         """
         usual = np.diag(np.repeat([turn_rad, shift], 3) ** 2.0)
         known = [usual if each is None else each + floor**2 * usual for each in self.covariances]
-        return np.linalg.inv(np.array(known))
+        return np.linalg.inv(regularize(np.array(known), "the poses"))
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,7 @@ class Poses:
         shifted = np.concatenate([np.zeros((count, 3, 3)), np.tile(axes, (count, 1, 1))], 2)
         scaled = np.concatenate([np.zeros((count, 1, 3)), centers[:, None]], 2)
         own = np.concatenate([cameras.rotations[:, :2], np.zeros((count, 2, 3))], 2)
-        roots = np.linalg.cholesky(prior)
+        roots = np.linalg.cholesky(regularize(prior, "the poses"))
         basis = (np.concatenate([turned, shifted, scaled, own], 1) @ roots).transpose(0, 2, 1).reshape(-1, 9)
         stacked = np.matmul(self.stacked[:, None], roots).ravel()
         return common_and_lens(basis[:, :7], basis[:, 7:], stacked)

@@ -15,6 +15,7 @@ from panoless.first_surface.contact import outline_contact
 from panoless.first_surface.mesh import TriangleMesh
 from panoless.first_surface.options import DEFAULTS, FirstSurfaceOptions
 from panoless.first_surface.visual_hull import Hull
+from panoless.numeric.factorize import factorize
 
 LEAST_AREA = 1e-3
 """Of the mean area of a vertex: a smaller one counts as this."""
@@ -39,11 +40,12 @@ class TrustedHull:
 
 
 def trusted_hull(hull: Hull, views: Views, options: FirstSurfaceOptions = DEFAULTS) -> TrustedHull:
-    """By the contact of silhouettes."""
+    """By the contact of silhouettes; a hull that none touches is all that is known."""
     surface = hull_surface(hull)
     pixel = max(hull.pixel, hull.voxel / options.pixels_a_voxel)
     contact = outline_contact(surface, views, options)
-    trust = contact.trust(options.contact_px * pixel, options.least_trust) + options.trust_floor
+    touched = contact.trust(options.contact_px * pixel, options.least_trust)
+    trust = (touched if touched.any() else np.ones_like(touched)) + options.trust_floor
     return TrustedHull(hull, surface, trust, pixel)
 
 
@@ -74,7 +76,10 @@ def completed(
 def _move_inside(
     hull: Hull, points: Float[np.ndarray, "P 3"], options: FirstSurfaceOptions
 ) -> Float[np.ndarray, "P 3"]:
-    """Points outside the hull on its surface, the others where they are: Newton steps along the gradient."""
+    """Points outside the hull on its surface, the others where they are: Newton steps along the gradient, from within
+    the cube that holds the hull.
+    """
+    points = np.clip(points, -hull.half_side, hull.half_side)
     for _ in range(options.projection_steps):
         value, gradient = hull.sample(points)
         step = np.maximum(value, 0) / np.maximum((gradient**2).sum(1), options.least_slope**2)
@@ -94,24 +99,19 @@ def thin_plate(
     x₀ are the targets, or else the given vertices; A are vertex areas, t the trust, Δ the intrinsic Delaunay Laplacian
     of the given mesh (Sharp & Crane 2020), which slivers don't harm. Where t is 1, details shorter than ℓ are smoothed;
     where it is 0, the plate continues its surroundings' position and slope. Tension τ (1/length²) draws parts longer
-    than 1/√τ straight: without any a plate bulges between the edges of a flat face.
+    than 1/√τ straight: without any a plate bulges between the edges of a flat face. A mesh without area has no plate:
+    its vertices are the targets.
     """
     from robust_laplacian import mesh_laplacian
     from scipy import sparse
-    from scipy.sparse.linalg import splu
 
+    goals = (surface.vertices if target is None else target).astype(np.float64)
+    if not surface.area_vectors().any():
+        return TriangleMesh(goals, surface.triangles)
     laplacian, mass = mesh_laplacian(surface.vertices.astype(np.float64), surface.triangles)
     areas = np.maximum(mass.diagonal(), LEAST_AREA * mass.diagonal().mean())
-    data = areas * trust
-    goals = surface.vertices if target is None else target
-    bending = laplacian.T @ sparse.diags(1 / areas) @ laplacian
-    system = length**4 * (bending + tension * laplacian) + sparse.diags(data)
-    # Positive definite: an ordering for symmetric matrices and pivots on the diagonal fill in less.
-    symmetric = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
-    try:
-        factors = splu(system.tocsc(), **symmetric)
-    except RuntimeError:
-        # Where next to nothing is trusted, rounding can leave no pivot on the diagonal.
-        factors = splu(system.tocsc())
-    moved = np.stack([factors.solve(data * column) for column in goals.T.astype(np.float64)], 1)
-    return TriangleMesh(moved, surface.triangles)
+    stiffness = length**4 * (laplacian.T @ sparse.diags(1 / areas) @ laplacian + tension * laplacian)
+    # Solved for x − x₀: a part that hardly anything holds then stays, where x itself would go to the origin.
+    solve = factorize(stiffness + sparse.diags(areas * trust), "the first surface")
+    moved = np.stack([solve(column) for column in -(stiffness @ goals).T], 1)
+    return TriangleMesh(goals + moved, surface.triangles)

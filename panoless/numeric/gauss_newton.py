@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from jaxtyping import Float, Int
 
+from panoless.numeric.factorize import LEAST_DAMPING, require_finite
+
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 State = TypeVar("State")
-LEAST_DAMPING = 1e-9
-"""As little as keeps a matrix regular where nothing tells a parameter; not tuned."""
 LEAST_GAIN = 0.02
 """Share of its held-out cost by which a finer model has to be better. Chosen on the development scenes."""
 
@@ -43,13 +43,14 @@ def damped_step(
 ) -> Float[np.ndarray, "D"]:
     """−(H + d·tr(H)/D·I)⁻¹ g for a positive semidefinite H; zero where H is.
 
-    `damping` d is a share of the mean diagonal. The whole step is shortened until none of the parameters `limited`
-    moves by more than `largest`.
+    `damping` d is a share of the mean diagonal, at least `LEAST_DAMPING`. The whole step is shortened until none of
+    the parameters `limited` moves by more than `largest`. Raises InputError for NaN and infinity.
     """
-    mean_diagonal = float(np.trace(matrix)) / len(matrix)
+    mean_diagonal = float(np.trace(require_finite(matrix, "a step"))) / len(matrix)
     if mean_diagonal <= 0:
         return np.zeros_like(gradient)
-    step = -np.linalg.solve(matrix + damping * mean_diagonal * np.eye(len(matrix)), gradient)
+    damped = matrix + max(damping, LEAST_DAMPING) * mean_diagonal * np.eye(len(matrix))
+    step = -np.linalg.solve(damped, require_finite(gradient, "a step"))
     return step * min(1.0, largest / max(float(np.abs(step[limited]).max()), 1e-300))
 
 

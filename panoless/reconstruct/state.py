@@ -2,6 +2,7 @@
 
 import io
 import json
+import pickle
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -109,10 +110,15 @@ def load_state(folder: Path) -> FitState | None:
         content["reflectance"] = None if reflectance is None else from_plain(Reflectance, reflectance)
         content["verdict"] = None if verdict is None else Trust(**verdict)
         return FitState(**content)
+    except MemoryError:
+        raise
     except Exception as error:
+        # Torch's own words advise to load code without a check.
+        is_refused = isinstance(error, pickle.UnpicklingError)
+        reason = "no numbers, but other content" if is_refused else next(iter(str(error).splitlines()), "")
         raise InputError(
             expected=f"a checkpoint of this version at {path}",
-            found=f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}",
+            found=f"{type(error).__name__}: {reason}",
             remedy="Delete that run folder and fit again.",
         ) from None
 

@@ -8,6 +8,7 @@ import tyro
 
 from shinypartial.cli.newest import announce_newest
 from shinypartial.conversion.layouts import AxisName, CaptureLayout
+from shinypartial.core.command_line import command_line
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.perturb.options import CameraErrors, MaskErrors, Perturbation, SensorErrors, ViewChoice, World
 
@@ -42,7 +43,7 @@ class Subset:
         print(f"{len(kept.dropped)} left out, in {made.root}")
         for split in made.without_normals:
             print(f"No normals in {split}: only some of its views had any, and scores need all or none.")
-        print(f"Next: panoless fit {made.root}")
+        print("Next:", command_line("panoless", "fit", made.root))
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ class FindLight:
         print(f"Lit by {match.name}, turned by {match.turn_deg:.2f}° about +Z, of which it shows {2**match.stops:.2f}")
         near = f"; next {found.others[0].name} {found.others[0].correlation:.2f}" if found.others else ""
         print(f"Correlation of details {match.correlation:.2f}{near}")
-        print(f"Next: panoless fit {found.root}")
+        print("Next:", command_line("panoless", "fit", found.root))
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ class ImportDataset:
         print(f"{self.output}: {made.train} training and {made.test} test views")
         for reason in made.left_out:
             print(f"Left out {reason}")
-        print(f"Next: panoless fit {self.output}")
+        print("Next:", command_line("panoless", "fit", self.output))
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ class Perturb:
             for name, value in values.items()
         ]
         print(f"{made.root}: {len(made.plan.views)} training views, {', '.join(changes) or 'nothing changed'}")
-        print(f"Next: panoless fit {made.root}")
+        print("Next:", command_line("panoless", "fit", made.root))
 
 
 @dataclass(frozen=True)
@@ -179,7 +180,8 @@ class Align:
 
         made = align(self.captured, self.truth, self.output, self.gauge)
         print(made.summary())
-        print(f"Next: panoless fit {self.output}, then shinypartial evaluate --dataset {self.truth}")
+        score = command_line("shinypartial", "evaluate", "--dataset", self.truth)
+        print("Next:", command_line("panoless", "fit", self.output) + ", then", score)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,8 @@ from typing import Literal
 
 import tyro
 
+from shinypartial.core.command_line import command_line
+
 
 @dataclass(frozen=True)
 class CameraOptions:
@@ -164,11 +166,11 @@ class Film:
         kept = f" (and kept {made.kept} that were there)" if made.kept else ""
         pictures, noun = (root / FRAMES, "photographs") if varied.photographs else (root / VIDEO, "frames")
         print(f"Recorded {made.recorded} {noun}{kept} into {pictures}; truth in {root / TRUTH}")
-        words = [f"panoless capture {pictures} --output datasets/{root.name}"]
+        words: list[str | Path] = ["panoless", "capture", pictures, "--output", Path("datasets", root.name)]
         if varied.photographs and isinstance(scene.object, Sphere):
-            words.append("--object ball")
+            words += ["--object", "ball"]
         else:
-            words.append(f"--masks {root / MASKS}")
+            words += ["--masks", root / MASKS]
         if scene.ground and scene.ground.board:
-            words.append(f"--board {scene.ground.board}")
-        print("Next:", " ".join(words))
+            words += ["--board", scene.ground.board]
+        print("Next:", command_line(*words))

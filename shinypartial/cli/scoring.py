@@ -7,6 +7,7 @@ from typing import Literal
 import tyro
 
 from shinypartial.cli.newest import announce_newest
+from shinypartial.core.command_line import command_line
 from shinypartial.core.errors import InputError
 
 
@@ -97,7 +98,8 @@ class Postprocess:
         output = self.output or prediction.resolve().with_name(f"{prediction.resolve().name}-blurred")
         made = postprocess(prediction, output, BlurOptions(self.blur_deg, self.feather_deg))
         print(f"{made.share:.1%} of the sphere has a visibility below {made.threshold:.3f} (Otsu) and was blurred")
-        print(f"Prediction written to {output}\nNext: shinypartial evaluate {output}")
+        print(f"Prediction written to {output}")
+        print("Next:", command_line("shinypartial", "evaluate", output))
 
 
 @dataclass(frozen=True)

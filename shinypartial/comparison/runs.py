@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from shinypartial.core.command_line import command_line
 from shinypartial.core.errors import InputError
 from shinypartial.evaluation.key_metrics import KeyMetric, key_metrics
 from shinypartial.evaluation.scores import PROTOCOL, SCORES, ScoreRow, Scores, read_scores, score_rows
@@ -119,11 +120,12 @@ def collect(predictions: Path) -> Leaderboard:
 
 def read_entry(folder: Path, name: str) -> Entry | Excluded:
     """A prediction under a name, or why it can't be compared; never an exception for what its files hold."""
-    again = f"Evaluate it again: `shinypartial evaluate {folder}`."
+    evaluate = command_line("shinypartial", "evaluate", folder)
+    again = f"Evaluate it again: `{evaluate}`."
     try:
         info = read_info(folder)
         if not (folder / SCORES).is_file():
-            return Excluded(name, "not scored yet", f"Run `shinypartial evaluate {folder}`.")
+            return Excluded(name, "not scored yet", f"Run `{evaluate}`.")
         scores = read_scores(folder)
         entry = Entry(name, info, scores, score_rows(scores))
         _check_entry(entry)

@@ -10,6 +10,10 @@ EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 
 
+#: What torch says when it has no memory left, by an error that it shares with all else.
+TORCH_OUT_OF_MEMORY = "out of memory", "allocate memory"
+
+
 class InputError(Exception):
     """Something the user gave can't be used: says what was expected, what was found and what to do."""
 
@@ -38,6 +42,15 @@ def from_os_error(error: OSError) -> InputError:
     )
 
 
+def from_memory_error() -> InputError:
+    """What to do where memory does not suffice."""
+    return InputError(
+        expected="enough memory for this command",
+        found="none left",
+        remedy="Close other programs, use smaller pictures or fewer of them, or take a machine with more memory.",
+    )
+
+
 def run_command(command: Callable[[], None]) -> int:
     """Run a command; return 0, 2 for bad input (one message, no traceback) or 130 when interrupted."""
     try:
@@ -48,6 +61,12 @@ def run_command(command: Callable[[], None]) -> int:
         raise
     except OSError as error:
         message = from_os_error(error)
+    except MemoryError:
+        message = from_memory_error()
+    except RuntimeError as error:
+        if not any(words in str(error) for words in TORCH_OUT_OF_MEMORY):
+            raise
+        message = from_memory_error()
     except KeyboardInterrupt:
         print("\nInterrupted. Run the same command again to continue where it stopped.", file=sys.stderr)
         return EXIT_INTERRUPTED

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from shinypartial.core.command_line import command_line
 from shinypartial.core.errors import InputError
 from shinypartial.io.files import read_json, write_json
 from shinypartial.io.records import read_record, write_record
@@ -162,11 +163,11 @@ def read_scores(prediction: Path) -> Scores:
         raise InputError(
             expected=f"scores at {path}",
             found="no such file",
-            remedy=f"Evaluate first: `shinypartial evaluate {prediction}`.",
+            remedy=f"Evaluate first: `{command_line('shinypartial', 'evaluate', prediction)}`.",
         )
     content = read_json(path, "the scores")
     content = content if isinstance(content, dict) else {}
-    remedy = f"Evaluate again: `shinypartial evaluate {prediction}`."
+    remedy = f"Evaluate again: `{command_line('shinypartial', 'evaluate', prediction)}`."
     if content.pop("format", None) != FORMAT or content.pop("format_version", None) != FORMAT_VERSION:
         raise InputError(
             expected=f"{SCORES} with format {FORMAT} version {FORMAT_VERSION}", found="another format", remedy=remedy
@@ -204,7 +205,7 @@ def require_oracle_baseline(folder: Path, prediction: Path, dataset: str, datase
         raise InputError(
             expected=f"the oracle of {dataset} (hash {dataset_hash[:12]}…) in {folder}",
             found=f"that of {baseline.dataset} (hash {baseline.dataset_hash[:12]}…)",
-            remedy=f"Make it: `shinypartial oracle {dataset}`, or leave out --oracle.",
+            remedy=f"Make it: `{command_line('shinypartial', 'oracle', dataset)}`, or leave out --oracle.",
         )
     return baseline
 

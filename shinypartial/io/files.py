@@ -140,12 +140,12 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_json(path: Path, what: str) -> Any:
-    """Read a JSON file; `what` names it in the message when it is missing or broken."""
+    """Read a JSON file; `what` names it in the message when it is missing, broken or nested too deeply."""
     if not path.is_file():
         raise InputError(expected=f"{what} at {path}", found="no such file", remedy="Check the path of the folder.")
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # Of text, of JSON, and of a number with thousands of digits.
         raise InputError(
             expected=f"{what} in {path} to be JSON",
             found=str(error),

@@ -27,6 +27,8 @@ EXR = ".exr"
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".hdr")
 #: Channels that `read_picture` returns: gray, RGB, RGBA; gray with alpha becomes the last.
 CHANNEL_COUNTS = (1, 3, 4)
+#: Of a picture that is read: a medium-format camera's has half as many. A small file may claim any number.
+LARGEST_PIXELS = 200_000_000
 #: Of maps that light scenes. Measured in Blender's own: −0.0022 (forest), beside radiance up to 1400.
 LOWEST_RADIANCE = -1e-2
 #: What brings stored pixels upright, by the EXIF orientation: whether rows and columns change places, then which axes
@@ -82,8 +84,13 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
             remedy="Check the path, or make it again.",
         )
     try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            low, high = file.header()["dataWindow"]
+        _require_few_pixels(path, int(high[0]) - int(low[0]) + 1, int(high[1]) - int(low[1]) + 1)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+    except (InputError, MemoryError):
+        raise
     except Exception as error:
         raise InputError(
             expected=f"a complete EXR image at {path}",
@@ -207,12 +214,22 @@ def _open_picture(path: Path) -> Iterator[tuple[Any, Any]]:
         raise _damaged(path, oiio.geterror())
     try:
         spec = file.spec()
+        _require_few_pixels(path, spec.width, spec.height)
         yield file, spec
         error = file.geterror()
     finally:
         file.close()
     if error:
         raise _damaged(path, error)
+
+
+def _require_few_pixels(path: Path, width: int, height: int) -> None:
+    if width * height > LARGEST_PIXELS:
+        raise InputError(
+            expected=f"a picture of at most {LARGEST_PIXELS // 10**6} megapixels at {path}",
+            found=f"{width}×{height}, {width * height / 1e6:.0f} megapixels",
+            remedy="Make it smaller, with the camera's intrinsics, or leave it out.",
+        )
 
 
 def _damaged(path: Path, error: str) -> InputError:

@@ -195,8 +195,11 @@ def _description(hint: Any) -> str:
     options = _options(hint)
     if len(options) > 1:
         return " or ".join("none" if option is types.NoneType else _description(option) for option in options)
-    if typing.get_origin(hint) is tuple:
+    if typing.get_origin(hint) in (tuple, list):
         return "a list"
+    if typing.get_origin(hint) is dict:
+        entry = typing.get_args(hint)[1]
+        return "a table" if entry is Any else f"a table with {_description(entry)} for each key"
     return "a table" if dataclasses.is_dataclass(hint) else NOUNS.get(hint, "a value")
 
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from shinypartial.core.command_line import command_line
 from shinypartial.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -66,7 +67,8 @@ def find_weights(network: str, folder: Path | None = None) -> Path | None:
             raise InputError(
                 expected=f"the LPIPS weights {names[0]} or {names[1]} in {explicit}",
                 found="no such file",
-                remedy=f"Make them: `shinypartial weights --folder {explicit}`, or unset {ENVIRONMENT_VARIABLE}.",
+                remedy=f"Make them: `{command_line('shinypartial', 'weights', '--folder', explicit)}`, "
+                f"or unset {ENVIRONMENT_VARIABLE}.",
             )
         return found
     places = [CACHE.expanduser()]

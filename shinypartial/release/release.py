@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from shinypartial.core.command_line import command_line
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.plain import is_plain
 from shinypartial.dataset.read import open_dataset
@@ -151,7 +152,7 @@ def _open(root: Path, output: Path, progress: bool) -> _Source:
         raise InputError(
             expected=f"a dataset that keeps every promise of the format in {root}",
             found=f"{first}{more}",
-            remedy=f"{broken[0].remedy} `shinypartial validate {root}` lists everything.",
+            remedy=f"{broken[0].remedy} `{command_line('shinypartial', 'validate', root)}` lists everything.",
         )
     dataset = open_dataset(root)
     if is_plain(root, dataset.manifest):

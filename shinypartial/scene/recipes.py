@@ -99,7 +99,7 @@ def load_film(film: str) -> FilmSpec:
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(
             expected=f"{path} to be TOML",
             found=str(error),

@@ -1,7 +1,9 @@
 """Mirrors that are no surface of ours: bodies given by a function, traced in numpy under a pattern of waves."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -10,6 +12,11 @@ from jaxtyping import Bool, Float
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import Photograph, Views, views_of
 from shinypartial.core.camera import Camera, look_at
+from shinypartial.core.color import linear_to_srgb
+from shinypartial.dataset.write import make_frames
+from shinypartial.io.files import write_json
+from shinypartial.io.images import write_png
+from tests.support.synthetic_dataset import entries_of
 
 Points = Float[np.ndarray, "P 3"]
 MARCH_STEPS, ROOT_STEPS = 160, 50
@@ -103,6 +110,21 @@ def dented(
     return Body(value)
 
 
+def rods_and_speck(radius: float) -> Body:
+    """Two thin rods with round ends that do not touch, and a ball of a rod's radius beside them."""
+    rods = [((0.0, -0.7, -0.6), (0.0, -0.5, 0.7)), ((0.1, 0.1, -0.7), (-0.1, 0.7, 0.5)), ((0.3, 0.2, 0.75),) * 2]
+
+    def value(x: Points) -> Float[np.ndarray, "P"]:
+        distances = []
+        for start, end in np.array(rods):
+            along = end - start
+            share = np.clip((x - start) @ along / max(along @ along, DIFFERENCE), 0, 1)
+            distances.append(np.linalg.norm(x - start - share[:, None] * along, axis=1))
+        return np.min(distances, axis=0) - radius
+
+    return Body(value)
+
+
 def pattern(directions: Points) -> Float[np.ndarray, "P 3"]:
     """Waves of three lengths, and soft edges, in [0, 1]."""
     waves = np.random.default_rng(6).normal(size=(3, 3)) * 3
@@ -159,6 +181,22 @@ def photograph(body: Body, camera: Camera, per_side: int = 2) -> Photograph:
     image = light.reshape(camera.height, camera.width, -1, 4).mean(2)
     planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))).float()
     return Photograph(camera, planes[:3].contiguous(), planes[3].contiguous())
+
+
+def write_plain_dataset(root: Path, body: Body, count: int, resolution: int, per_side: int = 3) -> Path:
+    """What cameras around +X see of it as a plain NeRF-synthetic folder; two of the views are for tests, too."""
+    cameras = cameras_around(count, resolution)
+    for split, chosen in (("train", cameras), ("test", cameras[:2])):
+        frames = make_frames(root, split, chosen)
+        for frame in frames:
+            light = light_of(body, *camera_rays_world(frame.camera, per_side))
+            image = light.reshape(resolution, resolution, -1, 4).mean(2)
+            straight = np.clip(image[..., :3] / np.maximum(image[..., 3:], 1e-6), 0, 1)
+            rgba = np.concatenate([linear_to_srgb(straight), image[..., 3:]], -1)
+            write_png(frame.png, np.rint(255 * rgba).astype(np.uint8))
+        angle = 2 * math.atan(resolution / 2 / chosen[0].fx)
+        write_json(root / f"transforms_{split}.json", {"camera_angle_x": angle, "frames": entries_of(frames)})
+    return root
 
 
 def body_views(body: Body, count: int, resolution: int, per_side: int = 2) -> Views:

@@ -118,7 +118,9 @@ def make_plain_sphere_dataset(root: Path, resolution: int = 32, train: int = 6, 
         frames = make_frames(root, split, sphere_cameras(split, number, resolution))
         for frame in frames:
             _write_rgba(frame, render_sphere(frame.camera))
-        write_json(root / f"transforms_{split}.json", {"camera_angle_x": FIELD_OF_VIEW_RAD, "frames": _entries(frames)})
+        write_json(
+            root / f"transforms_{split}.json", {"camera_angle_x": FIELD_OF_VIEW_RAD, "frames": entries_of(frames)}
+        )
     return open_dataset(root)
 
 
@@ -128,7 +130,8 @@ def _write_rgba(frame: Frame, view: View) -> None:
     write_png(frame.png, np.rint(rgba * 255).astype(np.uint8))
 
 
-def _entries(frames: tuple[Frame, ...]) -> list[dict[str, object]]:
+def entries_of(frames: tuple[Frame, ...]) -> list[dict[str, object]]:
+    """Frames as a plain transforms file lists them."""
     return [
         {
             "file_path": f"./{frame.name}",

@@ -24,6 +24,7 @@ from panoless.geometry.free_form.photometric import Sights, Solution, Task
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import Trust, full_trust
 from panoless.numeric.conjugate_gradients import solve_by_products
+from panoless.numeric.factorize import regularize
 from panoless.numeric.gauss_newton import keep_if_better
 from shinypartial.io.progress import Progress
 
@@ -213,12 +214,13 @@ def poses_by_outlines(
         for _ in range(options.pose_prior_rounds):
             assert told.poses is not None, "poses were free"
             prior = told.poses.likely_prior(cameras, stated, options.least_pose_share)
-            views = with_pose_covariances(views, np.linalg.inv(prior))
+            views = with_pose_covariances(views, np.linalg.inv(regularize(prior, "the poses")))
             told = coarse_stage(views, start, [settings], wide, poses=Poses.none(len(views.train)))
             task = make_task(views, settings, wide)
         assert told.poses is not None, "poses were free"
         known = Solution.at(task, told.surface, told.trust, None, 0, told.poses).beside[0].blocks - task.pose_prior
-    return ToldPoses(told.poses, np.linalg.inv(options.outline_trust * known + task.pose_prior), task.pose_prior)
+    precision = regularize(options.outline_trust * known + task.pose_prior, "the poses")
+    return ToldPoses(told.poses, np.linalg.inv(precision), task.pose_prior)
 
 
 def _joined(solved: Poses, tested: Poses) -> Poses:
@@ -380,7 +382,7 @@ def gauss_newton_step(solution: Solution, damping: float, *, still: bool = False
     options, shape = solution.task.options, solution.surface.shape
     diagonal, size = solution.diagonal(THIRD_DIFFERENCE_DIAGONAL), solution.surface.coefficients.size
     damped = [each.blocks * (1 + damping * np.eye(each.blocks.shape[1])) for each in solution.beside]
-    back = [np.linalg.inv(np.linalg.cholesky(blocks)).transpose(0, 2, 1) for blocks in damped]
+    back = [np.linalg.inv(np.linalg.cholesky(regularize(blocks, "the poses"))).transpose(0, 2, 1) for blocks in damped]
     ends = np.cumsum([size, *(each.value.size for each in solution.beside)])
 
     def unpacked(values: Float[np.ndarray, "N"]) -> Change:

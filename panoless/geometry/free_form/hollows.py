@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from panoless.geometry.free_form.options import ConcaveOptions
 from panoless.geometry.free_form.surface import NODE, LevelSet
+from panoless.numeric.factorize import regularize
 from shinypartial.core.sphere import tangents
 
 KNOTS = np.linspace(0, np.pi / 2, 5)
@@ -154,7 +155,7 @@ class Relief:
         at_rim = (np.abs(hollow.share(u, v) - 1) < self.options.rim_share) & np.isfinite(self.heights)
         rows, heights = _quadric(u[at_rim], v[at_rim]), self.heights[at_rim]
         stiff = np.diag([1e-6, 1e-6, 1e-6, 1.0, 1.0, 1.0]) * self.options.lid_stiffness * max(len(rows), 1)
-        found: np.ndarray = np.linalg.solve(rows.T @ rows + stiff, rows.T @ heights)
+        found: np.ndarray = np.linalg.solve(regularize(rows.T @ rows + stiff, "a lid"), rows.T @ heights)
         return found
 
     def carved(self, hollow: Hollow) -> LevelSet:

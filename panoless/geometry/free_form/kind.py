@@ -42,6 +42,7 @@ from panoless.geometry.free_form.trust import Trust, full_trust
 from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.geometry.surfels.placement import surfels_on_mesh
 from panoless.kernels.rasterize import RasterCamera
+from panoless.numeric.factorize import regularize
 from shinypartial.io.records import read_record, write_record
 
 
@@ -223,7 +224,10 @@ class FreeFormFamily(ExactFamily):
 
     def poses_by_outlines(self, views: Views, proposal: Proposal, config: FitConfig) -> ToldPoses | None:
         """Beside a shape, from the plain first surface or the hull."""
-        stated, always = with_pose_covariances(views, np.linalg.inv(_prior(views, config))), config.poses.mode == "on"
+        stated, always = (
+            with_pose_covariances(views, np.linalg.inv(regularize(_prior(views, config), "the poses"))),
+            config.poses.mode == "on",
+        )
         first: FirstSurfaces = proposal.shape
         starts, agree = (first.plain, first.hull), first.views_agree
         return poses_by_outlines(stated, starts, config.free_form, views_agree=agree, always=always)

@@ -30,6 +30,7 @@ from panoless.kernels.level_set import (
     without_means,
 )
 from panoless.kernels.reference.cubemap import padded_texels
+from panoless.numeric.factorize import regularize
 from panoless.numeric.robust import bounded_error, robust_weight
 
 
@@ -94,7 +95,7 @@ class Task:
     @cached_property
     def pose_prior(self) -> Float[np.ndarray, "V 6 6"]:
         """Weights of squared turns and shifts: the inverse of what the views state."""
-        return np.linalg.inv(np.array(self.cameras.covariances))
+        return np.linalg.inv(regularize(np.array(self.cameras.covariances), "the poses"))
 
     def outlined(self, gain: float) -> "Task":
         """The same with another factor of the outlines' weight."""

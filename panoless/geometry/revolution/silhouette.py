@@ -89,7 +89,7 @@ def axis_starts(views: Views, options: SilhouetteOptions = DEFAULTS.silhouette) 
         row, column = np.nonzero(inside if inside.any() else mask >= MASK_LEVEL)
         points = camera_rays(camera, column + PIXEL_CENTER, row + PIXEL_CENTER)[:, :2]
         middle = points.mean(0)
-        _, vectors = np.linalg.eigh(np.cov((points - middle).T))
+        _, vectors = np.linalg.eigh(np.cov((points - middle).T, ddof=int(len(points) > 1)))
         rotation, center = pose_of(camera)
         centers.append(center)
         for which in (0, 1):

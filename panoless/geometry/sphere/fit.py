@@ -16,6 +16,7 @@ from panoless.capture.views import Views
 from panoless.geometry.base import overlap
 from panoless.geometry.sphere.model import Sphere, sphere_buffers
 from panoless.geometry.sphere.options import SphereOptions
+from panoless.numeric.factorize import regularize
 from panoless.numeric.gauss_newton import accept_step, damped_step
 from panoless.numeric.robust import bounded_error, robust_scale, robust_weight
 
@@ -68,7 +69,7 @@ class Cones:
             for _ in range(options.cone_rounds):
                 weighted = directions * weights[:, None]
                 moment = weighted.T @ directions + 1e-12 * np.eye(3)
-                m = np.linalg.solve(moment, weighted.sum(0))
+                m = np.linalg.solve(regularize(moment, "a cone"), weighted.sum(0))
                 cosine = min(1 / float(np.linalg.norm(m)), WIDEST_COSINE)
                 # m·r = cos β/cos α, and the angle β − α is what the pixels are off by.
                 off_px = (np.arccos(np.clip(directions @ m * cosine, -1, 1)) - np.arccos(cosine)) * scale
@@ -115,7 +116,8 @@ def _second_harmonic(
     azimuth = np.arctan2(directions @ across[1], directions @ across[0])
     basis = np.stack([np.cos(2 * azimuth), np.sin(2 * azimuth)], 1)
     weighted = basis * weights[:, None]
-    return float(np.linalg.norm(np.linalg.solve(weighted.T @ basis + 1e-12 * np.eye(2), weighted.T @ values)))
+    moment = regularize(weighted.T @ basis + 1e-12 * np.eye(2), "an oval")
+    return float(np.linalg.norm(np.linalg.solve(moment, weighted.T @ values)))
 
 
 @dataclass(frozen=True)

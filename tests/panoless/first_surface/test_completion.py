@@ -8,10 +8,10 @@ import torch
 
 from panoless.capture.views import TrainView, Views
 from panoless.config import SurfelConfig
-from panoless.first_surface.completion import complete_surface, hull_surface, thin_plate
+from panoless.first_surface.completion import complete_surface, completed, hull_surface, thin_plate, trusted_hull
 from panoless.first_surface.contact import Contact, outline_contact
 from panoless.first_surface.mesh import TriangleMesh
-from panoless.first_surface.visual_hull import HULL_HALF_SIDE, carve_hull
+from panoless.first_surface.visual_hull import HULL_HALF_SIDE, Hull, carve_hull
 from panoless.geometry.surfels.placement import initial_surfels
 from shinypartial.core.errors import InputError
 
@@ -162,3 +162,100 @@ def test_a_taut_plate_is_flat_where_a_loose_one_bulges() -> None:
     loose, taut = (thin_plate(sloping, trust, 0.02, tension=tension).vertices[middle, 2] for tension in (0.0, 1e3))
     assert loose.min() > 0.25, "It rises above the strips, which end at 0.2."
     assert taut.max() < 0.2
+
+
+TETRAHEDRON = TriangleMesh(
+    np.concatenate([np.zeros((1, 3)), np.eye(3)]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+)
+
+
+@pytest.mark.parametrize("trust", [1e-7, 1e-12, 1e-16, 1e-30, 0.0])
+@pytest.mark.parametrize("size", [1.0, 1e-3, 1e-6])
+def test_a_part_that_hardly_anything_holds_stays_where_it_is(size: float, trust: float) -> None:
+    """Solved for its place itself, it went to the origin: the trust is lost beside the stiffness by rounding."""
+    speck = replace(TETRAHEDRON, vertices=np.array([0.5, -0.4, 0.3]) + size * TETRAHEDRON.vertices)
+    plate = thin_plate(speck, np.full(4, trust), 0.1).vertices
+    assert (plate >= speck.vertices.min(0) - 1e-3 * size).all()
+    assert (plate <= speck.vertices.max(0) + 1e-3 * size).all()
+
+
+def test_a_speck_changes_nothing_of_another_part() -> None:
+    """Up to what its share in the mean area of a vertex does, which bounds areas from below."""
+    flat = square(12)
+    bent = replace(flat, vertices=flat.vertices + np.outer(0.05 * np.sin(5 * flat.vertices[:, 0]), [0, 0, 1]))
+    count, speck = len(bent.vertices), 2 + 0.1 * TETRAHEDRON.vertices
+    both = TriangleMesh(
+        np.concatenate([bent.vertices, speck]), np.concatenate([bent.triangles, count + TETRAHEDRON.triangles])
+    )
+    alone = thin_plate(bent, np.full(count, 0.3), 0.05).vertices
+    beside = thin_plate(both, np.append(np.full(count, 0.3), np.zeros(4)), 0.05).vertices
+    np.testing.assert_allclose(beside[:count], alone, atol=1e-9)
+
+
+DEGENERATE = {
+    "nothing": TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int)),
+    "points alone": TriangleMesh(np.eye(3), np.zeros((0, 3), int)),
+    "one place": replace(TETRAHEDRON, vertices=np.zeros((4, 3))),
+    "a line": TriangleMesh(np.outer(np.arange(3.0), [1, 0, 0]), np.array([[0, 1, 2]])),
+    "one triangle": TriangleMesh(np.eye(3), np.array([[0, 1, 2]])),
+    "a corner twice": replace(TETRAHEDRON, triangles=np.array([[0, 0, 1], [0, 1, 2]])),
+    "an isolated vertex": replace(TETRAHEDRON, vertices=np.concatenate([TETRAHEDRON.vertices, np.ones((1, 3))])),
+    "three faces at an edge": TriangleMesh(
+        np.concatenate([TETRAHEDRON.vertices, -np.ones((1, 3))]), np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]])
+    ),
+    "faces that disagree": replace(TETRAHEDRON, triangles=np.array([[0, 2, 1], [0, 3, 1], [0, 3, 2], [1, 2, 3]])),
+}
+
+
+@pytest.mark.parametrize("trust", [0.0, 1e-7, 1.0])
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_a_degenerate_mesh_has_a_finite_plate(name: str, trust: float) -> None:
+    mesh = DEGENERATE[name]
+    plate = thin_plate(mesh, np.full(len(mesh.vertices), trust), 0.05)
+    assert plate.vertices.shape == mesh.vertices.shape
+    assert np.isfinite(plate.vertices).all()
+    assert np.abs(plate.vertices).max(initial=0) < 10
+
+
+def test_a_vertex_that_is_nowhere_is_refused() -> None:
+    vertices = TETRAHEDRON.vertices.copy()
+    vertices[1, 2] = np.nan
+    with pytest.raises(InputError, match="finite equations for the first surface"):
+        thin_plate(replace(TETRAHEDRON, vertices=vertices), np.ones(4), 0.05)
+
+
+HULLS = {
+    "specks": lambda x: (
+        np.minimum(np.linalg.norm(x - [0.4, 0.3, 0.2], axis=-1), np.linalg.norm(x - [-0.5, -0.2, -0.3], axis=-1))
+        - 1.2 * VOXEL
+    ),
+    "one voxel thick": lambda x: np.maximum(
+        np.abs(x[..., :2]).max(-1) - 0.5, np.abs(x[..., 2] - VOXEL / 2) - 0.6 * VOXEL
+    ),
+    "up to the side of the cube": lambda x: np.abs(x).max(-1) - (HULL_HALF_SIDE - 0.5 * VOXEL),
+    "one point": lambda x: np.linalg.norm(x - VOXEL / 2, axis=-1) - 1e-3,
+}
+
+
+@pytest.mark.parametrize("name", HULLS)
+@pytest.mark.parametrize("is_touched", [True, False])
+def test_a_thin_or_torn_hull_has_a_surface_within_its_cube(name: str, is_touched: bool, views: Views) -> None:
+    """Also where no outline comes near it, because masks are of something else."""
+    line = np.linspace(-HULL_HALF_SIDE, HULL_HALF_SIDE, 48)
+    points = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1)
+    hull = Hull(HULLS[name](points), HULL_HALF_SIDE, VOXEL)
+    known = trusted_hull(hull, views)
+    known = known if is_touched else replace(known, trust=np.full_like(known.trust, 1e-7))
+    for tension in (0.0, 100.0):
+        surface = completed(known, tension=tension)
+        assert np.isfinite(surface.vertices).all()
+        # Newton steps end within a voxel of the hull, whose function is no distance within a voxel of its middle.
+        assert np.abs(surface.vertices).max() <= HULL_HALF_SIDE
+        assert hull.at(surface.vertices).max() < VOXEL
+
+
+def test_a_hull_that_no_outline_touches_is_all_that_is_known(views: Views) -> None:
+    line = np.linspace(-HULL_HALF_SIDE, HULL_HALF_SIDE, 48)
+    points = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1)
+    hull = Hull(np.linalg.norm(points, axis=-1) - 2 * VOXEL, HULL_HALF_SIDE, VOXEL / 20)
+    assert trusted_hull(hull, views).trust.min() > 0.5

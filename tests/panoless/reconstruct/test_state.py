@@ -177,6 +177,13 @@ def test_a_damaged_checkpoint_is_named(tmp_path: Path, damage: str) -> None:
         load_state(tmp_path)
 
 
+def test_a_checkpoint_that_would_run_code_is_refused_without_advice_to_load_it(tmp_path: Path) -> None:
+    torch.save({"geometry": Path}, tmp_path / CHECKPOINT)
+    with pytest.raises(InputError, match=r"UnpicklingError.*Delete that run folder") as raised:
+        load_state(tmp_path)
+    assert "weights_only" not in str(raised.value)
+
+
 def test_a_failed_save_keeps_the_last_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save_state(tmp_path, some_state(False))
 

@@ -98,3 +98,21 @@ def test_help_that_is_cut_off_by_a_pipe_is_no_error(command: str) -> None:
             [sys.executable, "-m", *command.split()], stdout=closed, stderr=subprocess.PIPE, text=True
         )
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:121] data. DefaultCPUAllocator: can't allocate memory"),
+        RuntimeError("CUDA out of memory. Tried to allocate 20.00 GiB"),
+    ],
+)
+def test_too_little_memory_is_one_message(capsys: pytest.CaptureFixture[str], error: BaseException) -> None:
+    assert run_command(raising(error)) == EXIT_BAD_INPUT
+    assert "enough memory" in capsys.readouterr().err
+
+
+def test_another_runtime_error_stays_loud() -> None:
+    with pytest.raises(RuntimeError, match="ours"):
+        run_command(raising(RuntimeError("a mistake of ours")))

@@ -183,7 +183,7 @@ def test_json_never_holds_nan(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("content", [b"{", b"\xff\xfe\x00", b""])
+@pytest.mark.parametrize("content", [b"{", b"\xff\xfe\x00", b"", b"[" * 200_000, b'{"a":' * 200_000, b"1" * 5000])
 def test_broken_json_is_an_input_error(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "transforms_train.json"
     path.write_bytes(content)

@@ -1,8 +1,10 @@
 """Pictures in and out: exact round trips, and one clear message for whatever can't be read."""
 
 import errno
+import struct
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -305,3 +307,37 @@ def test_light_loses_what_compression_left_below_zero_and_is_refused_below_that(
     write_exr_rgb(tmp_path / "b.exr", light)
     with pytest.raises(InputError, match="radiance ≥ 0"):
         read_light(tmp_path / "b.exr")
+
+
+def png_of_size(path: Path, width: int, height: int) -> Path:
+    """A PNG that says so in its header and holds one row."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)
+    row = zlib.compress(bytes(1 + 4 * width))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", row) + chunk(b"IEND", b""))
+    return path
+
+
+@pytest.mark.parametrize("read", [read_picture, read_upright, read_as_stored, read_png, picture_size])
+def test_a_small_file_that_claims_a_huge_picture_is_refused_before_it_is_decoded(tmp_path: Path, read) -> None:
+    path = png_of_size(tmp_path / "a.png", 30_000, 30_000)
+    with pytest.raises(InputError, match=r"200 megapixels.*30000×30000, 900 megapixels"):
+        read(path)
+
+
+def test_a_picture_of_a_medium_format_camera_is_no_huge_one(tmp_path: Path) -> None:
+    assert picture_size(png_of_size(tmp_path / "a.png", 11_648, 8_736)) == (11_648, 8_736)
+
+
+def test_an_exr_that_claims_a_huge_picture_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+    write_exr(path, {"R": np.zeros((2, 2), np.float16)})
+    content = bytearray(path.read_bytes())
+    window = content.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
+    content[window : window + 16] = struct.pack("<4i", 0, 0, 29_999, 29_999)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="900 megapixels"):
+        read_exr(path)

@@ -1,0 +1,49 @@
+"""Masks whose hull is thin, torn or a speck end in a result with a verdict, or in one message."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import panoless
+from panoless.config import FitConfig
+from shinypartial.core.errors import InputError
+from tests.support.mirror_body import rods_and_speck, write_plain_dataset
+from tests.support.mirror_sphere import tiny_config
+
+SURFELS: FitConfig = tiny_config("fast", iterations=2, count=60)
+SHORT = (replace(SURFELS.free_form.rounds[0], rays=2000, steps=1),)
+CONFIG = replace(
+    SURFELS,
+    free_form=replace(
+        SURFELS.free_form,
+        start_cells=24,
+        outline_points=2000,
+        rounds=SHORT,
+        finer=(),
+        mending=(),
+        detailing=(),
+        descent=replace(SURFELS.free_form.descent, rounds=()),
+        concave=replace(SURFELS.free_form.concave, rounds=SHORT),
+    ),
+    poses=replace(SURFELS.poses, mode="off"),
+    corrections=replace(SURFELS.corrections, masks="off", exposure="off", lens="off"),
+)
+
+
+@pytest.mark.parametrize("model", ["surfels", "free_form"])
+@pytest.mark.parametrize("radius", [0.05, 0.025], ids=["of two pixels", "of one pixel"])
+def test_thin_and_disconnected_parts_end_in_a_verdict_or_in_a_message(
+    radius: float, model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A rod's diameter is one or two pixels. Some of its hull is lost between voxels then, so that specks are left."""
+    monkeypatch.chdir(tmp_path)
+    root = write_plain_dataset(tmp_path / "rods", rods_and_speck(radius), count=4, resolution=40)
+    try:
+        result = panoless.fit(root, config=replace(CONFIG, model=model), output="out")
+    except InputError:
+        assert not list(Path("out").iterdir())
+        return
+    assert result.verdict is not None
+    assert np.isfinite(result.environment).all()

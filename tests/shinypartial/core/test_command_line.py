@@ -1,0 +1,39 @@
+"""A command that is printed can be pasted, whatever its paths are called."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shinypartial.core.command_line import command_line
+from tests.architecture.source import ROOT, source_files
+
+#: Words of a command in a text with a place in braces; those in suites are run, and names of theirs have no spaces.
+UNQUOTED = re.compile(r"\b(?:panoless|shinypartial) [a-z-]+ [^\"'`]*\{(?!\{)")
+
+
+@given(st.lists(st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"])), min_size=1))
+def test_a_shell_reads_back_the_words(words: list[str]) -> None:
+    assert shlex.split(command_line(*words)) == words
+
+
+def test_plain_words_stay_plain() -> None:
+    assert command_line("panoless", "fit", Path("datasets/vase")) == "panoless fit datasets/vase"
+    assert command_line("panoless", "fit", Path("chrome pot")) == "panoless fit 'chrome pot'"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [each for each in source_files() if "suites" not in each.parts],
+    ids=lambda path: str(path.relative_to(ROOT)),
+)
+def test_no_command_is_put_together_without_quotes(path: Path) -> None:
+    found = [line.strip() for line in path.read_text(encoding="utf-8").splitlines() if UNQUOTED.search(line)]
+    assert not [line for line in found if "bundled_names" not in line and "--dataset {DATA}" not in line]
+
+
+def test_an_unquoted_command_would_be_seen() -> None:
+    assert UNQUOTED.search('print(f"Next: panoless fit {self.output}")')
