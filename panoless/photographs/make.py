@@ -26,9 +26,11 @@ from shinypartial.dataset.camera_plot import plot_cameras
 from shinypartial.dataset.schema import Frame
 from shinypartial.dataset.write import write_transforms
 from shinypartial.io.files import folder_lock, sha256_of
-from shinypartial.io.images import read_as_stored, read_png, read_upright, unit_values, write_png
+from shinypartial.io.images import read_as_stored, read_png, read_upright, to_bytes, unit_values, write_png
 from shinypartial.io.picture_sheet import write_picture_sheet
+from shinypartial.io.progress import Progress
 from shinypartial.io.records import write_record
+from shinypartial.io.threads import in_threads
 
 #: What the stages found, beside the dataset proper.
 WORK = "capture"
@@ -228,7 +230,7 @@ def _masks_of_frames(request: Request, frames: Frames, named: Mapping[str, Path]
         if one.name not in named:
             continue
         image = (read_upright if request.upright else read_as_stored)(named[one.name])
-        mask = np.rint(unit_values(image[..., -1] if image.shape[2] == 4 else image[..., 0]) * 255).astype(np.uint8)
+        mask = to_bytes(image[..., -1] if image.shape[2] == 4 else image[..., 0])
         if mask.shape != (one.full_height, one.full_width):
             raise InputError(
                 expected=f"a mask of {one.full_width}×{one.full_height} pixels for {one.name}",
@@ -253,11 +255,17 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
         own, remedy = True, CHECK_MASKS
         cameras = {view.name: view.camera for view in poses.views}
         told = bool(given_masks or request.hints)
-        for view in poses.views:
+
+        def undistort(view: PosedView) -> bool:
+            """Whether the picture has an alpha channel; a mask of its own replaces it."""
             picture = view.lens.undistorted(read_png(work / "frames" / f"{view.name}.png"))
-            # A mask of its own replaces an alpha channel.
-            write_png(train / f"{view.name}.png", np.ascontiguousarray(picture[..., :3]) if told else picture)
-            own = own and picture.shape[2] == 4
+            write_png(train / f"{view.name}.png", picture[..., :3] if told else picture, quick=True)
+            return picture.shape[2] == 4
+
+        progress = Progress("undistorting", len(poses.views))
+        for alpha in in_threads(undistort, poses.views):
+            own = own and alpha
+            progress.advance()
         if given_masks:
             origin = f"the model {request.segmenter.name}" if request.segmenter else "files"
             for view in poses.views:
