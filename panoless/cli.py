@@ -187,8 +187,8 @@ class Capture:
 
     source: Annotated[Path, tyro.conf.Positional]
     """Folder of photographs, or a video."""
-    output: Path
-    """Dataset folder to write."""
+    output: Path | None = None
+    """Dataset folder to write; default datasets/SOURCE."""
     colmap: Path | None = None
     """Folder of a COLMAP model, text or binary, for these photographs; found where it is SOURCE/sparse/0."""
     board: Literal["A4", "Letter", "A3", "none"] | None = None
@@ -216,11 +216,14 @@ class Capture:
     def run(self) -> None:
         """Make the dataset and say what was measured."""
         from panoless.photographs.make import Request, capture
+        from shinypartial.dataset.read import DEFAULT_FOLDER
 
         check_record(self.options, "--options", remedy="Correct that value.")
+        source = self.source.resolve()
+        output = self.output or DEFAULT_FOLDER / (source.stem if source.is_file() else source.name)
         request = Request(
             self.source,
-            self.output,
+            output,
             colmap=self.colmap,
             board=self.board,
             square_mm=self.square_mm,
@@ -231,7 +234,7 @@ class Capture:
             options=self.options,
         )
         print("\n".join(capture(request).summary()))
-        print(f"Look at {self.output}/capture/masks.jpg. Next: panoless fit {self.output}")
+        print(f"Look at {output}/capture/masks.jpg. Next: panoless fit {output}")
 
     def _hints(self) -> "dict[str, Hint]":
         from panoless.photographs.masks import Hint, read_clicks
@@ -270,7 +273,7 @@ class PrintBoard:
         board = BOARDS[self.paper]
         write_board(board, self.output)
         print(f"Print {self.output} at 100 % and measure: five squares are {5 * board.square_mm:g} mm.")
-        print("Then: panoless capture FOLDER --output DATASET")
+        print("Then: panoless capture FOLDER")
 
 
 def _preset_of(arguments: list[str]) -> str:

@@ -15,7 +15,7 @@ from shinypartial.dataset.read import read_whole_view
 from shinypartial.dataset.schema import Frame
 from shinypartial.io.picture_sheet import TILE_PX, write_picture_sheet
 
-HATCHING = 80
+HATCHING = 40
 """Rows of a map over those of a stripe, of which there are two colors, where it was not seen."""
 HATCH_COLORS = np.array([72, 104], np.uint8)
 """Codes of gray of its stripes."""

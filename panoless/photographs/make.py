@@ -12,7 +12,16 @@ from panoless.photographs.board import poses_from_board, recognized_board
 from panoless.photographs.frames import Frames, block_means, make_frames, source_files
 from panoless.photographs.ground import GIVE_MASKS, ground_masks
 from panoless.photographs.hull import nearest_point
-from panoless.photographs.masks import CHECK_MASKS, Hint, Masks, find_masks, given_mask, masks_beside, overlaps_of
+from panoless.photographs.masks import (
+    CHECK_MASKS,
+    MORE_HINTS,
+    Hint,
+    Masks,
+    find_masks,
+    given_mask,
+    masks_beside,
+    overlaps_of,
+)
 from panoless.photographs.models import find_model, find_transforms, read_colmap, read_transforms
 from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import PosedView, Poses, without_the_rest
@@ -274,7 +283,7 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
                 mask = view.lens.undistorted(read_png(given_masks[view.name])[..., 0])
                 write_png(train / f"{view.name}_alpha.png", mask)
         elif request.hints:
-            origin = f"hints in {', '.join(request.hints)}"
+            origin, remedy = f"hints in {', '.join(request.hints)}", MORE_HINTS
             sides = {one.name: one.side for one in frames.photographs}
             hints = {name: hint.scaled(sides.get(name, 1)) for name, hint in request.hints.items()}
             for name, mask in find_masks(cameras, train, hints, request.options).items():
@@ -287,7 +296,7 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
             for name, mask in found.items():
                 write_png(train / f"{name}_alpha.png", mask)
         masks = {view.name: _written_mask(train, view) for view in poses.views}
-        judged = [(cameras[name], mask) for name, mask in masks.items()]
+        judged = {name: (cameras[name], mask) for name, mask in masks.items()}
         overlaps = overlaps_of(judged, request.options, remedy)
         _write_mask_sheet(work / "masks.jpg", train, masks, dict(zip(masks, overlaps, strict=True)))
         return Masks(origin, tuple(masks), overlaps)
