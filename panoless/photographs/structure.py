@@ -29,11 +29,12 @@ REMEDY = (
     "lock the focus, and move by small steps; or find poses with another program and give --colmap."
 )
 PROGRAM = (sys.executable, "-m", "panoless.photographs.mapping")
+FEATURES, PLACING = "finding features", "placing cameras"
 #: What COLMAP says of its steps, by the name of the stage: the step and of how many, where it says that.
 STEPS = {
-    "finding features": re.compile(r"Processed file \[(\d+)/(\d+)\]"),
+    FEATURES: re.compile(r"Processed file \[(\d+)/(\d+)\]"),
     "matching frames": re.compile(r"Processing (?:image|block) \[(\d+)/(\d+)(?:, (\d+)/(\d+))?\]"),
-    "placing cameras": re.compile(r"Registering image #\d+ \(num_reg_frames=(\d+)\)"),
+    PLACING: re.compile(r"Registering image #\d+ \(num_reg_frames=(\d+)\)"),
 }
 
 
@@ -82,7 +83,7 @@ def poses_from_structure(
 def _run(program: Sequence[str], job: Path, log: Path, frames: int) -> None:
     """Run the program to its end with a line of progress a stage; what stops this process ends it."""
     last = ""
-    progress: dict[str, Progress] = {}
+    progress = {FEATURES: Progress(FEATURES, frames)}
     with (
         log.open("w", encoding="utf-8") as kept,
         subprocess.Popen(
@@ -115,7 +116,7 @@ def _run(program: Sequence[str], job: Path, log: Path, frames: int) -> None:
             remedy="Run the same line again. If it happens again, put the printed board of `panoless board` under the "
             f"object, or find poses with another program and give --colmap. Its log is {log}.",
         )
-    if bar := progress.get("placing cameras"):
+    if bar := progress.get(PLACING):
         bar.advance(steps=bar.total - bar.done)
 
 
