@@ -5,7 +5,6 @@ import sys
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
@@ -192,8 +191,8 @@ class Capture:
 
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folder of photographs, a video, or photographs."""
-    output: Path
-    """Dataset folder to write."""
+    output: Path | None = None
+    """Dataset folder to write; default datasets/SOURCE."""
     object: Literal["auto", "ball", "any"] = "auto"
     """`ball`: a mirror ball, from one photograph on, without masks and poses; `auto`: that, where less than eight
     photographs show one."""
@@ -226,20 +225,31 @@ class Capture:
     def run(self) -> None:
         """Make the dataset and say what was measured."""
         from panoless.photographs.make import Request, capture
+        from shinypartial.dataset.read import DEFAULT_FOLDER
 
         check_record(self.options, "--options", remedy="Correct that value.")
-        if self._shows_a_ball():
-            self._capture_ball()
+        files = self._files()
+        if not files or len({file.parent for file in files}) > 1 and self.output is None:
+            raise InputError(
+                expected="a folder of photographs, a video, or photographs of one folder",
+                found=f"{len(self.sources)} sources",
+                remedy="Name some, and --output DATASET.",
+            )
+        source = self.sources[0].resolve()
+        single = source.parent if source.is_file() and len(files) > 1 else source
+        output = self.output or DEFAULT_FOLDER / (single.stem if single.is_file() else single.name)
+        if self._shows_a_ball(files):
+            self._capture_ball(files, output)
             return
         if len(self.sources) != 1:
             raise InputError(
                 expected="one folder of photographs, or one video",
-                found=f"{len(self.sources)} files without a mirror ball",
+                found=f"{len(self.sources)} sources without a mirror ball",
                 remedy="Name the folder; or add --object ball.",
             )
         request = Request(
             self.sources[0],
-            self.output,
+            output,
             colmap=self.colmap,
             board=self.board,
             square_mm=self.square_mm,
@@ -250,14 +260,14 @@ class Capture:
             options=self.options,
         )
         print("\n".join(capture(request).summary()))
-        print(f"Look at {self.output}/capture/masks.jpg. Next:", command_line("panoless", "fit", self.output))
+        print(f"Look at {output}/capture/masks.jpg. Next:", command_line("panoless", "fit", output))
 
     def _files(self) -> tuple[Path, ...]:
         from panoless.photographs.frames import source_files
 
         return tuple(file for each in self.sources for file in ([each] if each.is_file() else source_files(each)))
 
-    def _shows_a_ball(self) -> bool:
+    def _shows_a_ball(self, files: tuple[Path, ...]) -> bool:
         """Whether that is stated, or less than eight photographs are given with nothing else about them."""
         if self.object != "auto":
             return self.object == "ball"
@@ -266,7 +276,6 @@ class Capture:
         from panoless.photographs.video import VIDEO_SUFFIXES
 
         named = self.colmap or self.masks or self.segmenter or self.board not in (None, "none")
-        files = self._files()
         if named or any(file.suffix.lower() in VIDEO_SUFFIXES for file in files):
             return False
         few = len(files) < self.options.least_views
@@ -281,14 +290,13 @@ class Capture:
             print("Note: these photographs show a round thing. If it is a mirror ball, --object ball is simpler.")
         return few
 
-    def _capture_ball(self) -> None:
+    def _capture_ball(self, files: tuple[Path, ...], output: Path) -> None:
         from panoless.photographs.ball.make import BallRequest, capture_ball
 
-        request = BallRequest(self._files(), self.output, self.focal_mm, self._hints())
-        captured = capture_ball(request)
+        captured = capture_ball(BallRequest(files, output, self.focal_mm, self._hints()))
         print("\n".join(captured.summary()))
-        light = " --config.environment.range hdr" if captured.high_dynamic_range else ""
-        print(f"Look at {self.output}/capture/ball.jpg. Next: panoless fit {quote(str(self.output))}{light}")
+        light = ("--config.environment.range", "hdr") if captured.high_dynamic_range else ()
+        print(f"Look at {output}/capture/ball.jpg. Next:", command_line("panoless", "fit", output, *light))
 
     def _hints(self) -> "dict[str, Hint]":
         from panoless.photographs.masks import Hint, read_clicks
@@ -327,7 +335,7 @@ class PrintBoard:
         board = BOARDS[self.paper]
         write_board(board, self.output)
         print(f"Print {self.output} at 100 % and measure: five squares are {5 * board.square_mm:g} mm.")
-        print("Then: panoless capture FOLDER --output DATASET")
+        print("Then: panoless capture FOLDER")
 
 
 def _preset_of(arguments: list[str]) -> str:

@@ -1,4 +1,4 @@
-"""A finished fit → the prediction folder that the evaluator reads, pictures of the decomposition, and a PLY."""
+"""A finished fit → the prediction folder that the evaluator reads, pictures of it, and a PLY."""
 
 import json
 import math
@@ -6,12 +6,13 @@ import os
 import platform
 import shutil
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from panoless import __version__
@@ -21,7 +22,7 @@ from panoless.capture.rays import raster_camera
 from panoless.config import FitConfig
 from panoless.environment.surroundings import FAR, LEAST_DEPTH, Surroundings
 from panoless.export.mesh_files import write_ply
-from panoless.export.pictures import crop_to_object, decomposition_pictures
+from panoless.export.pictures import decomposition_pictures, environment_picture, write_decomposition
 from panoless.export.render import Decomposition, render
 from panoless.geometry.registry import FAMILIES
 from panoless.geometry.surfels.shading.registry import LEFT_OUT
@@ -31,16 +32,17 @@ from panoless.reconstruct.recorder import timed
 from panoless.reconstruct.snapshots import read_snapshot, snapshot_folders
 from panoless.reconstruct.state import FitState
 from panoless.selection.candidates import Selection
+from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import latlong_directions
 from shinypartial.dataset.schema import Dataset, Frame, View
 from shinypartial.io.files import remove_partial_files
-from shinypartial.io.images import write_png
-from shinypartial.io.picture_sheet import write_picture_sheet
+from shinypartial.io.images import write_jpeg, write_png
 from shinypartial.io.progress import Progress
 from shinypartial.prediction.format import (
     DECOMPOSITION,
     ENVIRONMENT,
+    ENVIRONMENT_PICTURE,
     INVERSE_DISTANCE,
     SNAPSHOTS,
     TEST_VIEWS,
@@ -67,6 +69,7 @@ SUPERSAMPLING = 2
 FORMER_KINDS = ("sheet", "lathe")
 """Names of PLY files that an earlier version wrote."""
 EXPORT_THREADS = 2
+JPEG_QUALITY = 92
 
 
 def export_prediction(
@@ -85,12 +88,14 @@ def export_prediction(
     if earlier is None:
         for left in (folder / SNAPSHOTS, folder / PICTURES, *(folder / TEST_VIEWS).iterdir()):
             shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
-        (folder / DECOMPOSITION).unlink(missing_ok=True)
+        for name in (ENVIRONMENT_PICTURE, DECOMPOSITION):
+            (folder / name).unlink(missing_ok=True)
     height = 2 * state.environment.shape[-1]
     around, viewpoint = state.geometry.surroundings, viewpoint_of(state.frame, state.geometry.surroundings)
-    write_environment_map(folder, cube_to_latlong(state.environment, height, around, viewpoint))
-    visibility = cube_to_latlong(state.visibility[:, None], height, around, viewpoint)
-    write_visibility(folder, visibility[..., 0].clip(0, 1))
+    environment = cube_to_latlong(state.environment, height, around, viewpoint)
+    write_environment_map(folder, environment)
+    visibility = cube_to_latlong(state.visibility[:, None], height, around, viewpoint)[..., 0].clip(0, 1)
+    write_visibility(folder, visibility)
     (folder / INVERSE_DISTANCE).unlink(missing_ok=True)
     if not around.is_far:
         directions = latlong_directions(height)
@@ -100,6 +105,12 @@ def export_prediction(
     mesh_file = f"{state.geometry.kind}.ply"
     write_ply(folder / mesh_file, state.geometry.mesh(state.frame))
     _write_test_views(dataset, state, config, folder)
+    picture = environment_picture(environment, visibility)
+    write_jpeg(folder / ENVIRONMENT_PICTURE, picture, JPEG_QUALITY)
+    index = len(dataset.train) // 2
+    camera = _found_camera(dataset.train[index], state, index)
+    parts = _render(camera, state, state.shown_environment(), config)
+    write_decomposition(folder / DECOMPOSITION, dataset.train[index], parts, picture, visibility)
     info = PredictionInfo(
         method=_method(config),
         dataset=str(dataset.root.resolve()),
@@ -169,7 +180,8 @@ def is_exported(folder: Path, state: FitState, config: FitConfig, dataset: Datas
     """Whether the folder holds the whole prediction of this very state, by this version."""
     mesh = folder / f"{state.geometry.kind}.ply"
     views = (prediction_frame(folder, frame).exr for frame in dataset.test)
-    if not all(path.exists() for path in (folder / ENVIRONMENT, folder / VISIBILITY, mesh, *views)):
+    named = (folder / name for name in (ENVIRONMENT, VISIBILITY, ENVIRONMENT_PICTURE, DECOMPOSITION))
+    if not all(path.exists() for path in (*named, mesh, *views)):
         return False
     info, iteration = _description(folder, state, config, dataset), state.iteration if snapshot else None
     return info is not None and (info.method, info.iteration) == (_method(config), iteration)
@@ -203,7 +215,7 @@ def _write_test_views(dataset: Dataset, state: FitState, config: FitConfig, fold
 
     def export(index: int) -> None:
         frame = dataset.test[index]
-        parts = _render_frame(frame, state, environment, config)
+        parts = _render(frame.camera, state, environment, config)
         view = View(
             radiance=parts.radiance.permute(1, 2, 0).numpy(),
             alpha=parts.alpha.numpy(),
@@ -213,22 +225,28 @@ def _write_test_views(dataset: Dataset, state: FitState, config: FitConfig, fold
         )
         write_test_view(folder, frame, view)
         if index == len(dataset.test) // 2:
-            pictures = decomposition_pictures(parts)
-            for name, picture in pictures.items():
+            for name, picture in decomposition_pictures(parts).items():
                 write_png(folder / PICTURES / f"{name}.png", picture)
-            write_picture_sheet(folder / DECOMPOSITION, crop_to_object(pictures, parts.alpha))
 
     with ThreadPoolExecutor(EXPORT_THREADS) as pool:
         for _ in pool.map(export, range(len(dataset.test))):
             progress.advance()
 
 
-def _render_frame(
-    frame: Frame, state: FitState, environment: Float[Tensor, "6 3 L L"], config: FitConfig
-) -> Decomposition:
-    distance = np.linalg.norm(frame.camera.position_world - state.frame.center) / state.frame.radius
-    camera = raster_camera(frame.camera, state.frame, 0.1 * float(distance))
-    return render(state.geometry, environment, camera, state.frame, config, state.reflectance)
+def _found_camera(frame: Frame, state: FitState, index: int) -> Camera:
+    """That of a training view where the fit found it: turned about its center, then shifted."""
+    if state.geometry.poses is None:
+        return frame.camera
+    pose = frame.camera.camera_to_world.copy()
+    pose[:3, :3] = Rotation.from_rotvec(state.geometry.poses.turns[index]).as_matrix() @ pose[:3, :3]
+    pose[:3, 3] += state.frame.radius * state.geometry.poses.shifts[index]
+    return replace(frame.camera, camera_to_world=pose)
+
+
+def _render(camera: Camera, state: FitState, environment: Float[Tensor, "6 3 L L"], config: FitConfig) -> Decomposition:
+    distance = np.linalg.norm(camera.position_world - state.frame.center) / state.frame.radius
+    seen = raster_camera(camera, state.frame, 0.1 * float(distance))
+    return render(state.geometry, environment, seen, state.frame, config, state.reflectance)
 
 
 def viewpoint_of(frame: ObjectFrame, surroundings: Surroundings = FAR) -> Float[np.ndarray, "3"]:

@@ -1,22 +1,31 @@
 """Photographs or a video to frames: upright 8-bit pictures of moderate size, and how sharp they are."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 
+from panoless.photographs.lens import opencv
 from panoless.photographs.options import CaptureOptions
 from panoless.photographs.standstill import StillCheck
 from panoless.photographs.video import VIDEO_SUFFIXES, decoded_video, luminance
-from shinypartial.core.color import srgb_to_linear, to_display
+from shinypartial.core.color import CODES_OF_LINEAR, LINEAR_OF_CODES
 from shinypartial.core.errors import InputError
-from shinypartial.io.images import PICTURE_SUFFIXES, read_as_stored, read_upright, unit_values, write_png
+from shinypartial.io.images import PICTURE_SUFFIXES, read_as_stored, read_upright, to_bytes, write_png
 from shinypartial.io.progress import Progress
+from shinypartial.io.threads import in_threads
 
 #: What programs write beside a picture; no photograph of its own.
 COMPANIONS = ("_alpha", "_mask", "_normal", "_self", "_depth")
+#: Blocks are averaged in so many rows of them at a time: what is between stays in the processor's cache.
+BLOCK_ROWS = 32
+#: Channels of color; a fourth is alpha.
+COLORS = 3
+
+#: What a frame is made of: its name, its file, and its pixels where a video has them.
+Source = tuple[str, Path, UInt8[np.ndarray, "H W C"] | None]
 
 
 @dataclass(frozen=True)
@@ -76,18 +85,17 @@ def make_frames(files: list[Path], folder: Path, upright: bool, options: Capture
     total = options.video_frames if video else len(files)
     progress = Progress("frames", total)
     photographs = []
-    names: dict[str, Path] = {}
     borders = StillCheck()
-    for name, file, image in decoded_video(files[0], total) if video else _decoded(files, upright):
-        if name in names:
-            raise InputError(
-                expected="photographs with names of their own",
-                found=f"{names[name].name} and {file.name}",
-                remedy="Rename one of them.",
-            )
-        names[name] = file
-        photographs.append(_write_frame(name, file, image, folder, options))
+
+    def made(source: Source) -> Photograph:
+        name, file, pixels = source
+        image = _decoded(file, upright) if pixels is None else pixels
         borders.add(image)
+        return _write_frame(name, file, image, folder, options)
+
+    sources: Iterable[Source] = decoded_video(files[0], total) if video else _named(files)
+    for photograph in in_threads(made, sources):
+        photographs.append(photograph)
         progress.advance()
     if len(photographs) < options.least_views:
         raise InputError(
@@ -106,17 +114,30 @@ def make_frames(files: list[Path], folder: Path, upright: bool, options: Capture
     return Frames(tuple(photographs))
 
 
-def _decoded(files: list[Path], upright: bool) -> Iterator[tuple[str, Path, UInt8[np.ndarray, "H W C"]]]:
+def _named(files: list[Path]) -> list[Source]:
+    """Files by the names of their frames; InputError where two have the same."""
+    names: dict[str, Path] = {}
     for file in files:
-        image = read_upright(file) if upright else read_as_stored(file)
-        if image.dtype.kind == "f":
+        if file.stem in names:
             raise InputError(
-                expected=f"a photograph of 8 or 16 bits at {file}",
-                found="floating-point radiance",
-                remedy="Export it as PNG or JPEG in sRGB.",
+                expected="photographs with names of their own",
+                found=f"{names[file.stem].name} and {file.name}",
+                remedy="Rename one of them.",
             )
-        levels = image if image.dtype == np.uint8 else np.rint(unit_values(image) * 255).astype(np.uint8)
-        yield file.stem, file, np.repeat(levels, 3, 2) if levels.shape[2] == 1 else levels
+        names[file.stem] = file
+    return [(name, file, None) for name, file in names.items()]
+
+
+def _decoded(file: Path, upright: bool) -> UInt8[np.ndarray, "H W C"]:
+    image = read_upright(file) if upright else read_as_stored(file)
+    if image.dtype.kind == "f":
+        raise InputError(
+            expected=f"a photograph of 8 or 16 bits at {file}",
+            found="floating-point radiance",
+            remedy="Export it as PNG or JPEG in sRGB.",
+        )
+    codes = to_bytes(image)
+    return np.repeat(codes, COLORS, 2) if codes.shape[2] == 1 else codes
 
 
 def _write_frame(
@@ -127,8 +148,8 @@ def _write_frame(
     height, width = image.shape[:2]
     side = -(-max(height, width) // options.longest_side_px)
     small = block_means(image, side)
-    write_png(folder / f"{name}.png", np.ascontiguousarray(small))
-    light = luminance(small[..., :3])
+    write_png(folder / f"{name}.png", small, quick=True)
+    light = luminance(small[..., :COLORS])
     blur = float(blur_effect(light))
     return Photograph(name, source, small.shape[1], small.shape[0], side, width, height, blur, float(light.mean()))
 
@@ -138,11 +159,19 @@ def block_means(image: UInt8[np.ndarray, "H W *C"], side: int) -> UInt8[np.ndarr
     if side == 1:
         return image
     rows, columns = (size // side for size in image.shape[:2])
-    whole = unit_values(image[: rows * side, : columns * side].reshape(rows * side, columns * side, -1))
-    if whole.shape[2] >= 3:
-        whole[..., :3] = srgb_to_linear(whole[..., :3])
-    means = whole.reshape(rows, side, columns, side, -1).mean((1, 3))
-    levels = np.rint(means * 255).astype(np.uint8)
-    if levels.shape[2] >= 3:
-        levels[..., :3] = to_display(means[..., :3])
-    return levels.reshape(rows, columns, *image.shape[2:])
+    whole = image[: rows * side, : columns * side].reshape(rows * side, columns * side, -1)
+    channels = whole.shape[2]
+    codes = np.linspace(0, 1, 256, dtype=np.float32)
+    tables = [LINEAR_OF_CODES if channels >= COLORS > channel else codes for channel in range(channels)]
+    lookup = np.stack(tables, -1)[None]
+    found = np.empty((rows, columns, channels), np.uint8)
+    for top in range(0, rows, BLOCK_ROWS):
+        bottom = min(top + BLOCK_ROWS, rows)
+        values = opencv().LUT(np.ascontiguousarray(whole[top * side : bottom * side]), lookup)
+        # Of whole blocks, INTER_AREA takes the mean.
+        means = opencv().resize(values, (columns, bottom - top), interpolation=opencv().INTER_AREA)
+        means = means.reshape(bottom - top, columns, channels)
+        found[top:bottom] = np.rint(255 * means)
+        if channels >= COLORS:
+            found[top:bottom, :, :COLORS] = CODES_OF_LINEAR[np.rint(65535 * means[..., :COLORS]).astype(np.uint16)]
+    return found.reshape(rows, columns, *image.shape[2:])

@@ -12,7 +12,16 @@ from panoless.photographs.board import poses_from_board, recognized_board
 from panoless.photographs.frames import Frames, block_means, make_frames, source_files
 from panoless.photographs.ground import GIVE_MASKS, ground_masks
 from panoless.photographs.hull import nearest_point
-from panoless.photographs.masks import CHECK_MASKS, Hint, Masks, find_masks, given_mask, masks_beside, overlaps_of
+from panoless.photographs.masks import (
+    CHECK_MASKS,
+    MORE_HINTS,
+    Hint,
+    Masks,
+    find_masks,
+    given_mask,
+    masks_beside,
+    overlaps_of,
+)
 from panoless.photographs.models import find_model, find_transforms, read_colmap, read_transforms
 from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import PosedView, Poses, without_the_rest
@@ -26,9 +35,11 @@ from shinypartial.dataset.camera_plot import plot_cameras
 from shinypartial.dataset.schema import Frame
 from shinypartial.dataset.write import write_transforms
 from shinypartial.io.files import folder_lock, sha256_of
-from shinypartial.io.images import read_as_stored, read_png, read_upright, unit_values, write_png
+from shinypartial.io.images import read_as_stored, read_png, read_upright, to_bytes, unit_values, write_png
 from shinypartial.io.picture_sheet import write_picture_sheet
+from shinypartial.io.progress import Progress
 from shinypartial.io.records import write_record
+from shinypartial.io.threads import in_threads
 
 #: What the stages found, beside the dataset proper.
 WORK = "capture"
@@ -229,7 +240,7 @@ def _masks_of_frames(request: Request, frames: Frames, named: Mapping[str, Path]
         if one.name not in named:
             continue
         image = (read_upright if request.upright else read_as_stored)(named[one.name])
-        mask = np.rint(unit_values(image[..., -1] if image.shape[2] == 4 else image[..., 0]) * 255).astype(np.uint8)
+        mask = to_bytes(image[..., -1] if image.shape[2] == 4 else image[..., 0])
         if mask.shape != (one.full_height, one.full_width):
             raise InputError(
                 expected=f"a mask of {one.full_width}×{one.full_height} pixels for {one.name}",
@@ -254,11 +265,17 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
         own, remedy = True, CHECK_MASKS
         cameras = {view.name: view.camera for view in poses.views}
         told = bool(given_masks or request.hints)
-        for view in poses.views:
+
+        def undistort(view: PosedView) -> bool:
+            """Whether the picture has an alpha channel; a mask of its own replaces it."""
             picture = view.lens.undistorted(read_png(work / "frames" / f"{view.name}.png"))
-            # A mask of its own replaces an alpha channel.
-            write_png(train / f"{view.name}.png", np.ascontiguousarray(picture[..., :3]) if told else picture)
-            own = own and picture.shape[2] == 4
+            write_png(train / f"{view.name}.png", picture[..., :3] if told else picture, quick=True)
+            return picture.shape[2] == 4
+
+        progress = Progress("undistorting", len(poses.views))
+        for alpha in in_threads(undistort, poses.views):
+            own = own and alpha
+            progress.advance()
         if given_masks:
             origin = f"the model {request.segmenter.name}" if request.segmenter else "files"
             for view in poses.views:
@@ -267,7 +284,7 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
                 mask = view.lens.undistorted(read_png(given_masks[view.name])[..., 0])
                 write_png(train / f"{view.name}_alpha.png", mask)
         elif request.hints:
-            origin = f"hints in {', '.join(request.hints)}"
+            origin, remedy = f"hints in {', '.join(request.hints)}", MORE_HINTS
             sides = {one.name: one.side for one in frames.photographs}
             hints = {name: hint.scaled(sides.get(name, 1)) for name, hint in request.hints.items()}
             for name, mask in find_masks(cameras, train, hints, request.options).items():
@@ -280,7 +297,7 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
             for name, mask in found.items():
                 write_png(train / f"{name}_alpha.png", mask)
         masks = {view.name: _written_mask(train, view) for view in poses.views}
-        judged = [(cameras[name], mask) for name, mask in masks.items()]
+        judged = {name: (cameras[name], mask) for name, mask in masks.items()}
         overlaps = overlaps_of(judged, request.options, remedy)
         _write_mask_sheet(work / "masks.jpg", train, masks, dict(zip(masks, overlaps, strict=True)))
         return Masks(origin, tuple(masks), overlaps)

@@ -31,7 +31,12 @@ Points = tuple[tuple[float, float], ...]
 AROUND, OBJECT, _, PERHAPS_OBJECT = range(4)
 #: Blur of an edge that GrabCut leaves as a staircase, in pixels: the line at one half stays where it was.
 EDGE_PX = 0.7
-CHECK_MASKS = "Check that masks are white on the object, and that the poses are those of these photographs."
+CHECK_MASKS = (
+    "Check that masks are white on the object, else invert them, and that poses are those of these photographs."
+)
+MORE_HINTS = "Draw a rectangle in another photograph, such as --box X0,Y0,X1,Y1 --box-in {}, or add --clicks there."
+NAMED = 5
+"""So many masks are named at most."""
 SEED_ITERATIONS, ITERATIONS = 5, 2
 
 
@@ -81,20 +86,7 @@ class Masks:
 def hull_of(
     views: Sequence[tuple[Camera, Float[np.ndarray, "_ _"]]], options: CaptureOptions
 ) -> tuple[Float[np.ndarray, "P 3"], float]:
-    """Points of the hull of masks, and their spacing; as few masks are left out as let it fill the others.
-
-    Raises InputError for masks of the background and for empty ones.
-    """
-    full = sum(sum(cut_sides(mask)) >= 3 for _, mask in views)
-    empty = sum(not (mask >= MASK_LEVEL).any() for _, mask in views)
-    if 2 * full > len(views) or empty:
-        raise InputError(
-            expected="masks that are white on the object and black around it",
-            found=f"{empty} of {len(views)} that are empty"
-            if empty
-            else f"{full} of {len(views)} that reach three borders of their picture",
-            remedy="Invert the masks, or mark the object alone.",
-        )
+    """Points of the hull of masks, and their spacing; as few masks are left out as let it fill the others."""
     frame = estimate_object_frame(views)
     half_side = options.hull_spare * frame.radius
     inside = [(camera, mask >= MASK_LEVEL) for camera, mask in views]
@@ -111,18 +103,30 @@ def hull_of(
 
 
 def overlaps_of(
-    views: Sequence[tuple[Camera, Float[np.ndarray, "_ _"]]],
+    views: Mapping[str, tuple[Camera, Float[np.ndarray, "_ _"]]],
     options: CaptureOptions,
     remedy: str = CHECK_MASKS,
 ) -> tuple[float, ...]:
-    """Overlap of each mask with the hull of all; InputError where they contradict each other."""
-    points, spacing = hull_of(views, options)
-    found = tuple(overlap(mask >= MASK_LEVEL, outline(camera, points, spacing)) for camera, mask in views)
+    """Overlap of each mask with the hull of all. Raises InputError for masks of the background, for empty ones, and
+    where they contradict each other; `remedy` may have a place, {}, for the name of a photograph.
+    """
+    full = [name for name, (_, mask) in views.items() if sum(cut_sides(mask)) >= 3]
+    empty = [name for name, (_, mask) in views.items() if not (mask >= MASK_LEVEL).any()]
+    if 2 * len(full) > len(views) or empty:
+        wrong, what = (empty, "are empty") if empty else (full, "reach three borders of their picture")
+        raise InputError(
+            expected="masks that are white on the object and black around it",
+            found=f"{len(wrong)} of {len(views)} that {what}: {', '.join(wrong[:NAMED])}{' …' * (len(wrong) > NAMED)}",
+            remedy=remedy.format(wrong[0]),
+        )
+    seen = tuple(views.values())
+    points, spacing = hull_of(seen, options)
+    found = tuple(overlap(mask >= MASK_LEVEL, outline(camera, points, spacing)) for camera, mask in seen)
     if np.median(found) < options.least_overlap:
         raise InputError(
             expected=f"masks and poses that agree on an object: overlap of at least {options.least_overlap:.0%}",
             found=f"{np.median(found):.0%} in the median view",
-            remedy=remedy,
+            remedy=remedy.format(list(views)[int(np.argmin(found))]),
         )
     return found
 

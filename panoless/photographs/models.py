@@ -1,5 +1,6 @@
 """Poses that another program has found: a model of COLMAP, or nerfstudio's transforms.json."""
 
+import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import ModuleType
@@ -14,12 +15,12 @@ from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import PosedView, Poses, as_rows, find_ground, lens_for, with_covariances
 from shinypartial.core.conventions import PIXEL_CENTER
 from shinypartial.core.errors import InputError
-from shinypartial.dataset.transforms import CAMERA_MODELS, DISTORTION_FIELDS, frames_of
+from shinypartial.dataset.transforms import ALL_CAMERAS, CAMERA_MODELS, DISTORTION_FIELDS, frames_of
 from shinypartial.io.files import read_json
 from shinypartial.io.images import PICTURE_SUFFIXES
 
 #: Files of cameras as nerfstudio and NeRF-synthetic name them.
-TRANSFORMS = ("transforms.json", "transforms_train.json")
+TRANSFORMS = (ALL_CAMERAS, "transforms_train.json")
 
 
 def pycolmap_module() -> ModuleType:
@@ -124,11 +125,12 @@ def read_transforms(path: Path, frames: Frames) -> tuple[Poses, dict[str, Path]]
     if errors:
         raise errors[0]
     known = {entry["file_path"]: (frame, {**content, **entry}) for frame, entry in zip(read, entries, strict=True)}
-    views, masks = [], {}
+    views, masks, used = [], {}, set()
     for photograph in frames.photographs:
         name = listed_name(photograph, known)
         if name is None:
             continue
+        used.add(name)
         frame, fields = known[name]
         camera = frame.camera
         coefficients = _distortion(fields, path)
@@ -136,6 +138,8 @@ def read_transforms(path: Path, frames: Frames) -> tuple[Poses, dict[str, Path]]
         views.append(PosedView(photograph.name, lens_for(photograph, lens), as_rows(camera.camera_to_world)))
         if frame.mask is not None:
             masks[photograph.name] = frame.mask
+    if left_out := [name for name in known if name not in used]:
+        print(f"poses: no photograph is read for {', '.join(left_out)} of {path}", file=sys.stderr)
     return Poses(f"{path.name} of {path.parent}", "unknown", tuple(views)), masks
 
 

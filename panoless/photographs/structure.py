@@ -1,6 +1,11 @@
 """Poses from what stands around the object, by pycolmap: SIFT, matching and incremental structure from motion."""
 
+import re
 import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,57 +13,121 @@ import numpy as np
 from jaxtyping import Float
 
 from panoless.photographs.frames import Frames, Photograph
+from panoless.photographs.mapping import Job
 from panoless.photographs.models import poses_of, pycolmap_module
 from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import LEVEL, Poses, as_rows
 from shinypartial.core.camera import Similarity
 from shinypartial.core.errors import InputError
+from shinypartial.io.files import write_json
 from shinypartial.io.images import read_png, write_png
+from shinypartial.io.progress import Progress
+from shinypartial.io.records import write_record
 
-SEED = 0
 REMEDY = (
     "Put textured things, such as newspaper, or a printed board (`panoless board`) under the object and around it, "
     "lock the focus, and move by small steps; or find poses with another program and give --colmap."
 )
+PROGRAM = (sys.executable, "-m", "panoless.photographs.mapping")
+FEATURES, PLACING = "finding features", "placing cameras"
+#: What COLMAP says of its steps, by the name of the stage: the step and of how many, where it says that.
+STEPS = {
+    FEATURES: re.compile(r"Processed file \[(\d+)/(\d+)\]"),
+    "matching frames": re.compile(r"Processing (?:image|block) \[(\d+)/(\d+)(?:, (\d+)/(\d+))?\]"),
+    PLACING: re.compile(r"Registering image #\d+ \(num_reg_frames=(\d+)\)"),
+}
 
 
 def poses_from_structure(
-    frames: Frames, folder: Path, masks: dict[str, Path], work: Path, options: CaptureOptions
+    frames: Frames,
+    folder: Path,
+    masks: dict[str, Path],
+    work: Path,
+    options: CaptureOptions,
+    program: Sequence[str] = PROGRAM,
 ) -> Poses:
     """Poses of the frames in the largest model that hangs together; what masks mark is left out.
 
     The world has no known unit. Its +z leads away from the ground, at which z is 0, or along the cameras' mean upward
-    direction where no ground is found. Raises InputError when nothing matches.
+    direction where no ground is found. `program` is given the file of a `Job`. Raises InputError when nothing matches,
+    and when the program crashes.
     """
     colmap = pycolmap_module()
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
-    database = work / "database.db"
-    colmap.set_random_seed(SEED)
-    names = [f"{photograph.name}.png" for photograph in frames.photographs]
-    reader = colmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
+    names = tuple(f"{photograph.name}.png" for photograph in frames.photographs)
     if masks:
         _write_outsides(masks, frames, work / "masks")
-        reader.mask_path = str(work / "masks")
-    one_size = len({(photograph.width, photograph.height) for photograph in frames.photographs}) == 1
-    mode = colmap.CameraMode.SINGLE if one_size else colmap.CameraMode.PER_IMAGE
-    colmap.extract_features(database, folder, image_names=names, camera_mode=mode, reader_options=reader)
-    if len(names) <= options.exhaustive_frames:
-        colmap.match_exhaustive(database)
-    else:
-        pairing = colmap.SequentialPairingOptions(overlap=options.neighbors, loop_detection=False)
-        colmap.match_sequential(database, pairing_options=pairing)
-    mapping = colmap.IncrementalPipelineOptions(random_seed=SEED)
-    models = colmap.incremental_mapping(database, folder, work, options=mapping)
-    if not models:
+    job = Job(
+        frames=folder.resolve(),
+        names=names,
+        masks=(work / "masks").resolve() if masks else None,
+        one_camera=len({(photograph.width, photograph.height) for photograph in frames.photographs}) == 1,
+        neighbors=None if len(names) <= options.exhaustive_frames else options.neighbors,
+        work=work.resolve(),
+        model=(work / "model").resolve(),
+    )
+    write_json(work / "job.json", write_record(job))
+    _run(program, work / "job.json", work / "log.txt", len(names))
+    if not job.model.exists():
         raise InputError(
             expected="photographs whose surroundings match",
             found=f"no two of {len(names)} frames that fit together",
             remedy=REMEDY,
         )
-    model = max(models.values(), key=lambda one: one.num_reg_images())
+    model = colmap.Reconstruction(str(job.model))
     in_frames = Frames(tuple(_as_frame(photograph) for photograph in frames.photographs))
     return upright_world(poses_of(model, in_frames, "structure from motion", options))
+
+
+def _run(program: Sequence[str], job: Path, log: Path, frames: int) -> None:
+    """Run the program to its end with a line of progress a stage; what stops this process ends it."""
+    last = ""
+    progress = {FEATURES: Progress(FEATURES, frames)}
+    with (
+        log.open("w", encoding="utf-8") as kept,
+        subprocess.Popen(
+            [*program, str(job)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+        ) as process,
+    ):
+        assert process.stderr is not None
+        try:
+            for line in process.stderr:
+                kept.write(line)
+                last = line.strip() or last
+                for stage, pattern in STEPS.items():
+                    if said := pattern.search(line):
+                        step, total = _step_of([int(number) for number in said.groups() if number], frames)
+                        bar = progress.setdefault(stage, Progress(stage, total))
+                        if step > bar.done:
+                            bar.advance(steps=step - bar.done)
+            code = process.wait()
+        finally:
+            process.kill()
+    if code:
+        raise InputError(
+            expected="structure from motion that runs to its end",
+            found=f"a crash of COLMAP ({signal.Signals(-code).name if code < 0 else f'exit code {code}'}: {last})",
+            remedy="Run the same line again. If it happens again, put the printed board of `panoless board` under the "
+            f"object, or find poses with another program and give --colmap. Its log is {log}.",
+        )
+    if bar := progress.get(PLACING):
+        bar.advance(steps=bar.total - bar.done)
+
+
+def _step_of(said: list[int], frames: int) -> tuple[int, int]:
+    """The step and the number of steps: of all frames, of a row, or of a square of blocks."""
+    if len(said) == 1:
+        return said[0], frames
+    if len(said) == 2:
+        return said[0], said[1]
+    row, rows, column, columns = said
+    return (row - 1) * columns + column, rows * columns
 
 
 def _as_frame(photograph: Photograph) -> Photograph:

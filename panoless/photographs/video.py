@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from panoless.photographs.lens import opencv
-from shinypartial.core.color import srgb_to_linear
+from shinypartial.core.color import LINEAR_OF_CODES
 from shinypartial.core.errors import InputError
-from shinypartial.io.images import unit_values
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 #: Luminance of linear light (IEC 61966-2-1).
@@ -107,4 +106,4 @@ def _sharpness(image: UInt8[np.ndarray, "H W 3"]) -> float:
 
 def luminance(image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
     """Of linear light, from sRGB codes."""
-    return srgb_to_linear(unit_values(image)) @ LUMINANCE
+    return LINEAR_OF_CODES[image] @ LUMINANCE

@@ -25,3 +25,9 @@ def srgb_to_linear(srgb: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 def to_display(linear: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
     """8-bit sRGB of linear light clipped to [0, 1]: the only place where radiance becomes a picture."""
     return np.rint(linear_to_srgb(np.clip(np.nan_to_num(linear), 0.0, 1.0)) * 255.0).astype(np.uint8)
+
+
+LINEAR_OF_CODES = srgb_to_linear(np.arange(256, dtype=np.float32) / 255)
+"""Linear light of the 256 codes of 8-bit sRGB, to look up: `srgb_to_linear` of a picture takes ten times as long."""
+CODES_OF_LINEAR = to_display(np.arange(65536) / 65535)
+"""`to_display` of i/65535, to look up: off by a code where light is within 2⁻¹⁷ of where codes change."""

@@ -164,7 +164,7 @@ def _read_photograph(frame: Frame) -> _Photograph:
         raise InputError(
             expected=f"{frame.camera.width}×{frame.camera.height} pixels for {frame.name}, as its transforms say",
             found=f"{photograph.color.shape[1]}×{photograph.color.shape[0]}",
-            remedy="Render the frame again or correct w and h.",
+            remedy="Correct w and h; a picture of another size than the others has its own in its frame.",
         )
     return photograph
 

@@ -21,6 +21,8 @@ from shinypartial.io.records import Positive, Text, read_record
 DISTORTION_FIELDS = ("k1", "k2", "k3", "k4", "p1", "p2")
 #: nerfstudio's names of cameras that are pinholes where nothing is distorted.
 CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+#: What nerfstudio and instant-ngp name the file of all cameras.
+ALL_CAMERAS = "transforms.json"
 UNITS = "(focal lengths, centers and sizes in pixels, angles in radians)"
 
 
@@ -61,6 +63,12 @@ def read_frames(root: Path, split: str) -> tuple[list[Frame], int, list[InputErr
     if split == "test" and not path.exists():
         return [], 0, []
     if root.is_dir() and not path.exists():
+        if (root / ALL_CAMERAS).exists():
+            raise InputError(
+                expected=f"the cameras of the {split} split at {path}",
+                found=f"{ALL_CAMERAS} of nerfstudio or instant-ngp, in which the cameras lie",
+                remedy=f"Make a dataset with masks and without distortion of it: `panoless capture {root}`.",
+            )
         raise InputError(
             expected=f"the cameras of the {split} split at {path}",
             found="no such file",
@@ -76,7 +84,7 @@ def frames_of(root: Path, content: Any, path: Path) -> tuple[list[Frame], int, l
         raise InputError(
             expected=f"`frames` of {path} to be a list with at least one frame",
             found="none",
-            remedy="Restore the file of the dataset.",
+            remedy="Restore the file, or write it again with a frame for each photograph.",
         )
     shared = _read_intrinsics(content, f"{path} {UNITS}")
     first_size = functools.cache(lambda: _first_size(root, entries, path))
@@ -121,7 +129,7 @@ def _first_size(root: Path, entries: list[Any], path: Path) -> tuple[int, int]:
 
 
 def _read_entry(entry: dict[str, Any], index: int, path: Path) -> _Entry:
-    remedy = "Restore the file of the dataset."
+    remedy = "Restore the file, or give that frame its file_path and a 4×4 transform_matrix."
     return read_record(_Entry, entry, f"frame {index} of {path}", allow_unknown=True, remedy=remedy)
 
 
@@ -150,7 +158,7 @@ def _read_frame(
         raise InputError(
             expected=f"transform_matrix (4×4) for {name} in {path}",
             found=str(error),
-            remedy="Restore the file of the dataset.",
+            remedy="Restore the file, or give that frame a camera-to-world matrix: four lists of four numbers.",
         ) from None
     check_pose(pose, name)
     width, height = own.w or shared.w, own.h or shared.h

@@ -29,6 +29,8 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".hdr")
 CHANNEL_COUNTS = (1, 3, 4)
 #: Of a picture that is read: a medium-format camera's has half as many. A small file may claim any number.
 LARGEST_PIXELS = 200_000_000
+#: PNG_FILTER_AVG: of single filters it leaves photographs smallest, and one takes less time than a choice in each row.
+AVERAGE_FILTER = 0x40
 #: Of maps that light scenes. Measured in Blender's own: −0.0022 (forest), beside radiance up to 1400.
 LOWEST_RADIANCE = -1e-2
 #: What brings stored pixels upright, by the EXIF orientation: whether rows and columns change places, then which axes
@@ -161,9 +163,13 @@ def read_light(path: Path) -> Float[np.ndarray, "H W 3"]:
     return np.maximum(radiance, 0)
 
 
-def write_png(path: Path, image: UInt8[np.ndarray, "H W *C"]) -> None:
-    """Write an 8-bit image: (H, W) gray, (H, W, 3) RGB or (H, W, 4) RGBA with straight alpha."""
-    _write_picture(path, image, "png", {"oiio:UnassociatedAlpha": 1})
+def write_png(path: Path, image: UInt8[np.ndarray, "H W *C"], *, quick: bool = False) -> None:
+    """Write an 8-bit image: (H, W) gray, (H, W, 3) RGB or (H, W, 4) RGBA with straight alpha.
+
+    A quick one takes a sixth of the time and is about 15 % larger.
+    """
+    speed = {"png:compressionLevel": 1, "png:filter": AVERAGE_FILTER} if quick else {}
+    _write_picture(path, image, "png", {"oiio:UnassociatedAlpha": 1, **speed})
 
 
 def write_jpeg(
@@ -322,7 +328,13 @@ def unit_values(image: Num[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     return image.astype(np.float32) / np.iinfo(image.dtype).max
 
 
+def to_bytes(image: Num[np.ndarray, "*S"]) -> UInt8[np.ndarray, "*S"]:
+    """Codes of 16 bits, and floating-point numbers clipped to [0, 1], as the nearest of 8 bits; 8 bits as they are."""
+    if image.dtype == np.uint16:
+        return ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)  # 65535 = 257 · 255.
+    return image if image.dtype == np.uint8 else np.rint(image.clip(0, 1) * 255).astype(np.uint8)
+
+
 def read_png(path: Path) -> UInt8[np.ndarray, "H W C"]:
     """Read a picture as `read_picture` does, reduced to 8 bits."""
-    image = read_picture(path)
-    return image if image.dtype == np.uint8 else np.rint(unit_values(image).clip(0, 1) * 255).astype(np.uint8)
+    return to_bytes(read_picture(path))

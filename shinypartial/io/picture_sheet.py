@@ -9,7 +9,6 @@ import numpy as np
 
 from shinypartial.io.files import atomic_write
 
-COLUMNS = 3
 TILE_PX = 340
 TITLE_PX = 22
 MAX_BYTES = 300_000
@@ -22,10 +21,13 @@ def write_picture_sheet(
     path: Path,
     pictures: Mapping[str, np.ndarray],
     *,
-    tile_size: tuple[int, int] = (TILE_PX, TILE_PX),
+    widths: tuple[int, ...] = (TILE_PX, TILE_PX, TILE_PX),
+    height: int = TILE_PX,
     max_bytes: int = MAX_BYTES,
 ) -> None:
-    """Write 8-bit gray or RGB pictures of any size, three a row with their titles above, as a JPEG below `max_bytes`.
+    """Write 8-bit gray or RGB pictures of any size, their titles above, as a JPEG below `max_bytes`.
+
+    Tiles are as wide as their column in `widths`, and `height` pixels high.
 
     Raises ValueError when there is no picture.
     """
@@ -33,12 +35,12 @@ def write_picture_sheet(
 
     if not pictures:
         raise ValueError("a sheet needs a picture")
-    width, height = tile_size
-    rows = math.ceil(len(pictures) / COLUMNS)
-    sheet = Image.new("RGB", (min(COLUMNS, len(pictures)) * width, rows * (height + TITLE_PX)), PAPER)
+    rows = math.ceil(len(pictures) / len(widths))
+    sheet = Image.new("RGB", (sum(widths[: len(pictures)]), rows * (height + TITLE_PX)), PAPER)
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(14)
     for index, (title, picture) in enumerate(pictures.items()):
-        left, top = index % COLUMNS * width, index // COLUMNS * (height + TITLE_PX)
+        row, column = divmod(index, len(widths))
+        left, top, width = sum(widths[:column]), row * (height + TITLE_PX), widths[column]
         draw.text((left + 6, top + 3), title, INK, font=font)
         tile = Image.fromarray(picture).convert("RGB")
         scale = min(width / tile.width, height / tile.height)

@@ -5,7 +5,8 @@ PREDICTION/environment.exr            lat-long, linear radiance, world frame of 
 PREDICTION/visibility.exr             lat-long, channel Y in [0, 1]: how well each direction was observed
 PREDICTION/inverse_distance.exr      optional: lat-long, channel Y, 1/D of every direction from the origin, 0 for far
 PREDICTION/test/r_000.exr r_000.png   linear premultiplied RGBA, unit world normals, z-depth; and the picture
-PREDICTION/decomposition.jpg          optional: what a test view is made of
+PREDICTION/environment.jpg            optional: the environment to look at, with what was not seen marked
+PREDICTION/decomposition.jpg          optional: a photograph, and what was recovered, in one picture
 PREDICTION/snapshots/000250           optional: earlier moments of the fit, each a prediction folder
 """
 
@@ -42,8 +43,8 @@ VISIBILITY_CHANNEL = "Y"
 #: Slack for values that 16-bit storage rounds beyond [0, 1].
 VISIBILITY_TOLERANCE = 1e-3
 INVERSE_DISTANCE = "inverse_distance.exr"
-#: One picture of what a test view is made of, optional.
-DECOMPOSITION = "decomposition.jpg"
+#: For the eye, optional: the environment, and one picture of a photograph and of all that was recovered.
+ENVIRONMENT_PICTURE, DECOMPOSITION = "environment.jpg", "decomposition.jpg"
 #: What `shinypartial evaluate` and `report` add to the folder: scores, pictures and a page.
 SCORES, EVALUATION, REPORT = "scores.json", "evaluation", "report.html"
 

@@ -151,7 +151,7 @@ _SURFACE_CAPTION = (
     "The surface, turning about +Z: its normals as (n + 1)/2; their errors, as far as test views see it, gray "
     "elsewhere; and its confidence, where the method states one (violet: none, yellow: full)."
 )
-_SHEET_CAPTION = "What the method makes of one test view."
+_SHEET_CAPTION = "A photograph, and what the method recovered."
 
 
 def summary_lines(prediction: Path) -> list[str]:

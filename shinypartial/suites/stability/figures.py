@@ -82,7 +82,7 @@ def write_pictures(folder: Path, suite: Path, results: Results, method: str) -> 
                 pictures[title] = to_display(to_protocol_size(read_environment_map(prediction), MAP_HEIGHT))
         path = folder / f"stability-{scene}-{name}.jpg"
         if len(pictures) > 1:
-            write_picture_sheet(path, pictures, tile_size=(2 * MAP_HEIGHT, MAP_HEIGHT), max_bytes=90_000)
+            write_picture_sheet(path, pictures, widths=(2 * MAP_HEIGHT,) * 3, height=MAP_HEIGHT, max_bytes=90_000)
         if path.exists():
             made.append((path.name, f"{scene}, {axis.title.lower()}, method {method}"))
     return made

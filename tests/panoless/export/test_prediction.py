@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
@@ -17,7 +18,7 @@ from panoless.capture.rays import pose_of, raster_camera
 from panoless.capture.views import TrainView
 from panoless.environment.surroundings import Floor, Surroundings
 from panoless.export.mesh_files import write_ply
-from panoless.export.pictures import crop_to_object
+from panoless.export.pictures import environment_picture, object_window
 from panoless.export.prediction import PICTURES, cube_to_latlong, export_prediction, is_exported, viewpoint_of
 from panoless.export.render import render
 from panoless.geometry.base import Geometry
@@ -29,15 +30,17 @@ from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.reconstruct.state import FitState
 from panoless.selection.candidates import Candidate, Selection, Verdict
+from shinypartial.core.color import to_display
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import cube_to_latlong as clamped_cube_to_latlong
 from shinypartial.core.sphere import directions_to_cube, latlong_directions
 from shinypartial.dataset.read import open_dataset, read_view
 from shinypartial.dataset.schema import Dataset
 from shinypartial.evaluation.evaluate import evaluate
-from shinypartial.io.picture_sheet import MAX_BYTES
+from shinypartial.io.picture_sheet import MAX_BYTES, TILE_PX, TITLE_PX
 from shinypartial.prediction.format import (
     DECOMPOSITION,
+    ENVIRONMENT_PICTURE,
     acquire_prediction,
     dataset_hash,
     prediction_frame,
@@ -103,20 +106,81 @@ def test_the_evaluator_scores_it(prediction: Path, finished: FinishedFit) -> Non
 def test_pictures_of_the_decomposition_are_there(prediction: Path) -> None:
     names = [path.name for path in sorted((prediction / PICTURES).iterdir())]
     assert [name[0] for name in names] == list("123456")
-    assert 5_000 < (prediction / DECOMPOSITION).stat().st_size < MAX_BYTES
 
 
-def test_the_sheet_shows_the_object_and_not_the_empty_picture() -> None:
+def tiles_of(sheet: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Photograph, environment, normals and visibility of the picture that sums up a prediction."""
+    with Image.open(sheet) as opened:
+        picture = np.asarray(opened).astype(float)
+    lower, upper = picture[TILE_PX + 2 * TITLE_PX :], picture[TITLE_PX : TITLE_PX + TILE_PX]
+    return upper[:, :TILE_PX], upper[:, TILE_PX:], lower[:, :TILE_PX], lower[:, TILE_PX:]
+
+
+def test_one_picture_shows_photograph_normals_environment_and_visibility(
+    tmp_path: Path, prediction: Path, finished: FinishedFit
+) -> None:
+    """They are those of the files, in a training view; photographs of one's own have no test views."""
+    export_prediction(replace(finished.dataset, test=()), finished.state, finished.config, tmp_path)
+    assert (tmp_path / DECOMPOSITION).read_bytes() == (prediction / DECOMPOSITION).read_bytes()
+    assert (tmp_path / DECOMPOSITION).stat().st_size < MAX_BYTES
+    photograph, environment, normals, visibility = tiles_of(tmp_path / DECOMPOSITION)
+    truth = read_view(finished.dataset.train[len(finished.dataset.train) // 2])
+    assert truth.normals_world is not None
+    window = object_window(truth.alpha)
+    known = read_visibility(tmp_path)
+    assert known is not None
+    with Image.open(tmp_path / ENVIRONMENT_PICTURE) as opened:
+        picture = np.asarray(opened)
+    expected = (
+        (photograph, to_display(truth.radiance)[window], 3.0),
+        # A second of fitting leaves normals wrong by 3°, and surfels reach over the outline.
+        (normals, 127.5 * (truth.normals_world + 1)[window] * (truth.alpha[window] > 0.5)[..., None], 12.0),
+        (environment, picture, 3.0),
+        (visibility, np.repeat(255 * known[..., None], 3, 2), 3.0),
+    )
+    for tile, whole, tolerance in expected:
+        size = tile.shape[1], tile.shape[0]
+        enlarged = Image.fromarray(whole.astype(np.uint8)).resize(size, Image.Resampling.BICUBIC)
+        assert np.abs(tile - np.asarray(enlarged)).mean() < tolerance
+
+
+def test_what_no_view_saw_is_hatched_in_the_picture_of_the_environment() -> None:
+    environment, visibility = np.full((40, 80, 3), (0.9, 0.1, 0.2)), np.ones((40, 80))
+    visibility[:, 50:] = 0
+    picture = environment_picture(environment, visibility)
+    assert (picture[:, :50] == to_display(environment[0, 0])).all()
+    gray = picture[:, 50:]
+    assert (gray == gray[..., :1]).all()
+    assert len(np.unique(gray[0])) == 2
+
+
+def test_normals_of_the_picture_are_in_the_camera_that_was_found(tmp_path: Path) -> None:
+    """A wrong camera whose error the fit found shows what the right one shows."""
+    plane, frame, rng = plane_of(RECTANGLE), ObjectFrame(np.zeros(3), 2.0), np.random.default_rng(3)
+    dataset = make_plane_dataset(tmp_path / "plane", plane, train=3)
+    poses = Poses(*rng.normal(size=(2, 3, 3)) * 0.1)
+    wrong = []
+    for index, stated in enumerate(dataset.train):
+        pose = stated.camera.camera_to_world.copy()
+        pose[:3, :3] = Rotation.from_rotvec(-poses.turns[index]).as_matrix() @ pose[:3, :3]
+        pose[:3, 3] -= 2 * poses.shifts[index]
+        wrong.append(replace(stated, camera=replace(stated.camera, camera_to_world=pose)))
+    chosen = Candidate("plane", Verdict.CHOSEN, "it fits")
+    for name, train, found in (("right", dataset.train, None), ("found", tuple(wrong), poses)):
+        state = finished_state(PlaneMirror(plane, poses=found), frame, chosen)
+        export_prediction(replace(dataset, train=train), state, tiny_config(), tmp_path / name)
+    right, found_too = (tiles_of(tmp_path / name / DECOMPOSITION)[2] for name in ("right", "found"))
+    assert right.std() > 10
+    np.testing.assert_allclose(found_too, right, atol=16)  # A pixel of the edge may be rounded otherwise.
+
+
+def test_the_window_shows_the_object_and_not_the_empty_picture() -> None:
     """Pictures are cut to where there is alpha, whatever surrounds it; nothing at all is shown whole."""
-    rows, columns = slice(30, 42), slice(5, 17)
-    alpha = torch.zeros(80, 60)
-    alpha[rows, columns] = 1.0
-    pictures = {"1-a-b": (255 * alpha.numpy()).astype(np.uint8)}
-    (title, shown), *_ = crop_to_object(pictures, alpha).items()
-    assert title == "a b"
-    assert shown.shape == (14, 14)
-    assert (shown > 0).sum() == 144
-    assert crop_to_object(pictures, 0 * alpha)["a b"].shape == (80, 60)
+    alpha = np.zeros((80, 60), np.float32)
+    alpha[30:42, 5:17] = 1.0
+    assert alpha[object_window(alpha)].shape == (14, 14)
+    assert alpha[object_window(alpha)].sum() == 144
+    assert alpha[object_window(0 * alpha)].shape == (80, 60)
 
 
 def test_nothing_half_written_stays(prediction: Path) -> None:

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from panoless.photographs.frames import block_means, make_frames, source_files
 from panoless.photographs.options import CaptureOptions
 from panoless.photographs.video import sharpest_frames
+from shinypartial.core.color import linear_to_srgb, srgb_to_linear
 from shinypartial.core.errors import InputError
-from shinypartial.io.images import read_png, write_png
+from shinypartial.io.images import read_png, to_bytes, write_png
 
 RANDOM = np.random.default_rng(3)
 TEXTURE = cv2.resize(RANDOM.integers(0, 256, (24, 32, 3), dtype=np.uint8), (128, 96), interpolation=cv2.INTER_NEAREST)
@@ -59,6 +60,30 @@ def test_large_photographs_are_averaged_over_blocks_in_linear_light(tmp_path: Pa
     black_and_white = np.zeros((2, 2, 3), np.uint8)
     black_and_white[0] = 255
     assert block_means(black_and_white, 2).ravel().tolist() == [188] * 3  # sRGB of one half.
+
+
+@pytest.mark.parametrize("channels", [0, 1, 3, 4])
+@pytest.mark.parametrize("side", [2, 3])
+def test_block_means_are_those_of_the_formula(channels: int, side: int) -> None:
+    """More rows than are averaged at a time, and pixels that fill no block; masks and alpha are no light."""
+    shape = (150, 47, channels) if channels else (150, 47)
+    image = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
+    rows, columns = shape[0] // side, shape[1] // side
+    values = image[: rows * side, : columns * side].reshape(rows, side, columns, side, -1) / 255
+    light = values.copy()
+    light[..., :3] = srgb_to_linear(values[..., :3])
+    expected = values.mean((1, 3))
+    if channels >= 3:
+        expected[..., :3] = linear_to_srgb(light.mean((1, 3))[..., :3])
+    found = block_means(image, side)
+    assert found.shape == (rows, columns, *shape[2:])
+    # Half a code and what a table of 65536 lights leaves.
+    assert np.abs(found.reshape(expected.shape) - 255 * expected).max() < 0.53
+
+
+def test_sixteen_bits_are_rounded_to_the_nearest_code() -> None:
+    codes = np.arange(65536, dtype=np.uint16)
+    np.testing.assert_array_equal(to_bytes(codes), np.rint(codes / 257))
 
 
 @pytest.mark.parametrize(("count", "blur_px", "message"), [(3, 0.0, "at least 8"), (8, 8.0, "sharp photographs")])

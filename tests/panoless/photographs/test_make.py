@@ -17,7 +17,7 @@ from panoless.photographs.options import CaptureOptions
 from panoless.photographs.structure import poses_from_structure, turned_up
 from shinypartial.core.camera import opencv_to_opengl
 from shinypartial.core.errors import InputError
-from shinypartial.dataset.bundled import bundled_dataset
+from shinypartial.dataset.bundled import bundled_dataset, resolve_dataset
 from shinypartial.dataset.export_cameras import export_cameras
 from shinypartial.dataset.read import open_dataset, read_view
 from shinypartial.io.images import write_png
@@ -212,3 +212,30 @@ def test_a_dataset_that_went_around_by_colmap_is_the_same(tmp_path: Path) -> Non
         one, other = read_view(old), read_view(new)
         np.testing.assert_array_equal(one.alpha, other.alpha)
         np.testing.assert_array_equal(one.radiance, other.radiance)
+
+
+def test_the_newest_dataset_is_the_one_that_was_captured(
+    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without --output; a folder with a file of all cameras is no dataset yet, and fitting it says the command."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"panoless capture photos") as error:
+        open_dataset(Path("photos"))
+    assert "transforms.json" in error.value.found
+    command = ["capture", "photos", "--options.most-blur", "1", "--options.hull-voxels", "32"]
+    assert main(command) == 0
+    assert "Next: panoless fit datasets/photos" in capsys.readouterr().out
+    assert resolve_dataset() == Path("datasets/photos")
+
+
+def test_listed_frames_without_a_photograph_are_named(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = photographs / "transforms.json"
+    content = json.loads(path.read_text())
+    write_png(tmp_path / "bad" / "outside.png", np.zeros((96, 96, 3), np.uint8))
+    content["frames"].append(content["frames"][0] | {"file_path": "../bad/outside.png"})
+    path.write_text(json.dumps(content))
+    made = capture(Request(photographs, tmp_path / "dataset", options=OPTIONS))
+    assert len(made.poses.views) == 9
+    assert "no photograph is read for ../bad/outside.png" in capsys.readouterr().err

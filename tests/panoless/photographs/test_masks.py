@@ -1,12 +1,21 @@
 """Masks: their hull judges them, and a rectangle is enough where the object stands out."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from panoless.photographs.hull import carve, nearest_point, outline, overlap
-from panoless.photographs.masks import Hint, find_masks, masks_beside, moved_mask, overlaps_of, read_clicks
+from panoless.photographs.masks import (
+    MORE_HINTS,
+    Hint,
+    find_masks,
+    masks_beside,
+    moved_mask,
+    overlaps_of,
+    read_clicks,
+)
 from panoless.photographs.options import CaptureOptions
 from shinypartial.core.camera import Camera, ray_directions_world
 from shinypartial.core.errors import InputError
@@ -29,8 +38,12 @@ def ball(camera: Camera, center=CENTER, radius: float = RADIUS) -> np.ndarray:
 TRUTH = [ball(camera) for camera in CAMERAS]
 
 
+def named(cameras: Sequence[Camera], masks: Sequence[np.ndarray]) -> dict[str, tuple[Camera, np.ndarray]]:
+    return {f"v_{i}": (c, m.astype(float)) for i, (c, m) in enumerate(zip(cameras, masks, strict=True))}
+
+
 def test_the_hull_of_true_masks_has_their_outline() -> None:
-    overlaps = overlaps_of([(c, m.astype(float)) for c, m in zip(CAMERAS, TRUTH, strict=True)], OPTIONS)
+    overlaps = overlaps_of(named(CAMERAS, TRUTH), OPTIONS)
     assert min(overlaps) > 0.95  # A voxel is 1.5 pixels.
 
 
@@ -38,7 +51,7 @@ def test_one_wrong_mask_of_many_is_left_out() -> None:
     cameras = arc(12, 3.0, (96, 96), 200.0)
     masks = [ball(camera) for camera in cameras]
     masks[4] = np.roll(masks[4], 30, 1)
-    overlaps = overlaps_of([(c, m.astype(float)) for c, m in zip(cameras, masks, strict=True)], OPTIONS)
+    overlaps = overlaps_of(named(cameras, masks), OPTIONS)
     assert np.argmin(overlaps) == 4
     assert np.median(overlaps) > 0.9
 
@@ -73,15 +86,25 @@ def test_a_mask_moves_to_a_neighboring_view() -> None:
     ("change", "message"), [(np.logical_not, "white on the object"), (np.zeros_like, "that are empty")]
 )
 def test_masks_of_the_background_and_empty_ones_are_refused(change, message: str) -> None:
-    masks = [(camera, change(mask).astype(float)) for camera, mask in zip(CAMERAS, TRUTH, strict=True)]
-    with pytest.raises(InputError, match=message):
-        overlaps_of(masks, OPTIONS)
+    with pytest.raises(InputError, match=message) as error:
+        overlaps_of(named(CAMERAS, [change(mask) for mask in TRUTH]), OPTIONS)
+    assert "v_0, v_1" in error.value.found
+    assert "invert them" in error.value.remedy
+
+
+def test_masks_that_were_found_are_not_blamed_on_the_user() -> None:
+    """The view whose mask is empty is named, and where a rectangle would help."""
+    masks = [mask & (index != 3) for index, mask in enumerate(TRUTH)]
+    with pytest.raises(InputError, match="1 of 9 that are empty: v_3") as error:
+        overlaps_of(named(CAMERAS, masks), OPTIONS, MORE_HINTS)
+    assert "--box-in v_3" in error.value.remedy
+    assert "nvert" not in error.value.remedy
 
 
 def test_masks_that_contradict_the_poses_are_refused() -> None:
     masks = [np.roll(mask, (17 * i % 48 - 24, 29 * i % 48 - 24), (0, 1)) for i, mask in enumerate(TRUTH)]
     with pytest.raises(InputError, match="agree on an object"):
-        overlaps_of([(camera, mask.astype(float)) for camera, mask in zip(CAMERAS, masks, strict=True)], OPTIONS)
+        overlaps_of(named(CAMERAS, masks), OPTIONS)
 
 
 def write_pictures(folder: Path) -> None:
