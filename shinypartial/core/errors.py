@@ -39,7 +39,10 @@ def from_os_error(error: OSError) -> InputError:
 
 
 def run_command(command: Callable[[], None]) -> int:
-    """Run a command; return 0, 2 for bad input (one message, no traceback) or 130 when interrupted."""
+    """Run a command; return 0, 2 for bad input (one message, no traceback) or 130 when interrupted.
+
+    Notes of an interruption say what is lost.
+    """
     try:
         command()
     except InputError as error:
@@ -48,8 +51,9 @@ def run_command(command: Callable[[], None]) -> int:
         raise
     except OSError as error:
         message = from_os_error(error)
-    except KeyboardInterrupt:
-        print("\nInterrupted. Run the same command again to continue where it stopped.", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        again = "Run the same command again: it continues after what it has finished."
+        print("\nInterrupted.", again, *getattr(stop, "__notes__", ()), file=sys.stderr)
         return EXIT_INTERRUPTED
     else:
         return 0
