@@ -131,8 +131,8 @@ def fit(
     without it the newest below ./datasets is taken. `config` replaces the preset's values, `model` and `set`, such
     as `("plane.max_vertices=64",)`, change some of them.
     `output` is the prediction folder, predictions/DATASET-PRESET by default; checkpoints lie in the run folder of the
-    same name below ./runs. A call that was interrupted continues where it stopped, and one that had ended returns what
-    is there. Raises InputError for what can't be read or fitted.
+    same name below ./runs. A call that was interrupted continues after its last finished stage, and one that had ended
+    returns what is there. Raises InputError for what can't be read or fitted.
     """
     if preset not in PRESETS:
         raise InputError(expected=f"a preset: {', '.join(PRESETS)}", found=repr(preset), remedy="Choose one of them.")

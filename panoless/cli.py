@@ -229,7 +229,7 @@ class Capture:
 
         check_record(self.options, "--options", remedy="Correct that value.")
         files = self._files()
-        if not files or len({file.parent for file in files}) > 1 and self.output is None:
+        if not files or (len({file.parent for file in files}) > 1 and self.output is None):
             raise InputError(
                 expected="a folder of photographs, a video, or photographs of one folder",
                 found=f"{len(self.sources)} sources",

@@ -31,6 +31,7 @@ from panoless.environment.mirrored import radiance_of, slopes_of
 from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry
+from panoless.journal import remembered
 from panoless.numeric.robust import robust_weight
 from shinypartial.core.conventions import PIXEL_CENTER
 
@@ -70,6 +71,7 @@ class LensPull:
     sigma: float
 
 
+@remembered()
 def lens_pull(
     views: Views, geometry: Geometry, unknown: LensUnknown, rays: int, resolution: int, robust_scale: float
 ) -> LensPull:

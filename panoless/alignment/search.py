@@ -16,6 +16,7 @@ from panoless.config import FitConfig
 from panoless.environment.resolution import prediction_error
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import Family, Geometry, Proposal, observe_views, usable_views
+from panoless.journal import remembered
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,13 @@ class PosedProposal:
         return replace(self, proposal=replace(self.proposal, fitted=fitted))
 
 
+@remembered()
+def proposed(source: Family, views: Views, config: FitConfig, *, asked: bool = False) -> Proposal | None:
+    """What a kind proposes of views."""
+    return source.propose(views, config, asked=asked)
+
+
+@remembered()
 def align_proposal(family: Family, views: Views, proposal: Proposal, config: FitConfig) -> PosedProposal | None:
     """The proposal of a kind after its outlines turned the cameras, and it followed them, in turn; None where that does
     not bring it clearly nearer to the masks.
@@ -117,12 +125,13 @@ def fit_with_poses(
             return first
         geometry = first
     assert geometry.poses is not None
-    proposal = source.propose(geometry.poses.moved(views), config, asked=False)
+    proposal = proposed(source, geometry.poses.moved(views), config)
     if proposal is None:
         return geometry
     return fit_at(family, views, PosedProposal(proposal.in_surroundings(geometry.surroundings), geometry.poses), config)
 
 
+@remembered()
 def fit_at(family: Family, views: Views, start: PosedProposal, config: FitConfig) -> Geometry:
     """The geometry of a kind by views at the poses of a proposal, which it may change where it finds them itself."""
     if start.poses is None:
@@ -144,6 +153,7 @@ def _believed(family: Family, views: Views, start: PosedProposal, fitted: Geomet
     return family.fit(views, replace(start.proposal, told=None, fitted=believed), config)
 
 
+@remembered()
 def _next_poses(views: Views, geometry: Geometry, config: FitConfig) -> Poses:
     """Poses under a geometry and its map."""
     alignment, poses = Alignment(views, config.poses), geometry.poses

@@ -15,7 +15,8 @@ from panoless.environment.resolution import count_rays
 from panoless.environment.roughness import sharpened_map, with_smaller_lamps
 from panoless.environment.solve import solve_environment
 from panoless.environment.visibility import agreement, visibility_from_agreement, visibility_from_evidence
-from panoless.geometry.base import Geometry, observe_views, pixel_areas, usable_views
+from panoless.geometry.base import Geometry, Training, observe_views, pixel_areas, usable_views
+from panoless.journal import remembered
 from panoless.reconstruct.state import FitState
 from panoless.selection.material import Softness, as_perfect_mirror, earned_reflectance, earned_softness
 
@@ -44,33 +45,38 @@ def complete(state: FitState, views: Views, config: FitConfig) -> tuple[Views, F
     softness = earned_softness(usable, state.geometry, config) if state.training is None else Softness()
     state.roughness, state.blur_px = softness.roughness, softness.blur_px
     taken = exposed(usable if state.blur_px is None else replace(usable, blur_px=state.blur_px), 1 / exposure)
-    _solve(state, taken, replace(config, exposure=1.0))
+    state.environment, state.visibility = _solved(
+        taken, state.geometry, state.training, state.roughness, replace(config, exposure=1.0)
+    )
     return views if state.blur_px is None else replace(views, blur_px=state.blur_px), config
 
 
-def _solve(state: FitState, views: Views, config: FitConfig) -> None:
+@remembered()
+def _solved(
+    views: Views, geometry: Geometry, training: Training | None, roughness: float | None, config: FitConfig
+) -> tuple[Float[Tensor, "6 3 L L"], Float[Tensor, "6 L L"]]:
     """Environment and visibility from usable pixels."""
-    encoding, training = encoding_of(config), state.training
+    encoding = encoding_of(config)
     with torch.no_grad():
         if config.environment.solve or training is None:
-            environment, rays = state.geometry.solve_map(views, config)
+            environment, rays = geometry.solve_map(views, config)
             shown = environment
-            if state.roughness is not None:
-                environment = _of_rough_mirror(state.roughness, state.geometry, views, config, environment.shape[-1])
-                shown = Lobe.of(state.roughness, environment.shape[-1]).blurred(environment)
+            if roughness is not None:
+                environment = _of_rough_mirror(roughness, geometry, views, config, environment.shape[-1])
+                shown = Lobe.of(roughness, environment.shape[-1]).blurred(environment)
             if not config.environment.fill:
                 environment = torch.where(count_rays(rays, environment.shape[-1]) > 0, environment, GRAY)
         else:
-            rays = list(observe_views(views, state.geometry, config.environment.rays))
+            rays = list(observe_views(views, geometry, config.environment.rays))
             sigmoid = config.environment.activation == "sigmoid"
             environment = torch.sigmoid(training.environment) if sigmoid else training.environment
             shown = environment
         if config.visibility == "online" and training is not None:
-            state.visibility = visibility_from_evidence(training.evidence)
+            visibility = visibility_from_evidence(training.evidence)
         else:
             agreed = agreement(rays, shown, encoding.saturation, config.confidence)
-            state.visibility = visibility_from_agreement(agreed, config.confidence)
-        state.environment = encoding.decoded(environment)
+            visibility = visibility_from_agreement(agreed, config.confidence)
+        return encoding.decoded(environment), visibility
 
 
 def _of_rough_mirror(

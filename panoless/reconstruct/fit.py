@@ -1,6 +1,9 @@
 """The fit: views in, geometry and environment out. It never sees a score."""
 
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -11,6 +14,7 @@ from panoless.capture.views import Views
 from panoless.config import FitConfig, check_config
 from panoless.geometry.base import usable_views
 from panoless.geometry.registry import FAMILIES
+from panoless.journal import forget, journal_in
 from panoless.kernels.backend import gpu_kernels_installed
 from panoless.reconstruct.final_map import complete
 from panoless.reconstruct.recorder import Recorder, note_peak_memory, timed
@@ -24,6 +28,7 @@ from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import photographs_hash, read_ball_evidence
 from shinypartial.dataset.schema import BallEvidence, Dataset
 from shinypartial.io.files import folder_lock
+from shinypartial.io.progress import format_seconds
 from shinypartial.prediction.format import Trust, dataset_hash
 
 MAIN_MEMORY = torch.device("cpu")
@@ -36,7 +41,8 @@ def fit(
     schedule: SnapshotSchedule = NO_SNAPSHOTS,
     device: torch.device = MAIN_MEMORY,
 ) -> FitState:
-    """Fit a dataset in a run folder; a killed fit continues from its last checkpoint, a finished one is returned.
+    """Fit a dataset in a run folder; a killed fit continues after its last finished stage or from its last checkpoint,
+    a finished one is returned.
 
     The views, the surfels and the environment are placed on `device` once and stay there; the state that is returned
     lies in main memory. Raises InputError when another fit is writing to the folder, or snapshots are asked of a
@@ -46,38 +52,64 @@ def fit(
     with folder_lock(folder):
         acquire_run(folder, dataset.root, dataset_hash(dataset), config, photographs_hash(dataset))
         state = load_state(folder)
-        if state is not None and state.environment is not None:
-            if state.training is not None:
-                require_snapshots(folder, schedule)
-            return state
-        seconds: dict[str, float] = {} if state is None else state.seconds
-        before = sum(seconds.values())
-        with timed(seconds, "read views"):
-            views, config = configured_views(dataset, config)
-            views = views.to(device)
-        if state is None:
-            with timed(seconds, "initialize"):
-                _tell_repairs(views)
-                state = begin(views, config)
-            state.seconds, state.device = seconds, device_name(device)
-            print(f"Model: {state.selection.sentence}", file=sys.stderr)
-        state = state.to(device)
-        photographs = state.selection.corrections.applied(views, config)
-        if state.training is not None:
-            views = usable_views(photographs, state.geometry)
-            family, recorder = FAMILIES[state.geometry.kind], Recorder(folder, schedule, state, before)
-            state.geometry, state.training = family.train(views, state.geometry, state.training, config, recorder)
-        with timed(state.seconds, "solve environment"):
-            photographs, shown = complete(state, photographs, config)
-        with timed(state.seconds, "judge"):
-            state.verdict = assess(state, photographs, shown, read_ball_evidence(dataset))
-            if state.geometry.poses is not None:
-                with torch.no_grad():
-                    found = Alignment(photographs, config.poses).uncertainty(state.geometry)
-                state.pose_uncertainty = torch.from_numpy(found)
-        note_peak_memory(state)
-        save_state(folder, state)
-        return state.to(MAIN_MEMORY)
+        if state is None or state.environment is None:
+            with journal_in(folder), _noting_what_is_repeated(folder):
+                state = _finished(state, dataset, config, schedule, folder, device)
+        elif state.training is not None:
+            require_snapshots(folder, schedule)
+        forget(folder)
+        return state
+
+
+def _finished(
+    state: FitState | None,
+    dataset: Dataset,
+    config: FitConfig,
+    schedule: SnapshotSchedule,
+    folder: Path,
+    device: torch.device,
+) -> FitState:
+    """The end of a fit, saved, from the state that was saved before; None: from the beginning."""
+    seconds: dict[str, float] = {} if state is None else state.seconds
+    before = sum(seconds.values())
+    with timed(seconds, "read views"):
+        views, config = configured_views(dataset, config)
+        views = views.to(device)
+    if state is None:
+        with timed(seconds, "initialize"):
+            _tell_repairs(views)
+            state = begin(views, config)
+        state.seconds, state.device = seconds, device_name(device)
+        print(f"Model: {state.selection.sentence}", file=sys.stderr)
+    state = state.to(device)
+    photographs = state.selection.corrections.applied(views, config)
+    if state.training is not None:
+        views = usable_views(photographs, state.geometry)
+        family, recorder = FAMILIES[state.geometry.kind], Recorder(folder, schedule, state, before)
+        state.geometry, state.training = family.train(views, state.geometry, state.training, config, recorder)
+    with timed(state.seconds, "solve environment"):
+        photographs, shown = complete(state, photographs, config)
+    with timed(state.seconds, "judge"):
+        state.verdict = assess(state, photographs, shown, read_ball_evidence(dataset))
+        if state.geometry.poses is not None:
+            with torch.no_grad():
+                found = Alignment(photographs, config.poses).uncertainty(state.geometry)
+            state.pose_uncertainty = torch.from_numpy(found)
+    note_peak_memory(state)
+    save_state(folder, state)
+    return state.to(MAIN_MEMORY)
+
+
+@contextmanager
+def _noting_what_is_repeated(folder: Path) -> Iterator[None]:
+    """Notes at an interruption how long ago the run folder was written to, in this run."""
+    start = time.time()
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        saved = (path.stat().st_mtime for path in folder.rglob("*") if path.is_file())
+        stop.add_note(f"It repeats the work of the last {format_seconds(time.time() - max(start, *saved))}.")
+        raise
 
 
 def _tell_repairs(views: Views) -> None:

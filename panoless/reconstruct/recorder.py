@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from panoless.geometry.base import Geometry, Training
+from panoless.journal import seconds_before
 from panoless.reconstruct.snapshots import SnapshotSchedule, snapshot_folders
 from panoless.reconstruct.state import FitState, save_state
 from shinypartial.io.memory import peak_memory_bytes, release_free_memory
@@ -65,10 +66,12 @@ def note_peak_memory(state: FitState) -> None:
 
 @contextmanager
 def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Add the time that a block takes to its stage, and give back the memory that it no longer needs."""
-    start = time.monotonic()
+    """Add the time that a block takes to its stage, with that of what it takes from an earlier run, and give back the
+    memory that it no longer needs.
+    """
+    start = time.monotonic() - seconds_before()
     try:
         yield
     finally:
         release_free_memory()
-        seconds[stage] = seconds.get(stage, 0.0) + time.monotonic() - start
+        seconds[stage] = seconds.get(stage, 0.0) + time.monotonic() + seconds_before() - start

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from panoless.alignment.align import pose_prior
-from panoless.alignment.search import PosedProposal, align_proposal, fit_at, fit_with_poses
+from panoless.alignment.search import PosedProposal, align_proposal, fit_at, fit_with_poses, proposed
 from panoless.capture.corrections import NO_CORRECTIONS
 from panoless.capture.silhouettes import silhouette_distance_px
 from panoless.capture.views import Views
@@ -21,6 +21,7 @@ from panoless.environment.surroundings import FAR, Surroundings
 from panoless.first_surface.visual_hull import contradiction_px
 from panoless.geometry.base import Family, Geometry, Proposal, usable_views
 from panoless.geometry.registry import FAMILIES
+from panoless.journal import remembered
 from panoless.selection.candidates import Candidate, Selection, Verdict
 from panoless.selection.corrections import with_corrections
 from panoless.selection.fitted import Fitted, is_refined, missed_share
@@ -83,7 +84,7 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
     if fitted:
         candidate, start = min(reversed(fitted), key=lambda each: each[0].surfels_error or 0.0)
         corrections = candidate.corrections
-    geometry = last.fit(corrections.applied(views, config), Proposal(start, 0.0, 1.0), config)
+    geometry = fit_at(last, corrections.applied(views, config), PosedProposal(Proposal(start, 0.0, 1.0)), config)
     reason = "no simpler kind explains the views"
     table.append(Candidate(last.kind, Verdict.CHOSEN, reason, corrections=corrections))
     return geometry, Selection(last.kind, tuple(table))
@@ -148,9 +149,10 @@ def _source(family: Family) -> Family:
     return family if family.refines is None else FAMILIES[family.refines]
 
 
+@remembered()
 def _proposals(source: Family, views: Views, config: FitConfig, *, asked: bool) -> list[PosedProposal]:
     """With the cameras turned so that outlines agree, where that helps, and with the cameras as they are said to be."""
-    proposal = source.propose(views, config, asked=asked)
+    proposal = proposed(source, views, config, asked=asked)
     if proposal is None:
         return []
     worthwhile = asked or _few_come_near(source, views, proposal, config)
@@ -215,7 +217,7 @@ def _best_fit(
         elif family.finds_poses or poses is None:
             again = _proposals(source, views, config, asked=False)
         else:
-            proposal = source.propose(poses.moved(views), config, asked=False)
+            proposal = proposed(source, poses.moved(views), config)
             start = None if proposal is None else PosedProposal(proposal, poses)
             again = [] if start is None else [start if anew else start.after(before.geometry)]
         return _first_fit(family, near(again), views, config, before.geometry.surroundings)
@@ -293,6 +295,7 @@ def _bends_rather(
     return False
 
 
+@remembered(lambda _, config: f"Stage 1 of 1: {FAMILIES[config.model].label}")
 def _fit_asked(views: Views, config: FitConfig) -> tuple[Geometry, Selection]:
     family = FAMILIES[config.model]
     if views.object_frame.depth_is_open and family.needs_depth:
@@ -318,6 +321,12 @@ def _along_one_line() -> InputError:
     )
 
 
+def _stage(family: Family, *_: object) -> str:
+    """Which of the kinds is examined."""
+    return f"Stage {list(FAMILIES).index(family.kind) + 1} of at most {len(FAMILIES)}: {family.label}"
+
+
+@remembered(_stage)
 def _examine(
     family: Family, proposals: Sequence[PosedProposal], views: Views, config: FitConfig, trial: Trial
 ) -> tuple[Candidate, Geometry | None]:

@@ -17,12 +17,14 @@ from panoless.environment.rays import Rays
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import observe_views, usable_views
+from panoless.journal import remembered
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.robust import robust_weight
 from panoless.selection.fitted import Fitted, Refit, fewer_pixels, held_out_errors
 from panoless.selection.held_out import held_out_parts, is_clearly_lower
 
 
+@remembered()
 def earned_exposures(
     views: Views, fitted: Fitted, errors: Float[np.ndarray, "V"], config: FitConfig
 ) -> tuple[Corrections, Float[np.ndarray, "V"]] | None:
@@ -67,6 +69,7 @@ def fitted_to_equal_exposures(views: Views, fitted: Fitted, config: FitConfig, r
     return replace(again, corrections=fitted.corrections)
 
 
+@remembered()
 def equal_exposures(views: Views, fitted: Fitted, config: FitConfig) -> Corrections:
     """The corrections of a fit with gains found anew by its geometry, for the channels that share one in it."""
     groups = EXPOSURE if fitted.corrections.balances is None else WHITE_BALANCE

@@ -17,6 +17,7 @@ from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.geometry.base import Geometry, usable_views
 from panoless.geometry.registry import FAMILIES
+from panoless.journal import remembered
 from panoless.selection.held_out import held_out_parts, unexplained
 
 
@@ -71,6 +72,7 @@ def _outlines(views: Views, geometry: Geometry) -> Iterator[PoseRows]:
             yield rows
 
 
+@remembered()
 def outline_pull_px(views: Views, geometry: Geometry) -> float:
     """How far outside the masks the outlines of a geometry lie: the median over views of the median.
 

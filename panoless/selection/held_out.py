@@ -13,6 +13,7 @@ from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, Training, observe_views
 from panoless.geometry.registry import FAMILIES
+from panoless.journal import remembered
 from panoless.selection.options import SelectionOptions
 
 Trial = Callable[[Views, FitConfig, Geometry], Geometry]
@@ -31,6 +32,7 @@ class Unobserved:
         """Nothing."""
 
 
+@remembered()
 def train_briefly(views: Views, config: FitConfig, start: Geometry) -> Geometry:
     """A geometry after a share of the configured steps, in memory only; itself where its kind takes none."""
     steps = max(round(config.iterations * config.selection.trial_share), 1)

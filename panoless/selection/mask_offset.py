@@ -11,6 +11,7 @@ from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.geometry.base import Family, Geometry
 from panoless.geometry.registry import FAMILIES
+from panoless.journal import remembered
 from panoless.selection.fitted import (
     Fitted,
     Refit,
@@ -139,6 +140,7 @@ def _left(views: Views, before: Fitted, after: Fitted, config: FitConfig) -> tup
     return left, pulls[0] > options.doubted_inward_px and pulls[1] < options.settled_pull * pulls[0]
 
 
+@remembered()
 def find_mask_offset(source: Family, views: Views, fitted: Fitted, config: FitConfig) -> float:
     """By how much all masks are too small, in pixels: where proposals of moved outlines leave least unexplained.
 

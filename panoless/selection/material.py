@@ -26,10 +26,12 @@ from panoless.environment.resolution import ERROR_SCALE
 from panoless.environment.roughness import sharpened_map
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, pixel_areas, usable_views
+from panoless.journal import remembered
 from panoless.numeric.robust import bounded_error
 from panoless.selection.held_out import held_out_parts, is_clearly_lower
 
 
+@remembered()
 def earned_reflectance(views: Views, geometry: Geometry, config: FitConfig) -> Reflectance | None:
     """The reflectance of the object, if held-out views are clearly better explained by it; else None. Views are those
     of usable pixels. One that scatters light, too, has to explain them clearly better than one that does not.
@@ -133,6 +135,7 @@ class Softness:
     """Standard deviation of a Gaussian over the pictures; None: they are sharp."""
 
 
+@remembered()
 def earned_softness(views: Views, geometry: Geometry, config: FitConfig) -> Softness:
     """Roughness of the object or blur of the pictures, if held-out views are clearly better explained by one of them.
     Views are those of usable pixels.
@@ -201,6 +204,7 @@ class _SoftnessTrial:
         start = solve_environment([each.rays() for each in known], options.judged_resolution)
         return cls(known, held_out, start, encoding_of(config).saturation, options)
 
+    @remembered()
     def errors(self, softness: Softness, rounds: int, smoothing: Softness = Softness()) -> Float[np.ndarray, "V"]:
         """Mean of ‖e‖²/(‖e‖² + s²) of each held-out view with that softness, after so many rounds, under the map that
         the lobe of another one then smooths.

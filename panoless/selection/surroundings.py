@@ -19,12 +19,14 @@ from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
 from panoless.environment.surroundings import FAR, SHARPEST, Surroundings
 from panoless.geometry.base import Family, Geometry, Proposal, usable_views
+from panoless.journal import remembered
 from panoless.selection.held_out import is_clearly_lower
 
 NEARER = 1e-2
 """By which 1/D is changed to tell where a ray leaves the object; not tuned."""
 
 
+@remembered()
 def proposed_surroundings(family: Family, views: Views, proposal: Proposal, config: FitConfig) -> Surroundings:
     """A sphere around the proposed shape, or a floor below it before a sphere, if held-out views ask for one clearly;
     else a far world.

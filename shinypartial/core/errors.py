@@ -52,7 +52,10 @@ def from_memory_error() -> InputError:
 
 
 def run_command(command: Callable[[], None]) -> int:
-    """Run a command; return 0, 2 for bad input (one message, no traceback) or 130 when interrupted."""
+    """Run a command; return 0, 2 for bad input (one message, no traceback) or 130 when interrupted.
+
+    Notes of an interruption say what is lost.
+    """
     try:
         command()
     except InputError as error:
@@ -67,8 +70,9 @@ def run_command(command: Callable[[], None]) -> int:
         if not any(words in str(error) for words in TORCH_OUT_OF_MEMORY):
             raise
         message = from_memory_error()
-    except KeyboardInterrupt:
-        print("\nInterrupted. Run the same command again to continue where it stopped.", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        again = "Run the same command again: it continues after what it has finished."
+        print("\nInterrupted.", again, *getattr(stop, "__notes__", ()), file=sys.stderr)
         return EXIT_INTERRUPTED
     else:
         return 0

@@ -6,13 +6,14 @@ end of a run that nobody killed, and it begins anew. Runs have one thread; anoth
 hour on two cores; `--kills 0.1` is a quicker look.
 
 Compared are the bytes of all files, but for pages that state times; JSON files without their times. What a
-command had finished at a kill (`once`) must lie there untouched later, for otherwise it was done a second time.
+command had finished at a kill (`once`: files of its result, stages of a fit) must not be written again later.
 """
 
 import argparse
 import json
 import os
 import random
+import resource
 import shlex
 import shutil
 import signal
@@ -25,9 +26,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from panoless.journal import FOLDER as JOURNAL
 from shinypartial.dataset.bundled import bundled_dataset
 from shinypartial.dataset.read import open_dataset
 from shinypartial.io.files import PARTIAL_PREFIX, sha256_of, write_json
+from tests.support.synthetic_dataset import make_sphere_dataset
 from tests.support.tiny_scene import write_recipe
 from tests.support.truth_prediction import write_truth_prediction
 
@@ -40,16 +43,16 @@ from panoless.reconstruct import recorder; import panoless.cli, sys
 recorder.CHECKPOINT_INTERVAL_S = 0.2; sys.exit(panoless.cli.main(sys.argv[1:]))
 """.split(maxsplit=2)
 SMALL = shlex.split("""
-    fit fewer --preset fast --config.iterations 400 --config.surfels.count 500 --config.environment.rays 100000
+    --preset fast --config.iterations 400 --config.surfels.count 500 --config.environment.rays 100000
     --config.environment.resolution 32 --config.environment.solve-resolution 32
     --set corrections.masks=off corrections.exposure=off corrections.lens=off poses.mode=off surroundings.mode=off
 """)
 REVOLUTION = shlex.split("""
-    --model revolution --set revolution.photometric.pixels=10000 revolution.mouth.judged_pixels=5000
+    --set revolution.photometric.pixels=10000 revolution.mouth.judged_pixels=5000
     revolution.lip.length_px=5 revolution.map.pixels=100000 revolution.footprints.pixels=5000
 """)
 FREE_FORM = shlex.split("""
-    --model free_form --set free_form.concave.search=false free_form.descent.rounds=[] free_form.start_tensions=[10]
+    --set free_form.concave.search=false free_form.descent.rounds=[] free_form.start_tensions=[10]
     free_form.footprints=20000 free_form.render_samples=1 free_form.render_directions=1 free_form.rounds='[{
     "cells": 16, "resolution": 8, "robust_scale": 0.3, "samples": 1, "rays": 3000, "smoothing": 100, "steps": 2}]'
 """)
@@ -57,7 +60,7 @@ FREE_FORM = shlex.split("""
 
 @dataclass(frozen=True)
 class Command:
-    """A command, how often it is killed, and the files (as a pattern) that it writes once and for all."""
+    """A command, how often it is killed, and the files (as a pattern) that it writes once only."""
 
     words: list[str]
     kills: int
@@ -68,14 +71,23 @@ def _program(package: str, *words: str) -> list[str]:
     return [sys.executable, "-m", f"{package}.cli", *words, "--output", str(MADE)]
 
 
+def _fit(dataset: str, model: str, kills: int, *options: str) -> Command:
+    words = [*FIT, "fit", dataset, *SMALL, *options, "--model", model, "--output", str(MADE)]
+    return Command(words, kills, f"runs/{MADE}/{JOURNAL}/*.pt")
+
+
 COMMANDS = {
-    "generate": Command(_program("shinypartial", "generate", "--scene", "recipe/scene.toml"), 20, "t*/*.exr"),
+    "generate": Command(_program("shinypartial", "generate", "--scene", "recipe/scene.toml"), 20, "made/t*/*.exr"),
     "perturb": Command(
-        _program("shinypartial", "perturb", "tiny-vase", "--sensor.shot-noise", "0.02"), 10, "t*/r_???.png"
+        _program("shinypartial", "perturb", "tiny-vase", "--sensor.shot-noise", "0.02"), 10, "made/t*/r_???.png"
     ),
-    "fit: surfels": Command([*FIT, *SMALL, "--model", "surfels", "--output", str(MADE)], 20, "nothing"),
-    "fit: revolution": Command([*FIT, *SMALL, *REVOLUTION, "--output", str(MADE)], 15, "nothing"),
-    "fit: free form": Command([*FIT, *SMALL, *FREE_FORM, "--output", str(MADE)], 15, "nothing"),
+    "fit: sphere": _fit("ball", "sphere", 15),
+    "fit: plane": _fit("ball", "plane", 15),
+    "fit: height field": _fit("ball", "height_field", 15),
+    "fit: revolution": _fit("fewer", "revolution", 15, *REVOLUTION),
+    "fit: free form": _fit("fewer", "free_form", 15, *FREE_FORM),
+    "fit: surfels": _fit("fewer", "surfels", 20),
+    "fit: auto": _fit("fewer", "auto", 15, *REVOLUTION),
     "stability": Command(
         [
             *_program("shinypartial", "stability", "--plan", "tiny", "--seeds", "0", "--cores", "2"),
@@ -84,7 +96,7 @@ COMMANDS = {
             "copy=mkdir -p predictions && cp -rT ../truth {prediction} # {dataset}",
         ],
         20,
-        "records/*/*.json",
+        "made/records/*/*.json",
     ),
 }
 #: Below folders and in files of these names is what states times, or belongs to the work and not to its result.
@@ -103,6 +115,10 @@ class Bearing:
     """How often it came to its end between them."""
     seconds: float
     """Of a run that nobody killed."""
+    cpu_seconds: float
+    """Of that run."""
+    cpu_seconds_an_end: float
+    """Of all runs that were killed and ended, over the number of ends."""
     kills_with_work: int
     """Kills at which something lay there already: files of the result, or a run to continue."""
     different: list[str]
@@ -116,7 +132,8 @@ class Bearing:
 
 
 def prepare(place: Path) -> None:
-    """What the commands read: a recipe, twelve views of the vase, and a prediction to copy."""
+    """What the commands read: a recipe, a ball, twelve views of the vase, and a prediction to copy."""
+    make_sphere_dataset(place / "ball")
     scene = {"resolution": 48, "train": 4, "test": 2, "samples": 16}
     write_recipe(place / "recipe", **scene)
     write_truth_prediction(place / "truth", open_dataset(bundled_dataset("tiny-vase")))
@@ -133,9 +150,10 @@ def bear_kills(name: str, kills: int, place: Path, seed: int = 0) -> Bearing:
     _finish(_start(command, place, threads=2))
     by_two = result(made)
     _clear(place)
-    begun = time.monotonic()
+    begun, cpu_begun = time.monotonic(), _cpu_seconds()
     _finish(_start(command, place))
-    whole_s, expected = time.monotonic() - begun, result(made)
+    whole_s, cpu_s, expected = time.monotonic() - begun, _cpu_seconds() - cpu_begun, result(made)
+    cpu_begun = _cpu_seconds()
     assert expected
     _clear(place)
     chance, finished = random.Random(f"{name} {seed}"), dict[Path, tuple[int, int]]()
@@ -151,9 +169,9 @@ def bear_kills(name: str, kills: int, place: Path, seed: int = 0) -> Bearing:
             process.communicate()
             killed, ended = killed + 1, False
             with_work += any(path.is_file() for folder in (made, place / "runs") for path in folder.rglob("*"))
-        now = {path: (path.stat().st_ino, path.stat().st_mtime_ns) for path in made.glob(command.once)}
-        done_twice |= {str(path.relative_to(made)) for path in finished if now.get(path) != finished[path]}
-        finished = now
+        now = {path: (path.stat().st_ino, path.stat().st_mtime_ns) for path in place.glob(command.once)}
+        done_twice |= {str(path.relative_to(place)) for path in now if finished.get(path, now[path]) != now[path]}
+        finished |= now
         if ended:
             ends += 1
             found = result(made)
@@ -164,7 +182,14 @@ def bear_kills(name: str, kills: int, place: Path, seed: int = 0) -> Bearing:
             if killed >= kills:
                 break
     sets = different, _different(expected, by_two), done_twice, left_over
-    return Bearing(name, killed, ends, round(whole_s, 1), with_work, *map(sorted, sets))
+    seconds = whole_s, cpu_s, (_cpu_seconds() - cpu_begun) / ends
+    return Bearing(name, killed, ends, *(round(each, 1) for each in seconds), with_work, *map(sorted, sets))
+
+
+def _cpu_seconds() -> float:
+    """Of all processes that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def result(folder: Path) -> dict[str, object]:

@@ -1,6 +1,7 @@
 """A fit that the system kills at any moment continues with the same command, and ends as if nothing had happened."""
 
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -8,11 +9,18 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 
 from panoless.cli import main
-from panoless.reconstruct.state import load_state
+from panoless.config import FitConfig, with_overrides
+from panoless.geometry.registry import FAMILIES
+from panoless.journal import FOLDER as JOURNAL
+from panoless.reconstruct import recorder
+from panoless.reconstruct.fit import fit
+from panoless.reconstruct.state import FitState, load_state
 from shinypartial.dataset.schema import Dataset
 from shinypartial.prediction.format import read_info
+from tests.support.mirror_sphere import tiny_config
 
 ROOT = Path(__file__).resolve().parents[2]
 ITERATIONS = 150
@@ -34,10 +42,10 @@ def command(dataset: Dataset, output: str) -> list[str]:
     return ["fit", str(dataset.root), "--output", output, *options]
 
 
-def start(dataset: Dataset, place: Path, output: str) -> subprocess.Popen[str]:
+def start(dataset: Dataset, place: Path, output: str, *options: str) -> subprocess.Popen[str]:
     """The command in a process of its own, with frequent checkpoints."""
     return subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, *command(dataset, output)],
+        [sys.executable, "-c", PROGRAM, *command(dataset, output), *options],
         cwd=place,
         env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_WAIT_POLICY": "PASSIVE"},
         stdout=subprocess.PIPE,
@@ -46,9 +54,9 @@ def start(dataset: Dataset, place: Path, output: str) -> subprocess.Popen[str]:
     )
 
 
-def wait_for(path: Path, process: subprocess.Popen[str]) -> None:
+def wait_for(folder: Path, pattern: str, process: subprocess.Popen[str]) -> None:
     deadline = time.monotonic() + 120
-    while not path.exists():
+    while not list(folder.glob(pattern)):
         assert process.poll() is None, process.communicate()[1]
         assert time.monotonic() < deadline
         time.sleep(0.005)
@@ -59,7 +67,7 @@ def test_a_killed_fit_continues(tmp_path: Path, sphere_dataset: Dataset, monkeyp
     monkeypatch.chdir(tmp_path)
     run = tmp_path / "runs" / "killed"
     process = start(sphere_dataset, tmp_path, "killed")
-    wait_for(run / "checkpoint.pt", process)
+    wait_for(run, "checkpoint.pt", process)
     process.send_signal(signal.SIGKILL)
     process.communicate()
     assert process.returncode == -signal.SIGKILL
@@ -77,13 +85,108 @@ def test_a_killed_fit_continues(tmp_path: Path, sphere_dataset: Dataset, monkeyp
     assert not list(tmp_path.rglob(".partial-*"))
 
 
+def test_kinds_that_were_examined_before_a_kill_are_not_fitted_again(
+    tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The model is chosen before there is a checkpoint; what is found then is as if nothing had happened."""
+    monkeypatch.chdir(tmp_path)
+    run, auto = tmp_path / "runs" / "killed", ("--model", "auto")
+    process = start(sphere_dataset, tmp_path, "killed", *auto)
+    wait_for(run, f"{JOURNAL}/_examine-*.pt", process)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert not (run / "checkpoint.pt").exists()
+
+    for output in ("killed", "whole"):
+        assert main([*command(sphere_dataset, output), *auto]) == 0
+        found_before = "Stage 1 of at most 6: a sphere: found before" in capsys.readouterr().err
+        assert found_before == (output == "killed")
+        assert not (tmp_path / "runs" / output / JOURNAL).exists()
+    first, second = (tmp_path / name for name in ("killed", "whole"))
+    for name in ("environment.exr", "visibility.exr", "sphere.ply", "test/r_001.png"):
+        assert (first / name).read_bytes() == (second / name).read_bytes(), name
+
+
+SHORT = {
+    "free_form": (
+        "free_form.concave.search=false",
+        "free_form.descent.rounds=[]",
+        "free_form.detailing=[]",
+        "free_form.finer=[]",
+        "free_form.mending=[]",
+        "free_form.start_tensions=[10]",
+        'free_form.rounds=[{"cells": 16, "resolution": 8, "robust_scale": 0.3, "samples": 1, "rays": 3000, '
+        '"smoothing": 100, "steps": 2}]',
+    ),
+    "revolution": ("revolution.photometric.pixels=10000", "revolution.map.pixels=100000"),
+}
+BELIEVED = "corrections.masks=off", "corrections.exposure=off", "corrections.lens=off", "poses.mode=off"
+QUICK = "sphere", "plane"
+
+
+def short_config(kind: str) -> FitConfig:
+    """A fit of few steps; of spheres with all that is asked of photographs."""
+    believed = () if kind == "sphere" else BELIEVED
+    return with_overrides(tiny_config(), (f"model={kind}", *SHORT.get(kind, ()), *believed))
+
+
+def numbers(state: FitState) -> list[object]:
+    """All that a fit found, to the last bit."""
+    assert state.environment is not None
+    assert state.visibility is not None
+    found = torch.utils._pytree.tree_leaves([state.geometry.state_dict(), state.environment, state.visibility])
+    plain = [each.tolist() if isinstance(each, torch.Tensor) else each for each in found]
+    return [*plain, state.selection.sentence, state.verdict]
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="the system has no timers of processor time")
+@pytest.mark.parametrize(
+    "kind", [each if each in QUICK else pytest.param(each, marks=pytest.mark.slow) for each in (*FAMILIES, "auto")]
+)
+@pytest.mark.timeout(1800)
+def test_a_fit_ends_in_parts_that_are_each_too_short_for_it(
+    tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    """Interrupted after 0.4 to 0.7 of its processor time again and again, a fit that began anew would never end. This
+    one ends, as if it had not been interrupted, on one thread: two have other last digits.
+    """
+    monkeypatch.setattr(recorder, "CHECKPOINT_INTERVAL_S", 0.2)
+    config, threads = short_config(kind), torch.get_num_threads()
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before, chance = signal.signal(signal.SIGPROF, stop), random.Random(kind)
+    torch.set_num_threads(1)
+    try:
+        fit(sphere_dataset, config, tmp_path / "compiled")
+        begun = time.process_time()
+        whole = fit(sphere_dataset, config, tmp_path / "whole")
+        seconds, notes, ended = time.process_time() - begun, list[str](), None
+        while ended is None:
+            assert len(notes) < 30
+            signal.setitimer(signal.ITIMER_PROF, chance.uniform(0.4, 0.7) * seconds)
+            try:
+                ended = fit(sphere_dataset, config, tmp_path / "parts")
+            except KeyboardInterrupt as interruption:
+                notes += interruption.__notes__
+            finally:
+                signal.setitimer(signal.ITIMER_PROF, 0)
+    finally:
+        torch.set_num_threads(threads)
+        signal.signal(signal.SIGPROF, before)
+    assert notes
+    assert all("It repeats the work of the last" in each for each in notes)
+    assert numbers(ended) == numbers(whole)
+
+
 def test_two_fits_do_not_write_to_one_folder(
     tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The second is refused with one message and harms nothing; the first ends as if it had been alone."""
     monkeypatch.chdir(tmp_path)
     process = start(sphere_dataset, tmp_path, "one")
-    wait_for(tmp_path / "runs" / "one" / "checkpoint.pt", process)
+    wait_for(tmp_path / "runs" / "one", "checkpoint.pt", process)
     process.send_signal(signal.SIGSTOP)
     try:
         # The prediction folder, then the run folder alone: another working folder could name the same prediction.

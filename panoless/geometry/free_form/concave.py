@@ -16,6 +16,7 @@ from panoless.geometry.free_form.observations import PixelRays, Pixels, solid_pi
 from panoless.geometry.free_form.options import ConcaveOptions
 from panoless.geometry.free_form.spread import FinalRays, disagreement
 from panoless.geometry.free_form.surface import LevelSet
+from panoless.journal import remembered
 from panoless.numeric.evolution import evolve
 from panoless.numeric.robust import bounded_error
 from shinypartial.io.progress import Progress
@@ -218,6 +219,7 @@ def outline_of(relief: Relief, angle_deg: float) -> tuple[float, Float[np.ndarra
     return float(radius.mean()), 2 * terms.T @ (radius - radius.mean()) / len(turns)
 
 
+@remembered()
 def searched(patch: Patch, options: ConcaveOptions) -> Hollow | None:
     """The hollow under which pixels agree best: first guesses of many depths, then descents from the best of them.
 

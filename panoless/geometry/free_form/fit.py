@@ -23,6 +23,7 @@ from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions, FreeF
 from panoless.geometry.free_form.photometric import Sights, Solution, Task
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import Trust, full_trust
+from panoless.journal import remembered
 from panoless.numeric.conjugate_gradients import solve_by_products
 from panoless.numeric.factorize import regularize
 from panoless.numeric.gauss_newton import keep_if_better
@@ -278,6 +279,7 @@ def distrusted_share(views: Views, stage: FitStage, options: FreeFormOptions) ->
     return float((trust < options.distrusted).mean()) if len(trust) else 0.0
 
 
+@remembered()
 def take_round(
     views: Views,
     stage: FitStage,

@@ -35,6 +35,7 @@ from panoless.geometry.revolution.silhouette import (
     refine_outer,
     silhouette_residuals,
 )
+from panoless.journal import remembered
 from panoless.numeric.gauss_newton import keep_if_better
 from shinypartial.io.progress import Progress
 
@@ -225,6 +226,7 @@ class Refinement:
             surface, _ = self.refine_by_centers(surface, each, None, photometric)
         return self._judged(surface, seen)
 
+    @remembered()
     def _judged(self, surface: SurfaceOfRevolution, seen: PixelBundles, going_on: Tensor | None = None) -> _Judged:
         """A surface under its own map of the views that are not held out, from nothing, since others' leave traces;
         with rays that are mirrored often, since some directions are seen by way of the walls only.
@@ -245,6 +247,7 @@ class Refinement:
         base, lid = end_pixels(self.held_out, closed, self.options.mouth.judged_pixels)
         return PixelBundles.of([*base, *lid], CENTER)
 
+    @remembered()
     def refine_by_centers(
         self,
         surface: SurfaceOfRevolution,
@@ -267,6 +270,7 @@ class Refinement:
         )
         return surface, environment
 
+    @remembered()
     def solve_finest_map(self, surface: SurfaceOfRevolution, environment: Tensor) -> Float[Tensor, "6 3 L L"]:
         """The map of many rays in the resolution of the last round on areas."""
         own = self.options.footprints
@@ -277,6 +281,7 @@ class Refinement:
         """Grooves and edges, by pixels as areas, where there are any."""
         return self._keep_areas(surface, surface, environment)
 
+    @remembered()
     def _keep_areas(
         self, surface: SurfaceOfRevolution, start: SurfaceOfRevolution, environment: Tensor
     ) -> SurfaceOfRevolution:
@@ -301,6 +306,7 @@ class Refinement:
             return surface
         return self._keep_areas(surface, candidate, environment)
 
+    @remembered()
     def refine_floor(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
         """The floor, where enough pixels see it by way of the walls or from below."""
         seen, judging = (floor_pixels(part, surface, self.options) for part in (self.kept, self.held_out))
@@ -309,6 +315,7 @@ class Refinement:
         candidate = fit_floor(seen, surface, environment, self.pixel, self.options)
         return self.keep_if_better(surface, candidate, judging, environment)
 
+    @remembered()
     def refine_lip(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
         """The lip, where the wall is long enough and pixels mix it with what lies around it.
 

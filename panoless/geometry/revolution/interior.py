@@ -18,6 +18,7 @@ from panoless.geometry.revolution.model import SurfaceOfRevolution
 from panoless.geometry.revolution.options import DEFAULTS, MouthOptions
 from panoless.geometry.revolution.pixels import evenly
 from panoless.geometry.revolution.profile import resample_profile
+from panoless.journal import remembered
 from panoless.kernels.revolution import slope_votes
 
 
@@ -45,6 +46,7 @@ class Grid:
     """Rows above the lip: a wall may rise on where outlines end."""
 
 
+@remembered()
 def search_interior(
     views: Views,
     closed: SurfaceOfRevolution,
