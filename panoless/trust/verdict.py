@@ -25,6 +25,10 @@ AROUND = "Add views from between these and from farther around, and look at the 
 SHINE = "Photograph a shinier object: what a rough one blurs comes back in part only, beside lamps least of all."
 TEXTURE = "Take it to surroundings that differ from one direction to another, or expose longer."
 EXPOSURE = "Photograph with a shorter exposure, or in high dynamic range."
+NEAR_BALL = (
+    "What stands near the ball, and who photographs it, has a low visibility: add views from other sides, or put the ball "
+    "on something thin."
+)
 RIM = "Look at capture/ball.jpg: the circle must lie on the rim of a polished ball; else give --box or --clicks."
 LEAST_AGREEMENT = 0.1
 """Correlation from which direct and mirrored views agree for sure: random poses give 0.00 ± 0.01 (37 photographs)."""
@@ -40,6 +44,8 @@ class _Doubt:
     limit: Callable[[TrustOptions], float]
     reason: Callable[[Evidence], str]
     remedy: str
+    of_balls: str | None = None
+    """The remedy where a ball was captured, whose shape and cameras are known before; none: no doubt of such fits."""
 
 
 DOUBTS = (
@@ -72,6 +78,7 @@ DOUBTS = (
         lambda options: options.largest_unexplained,
         lambda found: f"{found.unexplained:.0%} of the light in held-out views is unexplained",
         SHAPE,
+        NEAR_BALL,
     ),
     _Doubt(
         lambda found: found.unexplained_part,
@@ -105,15 +112,17 @@ DOUBTS = (
         lambda options: options.largest_silhouette_px,
         lambda found: f"the rim of the ball is {found.rim_px:.2g} px off a circular cone",
         RIM,
+        RIM,
     ),
     _Doubt(
         lambda found: None if found.agreement is None else LEAST_AGREEMENT / max(found.agreement, LEAST_TOLD),
         lambda options: options.refused,
         lambda found: f"what lies beside the ball is not what it mirrors (correlation {found.agreement:.2f})",
         RIM,
+        RIM,
     ),
     _Doubt(
-        lambda found: 1 / max(found.viewed, 1e-3) if found.rim_px is None else None,
+        lambda found: 1 / max(found.viewed, 1e-3),
         lambda options: 1 / options.least_viewed,
         lambda found: f"{found.views} views see the object from {found.viewed:.0%} of all directions only",
         AROUND,
@@ -123,11 +132,13 @@ DOUBTS = (
         lambda options: options.largest_saturated,
         lambda found: f"{found.saturated:.0%} of the object's pixels are saturated",
         EXPOSURE,
+        EXPOSURE,
     ),
     _Doubt(
         lambda found: None if found.one_color is None else 1 / max(found.one_color, LEAST_TOLD),
         lambda options: 1 / options.least_one_color,
         lambda found: "the photographs show one plain color, so that they don't tell one direction from another",
+        TEXTURE,
         TEXTURE,
     ),
 )
@@ -154,11 +165,12 @@ def judge(found: Evidence, options: TrustOptions) -> Trust:
         )
         return Trust("trust", reason, "", risk, figures)
     word: Verdict = "partly" if risk < options.refused else "do not trust"
-    return Trust(word, doubt.reason(found), doubt.remedy, risk, figures)
+    remedy = doubt.remedy if found.rim_px is None else doubt.of_balls or doubt.remedy
+    return Trust(word, doubt.reason(found), remedy, risk, figures)
 
 
 def _risks(found: Evidence, options: TrustOptions) -> Iterator[tuple[float, _Doubt]]:
     for doubt in DOUBTS:
         measured = doubt.measure(found)
-        if measured is not None:
+        if measured is not None and (found.rim_px is None or doubt.of_balls):
             yield measured / doubt.limit(options), doubt
