@@ -14,8 +14,8 @@ from panoless.photographs.ball.rim import Circle
 from panoless.photographs.lens import opencv
 from panoless.photographs.shot import Shot
 
-SAME_CIRCLE_PX = 3.0
-"""Of a bracket, whose circles differ by no more…"""
+SAME_CIRCLE = 0.15
+"""Of a bracket, whose circles differ by no more than this share of their radius…"""
 SAME_PICTURE = 0.8
 """…and where so large a share of pixels lie on the same side of the median (Ward 2003)."""
 EQUAL_STOPS = 0.07
@@ -40,7 +40,9 @@ def same_pose(shots: Sequence[Shot], circles: Sequence[Circle]) -> list[list[int
     for number, (shot, circle) in enumerate(zip(shots, circles, strict=True)):
         for group in groups:
             first = group[0]
-            if shot.size == shots[first].size and _is_bracket(shot, circle, shots[first], circles[first]):
+            other = circles[first]
+            apart = np.hypot(circle.x - other.x, circle.y - other.y) + abs(circle.radius - other.radius)
+            if apart < SAME_CIRCLE * other.radius and is_bracket(shot, shots[first]):
                 group.append(number)
                 break
         else:
@@ -48,9 +50,9 @@ def same_pose(shots: Sequence[Shot], circles: Sequence[Circle]) -> list[list[int
     return groups
 
 
-def _is_bracket(one: Shot, circle: Circle, two: Shot, other: Circle) -> bool:
-    apart = np.hypot(circle.x - other.x, circle.y - other.y) + abs(circle.radius - other.radius)
-    if apart > SAME_CIRCLE_PX or abs(_stops(one, two)) < EQUAL_STOPS:
+def is_bracket(one: Shot, two: Shot) -> bool:
+    """Whether two photographs show the same at different exposures."""
+    if one.size != two.size or abs(_stops(one, two)) < EQUAL_STOPS:
         return False
     align = opencv().createAlignMTB()
     sides = []

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from panoless.photographs.ball.brackets import is_bracket
 from panoless.photographs.ball.rim import Circle, Rim, circle_near, circles, find_rim
 from panoless.photographs.lens import Lens, opencv
 from panoless.photographs.masks import Hint
@@ -19,8 +20,8 @@ from shinypartial.io.progress import Progress
 LARGEST_RADIUS_PX = 400.0
 """Photographs are averaged over blocks of pixels until the ball is no larger: a pixel in its middle then spans 0.3°."""
 LEAST_RADIUS_PX = 20.0
-LEAST_SUPPORT = 0.42
-"""Of the rim, from which a circle is a ball; circles by chance have 0.3."""
+LEAST_SCORE = 1.5
+"""Of a circle, from which it is a ball: by chance 1.4 at most in 60 photographs, some of patterns of disks."""
 RIVAL = 0.75
 """Share of the best score from which a larger circle is taken in its place."""
 TRIED = 3
@@ -66,31 +67,39 @@ def find_balls(
     files: Sequence[Path], hints: Mapping[str, Hint], focal_film_mm: float | None, sheet: Path
 ) -> list[FoundBall]:
     """Every photograph with its ball. Writes a `sheet` of what was found; InputError where there is none."""
-    progress = Progress("looking for the ball", len(files))
-
-    def work(path: Path) -> FoundBall | InputError:
-        try:
-            found = find_ball(read_shot(path), hints.get(path.stem), focal_film_mm)
-        except InputError as error:
-            return error
-        progress.advance()
-        return found
-
     names = [path.stem for path in files]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
         raise InputError(
             expected="photographs with names of their own", found=f"two named {twice[0]}", remedy="Rename one of them."
         )
+    progress = Progress("looking for the ball", len(files))
+
+    def work(path: Path) -> FoundBall | tuple[Shot, InputError]:
+        shot = read_shot(path)
+        try:
+            return find_ball(shot, hints.get(path.stem), focal_film_mm)
+        except InputError as error:
+            return shot, error
+        finally:
+            progress.advance()
+
     with ThreadPoolExecutor(THREADS) as pool:
         found = list(pool.map(work, files))
     balls = [each for each in found if isinstance(each, FoundBall)]
     if balls:
         write_ball_sheet(sheet, balls)
-    for each in found:
-        if isinstance(each, InputError):
-            raise each
-    return balls
+    return [each if isinstance(each, FoundBall) else _as_beside(*each, balls) for each in found]
+
+
+def _as_beside(shot: Shot, error: InputError, balls: Sequence[FoundBall]) -> FoundBall:
+    """A photograph without a ball that shows, with that of another exposure from the same place; raises the error."""
+    for ball in balls:
+        reduced = shot.reduced(ball.side)
+        if is_bracket(reduced, ball.shot):
+            gray = opencv().cvtColor(reduced.codes(), opencv().COLOR_RGB2GRAY)
+            return replace(ball, shot=reduced, gray=gray, rim=replace(ball.rim, seen=ball.rim.seen & False))
+    raise error
 
 
 def find_ball(shot: Shot, hint: Hint | None = None, focal_film_mm: float | None = None) -> FoundBall:
@@ -103,7 +112,7 @@ def find_ball(shot: Shot, hint: Hint | None = None, focal_film_mm: float | None 
     found = [each for each in circles(gray) if each.radius >= LEAST_RADIUS_PX]
     if hint is not None:
         found = _at_hint(gray, found, hint)
-    if not found or (hint is None and found[0].support < LEAST_SUPPORT):
+    if not found or (hint is None and found[0].score < LEAST_SCORE):
         raise InputError(
             expected=f"a mirror ball in {shot.name}",
             found="no circle that edges run along" if not found else f"edges along {found[0].support:.0%} of a circle",

@@ -15,8 +15,10 @@ from panoless.photographs.lens import opencv
 
 VOTING_SIDE_PX = 640
 """Votes are counted in a picture of this longest side."""
-VOTED_RADII = (0.02, 0.48, 64)
+VOTED_RADII = (0.03, 0.48, 56)
 """Radii that are voted for, over the longest side: from, to, how many in equal ratios."""
+OCTAVES, OF_OCTAVE = 4, 6
+"""So many circles of each octave of radii are judged, as small ones abound in patterns."""
 VOTES_BY_CHANCE = 0.1
 """Share of the circumference that has an edge pointing at any center."""
 JUDGED_RADIUS_PX = 64
@@ -25,9 +27,8 @@ SUPPORT_BY_CHANCE = 0.3
 """Largest support of circles about places where nothing is round: median of 37 pictures of a lobby."""
 LEAST_CONTRAST = 0.6
 """Slope of an edge, in codes of 255 a pixel."""
-AS_MUCH = 0.85
+AS_MUCH = 0.92
 """Share of the largest support from which a circle counts as having as much."""
-CANDIDATES = 16
 POINTS = 720
 """Of the rim, all around."""
 RIM_WINDOW_PX = (4.0, 2.0, 1.5)
@@ -95,10 +96,10 @@ def _closed(seen: Bool[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
     return near > 0.4
 
 
-def circles(gray: UInt8[np.ndarray, "H W"], count: int = CANDIDATES) -> list[Circle]:
+def circles(gray: UInt8[np.ndarray, "H W"]) -> list[Circle]:
     """The circles of a picture that have most support, the best first."""
     levels = _pyramid(gray)
-    found = [_settled(levels, each) for each in _voted(gray)[:count]]
+    found = [_settled(levels, each) for each in _voted(gray)]
     found.sort(key=lambda each: -each.score)
     apart: list[Circle] = []
     for each in found:
@@ -209,18 +210,17 @@ def _voted(gray: UInt8[np.ndarray, "H W"]) -> list[Circle]:
         share = cv2.GaussianBlur(layer, (0, 0), spread) * (spread**2 / radius)
         layer[:] = (share - VOTES_BY_CHANCE) * np.sqrt(radius)
     found = []
-    for _ in range(2 * CANDIDATES):
-        number, row, column = (int(each) for each in np.unravel_index(votes.argmax(), votes.shape))
-        if votes[number, row, column] <= 0:
-            break
-        radius = float(radii[number])
-        found.append(Circle((2 * column + 1) / scale, (2 * row + 1) / scale, radius / scale))
-        reach = int(0.15 * radius) + 1
-        votes[
-            max(number - 8, 0) : number + 9,
-            max(row - reach, 0) : row + reach + 1,
-            max(column - reach, 0) : column + reach + 1,
-        ] = 0
+    for band in np.array_split(np.arange(len(radii)), OCTAVES):
+        of_band = votes[band]
+        for _ in range(OF_OCTAVE):
+            number, row, column = (int(each) for each in np.unravel_index(of_band.argmax(), of_band.shape))
+            if of_band[number, row, column] <= 0:
+                break
+            radius = float(radii[band[number]])
+            found.append(Circle((2 * column + 1) / scale, (2 * row + 1) / scale, radius / scale))
+            reach = int(0.15 * radius) + 1
+            around = (slice(max(at - reach, 0), at + reach + 1) for at in (row, column))
+            of_band[max(number - 8, 0) : number + 9, *around] = 0
     return found
 
 
