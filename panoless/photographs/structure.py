@@ -116,8 +116,8 @@ def _run(program: Sequence[str], job: Path, log: Path, frames: int) -> None:
             remedy="Run the same line again. If it happens again, put the printed board of `panoless board` under the "
             f"object, or find poses with another program and give --colmap. Its log is {log}.",
         )
-    if bar := progress.get(PLACING):
-        bar.advance(steps=bar.total - bar.done)
+    if PLACING in progress:
+        progress[PLACING].advance(steps=progress[PLACING].total - progress[PLACING].done)
 
 
 def _step_of(said: list[int], frames: int) -> tuple[int, int]:
