@@ -146,7 +146,8 @@ def _center(
 
 def _mask_radius(camera: Camera, inside: Bool[np.ndarray, "H W"], center: Float[np.ndarray, "3"]) -> float:
     x, y, depth = project(camera, center[None])[0]
-    if depth <= 0:
+    distance = float(np.linalg.norm(center - camera.position_world))  # Zero too where its square is too small.
+    if min(depth, distance) <= 0:
         raise InputError(
             expected="cameras that look at one object",
             found="an object center behind one of the cameras",
@@ -155,4 +156,4 @@ def _mask_radius(camera: Camera, inside: Bool[np.ndarray, "H W"], center: Float[
         )
     rows, columns = np.nonzero(inside)
     across = np.hypot((columns + PIXEL_CENTER - x) / camera.fx, (rows + PIXEL_CENTER - y) / camera.fy).max()
-    return float(np.linalg.norm(center - camera.position_world) * math.sin(math.atan(across)))
+    return distance * math.sin(math.atan(across))

@@ -56,8 +56,10 @@ def check_pose(camera_to_world: Float[np.ndarray, "..."], name: str) -> None:
     remedy = "Correct transform_matrix of that frame: a 4×4 camera-to-world matrix, rotation and translation only."
     if camera_to_world.shape != (4, 4):
         raise InputError(expected=f"a 4×4 pose for {name}", found=f"shape {camera_to_world.shape}", remedy=remedy)
-    if not np.isfinite(camera_to_world).all():
-        raise InputError(expected=f"a finite pose for {name}", found="NaN or infinity in it", remedy=remedy)
+    # Not all that a float64 holds: squares of distances overflow, and meshes are written in float32.
+    if not (np.abs(camera_to_world) <= np.finfo(np.float32).max).all():
+        found = "NaN, infinity or a number above 3e38 in it"
+        raise InputError(expected=f"a finite pose for {name}", found=found, remedy=remedy)
     rotation = camera_to_world[:3, :3]
     rigid = np.abs(rotation.T @ rotation - np.eye(3)).max() < ROTATION_TOLERANCE
     if not rigid or np.linalg.det(rotation) < 0 or not np.allclose(camera_to_world[3], [0, 0, 0, 1]):

@@ -118,6 +118,7 @@ BAD_POSES = {
     "flat": np.eye(4).ravel(),
     "NaN": _changed((0, 3), np.nan),
     "infinite": _changed((1, 1), np.inf),
+    "too far for its square": _changed((0, 3), 1e200),
     "singular": _changed((2, 2), 0.0),
     "scaled": np.diag([2.0, 2.0, 2.0, 1.0]),
     "sheared": _changed((0, 1), 0.1),
