@@ -18,6 +18,7 @@ from panoless.geometry.height_field.photometric import Photographs, observe
 from panoless.geometry.height_field.silhouette import edge_equations, edge_residuals
 from panoless.geometry.plane.model import Plane
 from panoless.geometry.plane.silhouette import apply_plane_step
+from panoless.journal import remembered
 from panoless.numeric.gauss_newton import accept_step, damped_step, keep_if_better
 from panoless.numeric.robust import bounded_error
 from shinypartial.io.progress import Progress
@@ -64,6 +65,7 @@ def fit_height_field(
     return height_field
 
 
+@remembered()
 def best_dome(views: Views, height_field: HeightField, options: HeightFieldOptions) -> HeightField:
     """The heights with the dome or bowl more under which photographs agree best: of those to begin with, and then of
     others that are a little steeper or flatter.
@@ -129,6 +131,7 @@ def _unexplained(
     return float(bounded_error(shown - observed.radiance, each.robust_scale).mean()) if len(shown) else 1.0
 
 
+@remembered()
 def _refine(
     views: Views,
     contours: MaskContours,
