@@ -5,11 +5,13 @@ Importing this module is cheap; torch is loaded by `fit`.
 
 import os
 import shutil
+import subprocess
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -31,6 +33,9 @@ from shinypartial.prediction.format import (
     read_info,
     read_visibility,
 )
+
+if TYPE_CHECKING:
+    from panoless.photographs.masks import Hint
 
 RUNS = Path("runs")
 
@@ -157,6 +162,74 @@ def fit(
         if not is_exported(prediction, state, config, data):
             export_prediction(data, state, config, prediction)
     return Reconstruction(prediction)
+
+
+@dataclass(frozen=True)
+class Light:
+    """A light from photographs of a mirror ball."""
+
+    folder: Path
+    reconstruction: Reconstruction
+    lines: tuple[str, ...]
+    """What was found, a line each."""
+    files: dict[str, str]
+    """Names of files in the folder, and what each is for."""
+
+
+def light(
+    photographs: Sequence[str | Path],
+    output: str | Path,
+    *,
+    focal_mm: float | None = None,
+    hints: "Mapping[str, Hint] | None" = None,
+) -> Light:
+    """Photographs of a mirror ball to a light: an HDR lat-long, a Blender world and a page, in the folder `output`.
+
+    What the command `panoless light` does. Raises InputError where no ball is found, or reflections don't agree.
+    """
+    prepare_threads()
+    from panoless.export.page import write_page
+    from panoless.photographs.ball.make import BallRequest, capture_ball
+    from shinypartial.io.images import write_exr_rgb, write_hdr
+
+    folder = Path(output)
+    dataset = folder / "dataset"
+    captured = capture_ball(BallRequest(tuple(map(Path, photographs)), dataset, focal_mm, hints or {}))
+    options = ("environment.range=hdr",) if captured.high_dynamic_range else ()
+    result = fit(dataset, output=folder / f"{folder.resolve().name}-prediction", set=options)
+    write_hdr(folder / "light.hdr", result.environment)
+    write_exr_rgb(folder / "light.exr", result.environment)
+    files = {
+        "light.hdr": "lat-long map of linear light, up is up: for any program that takes an HDRI",
+        "light.exr": "the same as OpenEXR",
+        result.folder.name: "the prediction: visibility, confidence, surface",
+    }
+    if _blender_world(result.folder, folder):
+        files["scene.blend"] = "the light as a Blender world, with the ball"
+    lines = (*captured.summary(), *((result.info.surroundings.sentence(),) if result.info.surroundings else ()))
+    verdict = result.verdict
+    write_page(
+        folder / "index.html",
+        f"A light from {len(captured.frames)} photograph{'s' if len(captured.frames) > 1 else ''} of a ball",
+        ("", "") if verdict is None else (verdict.verdict, verdict.sentence()),
+        lines,
+        {
+            result.folder
+            / "environment.jpg": "The light: every direction around the ball; hatched where nothing was seen",
+            dataset / "capture" / "ball.jpg": "What was found: the rim of the ball, green where it was seen",
+            result.folder
+            / "decomposition.jpg": "A photograph, the normals, the light, and how well each direction was seen",
+        },
+        files,
+    )
+    return Light(folder, result, lines, {**files, "index.html": "this page"})
+
+
+def _blender_world(prediction: Path, folder: Path) -> bool:
+    """Whether Blender's module is installed and has written the world; in a process of its own."""
+    command = [sys.executable, "-m", "shinypartial.cli", "convert", str(prediction), "--to", "blender"]
+    made = subprocess.run([*command, "--output", str(folder)], capture_output=True, check=False)
+    return made.returncode == 0
 
 
 def prediction_folder(dataset: Dataset, config: FitConfig, output: str | Path | None) -> Path:

@@ -319,6 +319,38 @@ class Capture:
 
 
 @dataclass(frozen=True)
+class Light:
+    """Photographs of a mirror ball to a light: an HDR lat-long, a Blender world and a page; see docs/how-to/ball.md."""
+
+    sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Photographs, or a folder of them: one, two, three or fifty, also of several exposures."""
+    output: Path | None = None
+    """Folder to write; default lights/NAME."""
+    focal_mm: float | None = None
+    """Focal length on 35 mm film; None for what EXIF states."""
+    clicks: Path | None = None
+    """Where the ball is not found: a JSON file of points on it, {"NAME": {"on": [[x, y]]}}, in pixels."""
+
+    def run(self) -> None:
+        """Capture, fit, convert, and say what to look at."""
+        from panoless.api import light
+        from panoless.photographs.frames import source_files
+        from panoless.photographs.masks import read_clicks
+
+        files = tuple(file for each in self.sources for file in ([each] if each.is_file() else source_files(each)))
+        first = self.sources[0].resolve()
+        name = first.stem if len(files) == 1 else first.parent.name if first.is_file() else first.name
+        hints = {} if self.clicks is None else read_clicks(self.clicks)
+        made = light(files, self.output or Path("lights") / name, focal_mm=self.focal_mm, hints=hints)
+        print("\n".join(made.lines))
+        if made.reconstruction.verdict:
+            print(f"Verdict: {made.reconstruction.verdict.sentence()}")
+        print(f"Look at {made.folder}/index.html. Written: {', '.join(made.files)}")
+        if "scene.blend" not in made.files:
+            print("No Blender world: pip install 'panoless[blender]' adds Blender's module.")
+
+
+@dataclass(frozen=True)
 class PrintBoard:
     """Write the board that lies under the object while photographs are taken, at its true size."""
 
@@ -358,10 +390,11 @@ def main(arguments: list[str] | None = None) -> int:
         | Annotated[Export, tyro.conf.subcommand("export")]
         | Annotated[View, tyro.conf.subcommand("view")]
         | Annotated[Capture, tyro.conf.subcommand("capture")]
+        | Annotated[Light, tyro.conf.subcommand("light")]
         | Annotated[PrintBoard, tyro.conf.subcommand("board")]
     )
 
-    def parse() -> Fit | Export | View | Capture | PrintBoard:
+    def parse() -> Fit | Export | View | Capture | Light | PrintBoard:
         return tyro.cli(
             kinds,  # type: ignore[arg-type]
             args=arguments,
