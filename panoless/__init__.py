@@ -15,20 +15,21 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from panoless.api import Reconstruction, fit, load
+    from panoless.api import Reconstruction, fit, light, load
     from panoless.config import FitConfig
     from panoless.presets import PRESETS
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 __version__ = "0.1.0"
-__all__ = ["PRESETS", "FitConfig", "Reconstruction", "fit", "load"]
+__all__ = ["PRESETS", "FitConfig", "Reconstruction", "fit", "light", "load"]
 
 _PLACES = {
     "PRESETS": "panoless.presets",
     "FitConfig": "panoless.config",
     "Reconstruction": "panoless.api",
     "fit": "panoless.api",
+    "light": "panoless.api",
     "load": "panoless.api",
 }
 

@@ -214,11 +214,9 @@ def light(
         ("", "") if verdict is None else (verdict.verdict, verdict.sentence()),
         lines,
         {
-            result.folder
-            / "environment.jpg": "The light: every direction around the ball; hatched where nothing was seen",
+            result.folder / "environment.jpg": "Every direction around the ball, hatched where none saw it",
             dataset / "capture" / "ball.jpg": "What was found: the rim of the ball, green where it was seen",
-            result.folder
-            / "decomposition.jpg": "A photograph, the normals, the light, and how well each direction was seen",
+            result.folder / "decomposition.jpg": "A photograph, normals, the light, how well it was seen",
         },
         files,
     )
