@@ -10,6 +10,7 @@ from torch import Tensor
 from panoless.capture.masks import without_specks
 from panoless.export.render import Decomposition
 from panoless.kernels.constants import ALPHA_FLOOR
+from shinypartial.core.camera import Camera
 from shinypartial.core.color import to_display
 from shinypartial.dataset.read import read_whole_view
 from shinypartial.dataset.schema import Frame
@@ -47,34 +48,50 @@ def _pixels(planes: Tensor) -> np.ndarray:
     return planes.permute(1, 2, 0).contiguous().numpy()
 
 
+def display_gain(environment: Float[np.ndarray, "H W 3"]) -> float:
+    """By which a dark map is brightened for people: its 95th percentile is shown as 0.7 of linear light at least."""
+    return max(1.0, 0.7 / max(float(np.percentile(environment.max(-1), 95)), 1e-6))
+
+
 def environment_picture(
     environment: Float[np.ndarray, "H W 3"], visibility: Float[np.ndarray, "H W"]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A map in display colors; directions whose visibility is zero, where it is filled, are hatched in gray."""
+    """A map in display colors, dark ones brightened; directions whose visibility is zero, where it is filled, are hatched
+    in gray.
+    """
     rows, columns = np.indices(visibility.shape)
     stripes = (rows + columns) // max(len(visibility) // HATCHING, 1) % 2
-    return np.where((visibility > 0)[..., None], to_display(environment), HATCH_COLORS[stripes][..., None])
+    shown = to_display(environment * display_gain(environment))
+    return np.where((visibility > 0)[..., None], shown, HATCH_COLORS[stripes][..., None])
 
 
 def write_decomposition(
     path: Path,
-    frame: Frame,
+    photograph: Float[np.ndarray, "H W 3"],
     parts: Decomposition,
-    environment: UInt8[np.ndarray, "H W 3"],
-    visibility: Float[np.ndarray, "H W"],
+    environment: UInt8[np.ndarray, "_ _ 3"],
+    visibility: Float[np.ndarray, "_ _"],
 ) -> None:
-    """Write the sheet of a prediction: a photograph and the normals found in it, both around the object, and beside
-    them the recovered environment and its visibility, white for 1.
+    """Write the sheet of a prediction: a photograph around the object and the normals found in it, and beside them the
+    recovered environment and its visibility, white for 1.
     """
-    view, color, shown = read_whole_view(frame)
-    window = object_window(without_specks(view.alpha))
     pictures = {
-        "photograph": to_display(color * shown[..., None])[window],
+        "photograph": to_display(photograph),
         "recovered environment (hatched: not seen)": environment,
-        "recovered normals": normal_picture(parts)[window],
+        "recovered normals": normal_picture(parts),
         "visibility: how well each direction was seen": np.rint(255 * visibility).astype(np.uint8),
     }
     write_picture_sheet(path, pictures, widths=(TILE_PX, 2 * TILE_PX))
+
+
+def around_object(frame: Frame) -> tuple[Camera, Float[np.ndarray, "H W 3"]]:
+    """The camera of a frame and its photograph, linear, both cut to the object with a margin."""
+    view, color, shown = read_whole_view(frame)
+    rows, columns = object_window(without_specks(view.alpha))
+    camera, (height, width) = frame.camera, color[rows, columns].shape[:2]
+    center = camera.cx - columns.start, camera.cy - rows.start
+    cut = Camera(camera.camera_to_world, camera.fx, camera.fy, *center, width, height)
+    return cut, (color * shown[..., None])[rows, columns]
 
 
 def object_window(alpha: Float[np.ndarray, "H W"]) -> tuple[slice, slice]:

@@ -22,7 +22,13 @@ from panoless.capture.rays import raster_camera
 from panoless.config import FitConfig
 from panoless.environment.surroundings import FAR, LEAST_DEPTH, Surroundings
 from panoless.export.mesh_files import write_ply
-from panoless.export.pictures import decomposition_pictures, environment_picture, write_decomposition
+from panoless.export.pictures import (
+    around_object,
+    decomposition_pictures,
+    display_gain,
+    environment_picture,
+    write_decomposition,
+)
 from panoless.export.render import Decomposition, render
 from panoless.geometry.registry import FAMILIES
 from panoless.geometry.surfels.shading.registry import LEFT_OUT
@@ -35,7 +41,7 @@ from panoless.selection.candidates import Selection
 from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import latlong_directions
-from shinypartial.dataset.schema import Dataset, Frame, View
+from shinypartial.dataset.schema import Dataset, View
 from shinypartial.io.files import remove_partial_files
 from shinypartial.io.images import write_jpeg, write_png
 from shinypartial.io.progress import Progress
@@ -108,9 +114,9 @@ def export_prediction(
     picture = environment_picture(environment, visibility)
     write_jpeg(folder / ENVIRONMENT_PICTURE, picture, JPEG_QUALITY)
     index = len(dataset.train) // 2
-    camera = _found_camera(dataset.train[index], state, index)
-    parts = _render(camera, state, state.shown_environment(), config)
-    write_decomposition(folder / DECOMPOSITION, dataset.train[index], parts, picture, visibility)
+    camera, photograph = around_object(dataset.train[index])
+    parts = _render(_found_camera(camera, state, index), state, state.shown_environment(), config)
+    write_decomposition(folder / DECOMPOSITION, photograph * display_gain(environment), parts, picture, visibility)
     info = PredictionInfo(
         method=_method(config),
         dataset=str(dataset.root.resolve()),
@@ -233,14 +239,14 @@ def _write_test_views(dataset: Dataset, state: FitState, config: FitConfig, fold
             progress.advance()
 
 
-def _found_camera(frame: Frame, state: FitState, index: int) -> Camera:
+def _found_camera(camera: Camera, state: FitState, index: int) -> Camera:
     """That of a training view where the fit found it: turned about its center, then shifted."""
     if state.geometry.poses is None:
-        return frame.camera
-    pose = frame.camera.camera_to_world.copy()
+        return camera
+    pose = camera.camera_to_world.copy()
     pose[:3, :3] = Rotation.from_rotvec(state.geometry.poses.turns[index]).as_matrix() @ pose[:3, :3]
     pose[:3, 3] += state.frame.radius * state.geometry.poses.shifts[index]
-    return replace(frame.camera, camera_to_world=pose)
+    return replace(camera, camera_to_world=pose)
 
 
 def _render(camera: Camera, state: FitState, environment: Float[Tensor, "6 3 L L"], config: FitConfig) -> Decomposition:

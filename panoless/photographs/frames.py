@@ -13,6 +13,7 @@ from panoless.photographs.standstill import StillCheck
 from panoless.photographs.video import VIDEO_SUFFIXES, decoded_video, luminance
 from shinypartial.core.color import CODES_OF_LINEAR, LINEAR_OF_CODES
 from shinypartial.core.errors import InputError
+from shinypartial.dataset.bundled import bundled_photographs
 from shinypartial.io.images import PICTURE_SUFFIXES, read_as_stored, read_upright, to_bytes, write_png
 from shinypartial.io.progress import Progress
 from shinypartial.io.threads import in_threads
@@ -56,7 +57,11 @@ class Frames:
 
 
 def source_files(source: Path) -> list[Path]:
-    """The pictures of a folder, or a video alone; InputError when there is neither."""
+    """The pictures of a folder, or a video alone, or those that are bundled by that name; InputError when there is none
+    of these.
+    """
+    if not source.exists() and (bundled := bundled_photographs(str(source))):
+        return list(bundled)
     if source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES:
         return [source]
     if source.is_dir():

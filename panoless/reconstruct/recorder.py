@@ -69,7 +69,7 @@ def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     """Add the time that a block takes to its stage, with that of what it takes from an earlier run, and give back the
     memory that it no longer needs.
     """
-    start = time.monotonic() - seconds_before()
+    start = time.monotonic() + seconds_before()
     try:
         yield
     finally:

@@ -37,6 +37,10 @@ LIGHT_FIGURES = ("unexplained", "one_color", "matte", "unexplained_part", "noise
 """What comes from held-out light."""
 
 
+SURE = 0.5
+"""Confidence from which a direction counts in a capture of a ball."""
+
+
 @dataclass(frozen=True)
 class Evidence:
     """Figures of a fit. Errors are means of ‖e‖²/(‖e‖² + s²) over held-out rays; what can't be told is None."""
@@ -113,8 +117,8 @@ def gather_evidence(
     """The evidence for a geometry in the views that it was fitted to, after their corrections, which are told along as
     the roughness is; `visibility` is that of the final map.
 
-    The shape and the cameras of a `ball` that was captured are known before. So held-out light counts as far as the map
-    is sure of its direction: what stands near the ball, and who photographs it, is left to the visibility.
+    The shape and the cameras of a `ball` that was captured are known before. So held-out light counts where the map is
+    rather sure than not: what stands near the ball, and who photographs it, is left to the visibility.
     """
     options = config.trust
     found = usable_views(views, geometry).train
@@ -208,7 +212,7 @@ def _light(
         rays, seen = areas.rays(), areas.seen(environment).minimum(saturation)
         error = contrast.shown(seen) - contrast.shown(areas.radiance)
         confidence.append(sample_cubemap(visibility[:, None], rays.directions)[:, 0])
-        weight = rays.initial_weight() * (confidence[-1] if by_confidence else 1)
+        weight = rays.initial_weight() * (confidence[-1] > SURE if by_confidence else 1)
         explained.add(bounded_error(error, options.scale), weight)
         errors.append(error)
     for (view, surface), (_, pixels) in zip(held_out, at_most_pixels(tested, options.rays), strict=True):

@@ -24,6 +24,11 @@ def bundled_dataset(name: str) -> Path:
     return BUNDLED / name
 
 
+def bundled_photographs(name: str) -> tuple[Path, ...]:
+    """Photographs that come with the package by the name of their folder, `lobby-ball`; empty where none have it."""
+    return tuple(sorted((BUNDLED / name).glob("*.jpg"))) if name == Path(name).name else ()
+
+
 def resolve_dataset(dataset: str | Path | None = None) -> Path:
     """The folder that a user means: a path that exists, a bundled name, or without either the newest below ./datasets.
 
