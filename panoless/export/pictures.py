@@ -56,8 +56,8 @@ def display_gain(environment: Float[np.ndarray, "H W 3"]) -> float:
 def environment_picture(
     environment: Float[np.ndarray, "H W 3"], visibility: Float[np.ndarray, "H W"]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A map in display colors, dark ones brightened; directions whose visibility is zero, where it is filled, are hatched
-    in gray.
+    """A map in display colors, dark ones brightened; directions whose visibility is zero, where it is filled, are
+    hatched in gray.
     """
     rows, columns = np.indices(visibility.shape)
     stripes = (rows + columns) // max(len(visibility) // HATCHING, 1) % 2
