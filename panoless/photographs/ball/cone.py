@@ -86,7 +86,7 @@ class BallCone:
         return Sighting(rays, normals, mirrored, (room > 0) & (middle > 0))
 
     def toward(self, directions: Float[np.ndarray, "*P 3"]) -> Sighting:
-        """The rays that leave the ball along unit directions: every direction but a itself is mirrored."""
+        """The rays that leave the ball along unit directions: none leaves within α of a, what the ball itself hides."""
         normals = directions - self.axis
         normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
         for _ in range(int(np.ceil(np.log(PRECISION) / np.log(1 / max(self.distance, 1.1))))):
@@ -94,4 +94,4 @@ class BallCone:
             rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
             normals = directions - rays
             normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
-        return Sighting(rays, normals, directions, np.ones(directions.shape[:-1], bool))
+        return Sighting(rays, normals, directions, directions @ self.axis < np.cos(self.half_angle))
