@@ -10,7 +10,6 @@ from panoless.config import FitConfig, can_be_exposed
 from shinypartial.dataset.read import read_ball_evidence
 from shinypartial.dataset.schema import Dataset
 
-
 PHOTOGRAPHER_DEG = 30.0
 """About each camera, seen from a ball: who holds it reaches so far, legs included, in 37 photographs of a lobby."""
 

@@ -26,8 +26,8 @@ SHINE = "Photograph a shinier object: what a rough one blurs comes back in part 
 TEXTURE = "Take it to surroundings that differ from one direction to another, or expose longer."
 EXPOSURE = "Photograph with a shorter exposure, or in high dynamic range."
 NEAR_BALL = (
-    "What stands near the ball, and who photographs it, has a low visibility: add views from other sides, or put the ball "
-    "on something thin."
+    "What stands near the ball, and who photographs it, has a low visibility: add views from other sides, or put the "
+    "ball on something thin."
 )
 RIM = "Look at capture/ball.jpg: the circle must lie on the rim of a polished ball; else give --box or --clicks."
 LEAST_AGREEMENT = 0.1
