@@ -139,7 +139,7 @@ def read_shot(path: Path) -> Shot:
     if pixels.shape[2] != 3:
         pixels = np.repeat(pixels[..., :1], 3, 2) if pixels.shape[2] == 1 else pixels[..., :3]
     exif = {} if path.suffix.lower() == EXR else _attributes(path)
-    clips_at = math.inf if pixels.dtype.kind == "f" else float(srgb_to_linear(np.float32([CLIPPED]))[0])
+    clips_at = math.inf if pixels.dtype.kind == "f" else float(srgb_to_linear(np.array([CLIPPED]))[0])
     if raw:
         pixels, clips_at = unit_values(pixels), CLIPPED
     height, width = pixels.shape[:2]

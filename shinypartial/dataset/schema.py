@@ -118,7 +118,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class BallEvidence:
-    """What a capture of a mirror ball knows of itself: `ball` of `transforms_train.json`."""
+    """What a capture of a mirror ball knows of itself, as `transforms_train.json` states it."""
 
     rim_px: NonNegative
     """Median distance of the rim's points from its cone."""

@@ -99,7 +99,7 @@ def _of_view(ball: PosedBall, balls: Sequence[PosedBall], distance: float) -> fl
         normals = other.cone.toward(directions).normals
         leaving = distance * directions - normals
         seen = other.cone.toward(leaving / np.linalg.norm(leaving, axis=-1, keepdims=True))
-        good = seen.directions @ -other.cone.axis < np.cos(np.radians(PHOTOGRAPHER_DEG))
+        good = seen.met & (seen.directions @ -other.cone.axis < np.cos(np.radians(PHOTOGRAPHER_DEG)))
         values.append(other.at(seen.rays))
         weights.append(np.where(good, spans(other.cone, seen, other.lens), np.inf))
     sharpest = np.argsort(np.stack(weights), 0)[:3]
@@ -131,8 +131,9 @@ def ring_agreement(ball: PosedBall) -> float:
     angle = np.radians(np.linspace(*RING_DEG, 24))[None, :, None]
     side = np.stack([np.cos(azimuth), np.sin(azimuth)], 1) @ ball.cone.across
     directions = np.cos(angle) * ball.cone.axis + np.sin(angle) * side[:, None]
-    direct, mirrored = ball.at(directions), ball.at(ball.cone.toward(directions).rays)
-    shown = np.isfinite(direct) & np.isfinite(mirrored)
+    seen = ball.cone.toward(directions)
+    direct, mirrored = ball.at(directions), ball.at(seen.rays)
+    shown = seen.met & np.isfinite(direct) & np.isfinite(mirrored)
     count = shown.sum(1)
     kept = (count >= shown.shape[1] / 2) & (side[:, 1] < np.cos(np.radians(SUPPORT_DEG)))
     if kept.sum() < RING_AZIMUTHS / 3:

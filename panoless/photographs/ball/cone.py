@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 
 from shinypartial.core.sphere import tangents
 
-PRECISION = 1e-6
-"""Of the fixed point n ← (ω − v)/‖ω − v‖, v ∝ d a + n, whose error falls by 1/d in each round."""
+NEWTON_STEPS = 8
+"""For the angle φ of n from −a where ω is: 2 φ + atan(sin φ/(d − cos φ)) = π − ∠(a, ω), whose left side is concave."""
 
 
 @dataclass(frozen=True)
@@ -86,12 +86,18 @@ class BallCone:
         return Sighting(rays, normals, mirrored, (room > 0) & (middle > 0))
 
     def toward(self, directions: Float[np.ndarray, "*P 3"]) -> Sighting:
-        """The rays that leave the ball along unit directions: every direction but a itself is mirrored."""
-        normals = directions - self.axis
-        normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
-        for _ in range(int(np.ceil(np.log(PRECISION) / np.log(1 / max(self.distance, 1.1))))):
-            rays = self.center + normals
-            rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-            normals = directions - rays
-            normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
-        return Sighting(rays, normals, directions, np.ones(directions.shape[:-1], bool))
+        """The rays that leave the ball along unit directions: none leaves within α of a, what the ball itself hides."""
+        middle = directions @ self.axis
+        aside = directions - middle[..., None] * self.axis
+        sine = np.linalg.norm(aside, axis=-1)
+        target, d = np.pi - np.arctan2(sine, middle), self.distance
+        place = target / (2 + 1 / (d - 1))
+        for _ in range(NEWTON_STEPS):
+            turned = 2 * place + np.arctan2(np.sin(place), d - np.cos(place))
+            slope = 2 + (d * np.cos(place) - 1) / (d**2 - 2 * d * np.cos(place) + 1)
+            place = np.minimum(place + (target - turned) / slope, np.pi / 2 - self.half_angle)
+        aside /= np.maximum(sine, 1e-12)[..., None]
+        normals = np.sin(place)[..., None] * aside - np.cos(place)[..., None] * self.axis
+        rays = self.center + normals
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        return Sighting(rays, normals, directions, directions @ self.axis < np.cos(self.half_angle))

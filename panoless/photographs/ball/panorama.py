@@ -63,9 +63,8 @@ def usable(
     cone: BallCone, seen: Sighting, lens: Lens, unseen: Bool[np.ndarray, "H W"] | None
 ) -> Bool[np.ndarray, "*P"]:
     """Where features may lie."""
-    good = (spans(cone, seen, lens) < WIDEST_PIXEL_RAD) & (
-        seen.directions @ -cone.axis < np.cos(np.radians(PHOTOGRAPHER_DEG))
-    )
+    away = seen.directions @ -cone.axis < np.cos(np.radians(PHOTOGRAPHER_DEG))
+    good = seen.met & away & (spans(cone, seen, lens) < WIDEST_PIXEL_RAD)
     if unseen is not None:
         pixels = np.floor(lens.project(seen.rays)).astype(np.int64)
         columns, rows = (pixels[..., k].clip(0, unseen.shape[1 - k] - 1) for k in (0, 1))
