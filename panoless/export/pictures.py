@@ -16,6 +16,8 @@ from shinypartial.dataset.read import read_whole_view
 from shinypartial.dataset.schema import Frame
 from shinypartial.io.picture_sheet import TILE_PX, write_picture_sheet
 
+PICTURE_WIDTH = 1024
+"""Of the picture of a map, at least."""
 HATCHING = 40
 """Rows of a map over those of a stripe, of which there are two colors, where it was not seen."""
 HATCH_COLORS = np.array([72, 104], np.uint8)
@@ -59,10 +61,15 @@ def environment_picture(
     """A map in display colors, dark ones brightened; directions whose visibility is zero, where it is filled, are
     hatched in gray.
     """
+    from PIL import Image
+
     rows, columns = np.indices(visibility.shape)
     stripes = (rows + columns) // max(len(visibility) // HATCHING, 1) % 2
     shown = to_display(environment * display_gain(environment))
-    return np.where((visibility > 0)[..., None], shown, HATCH_COLORS[stripes][..., None])
+    picture = np.where((visibility > 0)[..., None], shown, HATCH_COLORS[stripes][..., None])
+    if picture.shape[1] >= PICTURE_WIDTH:
+        return picture
+    return np.asarray(Image.fromarray(picture).resize((PICTURE_WIDTH, PICTURE_WIDTH // 2), Image.Resampling.BICUBIC))
 
 
 def write_decomposition(

@@ -17,7 +17,7 @@ from shinypartial.cli.datasets import (
 )
 from shinypartial.cli.presenting import Chart, Leaderboard, Report
 from shinypartial.cli.scenes import Film, Generate
-from shinypartial.cli.scoring import Compare, Evaluate, Oracle, Postprocess, Weights
+from shinypartial.cli.scoring import Compare, Evaluate, EvaluateDirect, Oracle, Postprocess, Weights
 from shinypartial.cli.stability import Stability
 from shinypartial.cli.tables import Tables
 from shinypartial.core.errors import parse_and_run
@@ -33,6 +33,7 @@ Command = (
     | ExportCameras
     | Validate
     | Evaluate
+    | EvaluateDirect
     | Oracle
     | Postprocess
     | Convert

@@ -49,6 +49,26 @@ class Evaluate:
 
 
 @dataclass(frozen=True)
+class EvaluateDirect:
+    """Score a prediction of a mirror ball by what photographs from its other side show directly, past the ball."""
+
+    prediction: tyro.conf.Positional[Path]
+    """Prediction folder, fitted to some photographs of a capture; direct_views.json and .jpg are written into it."""
+    dataset: Path
+    """Dataset of all photographs of the capture, in the same world."""
+    hold_out: tuple[str, ...] = ()
+    """Names of the views to compare with; all that the prediction was not fitted to when not given."""
+
+    def run(self) -> None:
+        """Score and print the table."""
+        from shinypartial.evaluation.direct_views import DIRECT_PICTURE, evaluate_direct
+
+        found = evaluate_direct(self.prediction, self.dataset, self.hold_out)
+        print("\n".join(found.lines()))
+        print(f"Wrote {self.prediction / DIRECT_PICTURE}")
+
+
+@dataclass(frozen=True)
 class Oracle:
     """Make and score the oracle baseline of a dataset: a map solved from training views with ground-truth normals."""
 

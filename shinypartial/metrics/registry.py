@@ -82,6 +82,10 @@ METRICS = (
     Metric("lpips_vgg", "LPIPS v0.1, VGG-16", "", _LOWER, ".4f", ZHANG),
     Metric("visibility_error_spearman", "Rank correlation of visibility and error", "", _LOWER, "+.3f", SPEARMAN),
     Metric("visibility_error_auroc", "AUROC of low visibility for error > 0.1", "", _HIGHER, ".3f", HANLEY),
+    Metric("direct_correlation", "Correlation with direct views, in a band", "", _HIGHER, ".3f", DEFINED_HERE),
+    Metric("direct_correlation_unfiltered", "Correlation with direct views", "", _HIGHER, ".3f", DEFINED_HERE),
+    Metric("direct_offset_deg", "Median angle by which features are off", "°", _LOWER, ".2f", DEFINED_HERE),
+    Metric("lamp_error_deg", "Angle to the brightest lamp", "°", _LOWER, ".2f", DEFINED_HERE),
     Metric("sparsification_area", "Area between sparsification curve and perfect order", "", _LOWER, ".3f", ILG),
 )
 

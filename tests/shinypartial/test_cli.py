@@ -21,6 +21,7 @@ COMMANDS = (
     "perturb",
     "validate",
     "evaluate",
+    "evaluate-direct",
     "report",
     "release",
     "leaderboard",
