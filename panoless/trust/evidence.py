@@ -100,7 +100,7 @@ class Evidence:
     repaired_views: int = 0
     """Number of views whose masks had holes or stray pieces that the others contradict."""
     rim_px: float | None = None
-    """Of the capture of a ball: median distance of its rim from a cone…"""
+    """Of a captured ball, and of one of which no view is held out: median distance of its rim from a cone…"""
     agreement: float | None = None
     """…and correlation of what lies beside the ball with what it mirrors."""
 
@@ -154,9 +154,18 @@ def gather_evidence(
         roughness=roughness or 0.0,
         blur_px=views.blur_px,
         repaired_views=views.repairs.views,
-        rim_px=None if ball is None else ball.rim_px,
+        rim_px=_rim_px(ball, geometry, _median(distance), light),
         agreement=None if ball is None else ball.agreement,
     )
+
+
+def _rim_px(
+    ball: BallEvidence | None, geometry: Geometry, silhouette_px: float, light: dict[str, float | None]
+) -> float | None:
+    """That of a capture; of a sphere of which no view is held out, how far its silhouettes are off."""
+    if ball is not None:
+        return ball.rim_px
+    return silhouette_px if geometry.kind == "sphere" and light["unexplained"] is None else None
 
 
 def _evenly(views: Sequence[TrainView], count: int) -> list[TrainView]:

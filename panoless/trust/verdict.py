@@ -149,7 +149,8 @@ def judge(found: Evidence, options: TrustOptions) -> Trust:
     figures = {name: value for name, value in vars(found).items() if value is not None}
     if found.unexplained is None and found.rim_px is None:
         if found.views <= HELD_OUT_EVERY // 2:
-            reason, remedy = f"{found.views} usable views leave none to hold out", VIEWS
+            noun = "view leaves" if found.views == 1 else "views leave"
+            reason, remedy = f"{found.views} usable {noun} none to hold out", VIEWS
         else:
             reason, remedy = "no held-out view shows the surface where its mask has the object", MASKS
         return Trust("do not trust", reason, remedy, options.refused, figures)

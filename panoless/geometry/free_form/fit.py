@@ -234,9 +234,8 @@ def _joined(solved: Poses, tested: Poses) -> Poses:
 def found_poses(solved: Views, views: Views, stage: FitStage, options: FreeFormOptions) -> Poses:
     """Poses of views that took no part, under the surface and the map of those that did, which stay as they are."""
     known = make_task(solved, stage.last, options)
-    environment = Solution.at(
-        known, stage.surface, stage.trust, None, options.first_map_rounds, stage.poses
-    ).environment
+    under = Solution.at(known, stage.surface, stage.trust, None, options.first_map_rounds, stage.poses)
+    environment = under.environment
     settings = replace(stage.last, steps=options.pose_steps, under_known_map=True)
     task = make_task(views, settings, options)
     poses = Poses.none(len(views.train))
