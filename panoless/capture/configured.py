@@ -8,19 +8,33 @@ from panoless.capture.repair import with_repaired_masks
 from panoless.capture.views import Views, load_views
 from panoless.config import FitConfig, can_be_exposed
 from shinypartial.dataset.read import read_ball_evidence
-from shinypartial.dataset.schema import Dataset
+from shinypartial.dataset.schema import BallEvidence, Dataset
 
 PHOTOGRAPHER_DEG = 30.0
 """About each camera, seen from a ball: who holds it reaches so far, legs included, in 37 photographs of a lobby."""
 
 
-def of_ball(config: FitConfig) -> FitConfig:
-    """The configuration of a fit to a capture of a polished ball."""
+FEW_VIEWS = 5
+"""Of a ball, from which one can be spared to judge how near the surroundings are."""
+
+
+def of_ball(config: FitConfig, ball: BallEvidence, views: int) -> FitConfig:
+    """The configuration of a fit to a capture of a polished ball from so many views."""
     corrections = replace(config.corrections, masks="off", lens="off")
-    material = replace(config.material, roughness="off", blur="off")
-    sphere = replace(config.sphere, operator_deg=PHOTOGRAPHER_DEG)
-    poses = replace(config.poses, mode="off")
-    return replace(config, model="sphere", poses=poses, corrections=corrections, material=material, sphere=sphere)
+    if ball.exposures_known:
+        corrections = replace(corrections, exposure="off")
+    surroundings = config.surroundings
+    if views < FEW_VIEWS and surroundings.mode == "auto":
+        surroundings = replace(surroundings, mode="off")
+    return replace(
+        config,
+        model="sphere",
+        poses=replace(config.poses, mode="off"),
+        corrections=corrections,
+        surroundings=surroundings,
+        material=replace(config.material, roughness="off", blur="off", least_scattering_error=1.0),
+        sphere=replace(config.sphere, operator_deg=PHOTOGRAPHER_DEG),
+    )
 
 
 def configured_views(dataset: Dataset, config: FitConfig) -> tuple[Views, FitConfig]:
@@ -30,8 +44,9 @@ def configured_views(dataset: Dataset, config: FitConfig) -> tuple[Views, FitCon
     Photographs stay as they are where options don't bear another exposure. A capture of a ball knows its shape and its
     cameras, by its rim and what it mirrors: nothing of that is chosen.
     """
-    if config.model in ("auto", "sphere") and read_ball_evidence(dataset) is not None:
-        config = of_ball(config)
+    ball = read_ball_evidence(dataset)
+    if config.model in ("auto", "sphere") and ball is not None:
+        config = of_ball(config, ball, len(dataset.train))
     views = load_views(
         dataset,
         config.crop_margin_px,

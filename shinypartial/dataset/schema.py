@@ -132,6 +132,8 @@ class BallEvidence:
     """Standard deviation of a camera's turn: median over views; 0 of a single view."""
     agreement: Annotated[float, Meta(ge=-1, le=1)] | None = None
     """Correlation of what lies beside the ball with what it mirrors; None where too little does."""
+    exposures_known: bool = False
+    """Whether all photographs state theirs, so that they have been equalized."""
 
 
 @dataclass(frozen=True)

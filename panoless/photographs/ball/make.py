@@ -145,6 +145,7 @@ def _evidence(posed: PosedBalls, focal: Focal, beside: Sequence[PosedBall]) -> B
         reflection_deg=adjusted.residual_deg if several else 0.0,
         turn_deg=float(np.median(turns)) if several else 0.0,
         agreement=None if np.isnan(agreed) else agreed,
+        exposures_known=all(ball.shot.exposure is not None for ball in posed.balls),
     )
 
 
