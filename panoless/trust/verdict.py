@@ -158,8 +158,11 @@ def judge(found: Evidence, options: TrustOptions) -> Trust:
     doubt = max(risks, key=lambda each: each[0])[1]
     risk = math.hypot(*(each for each, _ in risks))
     if risk < 1:
+        beside = (
+            "" if found.agreement is None else f", and what lies beside it is what it mirrors ({found.agreement:.2f})"
+        )
         reason = (
-            f"the rim of the ball is a circular cone to {found.rim_px:.2g} px"
+            f"the rim of the ball is a circular cone to {found.rim_px:.2g} px{beside}"
             if found.unexplained is None
             else f"the mirror explains {1 - found.unexplained:.0%} of the light in held-out views, "
             f"and silhouettes agree to {found.silhouette_px:.2g} px"
