@@ -99,6 +99,8 @@ class Scene:
         light = self._traced(pose, lens, 0, 0, lens.width, lens.height, 1)
         for *center, radius in self.balls:
             x, y, z = (np.array(center) - pose[:3, 3]) @ pose[:3, :3]
+            if z <= radius:
+                continue
             reach = 1.15 * lens.fx * radius / z + 3
             column, row = lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy
             left, right = (int(np.clip(column + sign * reach, 0, lens.width)) for sign in (-1, 1))

@@ -16,8 +16,8 @@ from panoless.presets import PRESETS
 from panoless.reconstruct.fit import fit
 from panoless.reconstruct.state import FitState
 from shinypartial.dataset.read import open_dataset, read_view
-from shinypartial.dataset.schema import Dataset
-from shinypartial.dataset.write import write_view
+from shinypartial.dataset.schema import BallEvidence, Dataset
+from shinypartial.dataset.write import write_transforms, write_view
 from tests.support.mirror_sphere import tiny_config
 from tests.support.synthetic_dataset import make_sphere_dataset
 
@@ -90,3 +90,21 @@ def test_a_darker_exposure_gives_the_same_surface_and_a_darker_map(tmp_path: Pat
     difference = (16 * dark.environment - bright.environment).abs().mean()
     # Files of half floats and steps of single precision leave 0.2 %.
     assert float(difference) < 0.01 * float(bright.environment.mean())
+
+
+def test_a_capture_of_a_ball_knows_its_shape_and_cameras(sphere_dataset: Dataset, damaged_dataset: Path) -> None:
+    """Its fit takes a sphere, and no correction of cameras, lens or masks; another kind that is asked for stays."""
+    evidence = BallEvidence(0.2, 0.9, 0.02, 0.1, 0.1, 0.5)
+    write_transforms(damaged_dataset, "train", sphere_dataset.train, ball=evidence)
+    captured = open_dataset(damaged_dataset)
+    _, config = configured_views(captured, FitConfig())
+    assert config.model == "sphere"
+    assert config.poses.mode == "off"
+    assert (config.corrections.masks, config.corrections.lens) == ("off", "off")
+    assert (config.material.roughness, config.material.blur) == ("off", "off")
+    assert config.material.reflectance == FitConfig().material.reflectance
+    assert config.sphere.operator_deg > FitConfig().sphere.operator_deg
+    for dataset, model in ((captured, "surfels"), (sphere_dataset, "auto")):
+        _, config = configured_views(dataset, FitConfig(model=model))
+        assert config.model == model
+        assert config.poses == FitConfig().poses
