@@ -29,6 +29,9 @@ LEAST_SIGMA_RAD = 0.003
 """Of a feature's direction."""
 SCALE = 2.0
 """Of the loss, in median residuals."""
+CORRELATED = 9.0
+"""By which variances are larger than those of independent features: cameras of traced balls are off by 2 to 4 times as
+much."""
 
 
 @dataclass(frozen=True)
@@ -274,7 +277,7 @@ class _Adjustment:
                 by[3:, k] = -rotation.T @ np.cross(cone.center, np.eye(3)[k])
                 by[3:, 3 + k] = -rotation.T @ (cone.moved(small * np.eye(3)[k]).center - cone.center) / small
             block = slice(OF_VIEW * v, OF_VIEW * (v + 1))
-            covariance[member] = by @ spread[block, block] @ by.T
+            covariance[member] = CORRELATED * by @ spread[block, block] @ by.T
         return Adjusted(
             rotations=dict(zip(self.members, state.rotations, strict=True)),
             cones=dict(zip(self.members, cones, strict=True)),
