@@ -282,10 +282,14 @@ class Capture:
         try:
             for file in {files[0], files[len(files) // 2], files[-1]}:
                 find_ball(read_shot(file))
-        except InputError:
-            if few:
-                raise
-            return False
+        except InputError as error:
+            if not few or self.clicks or self.box:
+                return few
+            raise InputError(
+                expected=f"a mirror ball, or at least {self.options.least_views} photographs of another object",
+                found=f"{len(files)} photographs; {error.found} in {file.name}",
+                remedy=f"Take more photographs. If it is a ball: {error.remedy}",
+            ) from None
         if not few:
             print("Note: these photographs show a round thing. If it is a mirror ball, --object ball is simpler.")
         return few
