@@ -153,6 +153,8 @@ def numbers(state: FitState) -> list[object]:
     "kind", [each if each in QUICK else pytest.param(each, marks=pytest.mark.slow) for each in (*FAMILIES, "auto")]
 )
 @pytest.mark.timeout(3600)
+# Python ignores an interruption within the callback of a weak reference; that part goes on to its end.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_fit_ends_in_parts_that_are_each_too_short_for_it(
     tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
