@@ -48,6 +48,15 @@ class _Doubt:
     """The remedy where a ball was captured, whose shape and cameras are known before; none: no doubt of such fits."""
 
 
+def _disagreement(found: Evidence) -> float | None:
+    """Of a captured ball: the least correlation over that of direct and mirrored views; a single photograph in which
+    they can't be compared is trusted in part.
+    """
+    if found.rim_px is None or (found.agreement is None and found.views > 1):
+        return None
+    return 2.0 if found.agreement is None else LEAST_AGREEMENT / max(found.agreement, LEAST_TOLD)
+
+
 DOUBTS = (
     _Doubt(
         lambda found: found.view_shift_px,
@@ -115,9 +124,13 @@ DOUBTS = (
         RIM,
     ),
     _Doubt(
-        lambda found: None if found.agreement is None else LEAST_AGREEMENT / max(found.agreement, LEAST_TOLD),
+        lambda found: _disagreement(found),
         lambda options: options.refused,
-        lambda found: f"what lies beside the ball is not what it mirrors (correlation {found.agreement:.2f})",
+        lambda found: (
+            "nothing beside the ball says whether it mirrors"
+            if found.agreement is None
+            else f"what lies beside the ball is not what it mirrors (correlation {found.agreement:.2f})"
+        ),
         RIM,
         RIM,
     ),

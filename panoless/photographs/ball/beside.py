@@ -33,6 +33,8 @@ RING_DEG = (10.0, 30.0)
 SUPPORT_DEG = 60.0
 """…but for this angle to either side of down."""
 RING_AZIMUTHS = 72
+LEAST_RING_CONTRAST = 0.05
+"""Root mean square of the logarithms beside the ball around the ring, below which nothing can be compared."""
 
 
 @dataclass(frozen=True)
@@ -143,6 +145,8 @@ def ring_agreement(ball: PosedBall) -> float:
     for values in (direct, mirrored):
         mean = (np.where(shown, values, 0).sum(1) / np.maximum(count, 1))[kept]
         left.append(mean - basis @ np.linalg.lstsq(basis, mean, rcond=None)[0])
+    if float(np.sqrt((left[0] ** 2).mean())) < LEAST_RING_CONTRAST:
+        return float("nan")
     return float((left[0] * left[1]).sum() / max(float(np.linalg.norm(left[0]) * np.linalg.norm(left[1])), 1e-12))
 
 
