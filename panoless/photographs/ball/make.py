@@ -192,8 +192,8 @@ def _cost(off_px: Float[np.ndarray, "K"]) -> float:
 
 def _refuse_glass(lights: Sequence[PosedBall], names: Sequence[str]) -> None:
     bent = [refraction_agreement(each) for each in lights[:: -(-len(lights) // 5)]]
-    told = [each for each in bent if not np.isnan(each)]
-    if told and float(np.median(told)) > REFRACTED:
+    known = [each for each in bent if not np.isnan(each)]
+    if known and float(np.median(known)) > REFRACTED:
         raise InputError(
             expected="a ball that mirrors its surroundings",
             found=f"one that shows what lies behind it upside down, as glass does, in {names[0]}",
