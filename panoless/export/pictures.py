@@ -57,7 +57,7 @@ def display_gain(environment: Float[np.ndarray, "H W 3"]) -> float:
 
 def environment_picture(
     environment: Float[np.ndarray, "H W 3"], visibility: Float[np.ndarray, "H W"]
-) -> UInt8[np.ndarray, "H W 3"]:
+) -> UInt8[np.ndarray, "_ _ 3"]:
     """A map in display colors, dark ones brightened; directions whose visibility is zero, where it is filled, are
     hatched in gray.
     """
