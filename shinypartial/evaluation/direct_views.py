@@ -57,7 +57,7 @@ class DirectEvaluation:
     lamps: int
     """That are seen directly and at least half as bright as the brightest: where clipped, nothing says which is."""
     lamp_error_deg: float | None
-    """From the map's brightest direction, among those seen directly, to the nearest of these lamps."""
+    """From the map's brightest direction, among those above the ball seen directly, to the nearest of these lamps."""
     lamp_chance_deg: float | None
 
     def lines(self) -> list[str]:
@@ -132,6 +132,7 @@ def compare_direct(
         for score in _rendered(views, environment, directions, np.radians(turn)).scores
     ]
     panorama, known = direct_panorama(views, inverses, PANORAMA_HEIGHT)
+    known &= latlong_directions(PANORAMA_HEIGHT)[..., 2] > 0  # Below, what is near glitters from one side.
     lamps = lamp_directions(panorama, known)
     errors = [_lamp_error(environment * found.gain, np.radians(turn), lamps, known) for turn in (0, *CHANCE_TURNS_DEG)]
     chances = [each for each in errors[1:] if each is not None]

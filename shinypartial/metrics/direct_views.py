@@ -273,11 +273,12 @@ def direct_panorama(
 def lamp_directions(radiance: Float[np.ndarray, "H W 3"], known: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "N 3"]:
     """Unit directions of lamps among the known directions of a lat-long map, the brightest first.
 
-    Luminance is clipped to [0, 1], as photographs are, and blurred by LAMP_DEG. Its largest value is a lamp, at the
-    centroid of what is within LAMP_REACH_DEG and at least half as bright; so is the largest one elsewhere, and so on
-    down to half the first.
+    Luminance is clipped to [0, 1], as photographs are; what is at least half as bright as the brightest is blurred by
+    LAMP_DEG. The largest value is a lamp, at the centroid of what is within LAMP_REACH_DEG and at least half as bright;
+    so is the largest one elsewhere, and so on down to half the first.
     """
     light = np.where(known, np.clip(radiance @ REC709, 0, 1), 0)
+    light = np.where(light >= light.max() / 2, light, 0)
     left = np.where(known, blur_latlong(light[..., None], np.radians(LAMP_DEG))[..., 0], 0)
     directions, least = latlong_directions(len(light)), left.max() / 2
     areas, found = np.linalg.norm(directions[..., :2], axis=-1), []
