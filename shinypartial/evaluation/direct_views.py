@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from shinypartial.core.color import to_display
 from shinypartial.core.errors import InputError
@@ -20,12 +20,11 @@ from shinypartial.metrics.direct_views import (
     REACH,
     DirectScores,
     DirectView,
-    band_correlation,
-    brightest_direction,
     direct_panorama,
     direct_scores,
     direct_view,
     gain_between,
+    lamp_directions,
     seen_from_origin,
     with_margin,
 )
@@ -33,13 +32,13 @@ from shinypartial.metrics.registry import metric
 from shinypartial.prediction.format import read_environment_map, read_info, read_inverse_distance
 
 DIRECT_SCORES, DIRECT_PICTURE = "direct_views.json", "direct_views.jpg"
-DISTANCES = (30.0, 80.0, 200.0, 1e6)
-"""D in radii of the ball, of which the one of the best correlation counts where the prediction states no distance."""
+DISTANCES = (1e6, 400.0, 200.0, 100.0, 50.0)
+"""D in radii of the ball, of which each view takes that of the least offset where the prediction states no distance."""
 CHANCE_TURNS_DEG = (90, 180, 270)
 """Turns of the map about the vertical; chance is the median over all of them."""
-PANORAMA_HEIGHT = 256
+PANORAMA_HEIGHT = 180
 PICTURED, TILE_PX = 3, (400, 300)
-FIGURES = ("correlation", "correlation_unfiltered", "psnr_srgb", "psnr_linear", "offset_deg")
+FIGURES = ("correlation", "correlation_unfiltered", "psnr_srgb", "psnr_linear", "offset_deg", "across_deg")
 
 
 @dataclass(frozen=True)
@@ -53,10 +52,13 @@ class DirectEvaluation:
     view_scores: tuple[DirectScores, ...]
     gain: tuple[float, float, float]
     """Of seen over predicted linear light, red, green and blue: one for all views."""
-    distance_radii: float | None
-    """Of the surroundings, where the prediction states none: that of the best median correlation."""
-    lamp_error_deg: float
-    """Between the brightest directions of the map and of what is seen directly, among directions seen directly."""
+    distances_radii: tuple[float, ...] | None
+    """Of the surroundings in each view, where the prediction states none: those of the least offset."""
+    lamps: int
+    """That are seen directly and at least half as bright as the brightest: where clipped, nothing says which is."""
+    lamp_error_deg: float | None
+    """From the map's brightest direction, among those above the ball seen directly, to the nearest of these lamps."""
+    lamp_chance_deg: float | None
 
     def lines(self) -> list[str]:
         """A table: what was found beside chance."""
@@ -66,7 +68,8 @@ class DirectEvaluation:
             values = (row.text(getattr(each, name)) for each in (self.median, self.chance))
             lines.append(f"{row.title:44s}" + "".join(f"{value:>10s}" for value in values))
         lamp = metric("lamp_error_deg")
-        lines.append(f"{lamp.title:44s}{lamp.text(self.lamp_error_deg):>10s}")
+        values = (lamp.text(each) for each in (self.lamp_error_deg, self.lamp_chance_deg))
+        lines.append(f"{lamp.title:44s}" + "".join(f"{value:>10s}" for value in values))
         return lines
 
 
@@ -90,6 +93,13 @@ def evaluate_direct(prediction: Path, dataset: Path, hold_out: Sequence[str] = (
     frames = _held_out(prediction, dataset, hold_out)
     views = [direct_view(frame.camera, read_whole_view(frame)[1]) for frame in frames]
     names = tuple(frame.stem.name for frame in frames)
+    covered = [name for name, view in zip(names, views, strict=True) if not view.shown.any()]
+    if covered:
+        raise InputError(
+            expected="views that show surroundings beside the ball and what it stands on",
+            found=f"none in {covered[0]}",
+            remedy="Name others: --hold-out NAMES.",
+        )
     found, pictures = compare_direct(names, views, environment, read_inverse_distance(prediction))
     write_json(prediction / DIRECT_SCORES, write_record(found))
     chosen = sorted({round(each) for each in np.linspace(0, len(names) - 1, PICTURED)})
@@ -108,19 +118,24 @@ def compare_direct(
     inverse_distance: Float[np.ndarray, "h w"] | None,
 ) -> tuple[DirectEvaluation, list[Float[np.ndarray, "_ _ 3"]]]:
     """The scores, and what the map has in each view's cells, after the gain; of arrays, without files."""
-    distance = None if inverse_distance is not None else _distance(views, environment)
-    inverse = np.full((2, 4), 1 / distance) if distance else inverse_distance
-    assert inverse is not None
-    directions = [seen_from_origin(with_margin(view.camera, REACH), inverse) for view in views]
+    if inverse_distance is None:
+        distances = tuple(_distance(view, environment) for view in views)
+        inverses = [np.full((2, 4), 1 / each) for each in distances]
+    else:
+        distances, inverses = None, [inverse_distance] * len(views)
+    parts = list(zip(views, inverses, strict=True))
+    directions = [seen_from_origin(with_margin(view.camera, REACH), inverse) for view, inverse in parts]
     found = _rendered(views, environment, directions)
     turned = [
         score
         for turn in CHANCE_TURNS_DEG
         for score in _rendered(views, environment, directions, np.radians(turn)).scores
     ]
-    panorama, known = direct_panorama(views, inverse, PANORAMA_HEIGHT)
-    own = sample_latlong(environment, latlong_directions(PANORAMA_HEIGHT)) * found.gain
-    lamps = [brightest_direction(each, known) for each in (panorama, own)]
+    panorama, known = direct_panorama(views, inverses, PANORAMA_HEIGHT)
+    known &= latlong_directions(PANORAMA_HEIGHT)[..., 2] > 0  # Below, what is near glitters from one side.
+    lamps = lamp_directions(panorama, known)
+    errors = [_lamp_error(environment * found.gain, np.radians(turn), lamps, known) for turn in (0, *CHANCE_TURNS_DEG)]
+    chances = [each for each in errors[1:] if each is not None]
     red, green, blue = map(float, found.gain)
     evaluation = DirectEvaluation(
         views=tuple(names),
@@ -128,21 +143,23 @@ def compare_direct(
         chance=_median(turned),
         view_scores=tuple(found.scores),
         gain=(red, green, blue),
-        distance_radii=distance,
-        lamp_error_deg=float(angular_error_deg(*lamps)),
+        distances_radii=distances,
+        lamps=len(lamps),
+        lamp_error_deg=errors[0],
+        lamp_chance_deg=float(np.median(chances)) if chances else None,
     )
     inner = slice(REACH, -REACH)
     return evaluation, [picture[inner, inner] * found.gain for picture in found.pictures]
 
 
-def _distance(views: Sequence[DirectView], environment: Float[np.ndarray, "H W 3"]) -> float:
-    """Of DISTANCES, the one at which direct views and map correlate best in the median."""
-    medians = []
+def _distance(view: DirectView, environment: Float[np.ndarray, "H W 3"]) -> float:
+    """Of DISTANCES, the one at which features are least off; the first where no feature tells."""
+    offsets = []
     for distance in DISTANCES:
-        inverse = np.full((2, 4), 1 / distance)
-        pictures = [sample_latlong(environment, seen_from_origin(view.camera, inverse)) for view in views]
-        medians.append(np.median([band_correlation(*each) for each in zip(views, pictures, strict=True)]))
-    return DISTANCES[int(np.argmax(medians))]
+        directions = seen_from_origin(with_margin(view.camera, REACH), np.full((2, 4), 1 / distance))
+        offset = direct_scores(view, sample_latlong(environment, directions), directions, np.ones(3)).offset_deg
+        offsets.append(np.inf if offset is None else offset)
+    return DISTANCES[int(np.argmin(offsets))]
 
 
 def _rendered(
@@ -152,23 +169,35 @@ def _rendered(
     turn: float = 0.0,
 ) -> _Rendered:
     """Of the map turned about +Z by an angle (rad)."""
-    cosine, sine = np.cos(turn), np.sin(turn)
-    back = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
-    pictures = [sample_latlong(environment, each @ back) for each in directions]
+    pictures = [sample_latlong(environment, each @ _turn(turn)) for each in directions]
     inner = slice(REACH, -REACH)
     gain = gain_between(views, [picture[inner, inner] for picture in pictures])
     parts = zip(views, pictures, directions, strict=True)
     return _Rendered(pictures, gain, [direct_scores(view, picture, each, gain) for view, picture, each in parts])
 
 
+def _turn(angle: float) -> Float[np.ndarray, "3 3"]:
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+
+
+def _lamp_error(
+    environment: Float[np.ndarray, "H W 3"],
+    turn: float,
+    lamps: Float[np.ndarray, "N 3"],
+    known: Bool[np.ndarray, "h w"],
+) -> float | None:
+    """From the brightest lamp of a map turned about +Z to the nearest of these; None where there is none."""
+    own = lamp_directions(sample_latlong(environment, latlong_directions(len(known)) @ _turn(turn)), known)
+    return float(angular_error_deg(lamps, own[:1]).min()) if len(lamps) and len(own) else None
+
+
 def _median(scores: Sequence[DirectScores]) -> DirectScores:
-    offsets = [each.offset_deg for each in scores if each.offset_deg is not None]
-    plain = {name: float(np.median([getattr(each, name) for each in scores])) for name in FIGURES[:-1]}
-    return DirectScores(
-        **plain,
-        offset_deg=float(np.median(offsets)) if offsets else None,
-        windows=sum(each.windows for each in scores),
-    )
+    found: dict[str, float | None] = {}
+    for name in FIGURES:
+        known = [value for each in scores if (value := getattr(each, name)) is not None]
+        found[name] = float(np.median(known)) if known else None
+    return DirectScores(**found, windows=sum(each.windows for each in scores))  # type: ignore[arg-type]
 
 
 def _held_out(prediction: Path, root: Path, hold_out: Sequence[str]) -> list[Frame]:

@@ -38,9 +38,9 @@ REC709 = np.array([0.2126, 0.7152, 0.0722])
 STEPS, CONVERGED = 24, 1e-9
 """Of the fixed point at which rays meet the surroundings, and by how much 1/D may then be off."""
 LAMP_DEG = 2.0
-"""Standard deviation of the Gaussian by which a map is blurred before its brightest direction is looked for…"""
+"""Standard deviation of the Gaussian by which a map is blurred before lamps are looked for…"""
 LAMP_REACH_DEG = 8.0
-"""…and the angle from it within which light of half its brightness or more counts for the centroid."""
+"""…and the angle within which light belongs to one of them."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,8 @@ class DirectScores:
     psnr_linear: float
     offset_deg: float | None
     """Median angle, from the object, between where the map has a window's features and where they are."""
+    across_deg: float | None
+    """Its part across the plane of camera, object and feature: whatever the distance of the surroundings."""
     windows: int
 
 
@@ -129,12 +131,6 @@ def gain_between(views: Sequence[DirectView], rendered: Sequence[Float[np.ndarra
     return np.array([np.median(each[~np.isnan(each)]) if (~np.isnan(each)).any() else 1.0 for each in ratios.T])
 
 
-def band_correlation(view: DirectView, rendered: Float[np.ndarray, "H W 3"]) -> float:
-    """Of log luminance in the band, of what the map has in the view's cells."""
-    seen, had = (_band(_log_luminance(each), view.shown)[view.shown] for each in (view.radiance, rendered))
-    return _correlation(seen, had)
-
-
 def direct_scores(
     view: DirectView,
     rendered: Float[np.ndarray, "h w 3"],
@@ -149,29 +145,31 @@ def direct_scores(
     had, seen, shown = rendered * gain, view.radiance, view.shown
     dark, light = _log_luminance(had), _log_luminance(seen)
     band = _band(light, shown), _band(dark[inner], shown)
-    offsets = feature_offsets_deg(band[0], shown, _band(dark, np.ones(dark.shape, bool)), directions)
+    offsets = feature_offsets_deg(view, band[0], _band(dark, np.ones(dark.shape, bool)), directions)
     clipped = [np.clip(each[shown], 0, 1)[None] for each in (had[inner], seen)]
     return DirectScores(
         correlation=_correlation(band[0][shown], band[1][shown]),
         correlation_unfiltered=_correlation(light[shown], dark[inner][shown]),
         psnr_srgb=psnr(*map(linear_to_srgb, clipped), data_range=1),
         psnr_linear=psnr(clipped[0], clipped[1], data_range=1),
-        offset_deg=float(np.median(offsets)) if len(offsets) else None,
+        offset_deg=float(np.median(offsets[:, 0])) if len(offsets) else None,
+        across_deg=float(np.median(offsets[:, 1])) if len(offsets) else None,
         windows=len(offsets),
     )
 
 
 def feature_offsets_deg(
+    view: DirectView,
     direct: Float[np.ndarray, "H W"],
-    shown: Bool[np.ndarray, "H W"],
     rendered: Float[np.ndarray, "h w"],
     directions: Float[np.ndarray, "h w 3"],
-) -> Float[np.ndarray, "N"]:
-    """Angles between where the map has the features of windows of a direct view, and where they are.
+) -> Float[np.ndarray, "N 2"]:
+    """Angles between where the map has the features of windows of a direct view, and where they are: whole, and across.
 
     A window is looked for in the rendered picture, REACH cells larger at each side, at the shift of the largest
     normalized correlation, to a fraction of a cell by parabolas. Windows count that are shown whole and slope in every
-    direction: the least eigenvalue of their mean ∇b ∇bᵀ is SLOPE² or more.
+    direction: the least eigenvalue of their mean ∇b ∇bᵀ is SLOPE² or more. Whatever its distance, a feature lies in the
+    plane of the camera, the origin and its ray: the angle from that plane is the one across.
     """
     slopes = np.stack(np.gradient(direct), -1)
     corners = []
@@ -179,15 +177,17 @@ def feature_offsets_deg(
         for left in range(0, direct.shape[1] - WINDOW + 1, STRIDE):
             place = slice(top, top + WINDOW), slice(left, left + WINDOW)
             slope = slopes[place].reshape(-1, 2)
-            if shown[place].all() and np.linalg.eigvalsh(slope.T @ slope / len(slope))[0] >= SLOPE**2:
+            if view.shown[place].all() and np.linalg.eigvalsh(slope.T @ slope / len(slope))[0] >= SLOPE**2:
                 corners.append((top, left))
     if not corners:
-        return np.zeros(0)
+        return np.zeros((0, 2))
     windows = _cut(direct, corners, WINDOW)
     shifts = _best_shifts(windows - windows.mean((1, 2), keepdims=True), _cut(rendered, corners, WINDOW + 2 * REACH))
     middles = np.array(corners) + REACH + (WINDOW - 1) / 2
     there, here = _at(directions, middles + shifts), _at(directions, middles)
-    return angular_error_deg(there, here)
+    normals = np.cross(view.camera.position_world, here)
+    sines = (there * normals).sum(-1) / np.linalg.norm(normals, axis=-1)
+    return np.stack([angular_error_deg(there, here), np.degrees(np.arcsin(np.abs(sines)))], -1)
 
 
 def _cut(
@@ -249,15 +249,17 @@ def _correlation(one: Float[np.ndarray, "N"], two: Float[np.ndarray, "N"]) -> fl
 
 
 def direct_panorama(
-    views: Sequence[DirectView], inverse_distance: Float[np.ndarray, "h w"], height: int
+    views: Sequence[DirectView], inverse_distances: Sequence[Float[np.ndarray, "_ _"]], height: int
 ) -> tuple[Float[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]]:
-    """What is seen directly as a lat-long map about the origin, the mean over views, and which directions are."""
+    """What is seen directly as a lat-long map about the origin, the mean over views, and which directions are.
+
+    Each view has its map of 1/D.
+    """
     directions = latlong_directions(height)
-    inverse = np.maximum(_inverse_at(inverse_distance, directions), FARTHEST)
-    points = (directions / inverse[..., None]).reshape(-1, 3)
-    total, count = np.zeros((len(points), 3)), np.zeros(len(points))
-    for view in views:
-        x, y, depth = project(view.camera, points).T
+    total, count = np.zeros((2 * height**2, 3)), np.zeros(2 * height**2)
+    for view, inverse_distance in zip(views, inverse_distances, strict=True):
+        inverse = np.maximum(_inverse_at(inverse_distance, directions), FARTHEST)
+        x, y, depth = project(view.camera, (directions / inverse[..., None]).reshape(-1, 3)).T
         inside = (depth > 0) & (x >= 0) & (x < view.camera.width) & (y >= 0) & (y < view.camera.height)
         rows, columns = y[inside].astype(int), x[inside].astype(int)
         kept = view.shown[rows, columns]
@@ -268,17 +270,22 @@ def direct_panorama(
     return (total / np.maximum(count, 1)[:, None]).reshape(*shape, 3), (count > 0).reshape(shape)
 
 
-def brightest_direction(radiance: Float[np.ndarray, "H W 3"], known: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "3"]:
-    """Unit direction of the brightest lamp among the known directions of a lat-long map.
+def lamp_directions(radiance: Float[np.ndarray, "H W 3"], known: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "N 3"]:
+    """Unit directions of lamps among the known directions of a lat-long map, the brightest first.
 
-    It is the peak of luminance clipped to [0, 1] and blurred by LAMP_DEG, moved to the centroid of what is near it and
-    at least half as bright: so the largest lamp wins where several are clipped.
+    Luminance is clipped to [0, 1], as photographs are; what is at least half as bright as the brightest is blurred by
+    LAMP_DEG. The largest value is a lamp, at the centroid of what is within LAMP_REACH_DEG and at least half as bright;
+    so is the largest one elsewhere, and so on down to half the first.
     """
     light = np.where(known, np.clip(radiance @ REC709, 0, 1), 0)
-    blurred = blur_latlong(light[..., None], np.radians(LAMP_DEG))[..., 0]
-    directions = latlong_directions(len(light))
-    peak = directions.reshape(-1, 3)[np.where(known, blurred, -1).argmax()]
-    near = (directions @ peak > np.cos(np.radians(LAMP_REACH_DEG))) & (blurred >= blurred.max() / 2) & known
-    weights = np.where(near, blurred, 0) * np.linalg.norm(directions[..., :2], axis=-1)
-    centroid = np.tensordot(weights, directions, 2)
-    return np.asarray(centroid / np.linalg.norm(centroid))
+    light = np.where(light >= light.max() / 2, light, 0)
+    left = np.where(known, blur_latlong(light[..., None], np.radians(LAMP_DEG))[..., 0], 0)
+    directions, least = latlong_directions(len(light)), left.max() / 2
+    areas, found = np.linalg.norm(directions[..., :2], axis=-1), []
+    while left.max() >= max(least, 1e-9):
+        near = directions @ directions.reshape(-1, 3)[left.argmax()] > np.cos(np.radians(LAMP_REACH_DEG))
+        weights = np.where(near & (left >= left.max() / 2), left, 0) * areas
+        centroid = np.tensordot(weights, directions, 2)
+        found.append(centroid / np.linalg.norm(centroid))
+        left = np.where(near, 0, left)
+    return np.array(found).reshape(-1, 3)

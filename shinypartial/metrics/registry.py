@@ -85,7 +85,8 @@ METRICS = (
     Metric("direct_correlation", "Correlation with direct views, in a band", "", _HIGHER, ".3f", DEFINED_HERE),
     Metric("direct_correlation_unfiltered", "Correlation with direct views", "", _HIGHER, ".3f", DEFINED_HERE),
     Metric("direct_offset_deg", "Median angle by which features are off", "°", _LOWER, ".2f", DEFINED_HERE),
-    Metric("lamp_error_deg", "Angle to the brightest lamp", "°", _LOWER, ".2f", DEFINED_HERE),
+    Metric("direct_across_deg", "Its part that no distance changes", "°", _LOWER, ".2f", DEFINED_HERE),
+    Metric("lamp_error_deg", "Brightest lamp off by", "°", _LOWER, ".2f", DEFINED_HERE),
     Metric("sparsification_area", "Area between sparsification curve and perfect order", "", _LOWER, ".3f", ILG),
 )
 
