@@ -145,11 +145,11 @@ def test_one_picture_shows_photograph_normals_environment_and_visibility(
 
 
 def test_what_no_view_saw_is_hatched_in_the_picture_of_the_environment() -> None:
-    environment, visibility = np.full((40, 80, 3), (0.9, 0.1, 0.2)), np.ones((40, 80))
-    visibility[:, 50:] = 0
+    environment, visibility = np.full((512, 1024, 3), (0.9, 0.1, 0.2)), np.ones((512, 1024))
+    visibility[:, 640:] = 0
     picture = environment_picture(environment, visibility)
-    assert (picture[:, :50] == to_display(environment[0, 0])).all()
-    gray = picture[:, 50:]
+    assert (picture[:, :640] == to_display(environment[0, 0])).all()
+    gray = picture[:, 640:]
     assert (gray == gray[..., :1]).all()
     assert len(np.unique(gray[0])) == 2
 

@@ -38,7 +38,9 @@ def test_a_single_photograph_of_a_ball_is_trusted_by_its_rim() -> None:
     """No view is left to hold out, and it sees one side: the rim and what lies beside it tell."""
     found = judge(SINGLE, OPTIONS)
     assert found.verdict == "trust"
-    assert found.reason == "the rim of the ball is a circular cone to 0.1 px"
+    assert found.reason == (
+        "the rim of the ball is a circular cone to 0.1 px, and what lies beside it is what it mirrors (0.60)"
+    )
     assert judge(replace(SINGLE, rim_px=None), OPTIONS).verdict == "do not trust"
 
 
@@ -63,9 +65,11 @@ def test_a_wrong_ball_is_not_trusted(evidence: Evidence, figures: dict[str, floa
     assert "capture/ball.jpg" in found.remedy
 
 
-def test_a_ball_whose_surroundings_tell_nothing_is_judged_by_its_rim() -> None:
-    """A plain background says neither yes nor no."""
-    assert judge(replace(SINGLE, agreement=None), OPTIONS).verdict == "trust"
+def test_a_single_ball_whose_surroundings_tell_nothing_is_trusted_in_part() -> None:
+    """A plain background says neither yes nor no; several photographs explain one another."""
+    found = judge(replace(SINGLE, agreement=None), OPTIONS)
+    assert (found.verdict, found.reason) == ("partly", "nothing beside the ball says whether it mirrors")
+    assert judge(replace(GOOD, agreement=None), OPTIONS).verdict == "trust"
 
 
 def test_what_is_unexplained_of_a_ball_stands_near_it() -> None:

@@ -207,7 +207,7 @@ def test_too_few_views_to_hold_one_out_are_said_to_be_so(views: Views, count: in
     assert found.unexplained is None
     verdict = judge(found, OPTIONS)
     assert verdict.verdict == "do not trust"
-    assert f"{count} usable views" in verdict.reason
+    assert f"{count} usable view" in verdict.reason
     assert all(np.isfinite(value) for value in verdict.evidence.values())
 
 
@@ -252,7 +252,8 @@ def test_photographs_of_one_color_tell_nothing(views: Views, radiance: float) ->
 
 def test_a_verdict_holds_every_figure_by_name(views: Views) -> None:
     found = evidence(views)
-    assert set(judge(found, OPTIONS).evidence) == {field.name for field in fields(Evidence)}
+    of_balls = {"rim_px", "agreement"}
+    assert set(judge(found, OPTIONS).evidence) == {field.name for field in fields(Evidence)} - of_balls
 
 
 def test_a_rough_mirror_is_not_trusted(views: Views) -> None:
