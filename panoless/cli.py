@@ -17,6 +17,7 @@ from shinypartial.core.errors import InputError, parse_and_run
 from shinypartial.io.records import check_record
 
 if TYPE_CHECKING:
+    from panoless.photographs.make import Request
     from panoless.photographs.masks import Hint
     from panoless.viewer.server import Viewer
 
@@ -224,32 +225,17 @@ class Capture:
 
     def run(self) -> None:
         """Make the dataset and say what was measured."""
-        from panoless.photographs.make import Request, capture
+        from panoless.photographs.make import Request, capture, check_options
         from shinypartial.dataset.read import DEFAULT_FOLDER
 
         check_record(self.options, "--options", remedy="Correct that value.")
-        files = self._files()
-        if not files or (len({file.parent for file in files}) > 1 and self.output is None):
-            raise InputError(
-                expected="a folder of photographs, a video, or photographs of one folder",
-                found=f"{len(self.sources)} sources",
-                remedy="Name some, and --output DATASET.",
-            )
-        source = self.sources[0].resolve()
-        single = source.parent if source.is_file() and len(files) > 1 else source
-        output = self.output or DEFAULT_FOLDER / (single.stem if single.is_file() else single.name)
-        if self._shows_a_ball(files):
-            self._capture_ball(files, output)
-            return
-        if len(self.sources) != 1:
-            raise InputError(
-                expected="one folder of photographs, or one video",
-                found=f"{len(self.sources)} sources without a mirror ball",
-                remedy="Name the folder; or add --object ball.",
-            )
+        first = self.sources[0].resolve()
+        name = first.stem if first.is_file() else first.name
+        if first.is_file() and len(self.sources) > 1:
+            name = first.parent.name
         request = Request(
             self.sources[0],
-            output,
+            self.output or DEFAULT_FOLDER / name,
             colmap=self.colmap,
             board=self.board,
             square_mm=self.square_mm,
@@ -259,8 +245,19 @@ class Capture:
             upright=self.upright,
             options=self.options,
         )
+        check_options(request)
+        files = self._files()
+        if self._shows_a_ball(files):
+            self._capture_ball(files, request)
+            return
+        if len(self.sources) != 1:
+            raise InputError(
+                expected="one folder of photographs, or one video",
+                found=f"{len(self.sources)} sources without a mirror ball",
+                remedy="Name the folder; or add --object ball.",
+            )
         print("\n".join(capture(request).summary()))
-        print(f"Look at {output}/capture/masks.jpg. Next:", command_line("panoless", "fit", output))
+        print(f"Look at {request.output}/capture/masks.jpg. Next:", command_line("panoless", "fit", request.output))
 
     def _files(self) -> tuple[Path, ...]:
         from panoless.photographs.frames import source_files
@@ -294,13 +291,15 @@ class Capture:
             print("Note: these photographs show a round thing. If it is a mirror ball, --object ball is simpler.")
         return few
 
-    def _capture_ball(self, files: tuple[Path, ...], output: Path) -> None:
+    def _capture_ball(self, files: tuple[Path, ...], request: "Request") -> None:
         from panoless.photographs.ball.make import BallRequest, capture_ball
 
-        captured = capture_ball(BallRequest(files, output, self.focal_mm, self._hints()))
+        captured = capture_ball(BallRequest(files, request.output, self.focal_mm, request.hints))
         print("\n".join(captured.summary()))
         light = ("--config.environment.range", "hdr") if captured.high_dynamic_range else ()
-        print(f"Look at {output}/capture/ball.jpg. Next:", command_line("panoless", "fit", output, *light))
+        print(
+            f"Look at {request.output}/capture/ball.jpg. Next:", command_line("panoless", "fit", request.output, *light)
+        )
 
     def _hints(self) -> "dict[str, Hint]":
         from panoless.photographs.masks import Hint, read_clicks

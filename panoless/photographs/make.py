@@ -100,7 +100,7 @@ def capture(request: Request) -> Captured:
     Raises InputError for options that exclude each other, for whatever photographs, poses or masks lack, and for an
     output folder that holds other things.
     """
-    _check_options(request)
+    check_options(request)
     files = source_files(request.source)
     check_output(request.output)
     with folder_lock(request.output):
@@ -118,8 +118,8 @@ def capture(request: Request) -> Captured:
     return Captured(frames, poses, masks)
 
 
-def _check_options(request: Request) -> None:
-    """InputError where two options each say how poses, or how masks, are found, and for a square without a side."""
+def check_options(request: Request) -> None:
+    """Raise InputError where two options each say how poses or masks are found, and for a square without a side."""
     if request.square_mm is not None and not 0 < request.square_mm < float("inf"):
         raise InputError(
             expected="--square-mm above 0",

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from msgspec import Meta
 
 from shinypartial.core.camera import Camera, check_pose, opengl_to_opencv
+from shinypartial.core.command_line import command_line
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Frame, find_picture
 from shinypartial.io.files import read_json
@@ -67,7 +68,7 @@ def read_frames(root: Path, split: str) -> tuple[list[Frame], int, list[InputErr
             raise InputError(
                 expected=f"the cameras of the {split} split at {path}",
                 found=f"{ALL_CAMERAS} of nerfstudio or instant-ngp, in which the cameras lie",
-                remedy=f"Make a dataset with masks and without distortion of it: `panoless capture {root}`.",
+                remedy=f"Make a dataset with masks and without distortion of it: `{command_line('panoless', 'capture', root)}`.",
             )
         raise InputError(
             expected=f"the cameras of the {split} split at {path}",

@@ -42,7 +42,7 @@ def test_two_places_are_no_group(brackets: list[list[Shot]], far: Taken) -> None
     shots = [brackets[0][0], brackets[1][1]]
     circle = far.balls[0].rim.circle
     assert same_pose(shots, [circle, circle]) == [[0], [1]]
-    assert same_pose(brackets[0][:2], [circle, Circle(circle.x + 9, circle.y, circle.radius)]) == [[0], [1]]
+    assert same_pose(brackets[0][:2], [circle, Circle(circle.x + 30, circle.y, circle.radius)]) == [[0], [1]]
 
 
 @pytest.mark.parametrize("stated", [True, False])
