@@ -68,7 +68,8 @@ def read_frames(root: Path, split: str) -> tuple[list[Frame], int, list[InputErr
             raise InputError(
                 expected=f"the cameras of the {split} split at {path}",
                 found=f"{ALL_CAMERAS} of nerfstudio or instant-ngp, in which the cameras lie",
-                remedy=f"Make a dataset with masks and without distortion of it: `{command_line('panoless', 'capture', root)}`.",
+                remedy="Make a dataset with masks and without distortion of it: "
+                f"`{command_line('panoless', 'capture', root)}`.",
             )
         raise InputError(
             expected=f"the cameras of the {split} split at {path}",
