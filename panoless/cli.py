@@ -2,6 +2,7 @@
 
 import math
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -17,6 +18,7 @@ from shinypartial.core.errors import InputError, parse_and_run
 from shinypartial.io.records import check_record
 
 if TYPE_CHECKING:
+    from panoless.photographs.ball.find import FoundBall
     from panoless.photographs.make import Request
     from panoless.photographs.masks import Hint
     from panoless.viewer.server import Viewer
@@ -229,13 +231,9 @@ class Capture:
         from shinypartial.dataset.read import DEFAULT_FOLDER
 
         check_record(self.options, "--options", remedy="Correct that value.")
-        first = self.sources[0].resolve()
-        name = first.stem if first.is_file() else first.name
-        if first.is_file() and len(self.sources) > 1:
-            name = first.parent.name
         request = Request(
             self.sources[0],
-            self.output or DEFAULT_FOLDER / name,
+            self.output or DEFAULT_FOLDER / _name_of(self.sources),
             colmap=self.colmap,
             board=self.board,
             square_mm=self.square_mm,
@@ -246,9 +244,10 @@ class Capture:
             options=self.options,
         )
         check_options(request)
-        files = self._files()
-        if self._shows_a_ball(files):
-            self._capture_ball(files, request)
+        files = _files_of(self.sources)
+        balls = self._balls(files, request.hints)
+        if balls is not None:
+            self._capture_ball(files, request, balls)
             return
         if len(self.sources) != 1:
             raise InputError(
@@ -259,42 +258,42 @@ class Capture:
         print("\n".join(capture(request).summary()))
         print(f"Look at {request.output}/capture/masks.jpg. Next:", command_line("panoless", "fit", request.output))
 
-    def _files(self) -> tuple[Path, ...]:
-        from panoless.photographs.frames import source_files
-
-        return tuple(file for each in self.sources for file in ([each] if each.is_file() else source_files(each)))
-
-    def _shows_a_ball(self, files: tuple[Path, ...]) -> bool:
-        """Whether that is stated, or less than eight photographs are given with nothing else about them."""
+    def _balls(self, files: tuple[Path, ...], hints: "Mapping[str, Hint]") -> "dict[Path, FoundBall] | None":
+        """Where a ball is photographed, those that were found to know it: that is stated, or less than eight
+        photographs are given with nothing else about them. None of other objects.
+        """
         if self.object != "auto":
-            return self.object == "ball"
+            return {} if self.object == "ball" else None
         from panoless.photographs.ball.find import find_ball
         from panoless.photographs.shot import read_shot
         from panoless.photographs.video import VIDEO_SUFFIXES
 
         named = self.colmap or self.masks or self.segmenter or self.board not in (None, "none")
         if named or any(file.suffix.lower() in VIDEO_SUFFIXES for file in files):
-            return False
-        few = len(files) < self.options.least_views
+            return None
+        few, balls = len(files) < self.options.least_views, {}
+        if few and hints:
+            return {}
         try:
-            for file in {files[0], files[len(files) // 2], files[-1]}:
-                find_ball(read_shot(file))
+            for file in dict.fromkeys((files[0], files[len(files) // 2], files[-1])):
+                balls[file] = find_ball(read_shot(file), focal_film_mm=self.focal_mm)
         except InputError as error:
-            if not few or self.clicks or self.box:
-                return few
+            if not few:
+                return None
             raise InputError(
                 expected=f"a mirror ball, or at least {self.options.least_views} photographs of another object",
                 found=f"{len(files)} photographs; {error.found} in {file.name}",
                 remedy=f"Take more photographs. If it is a ball: {error.remedy}",
             ) from None
-        if not few:
-            print("Note: these photographs show a round thing. If it is a mirror ball, --object ball is simpler.")
-        return few
+        if few:
+            return balls
+        print("Note: these photographs show a round thing. If it is a mirror ball, --object ball is simpler.")
+        return None
 
-    def _capture_ball(self, files: tuple[Path, ...], request: "Request") -> None:
+    def _capture_ball(self, files: tuple[Path, ...], request: "Request", balls: "dict[Path, FoundBall]") -> None:
         from panoless.photographs.ball.make import BallRequest, capture_ball
 
-        captured = capture_ball(BallRequest(files, request.output, self.focal_mm, request.hints))
+        captured = capture_ball(BallRequest(files, request.output, self.focal_mm, request.hints, balls))
         print("\n".join(captured.summary()))
         light = ("--config.environment.range", "hdr") if captured.high_dynamic_range else ()
         print(
@@ -337,14 +336,11 @@ class Light:
     def run(self) -> None:
         """Capture, fit, convert, and say what to look at."""
         from panoless.api import light
-        from panoless.photographs.frames import source_files
         from panoless.photographs.masks import read_clicks
 
-        files = tuple(file for each in self.sources for file in ([each] if each.is_file() else source_files(each)))
-        first = self.sources[0].resolve()
-        name = first.stem if len(files) == 1 else first.parent.name if first.is_file() else first.name
         hints = {} if self.clicks is None else read_clicks(self.clicks)
-        made = light(files, self.output or Path("lights") / name, focal_mm=self.focal_mm, hints=hints)
+        output = self.output or Path("lights") / _name_of(self.sources)
+        made = light(_files_of(self.sources), output, focal_mm=self.focal_mm, hints=hints)
         print("\n".join(made.lines))
         if made.reconstruction.verdict:
             print(f"Verdict: {made.reconstruction.verdict.sentence()}")
@@ -371,6 +367,21 @@ class PrintBoard:
         write_board(board, self.output)
         print(f"Print {self.output} at 100 % and measure: five squares are {5 * board.square_mm:g} mm.")
         print("Then: panoless capture FOLDER")
+
+
+def _name_of(sources: tuple[Path, ...]) -> str:
+    """Of a photograph, a video or a folder; of several photographs that of their folder."""
+    first = sources[0].resolve()
+    if not first.is_file():
+        return first.name
+    return first.stem if len(sources) == 1 else first.parent.name
+
+
+def _files_of(sources: tuple[Path, ...]) -> tuple[Path, ...]:
+    """The photographs that are named, and those of folders."""
+    from panoless.photographs.frames import source_files
+
+    return tuple(file for each in sources for file in ([each] if each.is_file() else source_files(each)))
 
 
 def _preset_of(arguments: list[str]) -> str:

@@ -12,8 +12,6 @@ from shinypartial.dataset.schema import BallEvidence, Dataset
 
 PHOTOGRAPHER_DEG = 30.0
 """About each camera, seen from a ball: who holds it reaches so far, legs included, in 37 photographs of a lobby."""
-
-
 FEW_VIEWS = 5
 """Of a ball, from which one can be spared to judge how near the surroundings are."""
 

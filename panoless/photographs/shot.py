@@ -14,15 +14,15 @@ import numpy as np
 from jaxtyping import Float, Num, UInt8
 
 from panoless.photographs.lens import INSTALL
-from shinypartial.core.color import srgb_to_linear, to_display
+from shinypartial.core.color import LINEAR_OF_CODES, srgb_to_linear, to_display
+from shinypartial.core.conventions import FILM_DIAGONAL_MM, INCH_MM
 from shinypartial.core.errors import InputError
 from shinypartial.io.images import EXR, picture_attributes, read_upright, unit_values
 
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
-FILM_DIAGONAL_MM = math.hypot(36, 24)
 CLIPPED = 0.985
 """Share of the largest code from which a pixel is clipped: JPEG moves codes by some levels."""
-INCH_MM, CENTIMETER_MM = 25.4, 10.0
+CENTIMETER_MM = 10.0
 
 
 @dataclass(frozen=True)
@@ -107,9 +107,9 @@ class Shot:
         """Linear light."""
         if self.linear:
             return np.asarray(self.pixels, np.float32)
-        largest = int(np.iinfo(self.pixels.dtype).max)
-        table = srgb_to_linear(np.arange(largest + 1, dtype=np.float32) / largest)
-        return np.asarray(table[self.pixels])
+        if self.pixels.dtype == np.uint8:
+            return np.asarray(LINEAR_OF_CODES[self.pixels])
+        return srgb_to_linear(unit_values(self.pixels))
 
     def codes(self) -> UInt8[np.ndarray, "H W 3"]:
         """8-bit sRGB; linear light so that its brightest hundredth ends at 1."""

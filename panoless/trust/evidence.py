@@ -28,6 +28,7 @@ from panoless.environment.resolution import densest_resolution
 from panoless.environment.sharpening import deblur_map
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, overlap, pixel_areas, usable_views
+from panoless.geometry.registry import FAMILIES
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.robust import NORMAL_MEDIAN, bounded_error, robust_scale, robust_weight
 from panoless.trust.options import TrustOptions
@@ -162,10 +163,11 @@ def gather_evidence(
 def _rim_px(
     ball: BallEvidence | None, geometry: Geometry, silhouette_px: float, light: dict[str, float | None]
 ) -> float | None:
-    """That of a capture; of a sphere of which no view is held out, how far its silhouettes are off."""
+    """That of a capture; of a kind that outlines determine and of which no view is held out, how far these are off."""
     if ball is not None:
         return ball.rim_px
-    return silhouette_px if geometry.kind == "sphere" and light["unexplained"] is None else None
+    by_outlines = FAMILIES[geometry.kind].told_by_outlines
+    return silhouette_px if by_outlines and light["unexplained"] is None else None
 
 
 def _evenly(views: Sequence[TrainView], count: int) -> list[TrainView]:

@@ -124,7 +124,7 @@ DOUBTS = (
         RIM,
     ),
     _Doubt(
-        lambda found: _disagreement(found),
+        _disagreement,
         lambda options: options.refused,
         lambda found: (
             "nothing beside the ball says whether it mirrors"

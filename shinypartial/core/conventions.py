@@ -6,10 +6,16 @@ center lies at 0.5. Rays point from the camera to the surface. Lat-long maps hav
 along +Z and the image center along +X. Cubemap faces follow FACES with the orientation of OpenGL 4.6 table 8.19.
 """
 
+import math
+
 import numpy as np
 
 FACES = ("px", "nx", "py", "ny", "pz", "nz")
 PIXEL_CENTER = 0.5
+
+#: Of 35 mm film, 36 × 24 mm, to which EXIF relates focal lengths by diagonals.
+FILM_DIAGONAL_MM = math.hypot(36, 24)
+INCH_MM = 25.4
 
 #: Multiplies the columns of a camera-to-world matrix: OpenGL axes ⇄ OpenCV axes (its own inverse).
 OPENGL_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])

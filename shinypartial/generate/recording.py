@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 
 from shinypartial.core.camera import Camera
 from shinypartial.core.color import to_display
+from shinypartial.core.conventions import FILM_DIAGONAL_MM, INCH_MM
 from shinypartial.dataset.perturb.sensor import add_noise, blur, undistorted_pixels, vignette_gain, warp
 from shinypartial.dataset.write import encode_unit
 from shinypartial.scene import FilmSpec, Phone, Photographs
@@ -16,8 +17,8 @@ from shinypartial.scene import FilmSpec, Phone, Photographs
 #: Of a picture whose gain is 1; the ISO speed and the aperture are the same in all of them.
 EXPOSURE_S = 1 / 60
 SENSITIVITY, F_NUMBER = 100, 1.8
-DIAGONAL_OF_35MM_FILM_MM = math.hypot(36, 24)
-MM_PER_INCH, INCHES = 25.4, 2
+#: EXIF's number for a resolution in pixels an inch.
+INCHES = 2
 
 
 @dataclass(frozen=True)
@@ -82,10 +83,10 @@ def exif_tags(camera: Camera, photographs: Photographs, moment: Moment) -> dict[
         "FNumber": F_NUMBER,
         "Exif:PhotographicSensitivity": SENSITIVITY,
         "Exif:FocalLength": camera.fx / px_per_mm,
-        "Exif:FocalLengthIn35mmFilm": round(camera.fx * DIAGONAL_OF_35MM_FILM_MM / diagonal),
+        "Exif:FocalLengthIn35mmFilm": round(camera.fx * FILM_DIAGONAL_MM / diagonal),
     }
     if photographs.focal_plane:
-        px_per_inch = px_per_mm * MM_PER_INCH
+        px_per_inch = px_per_mm * INCH_MM
         tags |= {f"Exif:FocalPlane{axis}Resolution": px_per_inch for axis in "XY"}
         tags["Exif:FocalPlaneResolutionUnit"] = INCHES
     return tags

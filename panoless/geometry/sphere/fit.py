@@ -16,6 +16,7 @@ from panoless.capture.views import Views
 from panoless.geometry.base import overlap
 from panoless.geometry.sphere.model import Sphere, sphere_buffers
 from panoless.geometry.sphere.options import SphereOptions
+from panoless.numeric.cones import nearest_cone
 from panoless.numeric.factorize import regularize
 from panoless.numeric.gauss_newton import accept_step, damped_step
 from panoless.numeric.robust import bounded_error, robust_scale, robust_weight
@@ -60,24 +61,22 @@ class Cones:
 
     @classmethod
     def of(cls, rays: OutlineRays, options: SphereOptions) -> "Cones":
-        """By robust linear least squares: m·r = 1 for all rays r of the cone with m = a/cos α."""
+        """Those nearest to the contour rays of each view."""
         found = []
         for view in np.unique(rays.view):
             own = rays.view == view
             directions, scale = rays.directions[own], rays.pixels_per_rad[own]
-            weights = np.ones(len(directions))
-            for _ in range(options.cone_rounds):
-                weighted = directions * weights[:, None]
-                moment = weighted.T @ directions + 1e-12 * np.eye(3)
-                m = np.linalg.solve(regularize(moment, "a cone"), weighted.sum(0))
-                cosine = min(1 / float(np.linalg.norm(m)), WIDEST_COSINE)
-                # m·r = cos β/cos α, and the angle β − α is what the pixels are off by.
-                off_px = (np.arccos(np.clip(directions @ m * cosine, -1, 1)) - np.arccos(cosine)) * scale
-                weights = robust_weight(off_px, robust_scale(off_px, options.scales_px[-1], options.noise_scale))
-            median_px = float(np.median(np.abs(off_px)))
-            axis, sine = m / np.linalg.norm(m), np.sqrt(1 - cosine**2)
-            oval = _second_harmonic(directions, axis, off_px / scale, weights) / np.arccos(cosine)
-            found.append((rays.origins[own][0], axis, sine, median_px, oval))
+            cone = nearest_cone(
+                directions,
+                scale,
+                rounds=options.cone_rounds,
+                scale_px=options.scales_px[-1],
+                medians=options.noise_scale,
+                widest_cosine=WIDEST_COSINE,
+            )
+            median_px = float(np.median(np.abs(cone.off_px)))
+            oval = _second_harmonic(directions, cone.axis, cone.off_px / scale, cone.weights) / np.arccos(cone.cosine)
+            found.append((rays.origins[own][0], cone.axis, cone.sine, median_px, oval))
         origins, axes, *figures = zip(*found, strict=True) if found else [()] * 5
         return cls(np.array(origins).reshape(-1, 3), np.array(axes).reshape(-1, 3), *map(np.array, figures))
 

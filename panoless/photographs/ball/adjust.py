@@ -13,15 +13,21 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from panoless.numeric.cones import nearest_cone
 from panoless.numeric.gauss_newton import damped_step
+from panoless.numeric.robust import robust_weight
 from panoless.photographs.ball.cone import BallCone
 from panoless.photographs.ball.panorama import Features
 from panoless.photographs.ball.rotations import Pair
 from panoless.photographs.lens import Lens
 from shinypartial.core.sphere import tangents
 
+CONE_ROUNDS, WIDEST_COSINE = 10, 0.99999
+"""Rounds of a rim's cone, and of half its angle (0.26°) the largest cosine."""
 ROUNDS = 20
 OF_VIEW = 6
+RAYLEIGH_MEDIAN = 1.18
+"""The median of ‖x‖ of two independent normal numbers, in standard deviations."""
 INVERSE_DISTANCE = 0.1
 """Standard deviation of w before anything is seen, in inverse radii of the ball; at most NEAREST."""
 NEAREST = 0.5
@@ -45,17 +51,11 @@ class SeenBall:
 
 
 def cone_of(points_px: Float[np.ndarray, "K 2"], lens: Lens) -> tuple[BallCone, Float[np.ndarray, "K"]]:
-    """The circular cone nearest to the rays of points, and how far (px) each is outside it: m·r = 1 with m = a/cos α,
-    by robust linear least squares.
-    """
-    rays, weights = lens.rays(points_px), np.ones(len(points_px))
-    for _ in range(10):
-        weighted = rays * weights[:, None]
-        m = np.linalg.solve(weighted.T @ rays + 1e-12 * np.eye(3), weighted.sum(0))
-        cosine = min(1 / float(np.linalg.norm(m)), 0.99999)
-        off = (np.arccos(np.clip(rays @ m * cosine, -1, 1)) - np.arccos(cosine)) * lens.fx
-        weights = 1 / (1 + (off / max(2 * float(np.median(np.abs(off))), 0.15)) ** 2) ** 2
-    return BallCone(m / np.linalg.norm(m), float(1 / np.sqrt(1 - cosine**2))), off
+    """The circular cone nearest to the rays of points, and how far (px) each is outside it."""
+    found = nearest_cone(
+        lens.rays(points_px), lens.fx, rounds=CONE_ROUNDS, scale_px=0.15, medians=2.0, widest_cosine=WIDEST_COSINE
+    )
+    return BallCone(found.axis, 1 / found.sine), found.off_px
 
 
 @dataclass(frozen=True)
@@ -105,9 +105,6 @@ class Adjusted:
     """Of a camera's turn (rad, world axes) and of the shift of its center (radii of the ball)."""
     residual_deg: float
     """Median angle between what is mirrored and where its point lies."""
-    inverse_distances: Float[np.ndarray, "T"]
-    """w of the points, in inverse radii of the ball."""
-    observations: int = 0
 
 
 @dataclass
@@ -189,24 +186,26 @@ class _Adjustment:
         prior = np.zeros(OF_VIEW * views)
         for v, ball in enumerate(self.balls):
             prior[OF_VIEW * v + 3 : OF_VIEW * v + 6] = 1 / ball.sigma_rad**2
-        matrix, unit = np.eye(len(prior)), 1.0
+        matrix = np.eye(len(prior))
         for _ in range(ROUNDS if len(self.view) else 0):
-            gradient, matrix, back, unit = self._reduced(state, prior)
+            gradient, matrix, back = self._reduced(state, prior)
             step = damped_step(gradient, matrix, 1e-6)
             self._move(state, step, back)
             if np.abs(step).max() < 1e-6:
                 break
-        return self._result(state, matrix, unit)
+        return self._result(state, matrix)
 
-    def _reduced(self, state: _State, prior: Float[np.ndarray, "D"]):  # type: ignore[no-untyped-def]
-        """Gradient and matrix over views with points eliminated, in units of the residuals' own
-        variance, and what gives the points' steps back.
+    def _reduced(
+        self, state: _State, prior: Float[np.ndarray, "D"]
+    ) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"], Float[np.ndarray, "T 3 E"]]:
+        """Gradient and matrix over views with points eliminated, in units of the residuals' own variance, and what
+        gives the points' steps back.
         """
         values, rows_of = self._observed(state)
         off, across, predicted, length = self._residuals(state, values)
         size = np.linalg.norm(off, axis=1)
-        unit = max(float(np.median(size)) / 1.18, 0.05)
-        weight = 1 / (1 + (size / (SCALE * 1.18 * unit)) ** 2) ** 2 / unit**2
+        unit = max(float(np.median(size)) / RAYLEIGH_MEDIAN, 0.05)
+        weight = robust_weight(size, SCALE * RAYLEIGH_MEDIAN * unit) / unit**2
         inverse = state.inverse[self.track]
         # d(predicted) = (1 − d dᵀ)/‖v‖ (du − p dw − w dp)
         project = (np.eye(3) - predicted[:, :, None] * predicted[:, None]) / length[:, None, None]
@@ -240,7 +239,7 @@ class _Adjustment:
         gradient -= flat.T @ solved[:, :, -1].ravel()
         matrix[np.diag_indices(size_all)] += prior
         gradient += prior * np.concatenate([np.zeros((len(self.balls), 3)), state.steps], 1).ravel()
-        return gradient, matrix, solved, unit
+        return gradient, matrix, solved
 
     def _move(self, state: _State, step: Float[np.ndarray, "D"], back: Float[np.ndarray, "T 3 E"]) -> None:
         by_view = step.reshape(-1, OF_VIEW)
@@ -253,7 +252,7 @@ class _Adjustment:
         state.rotations = turns @ state.rotations
         state.steps = state.steps + by_view[:, 3:]
 
-    def _result(self, state: _State, matrix: Float[np.ndarray, "D D"], unit: float) -> Adjusted:
+    def _result(self, state: _State, matrix: Float[np.ndarray, "D D"]) -> Adjusted:
         values, _ = self._observed(state)
         off, *_ = self._residuals(state, values)
         angle = np.linalg.norm(off, axis=1) * self.sigma
@@ -283,6 +282,4 @@ class _Adjustment:
             cones=dict(zip(self.members, cones, strict=True)),
             covariance=covariance,
             residual_deg=float(np.degrees(np.median(angle))) if len(angle) else 0.0,
-            inverse_distances=state.inverse,
-            observations=len(self.view),
         )

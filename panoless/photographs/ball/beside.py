@@ -5,7 +5,7 @@ ball it lies in the direction X/‖X‖, in which other photographs, or this one
 compared by the correlation of their logarithms, band-passed, so that neither exposure nor a lamp above decides.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -170,13 +170,3 @@ def refraction_agreement(ball: PosedBall, index: float = 1.5) -> float:
     outside = np.arccos(np.clip(out @ ball.cone.axis, -1, 1)) > 1.05 * ball.cone.half_angle
     good &= outside
     return float("nan") if good.sum() < LEAST_CELLS else _correlation(direct, shown, good)
-
-
-def posed(
-    lights: Mapping[int, Float32[np.ndarray, "_ _"]],
-    lenses: Mapping[int, Lens],
-    cones: Mapping[int, BallCone],
-    rotations: Mapping[int, Float[np.ndarray, "3 3"]],
-) -> list[PosedBall]:
-    """The photographs that have a pose."""
-    return [PosedBall(lights[i], lenses[i], cones[i], rotations[i]) for i in sorted(rotations)]

@@ -28,10 +28,15 @@ DARKEST = 0.004
 class Exposed:
     """A view's light at the exposure that all views share."""
 
-    radiance: Float[np.ndarray, "H W 3"]
+    radiance: Float[np.ndarray, "H W 3"] | None
+    """None where all views have one exposure, and their pictures are 8-bit codes: these say it all."""
     unknown: Bool[np.ndarray, "H W"]
     """Where it is clipped though another view was exposed less."""
-    high_dynamic_range: bool
+
+    @property
+    def high_dynamic_range(self) -> bool:
+        """Whether it is more than the codes of a picture."""
+        return self.radiance is not None
 
 
 def same_pose(shots: Sequence[Shot], circles: Sequence[Circle]) -> list[list[int]]:
@@ -92,8 +97,7 @@ def exposed(groups: Sequence[Sequence[Shot]]) -> list[Exposed]:
     found = []
     for group in groups:
         if equal and codes:
-            shape = group[0].pixels.shape
-            found.append(Exposed(np.zeros(shape, np.float32), np.zeros(shape[:2], bool), False))
+            found.append(Exposed(None, np.zeros(group[0].pixels.shape[:2], bool)))
             continue
         total = np.zeros(group[0].pixels.shape, np.float32)
         weight = np.zeros(total.shape[:2], np.float32)
@@ -105,5 +109,5 @@ def exposed(groups: Sequence[Sequence[Shot]]) -> list[Exposed]:
             weight += np.where(good, gain**2, 0)
         clipped = (least.radiance() >= least.clips_at).any(-1)
         unknown = clipped & (gains[id(least)] > shortest * 2**EQUAL_STOPS)
-        found.append(Exposed(total / weight[..., None], unknown, True))
+        found.append(Exposed(total / weight[..., None], unknown))
     return found

@@ -1,9 +1,9 @@
 """Balls in photographs: the circle of most support, its rim, and what a person says of where it is."""
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -16,6 +16,7 @@ from panoless.photographs.shot import Focal, Shot, given_focal, read_shot
 from shinypartial.core.errors import InputError
 from shinypartial.io.picture_sheet import write_picture_sheet
 from shinypartial.io.progress import Progress
+from shinypartial.io.threads import in_threads
 
 LARGEST_RADIUS_PX = 400.0
 """Photographs are averaged over blocks of pixels until the ball is no larger: a pixel in its middle then spans 0.3°."""
@@ -30,7 +31,6 @@ OVER_BORDER = 0.02
 """Share of the radius by which a rim may lie beyond the picture."""
 BLUR_SIDE_PX, MOST_BLUR = 200, 0.75
 """Blur (Crete et al. 2007, 0 to 1) above which a ball is refused, judged where it is so wide."""
-THREADS = 2
 SHEET_PICTURES = 12
 HELP_FIND = 'Name a point on it, --clicks FILE with {"NAME": {"on": [[x, y]]}}, or a rectangle, --box and --box-in.'
 
@@ -64,7 +64,11 @@ class FoundBall:
 
 
 def find_balls(
-    files: Sequence[Path], hints: Mapping[str, Hint], focal_film_mm: float | None, sheet: Path
+    files: Sequence[Path],
+    hints: Mapping[str, Hint],
+    focal_film_mm: float | None,
+    sheet: Path,
+    found_before: Mapping[Path, FoundBall] = MappingProxyType({}),
 ) -> list[FoundBall]:
     """Every photograph with its ball. Writes a `sheet` of what was found; InputError where there is none."""
     names = [path.stem for path in files]
@@ -76,6 +80,9 @@ def find_balls(
     progress = Progress("looking for the ball", len(files))
 
     def work(path: Path) -> FoundBall | tuple[Shot, InputError]:
+        if path in found_before:
+            progress.advance()
+            return found_before[path]
         shot = read_shot(path)
         try:
             return find_ball(shot, hints.get(path.stem), focal_film_mm)
@@ -84,8 +91,7 @@ def find_balls(
         finally:
             progress.advance()
 
-    with ThreadPoolExecutor(THREADS) as pool:
-        found = list(pool.map(work, files))
+    found = list(in_threads(work, files))
     balls = [each for each in found if isinstance(each, FoundBall)]
     if balls:
         write_ball_sheet(sheet, balls)
@@ -178,9 +184,8 @@ def write_ball_sheet(path: Path, balls: Sequence[FoundBall]) -> None:
         for x, y in ((ball.rim.points - low) * scale).astype(int):
             cv2.circle(tile, (int(x), int(y)), 1, (40, 230, 60), -1)
         for start, stop in ball.rim.gaps:
-            angles = np.linspace(start, stop, 24)
-            around = np.stack([circle.x + circle.radius * np.cos(angles), circle.y + circle.radius * np.sin(angles)], 1)
-            cv2.polylines(tile, [((around - low) * scale).astype(np.int32)], False, (240, 60, 40), 2)
+            gap = circle.points(np.linspace(start, stop, 24))
+            cv2.polylines(tile, [((gap - low) * scale).astype(np.int32)], False, (240, 60, 40), 2)
         tiles[f"{ball.name}  {ball.rim.seen.mean():.0%} of the rim"] = tile
     write_picture_sheet(path, tiles)
 
@@ -190,8 +195,7 @@ def hidden(ball: FoundBall) -> Bool[np.ndarray, "H W"]:
     cover = np.zeros(ball.gray.shape, np.uint8)
     circle = ball.rim.circle
     for start, stop in ball.rim.gaps:
-        angles = np.linspace(start, stop, 48)
-        around = np.stack([np.cos(angles), np.sin(angles)], 1) * circle.radius
-        outline = np.concatenate([1.1 * around, around[[-1, 0]]]) + np.array([circle.x, circle.y])
+        beyond, ends = circle.points(np.linspace(start, stop, 48), 1.1), circle.points(np.array([stop, start]))
+        outline = np.concatenate([beyond, ends])
         opencv().fillPoly(cover, [np.rint(outline).astype(np.int32)], 1)
     return cover > 0

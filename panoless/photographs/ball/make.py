@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from panoless.numeric.robust import bounded_error, robust_scale
 from panoless.photographs.ball.adjust import cone_of
 from panoless.photographs.ball.beside import PosedBall, agreement, log_light, refraction_agreement
 from panoless.photographs.ball.brackets import Exposed, exposed, same_pose
@@ -49,6 +50,8 @@ class BallRequest:
     focal_film_mm: float | None = None
     """Focal length on 35 mm film; None for what EXIF says."""
     hints: Mapping[str, Hint] = field(default_factory=dict)
+    found: Mapping[Path, FoundBall] = field(default_factory=dict)
+    """Balls that were looked for before."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,7 @@ def capture_ball(request: BallRequest) -> CapturedBall:
 
 def _captured(request: BallRequest) -> CapturedBall:
     sheet = request.output / "capture" / "ball.jpg"
-    balls = find_balls(request.files, request.hints, request.focal_film_mm, sheet)
+    balls = find_balls(request.files, request.hints, request.focal_film_mm, sheet, request.found)
     focal = _focal(balls, request)
     # Of a bracket, the exposure whose rim is seen best stands for all.
     groups = same_pose([ball.shot for ball in balls], [ball.rim.circle for ball in balls])
@@ -167,8 +170,7 @@ def _focal(balls: Sequence[FoundBall], request: BallRequest) -> Focal:
     stated = sorted((ball.focal for ball in balls), key=lambda each: each.over_diagonal)[len(balls) // 2]
     if request.focal_film_mm is not None:
         return stated
-    logs = FOCAL_LOGS
-    costs = []
+    logs, costs = FOCAL_LOGS, []
     for log in logs:
         moved = replace(stated, over_diagonal=stated.over_diagonal * float(np.exp(log)))
         of_balls = [cone_of(ball.rim.points, ball.lens(moved))[1] for ball in balls]
@@ -186,8 +188,8 @@ def _focal(balls: Sequence[FoundBall], request: BallRequest) -> Focal:
 
 def _cost(off_px: Float[np.ndarray, "K"]) -> float:
     """Of a rim's distances from its cone, neighbors of which are no news: some count once."""
-    scale = max(1.5 * float(np.median(np.abs(off_px))), 0.2)
-    return float((off_px**2 / (off_px**2 + 4 * scale**2)).sum() * 4 / RIM_CORRELATION / 2)
+    scale = robust_scale(off_px, 0.2, 1.5)
+    return float(bounded_error(off_px, 2 * scale).sum() * 4 / RIM_CORRELATION / 2)
 
 
 def _refuse_glass(lights: Sequence[PosedBall], names: Sequence[str]) -> None:
@@ -245,18 +247,16 @@ def _write_view(
     folder: Path,
 ) -> Frame:
     """Picture and mask; what is hidden or clipped has an alpha that counts as the object but shows nothing."""
-    stem = folder / ball.name
+    stem, suffix = folder / ball.name, ".exr" if light.high_dynamic_range else ".png"
+    picture, mask_file = folder / f"{ball.name}{suffix}", folder / f"{ball.name}_alpha.png"
     mask = np.rint(coverage(cone, lens) * 255).astype(np.uint8)
     unknown = hidden(ball) | light.unknown
     mask = np.where(unknown, np.minimum(mask, HIDDEN_ALPHA), mask)
-    write_png(stem.with_name(f"{stem.name}_alpha.png"), mask)
-    if light.high_dynamic_range:
-        write_exr_rgb(stem.with_name(f"{stem.name}.exr"), light.radiance)
+    write_png(mask_file, mask, quick=True)
+    if light.radiance is not None:
+        write_exr_rgb(picture, light.radiance)
     else:
-        write_png(stem.with_name(f"{stem.name}.png"), ball.shot.codes())
+        write_png(picture, ball.shot.codes(), quick=True)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ cone.center
-    camera = lens.pinhole(pose)
-    suffix = ".exr" if light.high_dynamic_range else ".png"
-    mask_file = stem.with_name(f"{stem.name}_alpha.png")
-    return Frame(f"train/{stem.name}", camera, stem, suffix, mask_file, covariance)
+    return Frame(f"train/{ball.name}", lens.pinhole(pose), stem, suffix, mask_file, covariance)

@@ -37,6 +37,11 @@ class Features:
     sigma: Float[np.ndarray, "P"]
     """Angle (rad) that a pixel spans there."""
 
+    @classmethod
+    def none(cls, cone: BallCone) -> "Features":
+        """Of a ball without any."""
+        return cls(np.zeros((0, 128), np.float32), np.zeros((0, 2)), cone.along(np.zeros((0, 3))), np.zeros(0))
+
     def __len__(self) -> int:
         return len(self.pixels)
 
@@ -105,7 +110,7 @@ def features_of(
         descriptors.append(found)
         pixels.append(lens.project(sighted.rays))
     if not pixels:
-        return Features(np.zeros((0, 128), np.float32), np.zeros((0, 2)), cone.along(np.zeros((0, 3))), np.zeros(0))
+        return Features.none(cone)
     stacked, places = np.concatenate(descriptors), np.concatenate(pixels)
     roots = np.sqrt(stacked / np.maximum(stacked.sum(1, keepdims=True), 1e-9)).astype(np.float32)
     seen = cone.along(lens.rays(places))

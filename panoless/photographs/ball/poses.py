@@ -1,7 +1,6 @@
 """Where the cameras of balls are: pairs of reflections that agree, their average, and the adjustment of all."""
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -9,12 +8,13 @@ import numpy as np
 
 from panoless.photographs.ball.adjust import Adjusted, SeenBall, adjust, cone_of
 from panoless.photographs.ball.cone import BallCone
-from panoless.photographs.ball.find import THREADS, FoundBall, hidden
+from panoless.photographs.ball.find import FoundBall, hidden
 from panoless.photographs.ball.panorama import Features, features_of
 from panoless.photographs.ball.rim import Circle, Rim, find_rim
 from panoless.photographs.ball.rotations import Pair, average, largest_group, pair_of
 from panoless.photographs.lens import Lens
 from shinypartial.io.progress import Progress
+from shinypartial.io.threads import in_threads
 
 RIM_SIGMA_PX = 0.3
 """Of a rim's cone, at least."""
@@ -79,17 +79,15 @@ def posed_balls(found: Sequence[FoundBall], lenses: Sequence[Lens]) -> PosedBall
 def _features(balls: Sequence[FoundBall], lenses: Sequence[Lens]) -> list[Features]:
     """Of all photographs; a single one is compared with none."""
     if len(balls) == 1:
-        cone, _ = cone_of(balls[0].rim.points, lenses[0])
-        return [Features(np.zeros((0, 128), np.float32), np.zeros((0, 2)), cone.along(np.zeros((0, 3))), np.zeros(0))]
+        return [Features.none(cone_of(balls[0].rim.points, lenses[0])[0])]
     progress = Progress("comparing reflections", len(balls))
 
-    def work(ball: FoundBall, lens: Lens) -> Features:
-        found = _features_of(ball, lens)
+    def work(view: tuple[FoundBall, Lens]) -> Features:
+        found = _features_of(*view)
         progress.advance()
         return found
 
-    with ThreadPoolExecutor(THREADS) as pool:
-        return list(pool.map(work, balls, lenses))
+    return list(in_threads(work, zip(balls, lenses, strict=True)))
 
 
 def _features_of(ball: FoundBall, lens: Lens) -> Features:
@@ -100,8 +98,7 @@ def _pairs(features: Sequence[Features], keys: Sequence[tuple[int, int]]) -> dic
     def work(key: tuple[int, int]) -> Pair | None:
         return pair_of(features[key[0]], features[key[1]], np.random.default_rng(key))
 
-    with ThreadPoolExecutor(THREADS) as pool:
-        found = list(pool.map(work, keys))
+    found = in_threads(work, keys)
     return {key: pair for key, pair in zip(keys, found, strict=True) if pair is not None}
 
 

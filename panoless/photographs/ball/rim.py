@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from panoless.numeric.robust import robust_scale, robust_weight
 from panoless.photographs.lens import opencv
 
 VOTING_SIDE_PX = 640
@@ -57,6 +58,11 @@ class Circle:
     def scaled(self, factor: float) -> "Circle":
         """In a picture that is so many times as large."""
         return replace(self, x=self.x * factor, y=self.y * factor, radius=self.radius * factor)
+
+    def points(self, azimuths: Float[np.ndarray, "N"], factor: float = 1.0) -> Float[np.ndarray, "N 2"]:
+        """At azimuths (rad) from +x toward +y, so many times as far from the center as the circle is."""
+        around = np.stack([np.cos(azimuths), np.sin(azimuths)], 1)
+        return np.array([self.x, self.y]) + factor * self.radius * around
 
     def contains(self, x: float, y: float) -> bool:
         """Whether a point lies inside."""
@@ -147,8 +153,8 @@ def _robust_fit(basis: Float[np.ndarray, "P D"], values: Float[np.ndarray, "P"])
     for _ in range(8):
         weighted = basis * weights[:, None]
         solved = np.linalg.lstsq(weighted.T @ basis + 1e-9 * np.eye(basis.shape[1]), weighted.T @ values, rcond=None)[0]
-        off = np.abs(values - basis @ solved)
-        weights = 1 / (1 + (off / max(2 * float(np.median(off)) if len(off) else 1.0, 0.15)) ** 2) ** 2
+        off = values - basis @ solved
+        weights = robust_weight(off, robust_scale(off, 0.15, 2.0))
     return solved
 
 

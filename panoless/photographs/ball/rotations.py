@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaln
 
+from panoless.numeric.robust import robust_weight
 from panoless.photographs.ball.panorama import Features
 
 TRIALS = 800
@@ -139,7 +140,7 @@ def average(members: Sequence[int], pairs: Mapping[tuple[int, int], Pair]) -> di
         scale = max(float(np.median([np.linalg.norm(each) for each in off.values()])), 0.003) if off else 1.0
         laplacian, right = np.zeros((len(place), len(place))), np.zeros((len(place), 3))
         for (i, j), each in off.items():
-            robust = weight[i, j] / (1 + (each @ each) / scale**2) ** 2
+            robust = weight[i, j] * float(robust_weight(each[None], scale)[0])
             p, q = place[i], place[j]
             laplacian[[p, q], [p, q]] += robust
             laplacian[[p, q], [q, p]] -= robust
