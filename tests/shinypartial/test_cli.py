@@ -46,14 +46,19 @@ def test_help_lists_all_commands(capsys: pytest.CaptureFixture[str]) -> None:
     assert all(command in out for command in COMMANDS)
 
 
-def test_help_is_fast() -> None:
-    command = [sys.executable, "-m", "shinypartial.cli", "--help"]
-    times = []
-    for _ in range(3):
-        start = time.perf_counter()
-        subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
-        times.append(time.perf_counter() - start)
-    assert min(times) < 1.0  # Measured 0.2 s on an idle machine.
+def test_help_costs_little_more_than_the_libraries_that_print_it() -> None:
+    """A ratio of times in one run: a slow machine slows both."""
+
+    def shortest(*arguments: str) -> float:
+        times = []
+        for _ in range(3):
+            start = time.perf_counter()
+            subprocess.run([sys.executable, *arguments], cwd=ROOT, check=True, capture_output=True)
+            times.append(time.perf_counter() - start)
+        return min(times)
+
+    # Measured 1.9 on an idle machine; with scipy loaded it is 4.
+    assert shortest("-m", "shinypartial.cli", "--help") < 3 * shortest("-c", "import numpy, tyro")
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["generate", "--help"]], ids=" ".join)

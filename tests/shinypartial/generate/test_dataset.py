@@ -246,7 +246,7 @@ def test_an_interrupt_ends_the_run_at_once_and_leaves_nothing_behind(tmp_path: P
     assert process.returncode == 130
     # Measured 0.3 s on an idle machine.
     assert time.monotonic() - began < 10
-    assert "Run the same command again to continue" in err
+    assert "Run the same command again" in err
     assert "Traceback" not in err
     assert len(list(root.glob("*/r_???.exr"))) < 400
     assert partial_files(root) == []

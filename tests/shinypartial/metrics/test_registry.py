@@ -7,6 +7,7 @@ import typing
 import pytest
 
 from shinypartial.evaluation.scores import Counts, LeftOut, Scores, ViewScores
+from shinypartial.metrics.direct_views import DirectScores
 from shinypartial.metrics.registry import METRICS, PSNR_CEILING_DB, Direction, metric
 
 
@@ -24,7 +25,8 @@ def score_fields(kind: type) -> set[str]:
 
 
 def test_every_score_is_registered_and_every_registered_metric_is_scored() -> None:
-    assert score_fields(Scores) == {entry.name for entry in METRICS}
+    direct = {name if name.startswith("psnr") else f"direct_{name}" for name in score_fields(DirectScores)}
+    assert score_fields(Scores) | direct | {"lamp_error_deg"} == {entry.name for entry in METRICS}
 
 
 def test_names_are_unique_and_never_the_ambiguous_one() -> None:
