@@ -10,14 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from panoless.photographs.ball.rim import Circle
 from panoless.photographs.lens import opencv
 from panoless.photographs.shot import Shot
 
-SAME_CIRCLE = 0.15
-"""Of a bracket, whose circles differ by no more than this share of their radius…"""
 SAME_PICTURE = 0.8
-"""…and where so large a share of pixels lie on the same side of the median (Ward 2003)."""
+"""Of a bracket: so large a share of pixels lie on the same side of the median (Ward 2003)."""
 EQUAL_STOPS = 0.07
 """Exposures that differ by less are equal."""
 DARKEST = 0.004
@@ -39,19 +36,15 @@ class Exposed:
         return self.radiance is not None
 
 
-def same_pose(shots: Sequence[Shot], circles: Sequence[Circle]) -> list[list[int]]:
+def same_pose(shots: Sequence[Shot]) -> list[list[int]]:
     """Groups of photographs from one place that differ in exposure."""
     groups: list[list[int]] = []
-    for number, (shot, circle) in enumerate(zip(shots, circles, strict=True)):
-        for group in groups:
-            first = group[0]
-            other = circles[first]
-            apart = np.hypot(circle.x - other.x, circle.y - other.y) + abs(circle.radius - other.radius)
-            if apart < SAME_CIRCLE * other.radius and is_bracket(shot, shots[first]):
-                group.append(number)
-                break
-        else:
+    for number, shot in enumerate(shots):
+        group = next((group for group in groups if is_bracket(shot, shots[group[0]])), None)
+        if group is None:
             groups.append([number])
+        else:
+            group.append(number)
     return groups
 
 

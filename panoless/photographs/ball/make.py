@@ -108,7 +108,7 @@ def _captured(request: BallRequest) -> CapturedBall:
     balls = find_balls(request.files, request.hints, request.focal_film_mm, sheet, request.found)
     focal = _focal(balls, request)
     # Of a bracket, the exposure whose rim is seen best stands for all.
-    groups = same_pose([ball.shot for ball in balls], [ball.rim.circle for ball in balls])
+    groups = same_pose([ball.shot for ball in balls])
     chosen = [balls[max(group, key=lambda i: balls[i].rim.seen.mean())] for group in groups]
     posed = posed_balls(chosen, [ball.lens(focal) for ball in chosen])
     members, adjusted = posed.members, posed.adjusted
