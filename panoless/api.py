@@ -182,10 +182,12 @@ def light(
     *,
     focal_mm: float | None = None,
     hints: "Mapping[str, Hint] | None" = None,
+    background: bool = False,
 ) -> Light:
     """Photographs of a mirror ball to a light: an HDR lat-long, a Blender world and a page, in the folder `output`.
 
-    What the command `panoless light` does. Raises InputError where no ball is found, or reflections don't agree.
+    What the command `panoless light` does; with `background`, what is seen past the ball is data for the map, too.
+    Raises InputError where no ball is found, or reflections don't agree.
     """
     prepare_threads()
     from panoless.export.page import write_page
@@ -194,7 +196,8 @@ def light(
 
     folder = Path(output)
     dataset = folder / "dataset"
-    captured = capture_ball(BallRequest(tuple(map(Path, photographs)), dataset, focal_mm, hints or {}))
+    files = tuple(map(Path, photographs))
+    captured = capture_ball(BallRequest(files, dataset, focal_mm, hints or {}, background=background))
     options = ("environment.range=hdr",) if captured.high_dynamic_range else ()
     result = fit(dataset, output=folder / f"{folder.resolve().name}-prediction", set=options)
     write_hdr(folder / "light.hdr", result.environment)

@@ -201,6 +201,8 @@ class Capture:
     photographs show one."""
     focal_mm: float | None = None
     """Focal length on 35 mm film, for a ball; None for what EXIF states."""
+    background: bool = False
+    """What is seen past a ball is data for the map, too, beside what it mirrors."""
     colmap: Path | None = None
     """Folder of a COLMAP model, text or binary, for these photographs; found where it is SOURCE/sparse/0."""
     board: Literal["A4", "Letter", "A3", "none"] | None = None
@@ -293,7 +295,9 @@ class Capture:
     def _capture_ball(self, files: tuple[Path, ...], request: "Request", balls: "dict[Path, FoundBall]") -> None:
         from panoless.photographs.ball.make import BallRequest, capture_ball
 
-        captured = capture_ball(BallRequest(files, request.output, self.focal_mm, request.hints, balls))
+        captured = capture_ball(
+            BallRequest(files, request.output, self.focal_mm, request.hints, balls, self.background)
+        )
         print("\n".join(captured.summary()))
         light = ("--config.environment.range", "hdr") if captured.high_dynamic_range else ()
         print(
@@ -332,6 +336,8 @@ class Light:
     """Focal length on 35 mm film; None for what EXIF states."""
     clicks: Path | None = None
     """Where the ball is not found: a JSON file of points on it, {"NAME": {"on": [[x, y]]}}, in pixels."""
+    background: bool = False
+    """What is seen past the ball is data for the map, too, beside what it mirrors."""
 
     def run(self) -> None:
         """Capture, fit, convert, and say what to look at."""
@@ -340,7 +346,7 @@ class Light:
 
         hints = {} if self.clicks is None else read_clicks(self.clicks)
         output = self.output or Path("lights") / _name_of(self.sources)
-        made = light(_files_of(self.sources), output, focal_mm=self.focal_mm, hints=hints)
+        made = light(_files_of(self.sources), output, focal_mm=self.focal_mm, hints=hints, background=self.background)
         print("\n".join(made.lines))
         if made.reconstruction.verdict:
             print(f"Verdict: {made.reconstruction.verdict.sentence()}")

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from panoless.capture.background import load_background
 from panoless.capture.contrast import exposed, exposure_of
 from panoless.capture.encoding import encoding_of
 from panoless.capture.repair import with_repaired_masks
@@ -53,6 +54,8 @@ def configured_views(dataset: Dataset, config: FitConfig) -> tuple[Views, FitCon
         least_object_px=config.least_object_px,
         known_radius=config.sphere.radius,
     )
+    if ball is not None and ball.background:
+        views = replace(views, background=load_background(dataset, encoding_of(config)))
     exposure = config.exposure
     if exposure == 0:
         exposure = exposure_of(views, config.contrast) if can_be_exposed(config) else 1.0

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from panoless.capture.background import Background
 from panoless.capture.encoding import LDR, RadianceEncoding
 from panoless.capture.masks import MASK_LEVEL, estimate_object_frame, without_specks
 from panoless.capture.object_frame import ObjectFrame
@@ -131,6 +132,8 @@ class Views:
     repairs: MaskRepairs = MaskRepairs()
     blur_px: float = 0.0
     """Standard deviation of a Gaussian that blurred the pictures, in pixels of the views."""
+    background: Background | None = None
+    """What was seen past the object, where that is data for the map, too."""
 
     @property
     def num_solid(self) -> int:
@@ -145,7 +148,8 @@ class Views:
 
     def to(self, device: torch.device) -> "Views":
         """The same views on a device."""
-        return replace(self, train=tuple(view.to(device) for view in self.train))
+        background = None if self.background is None else self.background.to(device)
+        return replace(self, train=tuple(view.to(device) for view in self.train), background=background)
 
 
 def load_views(

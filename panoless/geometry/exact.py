@@ -14,6 +14,7 @@ from panoless.capture.poses import Poses
 from panoless.capture.rays import pixel_rays, unit_rays_camera
 from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
+from panoless.environment.direct import scaled_to_map
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays, normalize_confidence
 from panoless.environment.resolution import RESOLUTIONS, densest_resolution
@@ -65,10 +66,12 @@ class ExactGeometry:
         """The map from all rays, and from footprints where the kind has them.
 
         It starts from nothing, because a coarse start would reject what is finer. Footprints are means of radiance, so
-        they take no part where radiance is encoded.
+        they take no part where radiance is encoded. What is seen past the object are rays as any others.
         """
         rays = normalize_confidence(merged(observe_views(views, cast(Geometry, self), config.environment.rays)))
         resolution, encoding = config.environment.solve_resolution, encoding_of(config)
+        if views.background is not None:
+            rays = [*rays, scaled_to_map(views.background, rays)]
         footprints = None if encoding.high_dynamic_range else self.footprints(views, config.environment.rays)
         if footprints is None or not footprints.smooth:
             return solve_environment(rays, resolution or densest_resolution(rays)), rays

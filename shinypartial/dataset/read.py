@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Bool, Float, Num
 
-from shinypartial.core.color import srgb_to_linear
+from shinypartial.core.color import LINEAR_OF_CODES, srgb_to_linear
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import (
+    BACKGROUND,
     COLOR_CHANNELS,
     DEPTH_CHANNEL,
     ENVIRONMENT_INVERSE_DISTANCE,
@@ -229,10 +230,13 @@ def require_normals(frame: Frame, view: View) -> Float[np.ndarray, "H W 3"]:
 
 def _linear_color(image: Num[np.ndarray, "H W C"]) -> tuple[Float[np.ndarray, "H W D"], bool]:
     """Linear RGB or RGBA of a picture as stored, and whether it was linear (and premultiplied) already."""
-    values, linear = unit_values(image), image.dtype.kind == "f"
-    if values.shape[2] == 1:
-        values = np.repeat(values, 3, 2)
-    return values if linear else np.concatenate([srgb_to_linear(values[..., :3]), values[..., 3:]], -1), linear
+    if image.shape[2] == 1:
+        image = np.repeat(image, 3, 2)
+    if image.dtype.kind == "f":
+        return unit_values(image), True
+    codes, rest = image[..., :3], unit_values(image[..., 3:])
+    color = LINEAR_OF_CODES[codes] if image.dtype == np.uint8 else srgb_to_linear(unit_values(codes))
+    return np.concatenate([color, rest], -1) if rest.size else color, False
 
 
 def _companion_normals(frame: Frame, alpha: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W 3"] | None:
@@ -291,6 +295,17 @@ def read_ball_evidence(dataset: Dataset) -> BallEvidence | None:
     path = dataset.root / "transforms_train.json"
     stated = read_table(path, "the cameras of the train split").get("ball")
     return None if stated is None else read_record(BallEvidence, stated, f"`ball` of {path}", allow_unknown=True)
+
+
+def read_background(dataset: Dataset) -> tuple[Float[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]]:
+    """What was seen past a ball: linear light as a lat-long map in the world frame, and where there is any.
+
+    Raises InputError where the file is missing, damaged or no lat-long map.
+    """
+    path = dataset.root / BACKGROUND
+    planes = stack_channels(read_exr(path), COLOR_CHANNELS, path)
+    require_latlong(planes, path, "light past the ball", "Run `panoless capture` again.")
+    return planes[..., :3], planes[..., 3] > 0.5
 
 
 def read_environment(dataset: Dataset) -> Float[np.ndarray, "H W 3"]:

@@ -32,6 +32,7 @@ ENVIRONMENT_LATLONG_Y_UP = Path("environment/latlong_yup.exr")
 ENVIRONMENT_INVERSE_DISTANCE = Path("environment/inverse_distance.exr")
 INVERSE_DISTANCE_CHANNEL = "Y"
 ENVIRONMENT_CUBE = Path("environment/cube")
+BACKGROUND = "background.exr"
 
 
 @dataclass(frozen=True)
@@ -134,6 +135,8 @@ class BallEvidence:
     """Correlation of what lies beside the ball with what it mirrors; None where too little does."""
     exposures_known: bool = False
     """Whether all photographs state theirs, so that they have been equalized."""
+    background: bool = False
+    """Whether `background.exr` has what was seen past the ball: linear light in lat-long, alpha 1 where any is."""
 
 
 @dataclass(frozen=True)

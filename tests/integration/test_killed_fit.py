@@ -87,6 +87,7 @@ def test_a_killed_fit_continues(tmp_path: Path, sphere_dataset: Dataset, monkeyp
     assert not list(tmp_path.rglob(".partial-*"))
 
 
+@pytest.mark.slow
 def test_kinds_that_were_examined_before_a_kill_are_not_fitted_again(
     tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -130,7 +131,7 @@ SHORT = {
 }
 SHORT["auto"] = SHORT["revolution"]
 BELIEVED = "corrections.masks=off", "corrections.exposure=off", "corrections.lens=off", "poses.mode=off"
-QUICK = "sphere", "plane"
+QUICK = ("plane",)
 
 
 def short_config(kind: str) -> FitConfig:

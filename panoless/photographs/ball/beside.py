@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from panoless.photographs.ball.cone import BallCone
 from panoless.photographs.ball.panorama import PHOTOGRAPHER_DEG, spans
@@ -86,10 +86,6 @@ def _of_view(ball: PosedBall, balls: Sequence[PosedBall], distance: float) -> fl
     right, down = np.meshgrid((np.arange(COLUMNS) + 0.5) * step, (np.arange(height) + 0.5) * ball.lens.height / height)
     rays = ball.lens.rays(np.stack([right, down], -1))
     direct = ball.at(rays)
-    center = ball.lens.project(ball.cone.axis)
-    radius = ball.lens.fx * np.tan(ball.cone.half_angle)
-    near = np.arccos(np.clip(rays @ ball.cone.axis, -1, 1)) < CLEARANCE * ball.cone.half_angle
-    below = (np.abs(right - center[0]) < SUPPORT_WIDTH * radius) & (down > center[1] + SUPPORT_FROM * radius)
     middle = rays @ ball.cone.center
     reach = middle + np.sqrt(np.maximum(middle**2 - ball.cone.distance**2 + distance**2, 0))
     points = reach[..., None] * rays - ball.cone.center
@@ -106,8 +102,17 @@ def _of_view(ball: PosedBall, balls: Sequence[PosedBall], distance: float) -> fl
         weights.append(np.where(good, spans(other.cone, seen, other.lens), np.inf))
     sharpest = np.argsort(np.stack(weights), 0)[:3]
     mirrored = np.median(np.take_along_axis(np.stack(values), sharpest, 0), 0)
-    shown = ~near & ~below & np.isfinite(direct) & np.isfinite(mirrored)
+    shown = beside(ball, rays) & np.isfinite(direct) & np.isfinite(mirrored)
     return None if shown.sum() < LEAST_CELLS else _correlation(direct, mirrored, shown)
+
+
+def beside(ball: PosedBall, rays: Float[np.ndarray, "*P 3"]) -> Bool[np.ndarray, "*P"]:
+    """Whether rays of the camera pass the ball, and what it stands on."""
+    center, radius = ball.lens.project(ball.cone.axis), ball.lens.fx * np.tan(ball.cone.half_angle)
+    right, down = np.moveaxis(ball.lens.project(rays) - center, -1, 0)
+    below = (np.abs(right) < SUPPORT_WIDTH * radius) & (down > SUPPORT_FROM * radius)
+    past = np.arccos(np.clip(rays @ ball.cone.axis, -1, 1)) >= CLEARANCE * ball.cone.half_angle
+    return np.asarray(past & ~below)
 
 
 def _correlation(one: np.ndarray, two: np.ndarray, shown: np.ndarray) -> float:

@@ -52,6 +52,13 @@ class FoundBall:
         """Of the photograph."""
         return self.shot.name
 
+    @property
+    def has_rival(self) -> bool:
+        """Whether another circle, apart from it, has as much support, nearly."""
+        best = self.candidates[0]
+        apart = (each for each in self.candidates[1:] if np.hypot(each.x - best.x, each.y - best.y) > best.radius)
+        return any(each.score >= RIVAL * best.score for each in apart)
+
     def lens(self, focal: Focal) -> Lens:
         """A pinhole of that focal length, centered."""
         width, height = self.shot.size

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from panoless.numeric.robust import bounded_error, robust_scale
 from panoless.photographs.ball.adjust import cone_of
+from panoless.photographs.ball.background import write_background
 from panoless.photographs.ball.beside import PosedBall, agreement, log_light, refraction_agreement
 from panoless.photographs.ball.brackets import Exposed, exposed, same_pose
 from panoless.photographs.ball.cone import BallCone
@@ -22,10 +23,10 @@ from panoless.photographs.ball.poses import PosedBalls, posed_balls
 from panoless.photographs.lens import Lens
 from panoless.photographs.make import check_output
 from panoless.photographs.masks import Hint
-from panoless.photographs.shot import Focal
+from panoless.photographs.shot import Focal, Shot
 from shinypartial.core.conventions import HIDDEN_ALPHA
 from shinypartial.core.errors import InputError
-from shinypartial.dataset.schema import BallEvidence, Frame
+from shinypartial.dataset.schema import BACKGROUND, BallEvidence, Frame
 from shinypartial.dataset.write import write_transforms
 from shinypartial.io.files import folder_lock
 from shinypartial.io.images import write_exr_rgb, write_png
@@ -37,6 +38,9 @@ LEAST_RING = 0.25
 nineteen of twenty photographs of a lobby, 0.19 at most of cups, coins, clocks and eyes."""
 RIM_CORRELATION = 20
 """Neighboring points of a rim are off alike: one in so many is news."""
+ROOM = 2.5
+"""Radii from the ball's middle within which its mask lies: beside the middle of a picture it is an oval, up to twice as
+wide at 45°."""
 FOCAL_LOGS = np.linspace(-0.3, 0.3, 13)
 """Logarithms of focal lengths over that stated, which ovals are asked of."""
 
@@ -52,6 +56,8 @@ class BallRequest:
     hints: Mapping[str, Hint] = field(default_factory=dict)
     found: Mapping[Path, FoundBall] = field(default_factory=dict)
     """Balls that were looked for before."""
+    background: bool = False
+    """Whether what lies past the ball is data for the map, too."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +71,8 @@ class CapturedBall:
     evidence: BallEvidence
     brackets: int
     high_dynamic_range: bool
+    rivals: int
+    """Photographs that show a second circle as clear."""
 
     def summary(self) -> list[str]:
         """What was found, a line each."""
@@ -83,6 +91,8 @@ class CapturedBall:
             lines.append(
                 f"Check: what lies beside the ball correlates with what it mirrors by {evidence.agreement:.2f}"
             )
+        if 2 * self.rivals >= found:
+            lines.append("Note: a second ball, or something as round, shows. The larger was taken; --clicks chooses.")
         if self.left_out:
             lines.append(f"Left out, as their reflections agree with no other: {', '.join(self.left_out)}")
         if self.high_dynamic_range:
@@ -99,7 +109,8 @@ def capture_ball(request: BallRequest) -> CapturedBall:
     check_output(request.output)
     with folder_lock(request.output):
         shutil.rmtree(request.output / "train", ignore_errors=True)
-        (request.output / "transforms_train.json").unlink(missing_ok=True)
+        for name in ("transforms_train.json", BACKGROUND):
+            (request.output / name).unlink(missing_ok=True)
         return _captured(request)
 
 
@@ -133,9 +144,12 @@ def _captured(request: BallRequest) -> CapturedBall:
         covariance = _turned_covariance(adjusted.covariance[i], world) if len(members) > 1 else None
         camera = posed.lenses[i], adjusted.cones[i], turned[i]
         frames.append(_write_view(posed.balls[i], *camera, covariance, each, request.output / "train"))
-    evidence = _evidence(posed, focal, beside)
-    agreed = evidence.agreement
-    if len(members) == 1 and not request.hints and agreed is not None and agreed < LEAST_RING:
+    agreed, distance = agreement(beside)
+    evidence = _evidence(posed, focal, agreed, request.background)
+    if request.background:
+        linear = [_linear(*each) for each in zip(shots, light, strict=True)]
+        write_background(request.output / BACKGROUND, beside, linear, distance)
+    if len(members) == 1 and not request.hints and agreed < LEAST_RING:
         raise InputError(
             expected=f"a polished ball in {posed.balls[0].name}, whose rim mirrors what lies beside it",
             found=f"something round: both correlate by {agreed:.2f}",
@@ -144,13 +158,20 @@ def _captured(request: BallRequest) -> CapturedBall:
     write_transforms(request.output, "train", frames, ball=evidence)
     names = tuple(posed.balls[i].name for i in members)
     hdr = any(each.high_dynamic_range for each in light)
-    return CapturedBall(request.output, names, posed.left_out, focal, evidence, sum(map(len, shots)), hdr)
+    rivals = 0 if request.hints else sum(posed.balls[i].has_rival for i in members)
+    return CapturedBall(request.output, names, posed.left_out, focal, evidence, sum(map(len, shots)), hdr, rivals)
 
 
-def _evidence(posed: PosedBalls, focal: Focal, beside: Sequence[PosedBall]) -> BallEvidence:
+def _linear(shots: Sequence[Shot], light: Exposed) -> Float[np.ndarray, "H W 3"]:
+    """Of a view, NaN where it is clipped."""
+    radiance = shots[0].radiance() if light.radiance is None else light.radiance
+    clipped = (radiance >= shots[0].clips_at).any(-1) if light.radiance is None else light.unknown
+    return np.where(clipped[..., None], np.nan, radiance).astype(np.float32)
+
+
+def _evidence(posed: PosedBalls, focal: Focal, agreed: float, background: bool) -> BallEvidence:
     adjusted, several = posed.adjusted, len(posed.members) > 1
     turns = [np.degrees(np.sqrt(np.trace(each[:3, :3]))) for each in adjusted.covariance.values()]
-    agreed, _ = agreement(beside)
     return BallEvidence(
         rim_px=posed.rim_px(),
         rim_seen=float(np.median([posed.balls[i].rim.seen.mean() for i in posed.members])),
@@ -159,6 +180,7 @@ def _evidence(posed: PosedBalls, focal: Focal, beside: Sequence[PosedBall]) -> B
         turn_deg=float(np.median(turns)) if several else 0.0,
         agreement=None if np.isnan(agreed) else agreed,
         exposures_known=all(ball.shot.exposure is not None for ball in posed.balls),
+        background=background,
     )
 
 
@@ -230,11 +252,16 @@ def _turned_covariance(
 
 def coverage(cone: BallCone, lens: Lens) -> Float[np.ndarray, "H W"]:
     """Share of each pixel that the ball covers, by its center's distance from the rim."""
-    right, down = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    covered = np.zeros((lens.height, lens.width))
+    middle, reach = lens.project(cone.axis), ROOM * lens.fx * np.tan(cone.half_angle)
+    left, top = np.clip(np.floor(middle - reach), 0, covered.shape[::-1]).astype(int)
+    past_right, past_bottom = np.clip(np.ceil(middle + reach), 0, covered.shape[::-1]).astype(int)
+    right, down = np.meshgrid(np.arange(left, past_right) + 0.5, np.arange(top, past_bottom) + 0.5)
     rays = lens.rays(np.stack([right, down], -1))
     angle = np.arccos(np.clip(rays @ cone.axis, -1, 1))
     scale = lens.fx / np.maximum(rays[..., 2], 1e-3)
-    return np.clip(0.5 - (angle - cone.half_angle) * scale, 0, 1)
+    covered[top:past_bottom, left:past_right] = np.clip(0.5 - (angle - cone.half_angle) * scale, 0, 1)
+    return covered
 
 
 def _write_view(

@@ -150,6 +150,7 @@ def test_turned_cameras_change_no_choice_between_flat_and_bent(bend: float) -> N
     assert 0.3 < turned < 0.9
 
 
+@pytest.mark.slow
 def test_right_surfels_beat_the_plane_of_a_bent_mirror_and_not_its_height_field(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

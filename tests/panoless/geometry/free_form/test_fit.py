@@ -214,6 +214,7 @@ def test_held_out_pixels_that_miss_the_surface_are_unexplained() -> None:
         assert held_out_error(solved, tested, stage, OPTIONS) == pytest.approx(missed / (missed + clear), abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_world_that_is_turned_and_scaled_gives_the_same_surface() -> None:
     """Up to the grid, whose axes are those of the world: normals agree far below their errors' scale."""
     body, turn = ellipsoid(), np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -499,6 +500,7 @@ def test_a_lens_that_is_right_is_believed_at_a_glance() -> None:
     assert change.focal == pytest.approx(0, abs=0.006)
 
 
+@pytest.mark.slow
 def test_flat_faces_that_no_outline_shows_are_found_by_a_descent() -> None:
     """The corner of a block faces the cameras. By the median of normals a start that descended is wrong by 1.6°, the
     plain one by 22°.

@@ -96,7 +96,9 @@ def two_balls() -> Shot:
 
 
 def test_of_two_balls_the_larger_one_is_taken(two_balls: Shot) -> None:
-    circle = find_ball(two_balls).rim.circle
+    ball = find_ball(two_balls)
+    assert ball.has_rival
+    circle = ball.rim.circle
     assert circle.x < WIDTH / 2
     assert circle.radius == pytest.approx(LENS.fx / 7, rel=0.05)
 

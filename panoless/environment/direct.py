@@ -1,0 +1,27 @@
+"""Direct views of the environment as rays beside those that are mirrored."""
+
+from collections.abc import Sequence
+
+import torch
+
+from panoless.capture.background import Background
+from panoless.environment.rays import Rays
+from panoless.environment.resolution import count_rays
+from panoless.environment.solve import solve_environment
+from panoless.kernels.cubemap import sample_cubemap
+
+RESOLUTION = 32
+"""Texels along a face side of the map by which both kinds of light are compared: 2.8°. Not tuned."""
+
+
+def scaled_to_map(background: Background, rays: Sequence[Rays]) -> Rays:
+    """Direct light c times g, one factor a channel: the median of E(ω)/c over directions that are mirrored, too.
+
+    E is the map of the mirrored rays; ones where no direction is seen in both ways.
+    """
+    environment = solve_environment(rays, RESOLUTION)
+    seen = sample_cubemap(environment, background.directions)
+    mirrored = sample_cubemap((count_rays(rays, RESOLUTION) > 0).float(), background.directions)[:, 0] > 0.5
+    both = mirrored & (background.radiance > 0).all(1)
+    gain = (seen / background.radiance)[both].median(0).values if both.any() else torch.ones_like(seen[0])
+    return Rays(background.directions, gain * background.radiance, background.weight)
