@@ -294,9 +294,11 @@ class Capture:
 
     def _capture_ball(self, files: tuple[Path, ...], request: "Request", balls: "dict[Path, FoundBall]") -> None:
         from panoless.photographs.ball.make import BallRequest, capture_ball
+        from panoless.photographs.models import find_model
 
+        model = request.colmap or find_model(request.source)
         captured = capture_ball(
-            BallRequest(files, request.output, self.focal_mm, request.hints, balls, self.background)
+            BallRequest(files, request.output, self.focal_mm, request.hints, balls, self.background, model)
         )
         print("\n".join(captured.summary()))
         light = ("--config.environment.range", "hdr") if captured.high_dynamic_range else ()

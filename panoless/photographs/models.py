@@ -1,12 +1,13 @@
 """Poses that another program has found: a model of COLMAP, or nerfstudio's transforms.json."""
 
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from panoless.photographs.certainty import SeenPoints
 from panoless.photographs.frames import Frames, Photograph
@@ -56,6 +57,19 @@ def read_colmap(folder: Path, frames: Frames, options: CaptureOptions) -> Poses:
 
     Raises InputError for a folder that is no model, and for cameras with other kinds of distortion.
     """
+    return poses_of(_opened(folder), frames, f"the COLMAP model {folder}", options)
+
+
+def read_rotations(folder: Path, files: Sequence[Path]) -> dict[Path, Float[np.ndarray, "3 3"]]:
+    """World-to-camera rotations of those of the photographs that a COLMAP model has.
+
+    Raises InputError where the folder holds no complete model.
+    """
+    images = {Path(image.name).stem: image for image in _opened(folder).images.values() if image.has_pose}
+    return {file: images[file.stem].cam_from_world().rotation.matrix() for file in files if file.stem in images}
+
+
+def _opened(folder: Path) -> Any:
     colmap = pycolmap_module()
     if not is_model(folder):
         raise InputError(
@@ -64,14 +78,13 @@ def read_colmap(folder: Path, frames: Frames, options: CaptureOptions) -> Poses:
             remedy="Name the folder, usually sparse/0.",
         )
     try:
-        model = colmap.Reconstruction(str(folder))
+        return colmap.Reconstruction(str(folder))
     except Exception as error:
         raise InputError(
             expected=f"a complete COLMAP model at {folder}",
             found=str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__,
             remedy="Export it again; cameras, images and points3D belong together.",
         ) from None
-    return poses_of(model, frames, f"the COLMAP model {folder}", options)
 
 
 def poses_of(model: Any, frames: Frames, origin: str, options: CaptureOptions) -> Poses:

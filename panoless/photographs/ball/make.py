@@ -23,6 +23,7 @@ from panoless.photographs.ball.poses import PosedBalls, posed_balls
 from panoless.photographs.lens import Lens
 from panoless.photographs.make import check_output
 from panoless.photographs.masks import Hint
+from panoless.photographs.models import read_rotations
 from panoless.photographs.shot import Focal, Shot
 from shinypartial.core.conventions import HIDDEN_ALPHA
 from shinypartial.core.errors import InputError
@@ -58,6 +59,8 @@ class BallRequest:
     """Balls that were looked for before."""
     background: bool = False
     """Whether what lies past the ball is data for the map, too."""
+    model: Path | None = None
+    """Folder of a COLMAP model of these photographs, whose rotations are compared with those by reflections."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,8 @@ class CapturedBall:
     high_dynamic_range: bool
     rivals: int
     """Photographs that show a second circle as clear."""
+    compared: str = ""
+    """What rotations of a COLMAP model explain, in one line."""
 
     def summary(self) -> list[str]:
         """What was found, a line each."""
@@ -87,6 +92,8 @@ class CapturedBall:
                 f"Poses: by what the ball mirrors, to {evidence.turn_deg:.2g}°; reflections agree to "
                 f"{evidence.reflection_deg:.2g}°"
             )
+        if self.compared:
+            lines.append(self.compared)
         if evidence.agreement is not None:
             lines.append(
                 f"Check: what lies beside the ball correlates with what it mirrors by {evidence.agreement:.2f}"
@@ -121,7 +128,9 @@ def _captured(request: BallRequest) -> CapturedBall:
     # Of a bracket, the exposure whose rim is seen best stands for all.
     groups = same_pose([ball.shot for ball in balls])
     chosen = [balls[max(group, key=lambda i: balls[i].rim.seen.mean())] for group in groups]
-    posed = posed_balls(chosen, [ball.lens(focal) for ball in chosen])
+    stated = {} if request.model is None else read_rotations(request.model, [ball.shot.source for ball in chosen])
+    by_number = {i: stated[ball.shot.source] for i, ball in enumerate(chosen) if ball.shot.source in stated}
+    posed = posed_balls(chosen, [ball.lens(focal) for ball in chosen], by_number)
     members, adjusted = posed.members, posed.adjusted
     if 2 * len(members) < len(chosen) or (len(chosen) > 1 and len(members) < 2):
         raise InputError(
@@ -159,7 +168,19 @@ def _captured(request: BallRequest) -> CapturedBall:
     names = tuple(posed.balls[i].name for i in members)
     hdr = any(each.high_dynamic_range for each in light)
     rivals = 0 if request.hints else sum(posed.balls[i].has_rival for i in members)
-    return CapturedBall(request.output, names, posed.left_out, focal, evidence, sum(map(len, shots)), hdr, rivals)
+    exposures, compared = sum(map(len, shots)), _compared(posed, request.model)
+    return CapturedBall(request.output, names, posed.left_out, focal, evidence, exposures, hdr, rivals, compared)
+
+
+def _compared(posed: PosedBalls, model: Path | None) -> str:
+    if model is None or len(posed.members) < 2:
+        return ""
+    if posed.stated_unexplained is None:
+        return f"Compared: {model} has not all of these photographs; poses are by reflections"
+    kept = "kept" if posed.by_stated else "not kept"
+    return (
+        f"Compared: by rotations of {model}, {1 - posed.stated_unexplained:.0%} of reflections agree; they are {kept}"
+    )
 
 
 def _linear(shots: Sequence[Shot], light: Exposed) -> Float[np.ndarray, "H W 3"]:

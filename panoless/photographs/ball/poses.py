@@ -1,11 +1,14 @@
 """Where the cameras of balls are: pairs of reflections that agree, their average, and the adjustment of all."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from types import MappingProxyType
 
 import numpy as np
+from jaxtyping import Float
 
+from panoless.numeric.robust import bounded_error
 from panoless.photographs.ball.adjust import Adjusted, SeenBall, adjust, cone_of
 from panoless.photographs.ball.cone import BallCone
 from panoless.photographs.ball.find import FoundBall, hidden
@@ -18,6 +21,9 @@ from shinypartial.io.threads import in_threads
 
 RIM_SIGMA_PX = 0.3
 """Of a rim's cone, at least."""
+AGREES_RAD = np.radians(5.0)
+"""Angle from which a match disagrees, rather than not: rims that are off by pixels of small balls turn what they mirror
+by degrees."""
 REFOUND_PX = 1.0
 """A rim that reflections move by more is looked for once more, beside where they have it."""
 REFOUND_SEEN = 0.8
@@ -32,6 +38,10 @@ class PosedBalls:
     lenses: tuple[Lens, ...]
     members: tuple[int, ...]
     adjusted: Adjusted
+    stated_unexplained: float | None = None
+    """Share of matches that disagree under rotations of another program; None where there are none."""
+    by_stated: bool = False
+    """Whether these explain more, and were kept."""
 
     @property
     def left_out(self) -> tuple[str, ...]:
@@ -44,10 +54,15 @@ class PosedBalls:
         return float(np.median(off))
 
 
-def posed_balls(found: Sequence[FoundBall], lenses: Sequence[Lens]) -> PosedBalls:
+def posed_balls(
+    found: Sequence[FoundBall],
+    lenses: Sequence[Lens],
+    stated: Mapping[int, Float[np.ndarray, "3 3"]] = MappingProxyType({}),
+) -> PosedBalls:
     """Photographs with their rims, whose cones and rotations are adjusted to all that is mirrored.
 
-    One whose reflections agree with no other is tried with other circles of it.
+    One whose reflections agree with no other is tried with other circles of it. Where another program `stated`
+    rotations (world to camera) of all that agree, and these explain more, the adjustment starts from them.
     """
     balls, features = list(found), _features(found, lenses)
     pairs = _pairs(features, list(combinations(range(len(balls)), 2)))
@@ -64,7 +79,12 @@ def posed_balls(found: Sequence[FoundBall], lenses: Sequence[Lens]) -> PosedBall
                 group = largest_group(len(balls), pairs)
                 break
     seen = [_seen(*each) for each in zip(balls, lenses, features, strict=True)]
-    adjusted = adjust(seen, average(group, pairs), pairs)
+    adjusted, unexplained, by_stated = adjust(seen, average(group, pairs), pairs), None, False
+    if len(group) > 1 and all(i in stated for i in group):
+        given = {i: stated[i] for i in group}
+        unexplained = disagreement(features, given, pairs)
+        by_stated = unexplained < disagreement(features, adjusted.rotations, pairs)
+        adjusted = adjust(seen, given, pairs) if by_stated else adjusted
     moved = False
     for i in group:
         rim = _refound(balls[i], lenses[i], adjusted.cones[i])
@@ -73,7 +93,22 @@ def posed_balls(found: Sequence[FoundBall], lenses: Sequence[Lens]) -> PosedBall
             seen[i] = _seen(balls[i], lenses[i], features[i])
     if moved:
         adjusted = adjust(seen, adjusted.rotations, pairs)
-    return PosedBalls(tuple(balls), tuple(lenses), tuple(sorted(group)), adjusted)
+    return PosedBalls(tuple(balls), tuple(lenses), tuple(sorted(group)), adjusted, unexplained, by_stated)
+
+
+def disagreement(
+    features: Sequence[Features],
+    rotations: Mapping[int, Float[np.ndarray, "3 3"]],
+    pairs: Mapping[tuple[int, int], Pair],
+) -> float:
+    """Mean of θ²/(θ² + s²) over matches in far surroundings, θ the angle between both directions, s = 5°."""
+    angles = []
+    for (one, two), pair in pairs.items():
+        if one in rotations and two in rotations:
+            x = features[one].seen.directions[pair.first] @ rotations[one]
+            y = features[two].seen.directions[pair.second] @ rotations[two]
+            angles.append(np.arccos(np.clip((x * y).sum(1), -1, 1)))
+    return float(bounded_error(np.concatenate(angles), AGREES_RAD).mean())
 
 
 def _features(balls: Sequence[FoundBall], lenses: Sequence[Lens]) -> list[Features]:

@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 
 from panoless.photographs.frames import Frames, Photograph
-from panoless.photographs.models import find_model, read_colmap, read_transforms
+from panoless.photographs.models import find_model, read_colmap, read_rotations, read_transforms
 from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import without_the_rest
 from shinypartial.core.camera import look_at, opencv_to_opengl
@@ -65,6 +65,15 @@ def test_cameras_of_a_colmap_model_are_read(tmp_path: Path, binary: bool) -> Non
     first, second, _ = (view.lens for view in found.views)
     assert (first.fx, first.fy, first.cx, first.cy, first.k1) == (70, 70, 32, 24, -0.05)
     assert (second.fx, second.fy, second.cx, second.cy, second.k1) == (80, 81, 31, 25, 0)
+
+
+def test_rotations_of_a_colmap_model_are_read(tmp_path: Path) -> None:
+    """Of the photographs that it has, by the names of their files."""
+    files = [tmp_path / f"{name}.jpg" for name in (*NAMES, "stranger")]
+    found = read_rotations(write_model(tmp_path, False), files)
+    assert list(found) == files[:3]
+    for file, pose in zip(files[:3], POSES, strict=True):
+        np.testing.assert_allclose(found[file], pose[:3, :3].T, atol=1e-12)
 
 
 def test_cameras_hold_for_averaged_pictures(tmp_path: Path) -> None:

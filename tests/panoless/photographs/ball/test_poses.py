@@ -56,6 +56,25 @@ def test_a_photograph_of_another_room_is_left_out(far: Taken) -> None:
     assert 1 not in posed.adjusted.rotations
 
 
+def test_wrong_rotations_of_another_program_are_not_kept(far: Taken) -> None:
+    """Structure from motion that mistook three equal cans for one another: two cameras by a quarter turn each."""
+    wrong = dict(enumerate(far.truth))
+    for i, turn in ((1, 90.0), (2, -90.0)):
+        wrong[i] = wrong[i] @ Rotation.from_euler("z", turn, degrees=True).as_matrix()
+    posed = posed_balls(far.balls, [far.lens] * 4, wrong)
+    assert not posed.by_stated
+    assert posed.stated_unexplained > 0.5
+    np.testing.assert_array_equal(rotations(posed), rotations(far.posed))
+
+
+def test_right_rotations_of_another_program_agree(far: Taken) -> None:
+    """In whatever world they are."""
+    world = Rotation.from_euler("xyz", [40, 10, 70], degrees=True).as_matrix()
+    posed = posed_balls(far.balls, [far.lens] * 4, dict(enumerate(far.truth @ world)))
+    assert posed.stated_unexplained < 0.3
+    assert np.median(turns_between(rotations(posed), far.truth)) < 0.25
+
+
 def test_a_single_photograph_has_the_cone_of_its_rim(far: Taken) -> None:
     posed = posed_balls(far.balls[:1], [far.lens])
     assert posed.members == (0,)
