@@ -9,12 +9,13 @@ from jaxtyping import UInt8
 
 from panoless.photographs.lens import opencv
 from panoless.photographs.options import CaptureOptions
+from panoless.photographs.shot import RAW_SUFFIXES
 from panoless.photographs.standstill import StillCheck
 from panoless.photographs.video import VIDEO_SUFFIXES, decoded_video, luminance
 from shinypartial.core.color import CODES_OF_LINEAR, LINEAR_OF_CODES
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.bundled import bundled_photographs
-from shinypartial.io.images import PICTURE_SUFFIXES, read_as_stored, read_upright, to_bytes, write_png
+from shinypartial.io.images import EXR, PICTURE_SUFFIXES, read_as_stored, read_upright, to_bytes, write_png
 from shinypartial.io.progress import Progress
 from shinypartial.io.threads import in_threads
 
@@ -67,9 +68,11 @@ def source_files(source: Path) -> list[Path]:
     if source.is_dir():
         # Structure-from-motion programs keep pictures in a folder `images`.
         for folder in (source, source / "images", source / "train"):
-            pictures = [path for path in sorted(folder.iterdir()) if _is_photograph(path)] if folder.is_dir() else []
-            if pictures:
-                return pictures
+            files = [path for path in sorted(folder.iterdir()) if _is_photograph(path)] if folder.is_dir() else []
+            # A camera may write a JPEG beside each RAW.
+            developed = [path for path in files if path.suffix.lower() in PICTURE_SUFFIXES]
+            if files:
+                return developed or files
         videos = [path for path in sorted(source.iterdir()) if path.suffix.lower() in VIDEO_SUFFIXES]
         if len(videos) == 1:
             return videos
@@ -81,7 +84,7 @@ def source_files(source: Path) -> list[Path]:
 
 
 def _is_photograph(path: Path) -> bool:
-    return path.suffix.lower() in PICTURE_SUFFIXES and not path.stem.endswith(COMPANIONS)
+    return path.suffix.lower() in (*PICTURE_SUFFIXES, EXR, *RAW_SUFFIXES) and not path.stem.endswith(COMPANIONS)
 
 
 def make_frames(files: list[Path], folder: Path, upright: bool, options: CaptureOptions) -> Frames:
@@ -134,6 +137,12 @@ def _named(files: list[Path]) -> list[Source]:
 
 
 def _decoded(file: Path, upright: bool) -> UInt8[np.ndarray, "H W C"]:
+    if file.suffix.lower() in RAW_SUFFIXES:
+        raise InputError(
+            expected=f"a developed photograph, as poses and masks are found in, at {file}",
+            found="RAW",
+            remedy="Develop all alike, to JPEG, PNG or TIFF; RAW of a ball is read with --object ball.",
+        )
     image = read_upright(file) if upright else read_as_stored(file)
     if image.dtype.kind == "f":
         raise InputError(

@@ -165,7 +165,7 @@ def _developed(path: Path) -> Num[np.ndarray, "H W 3"]:
     try:
         with rawpy.imread(str(path)) as file:
             developed: np.ndarray = file.postprocess(
-                gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True
+                gamma=(1, 1), no_auto_bright=True, adjust_maximum_thr=0.0, output_bps=16, use_camera_wb=True
             )
     except rawpy.LibRawError as error:
         raise InputError(

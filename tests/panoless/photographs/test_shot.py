@@ -6,10 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from panoless.photographs.frames import source_files
 from panoless.photographs.shot import Shot, exposure_of, focal_of, given_focal, read_shot
 from shinypartial.core.color import linear_to_srgb
 from shinypartial.core.errors import InputError
 from shinypartial.io.images import write_exr_rgb, write_jpeg, write_png
+from tests.support.dng import write_dng
 
 DIAGONAL_MM = 43.2666
 CODES = np.random.default_rng(0).integers(0, 256, (40, 60, 3)).astype(np.uint8)
@@ -124,3 +126,24 @@ def test_a_file_that_is_no_picture_is_refused(tmp_path: Path, content: bytes) ->
         read_shot(tmp_path / "one.jpg")
     with pytest.raises(InputError):
         read_shot(tmp_path / "none.jpg")
+
+
+def test_raw_is_linear_light_whatever_it_shows(tmp_path: Path) -> None:
+    """One scale for bright and dark photographs, or exposures would say nothing; and what EXIF says beside it."""
+    light = np.stack([np.tile(np.linspace(0.05, 0.9, 256), (192, 1)) * share for share in (1.0, 0.7, 0.4)], -1)
+    for share in (1.0, 0.3):
+        write_dng(tmp_path / "shot.dng", share * light, 0.02, 28)
+        shot = read_shot(tmp_path / "shot.dng")
+        assert shot.linear
+        assert shot.exposure == pytest.approx(0.02 * 100 / 4, rel=1e-3)
+        assert shot.focal.film_mm == pytest.approx(28)
+        inside = np.s_[20:-20, 20:-20]
+        np.testing.assert_allclose(shot.radiance()[inside], (share * light)[inside], atol=0.002)
+
+
+def test_a_folder_has_raw_photographs_where_none_are_developed(tmp_path: Path) -> None:
+    for name in ("a.dng", "b.NEF"):
+        (tmp_path / name).write_bytes(b"")
+    assert [path.name for path in source_files(tmp_path)] == ["a.dng", "b.NEF"]
+    (tmp_path / "a.jpg").write_bytes(b"")
+    assert [path.name for path in source_files(tmp_path)] == ["a.jpg"]
