@@ -196,8 +196,8 @@ def light(
 
     folder = Path(output)
     dataset = folder / "dataset"
-    files = tuple(map(Path, photographs))
-    captured = capture_ball(BallRequest(files, dataset, focal_mm, hints or {}, background=background))
+    shown = tuple(map(Path, photographs))
+    captured = capture_ball(BallRequest(shown, dataset, focal_mm, hints or {}, background=background))
     options = ("environment.range=hdr",) if captured.high_dynamic_range else ()
     result = fit(dataset, output=folder / f"{folder.resolve().name}-prediction", set=options)
     write_hdr(folder / "light.hdr", result.environment)
