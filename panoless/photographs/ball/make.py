@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from panoless.numeric.robust import bounded_error, robust_scale
 from panoless.photographs.ball.adjust import cone_of
-from panoless.photographs.ball.background import write_background
+from panoless.photographs.ball.background import FARTHEST, write_background
 from panoless.photographs.ball.beside import PosedBall, agreement, log_light, refraction_agreement
 from panoless.photographs.ball.brackets import Exposed, exposed, same_pose
 from panoless.photographs.ball.cone import BallCone
@@ -76,6 +76,8 @@ class CapturedBall:
     high_dynamic_range: bool
     rivals: int
     """Photographs that show a second circle as clear."""
+    walls_radii: float
+    """Distance of the surroundings at which direct and mirrored views agree best; infinite where none does."""
     compared: str = ""
     """What rotations of a COLMAP model explain, in one line."""
 
@@ -97,6 +99,7 @@ class CapturedBall:
         if evidence.agreement is not None:
             lines.append(
                 f"Check: what lies beside the ball correlates with what it mirrors by {evidence.agreement:.2f}"
+                + (f", best for walls at {self.walls_radii:.0f} of its radii" if self.walls_radii < FARTHEST else "")
             )
         if 2 * self.rivals >= found:
             lines.append("Note: a second ball, or something as round, shows. The larger was taken; --clicks chooses.")
@@ -169,7 +172,9 @@ def _captured(request: BallRequest) -> CapturedBall:
     hdr = any(each.high_dynamic_range for each in light)
     rivals = 0 if request.hints else sum(posed.balls[i].has_rival for i in members)
     exposures, compared = sum(map(len, shots)), _compared(posed, request.model)
-    return CapturedBall(request.output, names, posed.left_out, focal, evidence, exposures, hdr, rivals, compared)
+    return CapturedBall(
+        request.output, names, posed.left_out, focal, evidence, exposures, hdr, rivals, distance, compared
+    )
 
 
 def _compared(posed: PosedBalls, model: Path | None) -> str:
