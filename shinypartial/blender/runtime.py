@@ -15,20 +15,21 @@ from typing import Any, BinaryIO
 
 from shinypartial.core.errors import InputError
 
-PYTHON_OF_BPY = (3, 11)
+#: Versions of Python that a release of bpy is built for, the one of the newest Blender last.
+PYTHONS_OF_BPY = ("3.11", "3.13")
 INSTALL = "pip install 'panoless[blender]'"
 GPU_KINDS = ("OPTIX", "CUDA", "HIP", "METAL", "ONEAPI")
 
 
 def check_blender() -> None:
     """Raise InputError unless this Python can import bpy; imports nothing."""
-    version = sys.version_info[:2]
+    version = f"{sys.version_info.major}.{sys.version_info.minor}"
     if importlib.util.find_spec("bpy") is None:
-        if version != PYTHON_OF_BPY:
+        if version not in PYTHONS_OF_BPY:
             raise InputError(
-                expected=f"Python {PYTHON_OF_BPY[0]}.{PYTHON_OF_BPY[1]} to render with Blender as a module",
-                found=f"Python {version[0]}.{version[1]}, for which there is no such module",
-                remedy=f"Make an environment with Python 3.11 and run: {INSTALL}",
+                expected=f"Python {' or '.join(PYTHONS_OF_BPY)} to render with Blender as a module",
+                found=f"Python {version}, for which there is no such module",
+                remedy=f"Make an environment with Python {PYTHONS_OF_BPY[-1]} and run: {INSTALL}",
             )
         raise InputError(
             expected="Blender as a Python module (bpy) to render with",
