@@ -1,7 +1,6 @@
 """Getting at Blender: a clear refusal where it can't run, a quiet terminal, the fastest device."""
 
 import contextlib
-import ctypes
 import importlib
 import importlib.util
 import os
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from shinypartial.core.errors import InputError
+from shinypartial.io.system import flush_c_streams
 
 #: Versions of Python that a release of bpy is built for, the one of the newest Blender last.
 PYTHONS_OF_BPY = ("3.11", "3.13")
@@ -64,7 +64,9 @@ def quiet() -> Iterator[BinaryIO]:
                 os.dup2(log.fileno(), stream)
             yield log
         finally:
-            _flush_c_streams()
+            sys.stdout.flush()
+            sys.stderr.flush()
+            flush_c_streams()
             for stream, copy in saved.items():
                 os.dup2(copy, stream)
                 os.close(copy)
@@ -88,14 +90,6 @@ def interrupts_deferred() -> Iterator[None]:
         signal.signal(signal.SIGINT, previous)
     if received:
         raise KeyboardInterrupt
-
-
-def _flush_c_streams() -> None:
-    """What C code has printed but not yet written would appear after the terminal is back."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    if os.name == "posix":
-        ctypes.CDLL(None).fflush(None)
 
 
 def choose_device(bpy: Any) -> str:
