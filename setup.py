@@ -9,6 +9,7 @@ from setuptools.command.build_py import build_py
 
 RECIPES = Path("blender_scenes")
 PICTURE = re.compile(r"^!\[[^\]]*\]\((?!https?:)[^)]*\)\n+(\*.*?\n\n)?", re.MULTILINE | re.DOTALL)
+SITE = re.compile(r"^## Documentation\n.*?(?=^The method starts)", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[([^\]]+)\]\((?!https?:)[^)]*\)")
 
 
@@ -23,7 +24,7 @@ class BuildWithRecipes(build_py):
 
 def page(readme: str) -> str:
     """For a package page, which has neither the pictures nor the documentation beside it."""
-    return LINK.sub(r"\1", PICTURE.sub("", readme))
+    return LINK.sub(r"\1", PICTURE.sub("", SITE.sub("", readme)))
 
 
 setup(
