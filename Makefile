@@ -8,9 +8,10 @@
 SHELL := /bin/bash
 VENV ?= .venv
 BIN := $(VENV)/bin
-PYTHON ?= $(shell for p in python3.11 python3; do \
-    $$p -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null && { echo $$p; break; }; done)
-NEED_PYTHON := expected Python 3.11 as python3.11 or python3 (the newest Blender module for it is the one in use)
+# Blender's module is built for 3.13 and 3.11; on 3.12 all the rest runs.
+KNOWN_PYTHON := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
+PYTHON ?= $(shell for p in python3.13 python3.11 python3.12 python3; do \
+    $$p -c '$(KNOWN_PYTHON)' 2>/dev/null && { echo $$p; break; }; done)
 PIP_INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -c constraints.txt
 # On all cores, which pip does on one; templates that are no Python yet are passed over.
 COMPILE := $(BIN)/python -W ignore -m compileall -qq -j 0 $(VENV)/lib || true
@@ -68,10 +69,10 @@ $(VENV)/.installed-demo: extras := fit,blender
 $(VENV)/.installed-capture: extras := fit,blender,capture
 $(VENV)/.installed-dev: extras := dev
 $(VENV)/.installed-demo $(VENV)/.installed-capture $(VENV)/.installed-dev: pyproject.toml constraints.txt
-	@test -n "$(PYTHON)" && $(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { \
-	  echo "error: $(NEED_PYTHON)" >&2; \
+	@test -n "$(PYTHON)" && $(PYTHON) -c '$(KNOWN_PYTHON)' || { \
+	  echo "error: expected Python 3.13, 3.12 or 3.11" >&2; \
 	  echo "       found    $$($(or $(PYTHON),python3) --version 2>&1 | head -n 1)" >&2; \
-	  echo "       remedy   Install Python 3.11, or name it: make PYTHON=/path/to/python3.11 $(MAKECMDGOALS)" >&2; \
+	  echo "       remedy   Install Python 3.13, or name it: make PYTHON=/path/to/python3.13 $(MAKECMDGOALS)" >&2; \
 	  exit 2; }
 	@test -x $(BIN)/pip || { echo "Making $(VENV) …"; $(PYTHON) -m venv --clear $(VENV); }
 	@echo "Installing panoless[$(extras)] into $(VENV): a minute here, longer where torch comes with CUDA …"

@@ -14,6 +14,8 @@ import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from shinypartial import __version__ as __version__
+
 if TYPE_CHECKING:
     from panoless.api import Reconstruction, fit, light, load
     from panoless.config import FitConfig
@@ -21,7 +23,6 @@ if TYPE_CHECKING:
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-__version__ = "0.1.0"
 __all__ = ["PRESETS", "FitConfig", "Reconstruction", "fit", "light", "load"]
 
 _PLACES = {
@@ -41,4 +42,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return [*__all__, "__version__"]

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
@@ -14,7 +14,8 @@ from panoless.config import FitConfig, renamed_arguments, with_overrides
 from panoless.photographs.options import CaptureOptions
 from panoless.presets import PRESETS
 from shinypartial.core.command_line import command_line
-from shinypartial.core.errors import InputError, parse_and_run
+from shinypartial.core.errors import InputError
+from shinypartial.core.program import Program
 from shinypartial.io.records import check_record
 
 if TYPE_CHECKING:
@@ -28,11 +29,13 @@ if TYPE_CHECKING:
 class Fit:
     """Fit a dataset: its surface, an environment map and a visibility map; then export the prediction."""
 
+    FIRST: ClassVar = (
+        "dataset preset output viewer device set config.model config.tint config.downscale config.environment.range"
+    )
     dataset: Annotated[Path | None, tyro.conf.Positional] = None
-    """Dataset folder, also a plain NeRF-synthetic one, or the name of a bundled one, such as tiny-vase; without it the
-    newest below ./datasets."""
-    preset: Literal[tuple(PRESETS)] = "default"  # type: ignore[valid-type]
-    """Starting values of the configuration."""
+    """Dataset folder, also plain NeRF-synthetic, or a bundled one: tiny-vase; else the newest in ./datasets."""
+    preset: Annotated[Literal[tuple(PRESETS)], tyro.conf.arg(metavar="NAME")] = "default"  # type: ignore[valid-type]
+    """What the configuration starts from: `fast`, `default`, `best`, `paper`, or a compared method, as `3dgs-dr`."""
     output: Path | None = None
     """Prediction folder; default predictions/DATASET-PRESET. The run folder has the same name below ./runs."""
     snapshots: int = 0
@@ -41,10 +44,9 @@ class Fit:
     snapshot_seconds: tuple[float, ...] = ()
     """Keep the moments after these seconds of fitting."""
     viewer: bool = False
-    """Show cameras, photographs and what the fit saves in the browser while it runs, and the result afterwards."""
+    """Show the fit in the browser while it runs, and the result afterwards."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where the fit computes; `cuda` (NVIDIA or AMD) needs a GPU, torch for it and Triton; see
-    docs/how-to/use-a-gpu.md."""
+    """Where the fit computes; `cuda` (NVIDIA or AMD) needs torch for it and Triton: docs/how-to/use-a-gpu.md."""
     set: Annotated[
         tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="OPTION=VALUE [OPTION=VALUE ...]")
     ] = ()
@@ -192,6 +194,7 @@ class Capture:
     Run again to continue where an earlier run stopped.
     """
 
+    FIRST: ClassVar = "sources output object focal_mm colmap board masks segmenter box box_in clicks"
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folder of photographs, a video, or photographs."""
     output: Path | None = None
@@ -402,29 +405,21 @@ def _preset_of(arguments: list[str]) -> str:
     return "default"
 
 
+PROGRAM = Program(
+    "panoless",
+    "The environment that a shiny object reflects, from photographs of one side of it.",
+    {
+        "From photographs": {"light": Light, "capture": Capture, "board": PrintBoard},
+        "From a dataset": {"fit": Fit, "view": View, "export": Export},
+    },
+)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns 0, 2 for bad input or usage, 130 when interrupted."""
     arguments = renamed_arguments(sys.argv[1:] if arguments is None else arguments)
     preset = _preset_of(arguments)
-    fit_default = Fit(preset=preset, config=PRESETS[preset])
-    kinds = (
-        Annotated[Fit, tyro.conf.subcommand("fit", default=fit_default)]
-        | Annotated[Export, tyro.conf.subcommand("export")]
-        | Annotated[View, tyro.conf.subcommand("view")]
-        | Annotated[Capture, tyro.conf.subcommand("capture")]
-        | Annotated[Light, tyro.conf.subcommand("light")]
-        | Annotated[PrintBoard, tyro.conf.subcommand("board")]
-    )
-
-    def parse() -> Fit | Export | View | Capture | Light | PrintBoard:
-        return tyro.cli(
-            kinds,  # type: ignore[arg-type]
-            args=arguments,
-            prog="panoless",
-            description="The environment that a shiny object reflects, from photographs of one side of it.",
-        )
-
-    return parse_and_run(parse)
+    return PROGRAM.main(arguments, {"fit": Fit(preset=preset, config=PRESETS[preset])})
 
 
 if __name__ == "__main__":

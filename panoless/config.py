@@ -83,9 +83,9 @@ class EnvironmentConfig:
     activation: Literal["clamp", "sigmoid"] = "clamp"
     """`sigmoid`: Eq. 7 of the paper, started at random logits; `clamp`: radiance itself, kept in [0, 1]."""
     gray: Share = 0.5
-    """Radiance that it starts with…"""
+    """Radiance that it starts with."""
     noise: NonNegative = 5.0
-    """…and how far its logits may be from that at random; read for `sigmoid`."""
+    """How far its logits start from `gray` at random; read for `sigmoid`."""
     range: Literal["ldr", "hdr"] = "ldr"
     """`ldr`: views are clipped to [0, 1], as photographs are; `hdr`: radiance above 1 is fitted, too (EXR, HDR)."""
     warmup: Share = 0.06

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from shinypartial.api import evaluate
     from shinypartial.evaluation.scores import Scores
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = ["Scores", "evaluate"]
 
 _PLACES = {"Scores": "shinypartial.evaluation.scores", "evaluate": "shinypartial.api"}
@@ -28,4 +28,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return [*__all__, "__version__"]

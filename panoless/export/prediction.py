@@ -45,6 +45,7 @@ from shinypartial.dataset.schema import Dataset, View
 from shinypartial.io.files import remove_partial_files
 from shinypartial.io.images import write_jpeg, write_png
 from shinypartial.io.progress import Progress
+from shinypartial.io.system import processor_name
 from shinypartial.prediction.format import (
     DECOMPOSITION,
     ENVIRONMENT,
@@ -124,7 +125,7 @@ def export_prediction(
         config=asdict(config),
         seconds=_stated_seconds(state),
         hardware={
-            "processor": _processor_name(),
+            "processor": processor_name(),
             "device": state.device,
             "cores": os.cpu_count(),
             "threads": torch.get_num_threads(),
@@ -342,13 +343,3 @@ def _three(numbers: Float[np.ndarray, "N"] | None, first: int) -> tuple[float, f
         return None
     x, y, z = numbers[first : first + 3].tolist()
     return x, y, z
-
-
-def _processor_name() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()

@@ -73,13 +73,13 @@ class CaptureOptions:
     ground_difference: Share = 0.1
     """Codes of one place of the ground differ by less, of 1, between views that agree."""
     ground_agreeing: Count = 4
-    """So many views must agree on a texel…"""
+    """So many views must agree on a texel of the ground."""
     ground_share: Share = 0.15
-    """…and this share of those that reach it; what the object hides in most views is known from the others."""
+    """So must this share of the views that reach it; what the object hides in most views is known from the others."""
     ground_window_px: Count = 7
-    """Side of a window that shows the ground, or does not…"""
+    """Side of a window that shows the ground, or does not."""
     ground_wide_px: Count = 17
-    """…near a window of this side that does, because a small one can look like it by chance."""
+    """Side of a window near it that has to show it, too, because a small one can look like it by chance."""
     ground_noise: Positive = 0.06
     """Contrast, in codes of 1, that a plain window counts as having."""
     ground_match: Share = 0.1
@@ -105,9 +105,9 @@ class CaptureOptions:
     """Side of the square picture that a segmentation model is given. This and the two below are those of IS-Net (Qin et
     al. 2022)."""
     segmenter_mean: tuple[Finite, Finite, Finite] = (0.5, 0.5, 0.5)
-    """What is subtracted from red, green and blue in [0, 1] before…"""
+    """What is subtracted from red, green and blue in [0, 1], first."""
     segmenter_deviation: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
-    """…they are divided by this."""
+    """What red, green and blue are divided by then."""
     least_overlap: Share = 0.7
     """Overlap (intersection over union) of a view's mask and the hull's outline, in the median, below which poses and
     masks contradict each other: 0.99 with true masks of *vase*, 0.9 where those found of *mirror* are right to 0.98,

@@ -11,7 +11,7 @@ from panoless.geometry.base import Geometry, Training
 from panoless.journal import seconds_before
 from panoless.reconstruct.snapshots import SnapshotSchedule, snapshot_folders
 from panoless.reconstruct.state import FitState, save_state
-from shinypartial.io.memory import peak_memory_bytes, release_free_memory
+from shinypartial.io.system import peak_memory_bytes, release_free_memory
 from shinypartial.prediction.format import SNAPSHOTS
 
 CHECKPOINT_INTERVAL_S = 20.0

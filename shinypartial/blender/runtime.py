@@ -1,7 +1,6 @@
 """Getting at Blender: a clear refusal where it can't run, a quiet terminal, the fastest device."""
 
 import contextlib
-import ctypes
 import importlib
 import importlib.util
 import os
@@ -14,21 +13,23 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from shinypartial.core.errors import InputError
+from shinypartial.io.system import flush_c_streams
 
-PYTHON_OF_BPY = (3, 11)
+#: Versions of Python that a release of bpy is built for, the one of the newest Blender last.
+PYTHONS_OF_BPY = ("3.11", "3.13")
 INSTALL = "pip install 'panoless[blender]'"
 GPU_KINDS = ("OPTIX", "CUDA", "HIP", "METAL", "ONEAPI")
 
 
 def check_blender() -> None:
     """Raise InputError unless this Python can import bpy; imports nothing."""
-    version = sys.version_info[:2]
+    version = f"{sys.version_info.major}.{sys.version_info.minor}"
     if importlib.util.find_spec("bpy") is None:
-        if version != PYTHON_OF_BPY:
+        if version not in PYTHONS_OF_BPY:
             raise InputError(
-                expected=f"Python {PYTHON_OF_BPY[0]}.{PYTHON_OF_BPY[1]} to render with Blender as a module",
-                found=f"Python {version[0]}.{version[1]}, for which there is no such module",
-                remedy=f"Make an environment with Python 3.11 and run: {INSTALL}",
+                expected=f"Python {' or '.join(PYTHONS_OF_BPY)} to render with Blender as a module",
+                found=f"Python {version}, for which there is no such module",
+                remedy=f"Make an environment with Python {PYTHONS_OF_BPY[-1]} and run: {INSTALL}",
             )
         raise InputError(
             expected="Blender as a Python module (bpy) to render with",
@@ -63,7 +64,9 @@ def quiet() -> Iterator[BinaryIO]:
                 os.dup2(log.fileno(), stream)
             yield log
         finally:
-            _flush_c_streams()
+            sys.stdout.flush()
+            sys.stderr.flush()
+            flush_c_streams()
             for stream, copy in saved.items():
                 os.dup2(copy, stream)
                 os.close(copy)
@@ -87,14 +90,6 @@ def interrupts_deferred() -> Iterator[None]:
         signal.signal(signal.SIGINT, previous)
     if received:
         raise KeyboardInterrupt
-
-
-def _flush_c_streams() -> None:
-    """What C code has printed but not yet written would appear after the terminal is back."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    if os.name == "posix":
-        ctypes.CDLL(None).fflush(None)
 
 
 def choose_device(bpy: Any) -> str:

@@ -22,6 +22,7 @@ from shinypartial.blender.messages import BackdropOf, Ready, Refused, Start, rec
 from shinypartial.blender.render import RenderedView
 from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
+from shinypartial.io.system import usable_cores
 from shinypartial.scene import SceneSpec
 
 WORKER = "shinypartial.blender.worker"
@@ -49,7 +50,7 @@ def plan_pool(cores: int | None = None) -> PoolPlan:
     processes should keep many cores busier than one; each holds the scene in memory. On two cores one was faster.
     """
     if cores is None:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        cores = usable_cores()
     workers = min(max(cores // 2, 1), 4)
     return PoolPlan(workers, max(cores // workers, 1))
 

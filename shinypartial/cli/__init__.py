@@ -1,8 +1,7 @@
 """The command line `shinypartial`: one class a command. Imports every other room, inside the command that needs it."""
 
+import sys
 from collections.abc import Sequence
-
-import tyro
 
 from shinypartial.cli.converting import Convert, Import, Relight
 from shinypartial.cli.datasets import (
@@ -20,45 +19,41 @@ from shinypartial.cli.scenes import Film, Generate
 from shinypartial.cli.scoring import Compare, Evaluate, EvaluateDirect, Oracle, Postprocess, Weights
 from shinypartial.cli.stability import Stability
 from shinypartial.cli.tables import Tables
-from shinypartial.core.errors import parse_and_run
+from shinypartial.core.program import Program
 
-Command = (
-    Generate
-    | Film
-    | Subset
-    | FindLight
-    | ImportDataset
-    | Perturb
-    | Align
-    | ExportCameras
-    | Validate
-    | Evaluate
-    | EvaluateDirect
-    | Oracle
-    | Postprocess
-    | Convert
-    | Relight
-    | Import
-    | Compare
-    | Weights
-    | Report
-    | Release
-    | Leaderboard
-    | Chart
-    | Stability
-    | Tables
+PROGRAM = Program(
+    "shinypartial",
+    "Scenes, ground truth and scores for environments seen in partial reflections.",
+    {
+        "Make a dataset": {"generate": Generate, "film": Film, "import-dataset": ImportDataset},
+        "Change or check a dataset": {
+            "perturb": Perturb,
+            "subset": Subset,
+            "align": Align,
+            "find-light": FindLight,
+            "export-cameras": ExportCameras,
+            "validate": Validate,
+            "release": Release,
+        },
+        "Score predictions": {
+            "evaluate": Evaluate,
+            "report": Report,
+            "oracle": Oracle,
+            "evaluate-direct": EvaluateDirect,
+            "weights": Weights,
+        },
+        "Use a prediction": {"convert": Convert, "relight": Relight, "postprocess": Postprocess, "import": Import},
+        "Compare many": {
+            "compare": Compare,
+            "leaderboard": Leaderboard,
+            "chart": Chart,
+            "stability": Stability,
+            "tables": Tables,
+        },
+    },
 )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse and run; return 0, 2 for bad usage or bad input, 130 when interrupted."""
-
-    def parse() -> Command:
-        return tyro.cli(
-            Command,  # type: ignore[arg-type]
-            args=arguments,
-            prog="shinypartial",
-            description="Scenes, ground truth and scores for environments seen in partial reflections.",
-        )
-
-    return parse_and_run(parse)
+    return PROGRAM.main(sys.argv[1:] if arguments is None else arguments)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import tyro
 
@@ -125,6 +125,10 @@ class Perturb:
     Run again to continue where an earlier run stopped.
     """
 
+    FIRST: ClassVar = (
+        "source output seed cameras.rotation_deg cameras.focal_factor masks.erode_px masks.dilate_px sensor.blur_px "
+        "sensor.k1 views.keep"
+    )
     source: tyro.conf.Positional[Path]
     """Dataset folder, also a plain NeRF-synthetic one, or the name of a bundled one; it is only read."""
     output: Path

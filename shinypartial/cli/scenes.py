@@ -2,7 +2,7 @@
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import tyro
 
@@ -83,6 +83,10 @@ class SceneOptions:
 class Generate:
     """Render a benchmark dataset from a scene recipe; run again to continue where an earlier run stopped."""
 
+    FIRST: ClassVar = (
+        "scene object output resolution samples variation.world variation.surroundings_radii variation.roughness "
+        "camera.path camera.train camera.test"
+    )
     scene: str
     """Name of a scene in blender_scenes, or the path of a scene.toml or of a .blend file."""
     object: str | None = None

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import tyro
 
@@ -17,6 +18,7 @@ class Stability(Suite):
     Run again to continue where an earlier run stopped. Words after -- go to Snakemake, such as its --executor.
     """
 
+    FIRST: ClassVar = "snakemake cores collect_only plan methods scenes axes seeds output page"
     plan: Plans = "core"
     """The core axes; all axes; clean data alone, for the spread over many --seeds; or a tiny plan without rendering."""
     methods: tuple[str, ...] = ("fast",)

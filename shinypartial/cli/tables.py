@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import ClassVar, get_args
 
 import tyro
 
@@ -18,6 +18,7 @@ class Tables(Suite):
     Run again to continue where an earlier run stopped. Words after -- go to Snakemake, such as its --executor.
     """
 
+    FIRST: ClassVar = "snakemake cores collect_only tables scenes methods seeds output page missing"
     tables: tuple[TableName, ...] = get_args(TableName)
     """Which of them."""
     scenes: tuple[str, ...] = ()

@@ -6,13 +6,13 @@ import hashlib
 import json
 import os
 import shutil
-import sys
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from shinypartial.core.errors import InputError
+from shinypartial.io.system import lock_folder
 
 PARTIAL_PREFIX = ".partial-"
 
@@ -75,15 +75,13 @@ def remove_partial_files(root: Path) -> None:
 def folder_lock(folder: Path) -> Iterator[None]:
     """Hold `folder`, made where it is missing, against every other run that writes to it.
 
-    The system releases the lock however the process ends. The folder itself is locked (flock), so that nothing is
-    added to it; where no folder can be (Windows, NFS), a file among the temporary ones stands for it, which only runs
-    on the same machine see. Raises InputError when another run holds the folder or a file is in its place.
+    `lock_folder` says what keeps it. Raises InputError when another run holds the folder or a file is in its place.
     """
     if folder.exists() and not folder.is_dir():
         raise InputError(expected=f"a folder at {folder}", found="a file", remedy="Choose another --output.")
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        handle = _open_locked_folder(folder)
+        unlock = lock_folder(folder)
     except BlockingIOError:
         raise InputError(
             expected=f"to be the only run that writes to {folder}",
@@ -93,39 +91,7 @@ def folder_lock(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        os.close(handle)
-
-
-def _open_locked_folder(folder: Path) -> int:
-    try:
-        return _open_locked(folder, os.O_RDONLY)
-    except BlockingIOError:
-        raise
-    except OSError:
-        user = os.getuid() if hasattr(os, "getuid") else 0
-        digest = hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16]
-        return _open_locked(Path(tempfile.gettempdir()) / f"shinypartial-{user}-{digest}.lock", os.O_RDWR | os.O_CREAT)
-
-
-def _open_locked(path: Path, flags: int) -> int:
-    """A descriptor that holds the lock until it is closed; BlockingIOError when another one does."""
-    handle = os.open(path, flags, 0o600)
-    try:
-        if sys.platform == "win32":
-            import msvcrt
-
-            try:
-                msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
-            except PermissionError as error:
-                raise BlockingIOError(*error.args) from None
-        else:
-            import fcntl
-
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BaseException:
-        os.close(handle)
-        raise
-    return handle
+        unlock()
 
 
 def write_text(path: Path, text: str) -> None:

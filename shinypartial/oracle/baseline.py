@@ -17,8 +17,8 @@ from shinypartial.dataset.read import open_dataset, read_environment, read_view,
 from shinypartial.dataset.schema import ENVIRONMENT_LATLONG, Dataset, Frame, View
 from shinypartial.evaluation.masks import environment_mask
 from shinypartial.io.files import folder_lock
-from shinypartial.io.memory import peak_memory_bytes
 from shinypartial.io.progress import Progress
+from shinypartial.io.system import peak_memory_bytes
 from shinypartial.io.threads import in_threads
 from shinypartial.metrics.coverage import cells_of_view, cells_to_latlong
 from shinypartial.metrics.environment import PROTOCOL_HEIGHT, RegionMasks, region_scores

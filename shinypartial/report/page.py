@@ -56,10 +56,13 @@ JPEG_QUALITY = 88
 #: A PNG of up to this size is inlined losslessly.
 LOSSLESS_BYTES = 24_000
 
+RESOLVED = "environment.as_predicted.resolved"
+#: Small photographs resolve less than this share of the sphere, of which a score says nothing.
+LEAST_SHOWN = 0.001
 #: Lines of the summary: title and the group of scores.
 SUMMARY = (
     ("environment", "environment.as_predicted.full"),
-    ("  resolved", "environment.as_predicted.resolved"),
+    ("  resolved", RESOLVED),
     ("  perceptual", "environment.perceptual"),
     ("  distance", "surroundings"),
     ("normals", "normals"),
@@ -171,7 +174,7 @@ def summary_lines(prediction: Path) -> list[str]:
             for row in shown
             if row.value is not None
         ]
-        if parts:
+        if parts and not (group == RESOLVED and (scores.resolved_coverage or 0) < LEAST_SHOWN):
             lines.append(f"  {title:13s} {'   '.join(parts)}")
     if scores.coverage is not None:
         shares = [rows[name].metric.text(rows[name].value) for name in ("coverage", "resolved_coverage")]

@@ -13,7 +13,9 @@ from shinypartial.scene.film import FilmSpec
 from shinypartial.scene.shapes import BlendFile, Material
 from shinypartial.scene.spec import DEVELOPMENT, HELD_OUT, STUDIO_LIGHTS, FileWorld, SceneSpec, World
 
-SCENES = Path(__file__).resolve().parents[2] / "blender_scenes"
+#: Inside an installed wheel, or those of the checkout.
+_INSTALLED = Path(__file__).resolve().parents[1] / "data/blender_scenes"
+SCENES = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).resolve().parents[2] / "blender_scenes"
 FILMS = SCENES / "films"
 RECIPE = "scene.toml"
 BLEND = ".blend"
@@ -69,7 +71,7 @@ def load_scene(scene: str) -> SceneSpec:
         raise InputError(
             expected=f"one of the scenes {', '.join(scene_names()) or '(none found)'}, or the path of a {RECIPE}",
             found=f"'{scene}'",
-            remedy=f"Correct --scene, or add {SCENES / scene / RECIPE}.",
+            remedy=f"Correct --scene, or give the path of a {RECIPE} of your own.",
         )
     return _with_files(parse_scene(_read_toml(path), str(path)), path)
 

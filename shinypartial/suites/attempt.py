@@ -19,6 +19,7 @@ from pathlib import Path
 from shinypartial.core.errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, InputError
 from shinypartial.io.files import read_json, write_json
 from shinypartial.io.records import read_record as record_of
+from shinypartial.io.system import locked_log
 from shinypartial.suites.jobs import Job, Plan, read_jobs, require_commands
 
 RECORDS, LOGS = Path("records"), Path("logs")
@@ -69,13 +70,10 @@ def require_records(folder: Path, plan: Plan) -> None:
 
 def attempt(job: str, threads: int, folder: Path = Path()) -> int:
     """Run a job of the folder's plan unless its record is there; 0 unless it was stopped."""
-    import fcntl
-
     planned = next(each for each in read_jobs(folder) if each.name == job)
     log = folder / LOGS / f"{job}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("ab") as stream:
-        fcntl.flock(stream, fcntl.LOCK_EX)
+    with log.open("ab") as stream, locked_log(stream):
         earlier = read_record(folder, job)
         if earlier is not None and earlier.command == planned.command:
             return 0
@@ -106,21 +104,16 @@ def _timed(job: Job, threads: int, folder: Path, log: int) -> Record:
     before = read_record(folder, _stopped(job.name))
     if before is None or before.command != job.command:
         before = Record(job.command, None, 0.0, cpu_seconds=0.0)
-    started, worked, code = time.monotonic() - before.seconds, _worked() - (before.cpu_seconds or 0.0), None
+    started, code = time.monotonic() - before.seconds, None
+    worked = os.times().children_user - (before.cpu_seconds or 0.0)
     try:
         code = _run(job.command, threads, folder, log)
     finally:
-        seconds, cpu_seconds = round(time.monotonic() - started, 3), round(_worked() - worked, 3)
+        seconds, cpu_seconds = round(time.monotonic() - started, 3), round(os.times().children_user - worked, 3)
         record = Record(job.command, code, seconds, cpu_seconds=cpu_seconds)
         if code is None or code in STOP_CODES:
             _write_record(folder, _stopped(job.name), replace(record, code=None))
     return record
-
-
-def _worked() -> float:
-    import resource
-
-    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
 
 
 def _run(command: str, threads: int, folder: Path, log: int) -> int:

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shinypartial.io.memory import peak_memory_bytes
+from shinypartial.io.system import peak_memory_bytes
 
 WIDTH, HEIGHT = 4000, 3000
 K1 = -0.1

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from shinypartial.io.memory import peak_memory_bytes
+from shinypartial.io.system import peak_memory_bytes
 
 # Torch and what needs it are imported where they are used. A process begins with the peak memory of the one that
 # starts it, so the latter must stay small.

@@ -55,7 +55,7 @@ def option_names(config: object, prefix: str = "--config.") -> list[str]:
 def help_text(arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> str:
     """Help in one column, without its boxes and line breaks."""
     monkeypatch.setenv("COLUMNS", "80")
-    assert main([*arguments, "--help"]) == 0
+    assert main([*arguments, "--help-all"]) == 0
     return re.sub(r"[│╭╮╰╯─\s]+", " ", capsys.readouterr().out)
 
 

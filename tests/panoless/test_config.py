@@ -228,7 +228,7 @@ def test_a_run_of_the_former_name_can_be_read() -> None:
 
 
 def test_the_command_line_is_derived_from_the_same_fields(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["fit", "--help"]) == 0
+    assert main(["fit", "--help-all"]) == 0
     text = capsys.readouterr().out
     for name in (
         "--model {auto,sphere,plane,height_field,revolution,free_form,surfels}",

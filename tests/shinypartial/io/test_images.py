@@ -323,8 +323,9 @@ def png_of_size(path: Path, width: int, height: int) -> Path:
 
 @pytest.mark.parametrize("read", [read_picture, read_upright, read_as_stored, read_png, picture_size])
 def test_a_small_file_that_claims_a_huge_picture_is_refused_before_it_is_decoded(tmp_path: Path, read) -> None:
+    """By its size, or by OpenImageIO 3.2 as a file too small for it."""
     path = png_of_size(tmp_path / "a.png", 30_000, 30_000)
-    with pytest.raises(InputError, match=r"200 megapixels.*30000×30000, 900 megapixels"):
+    with pytest.raises(InputError, match=r"200 megapixels.*30000×30000, 900 megapixels|claims a 3433 MB image"):
         read(path)
 
 

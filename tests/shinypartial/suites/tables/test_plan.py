@@ -9,7 +9,7 @@ import tyro
 
 from panoless.cli import Fit
 from panoless.presets import PRESETS
-from shinypartial.cli import Command
+from shinypartial.cli import PROGRAM
 from shinypartial.core.errors import InputError
 from shinypartial.metrics.registry import metric
 from shinypartial.suites.jobs import Size
@@ -34,7 +34,7 @@ def test_every_command_parses() -> None:
     for program, *words in commands():
         assert program in ("panoless", "shinypartial")
         if program == "shinypartial":
-            tyro.cli(Command, args=words)  # type: ignore[call-overload]
+            PROGRAM.parse(words)
         else:
             preset = words[words.index("--preset") + 1]
             fit = tyro.cli(Fit, args=words[1:], default=Fit(preset=preset, config=PRESETS[preset]))

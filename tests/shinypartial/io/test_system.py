@@ -8,7 +8,7 @@ import pytest
 FREED_MB = 200
 PROGRAM = f"""
 import numpy as np
-from shinypartial.io.memory import release_free_memory
+from shinypartial.io.system import release_free_memory
 
 def resident_mb():
     return int(open("/proc/self/statm").read().split()[1]) * 4096 / 2**20
