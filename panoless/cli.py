@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from panoless.config import FitConfig, renamed_arguments, with_overrides
+from panoless.export.extension import Extension
 from panoless.photographs.options import CaptureOptions
 from panoless.presets import PRESETS
 from shinypartial.core.command_line import command_line
@@ -426,9 +427,10 @@ def main(arguments: list[str] | None = None) -> int:
         | Annotated[Capture, tyro.conf.subcommand("capture")]
         | Annotated[Light, tyro.conf.subcommand("light")]
         | Annotated[PrintBoard, tyro.conf.subcommand("board")]
+        | Annotated[Extension, tyro.conf.subcommand("extension")]
     )
 
-    def parse() -> Fit | Export | View | Capture | Light | PrintBoard:
+    def parse() -> Fit | Export | View | Capture | Light | PrintBoard | Extension:
         return tyro.cli(
             kinds,  # type: ignore[arg-type]
             args=arguments,

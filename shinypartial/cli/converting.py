@@ -10,7 +10,7 @@ from shinypartial.cli.newest import announce_newest
 from shinypartial.conversion.layouts import LayoutName
 from shinypartial.io.events import LongCommand, report_result
 
-Target = Literal["blender", "cubemap", "sh", "sg", "glb", "mitsuba", "usd", "threejs", "mask", "room"]
+Target = Literal["blender", "cubemap", "sh", "sg", "glb", "mitsuba", "usd", "threejs", "mask", "room", "extension"]
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,8 @@ class Convert(LongCommand):
     to: tuple[Target, ...] = field(kw_only=True)
     """What to write, one or more: `blender` world.exr and scene.blend; `cubemap` px.hdr to nz.hdr; `sh`
     harmonics.json; `sg` lobes.json; `glb` surface.glb; `mitsuba` scene.xml; `usd` scene.usda; `threejs` index.html;
-    `mask` mask.png of what was seen; `room` room.json of near surroundings."""
+    `mask` mask.png of what was seen; `room` room.json of near surroundings; `extension`
+    scene.json and what it names, for the Blender extension."""
     output: Path | None = None
     """Folder to write; PREDICTION-converted beside it when not given."""
     confidence: Literal["keep", "darken", "fill"] = "keep"
