@@ -19,7 +19,7 @@ from .program import INSTALL, PROGRESS_VERSION, Problem, Program, hidden
 
 RECORD, LOG = "run.json", "log.txt"
 RUNNING, CANCELLED, FAILED, DONE = "running", "cancelled", "failed", "done"
-#: A step of this one word is the command that the step before named as the next.
+#: At the head of a step: the command that the step before named as the next.
 NEXT = "{next}"
 #: How long a process may take to stop before it is ended.
 STOP_LIMIT_S = 10.0
@@ -107,7 +107,8 @@ class Job:
         return f"{self.stage}{rest}"
 
     def _begin(self) -> None:
-        words = self._next if self.steps[self._number] == [NEXT] else self.steps[self._number]
+        first, *options = self.steps[self._number]
+        words = [*self._next, *options] if first == NEXT else [first, *options]
         name, *rest = map(self._filled, words)
         self._last, self.share, self.seconds_left = {}, 0.0, None
         try:
@@ -164,8 +165,6 @@ class Job:
             self.paths |= event["paths"]
             self.lines += event["lines"]
             self.verdict, self._next = event["verdict"] or self.verdict, event["next"]
-            if self._next and "--json-progress" not in self._next:
-                self._next.append("--json-progress")
         if kind in ("result", "error", "cancelled"):
             self._last = event
 
@@ -173,7 +172,7 @@ class Job:
         """The process has ended."""
         assert self._process is not None
         code, self._process, last = self._process.returncode, None, self._last
-        reports = "--json-progress" in self.steps[self._number] or self.steps[self._number] == [NEXT]
+        reports = "--json-progress" in self.steps[self._number]
         if self.message:
             self._end(FAILED, self.message)
         elif self._stopping_since is not None and last.get("event") != "result":

@@ -13,8 +13,9 @@ from .content import PREDICTION as PREDICTION_FILE
 from .content import check_prediction
 from .insert import nearest_photograph, over_photograph, stand_on_ground, step_aside
 from .light import PREFIX, update_light
+from .job import NEXT
 from .program import Problem
-from .running import BENCHMARK, FOLLOWING, LIGHT, PREDICTION, JobOperator, convert_step, work_folder
+from .running import BENCHMARK, LIGHT, PREDICTION, JobOperator, convert_step, work_folder
 
 PICTURES = "*.jpg;*.jpeg;*.png;*.tif;*.tiff;*.exr;*.hdr;*.dng;*.cr2;*.cr3;*.nef;*.arw;*.mp4;*.mov;*.avi;*.mkv;*.json"
 CAMERAS = "transforms_train.json"
@@ -57,7 +58,7 @@ class PANOLESS_OT_light(JobOperator, bpy.types.Operator, ImportHelper):
             steps = [["panoless", "fit", str(sources[0].resolve()), "--output", "prediction", *fit]]
         else:
             words = ["panoless", "capture", *(str(each.resolve()) for each in sources), "--output", "dataset"]
-            steps = [[*words, "--object", self.object, "--json-progress"], [*FOLLOWING, "--output", "prediction", *fit]]
+            steps = [[*words, "--object", self.object, "--json-progress"], [NEXT, "--output", "prediction", *fit]]
         return self.run(context, LIGHT, [*steps, convert_step("{prediction}")])
 
 

@@ -8,7 +8,7 @@ import bpy
 
 from .build import build
 from .content import Content
-from .job import CANCELLED, DONE, NEXT, RUNNING, Job, read_record
+from .job import CANCELLED, DONE, RUNNING, Job, read_record
 from .program import Problem
 from .settings import installed
 
@@ -199,4 +199,3 @@ class PANOLESS_OT_continue(JobOperator, bpy.types.Operator):
 
 
 CLASSES = (PANOLESS_OT_cancel, PANOLESS_OT_continue)
-FOLLOWING = [NEXT]

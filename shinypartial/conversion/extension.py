@@ -3,7 +3,7 @@
 All conventions end here: the extension copies numbers into Blender. `scene.json` names the other files.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -81,9 +81,10 @@ def write_for_extension(prediction: Path, output: Path) -> list[Path]:
     """
     info = read_info(prediction)
     surface = surface_of(prediction, clouds=True)
+    cameras = _cameras(info)
     written = _write_light(prediction, output)
     if surface is not None and surface.faces:
-        written.append(_write_surface(output / SURFACE, surface))
+        written.append(_write_surface(output / SURFACE, surface, cameras))
     walls = read_inverse_distance(prediction)
     if walls is not None and walls.max() > 0:
         written.append(_write_walls(output / WALLS, walls))
@@ -97,7 +98,7 @@ def write_for_extension(prediction: Path, output: Path) -> list[Path]:
         "files": [path.name for path in written],
         "mirror": {"base_color": list(info.reflectance or (1.0, 1.0, 1.0)), "roughness": info.roughness or 0.0},
         "bounds": None if surface is None else [surface.vertices.min(0).tolist(), surface.vertices.max(0).tolist()],
-        "cameras": [write_record(each) for each in _cameras(info)],
+        "cameras": [write_record(each) for each in cameras],
         "ground": None if (ground := _ground(info, walls, surface)) is None else write_record(ground),
     }
     write_json(output / SCENE, content)
@@ -181,7 +182,8 @@ def _write_light(prediction: Path, output: Path) -> list[Path]:
     return [output / name for name in (FILLED, BLURRED, SEEN, CONFIDENCE)]
 
 
-def _write_surface(path: Path, surface: PredictedSurface) -> Path:
+def _write_surface(path: Path, surface: PredictedSurface, cameras: Sequence[BlenderCamera]) -> Path:
+    """The mesh, with the method's confidence in its vertices, and whether some camera sees their front."""
     sizes = [len(face) for face in surface.faces]
     arrays = {
         "vertices": surface.vertices,
@@ -191,6 +193,9 @@ def _write_surface(path: Path, surface: PredictedSurface) -> Path:
     }
     if surface.confidence is not None:
         arrays["confidence"] = surface.confidence
+    places = [np.array(each.matrix_world)[:3, 3] for each in cameras]
+    fronts = [((place - surface.vertices) * surface.normals).sum(1) > 0 for place in places]
+    arrays["seen"] = np.any(fronts, axis=0).astype(np.float64) if fronts else np.ones(len(surface.vertices))
     return _write_arrays(path, arrays)
 
 
