@@ -12,8 +12,8 @@ from .build import mirror_of, photograph_cameras, show_photograph
 from .content import PREDICTION as PREDICTION_FILE
 from .content import check_prediction
 from .insert import nearest_photograph, over_photograph, stand_on_ground, step_aside
-from .light import PREFIX, update_light
 from .job import NEXT
+from .light import PREFIX, update_light
 from .program import Problem
 from .running import BENCHMARK, LIGHT, PREDICTION, JobOperator, convert_step, work_folder
 

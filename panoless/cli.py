@@ -379,8 +379,7 @@ class PrintBoard:
 def _say_captured(dataset: Path, picture: str, lines: Sequence[str], *options: str) -> None:
     """What a capture made of photographs, and how a fit goes on."""
     print("\n".join(lines))
-    following = "panoless", "fit", dataset, *options
-    print(f"Look at {dataset}/capture/{picture}. Next:", command_line(*following))
+    print(f"Look at {dataset}/capture/{picture}. Next:", command_line("panoless", "fit", dataset, *options))
     paths = {"dataset": dataset, "picture": dataset / "capture" / picture}
     report_result(paths, lines, following=("panoless", "fit", dataset.resolve(), *options))
 

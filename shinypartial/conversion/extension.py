@@ -169,7 +169,7 @@ def _write_light(prediction: Path, output: Path) -> list[Path]:
         visibility = np.ones(radiance.shape[:2])
         seen = visibility
     else:
-        seen = seen_mask(prediction, FEATHER_DEG, np.finfo(np.float32).tiny)
+        seen = seen_mask(prediction, FEATHER_DEG, float(np.finfo(np.float32).tiny))
         fine = sample_latlong(visibility[..., None], latlong_directions(len(radiance)))[..., 0]
         radiance = filled(radiance, fine > 0)
     blurred = radiance

@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import json
 import os
 import sys
 from abc import ABC, abstractmethod
@@ -143,7 +144,7 @@ def emit(event: Event) -> None:
     if _stream is None:
         return
     try:
-        _stream.write(msgspec.json.encode(event).decode() + "\n")
+        _stream.write(json.dumps(msgspec.to_builtins(event)) + "\n")  # ASCII, whatever the pipe's encoding is.
         _stream.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), _stream.fileno())
