@@ -19,6 +19,8 @@ from .running import BENCHMARK, LIGHT, PREDICTION, JobOperator, convert_step, wo
 
 PICTURES = "*.jpg;*.jpeg;*.png;*.tif;*.tiff;*.exr;*.hdr;*.dng;*.cr2;*.cr3;*.nef;*.arw;*.mp4;*.mov;*.avi;*.mkv;*.json"
 CAMERAS = "transforms_train.json"
+#: panoless knows these photographs by name.
+EXAMPLE = "lobby-ball"
 
 
 class PANOLESS_OT_light(JobOperator, bpy.types.Operator, ImportHelper):
@@ -53,13 +55,28 @@ class PANOLESS_OT_light(JobOperator, bpy.types.Operator, ImportHelper):
             sources = [sources[0].parent]
         if missing := [str(each) for each in sources if not each.exists()]:
             return self.refuse(f"There is nothing at {', '.join(missing)}. Choose photographs, a video or a dataset")
-        fit = ["--preset", self.preset, "--json-progress"]
         if len(sources) == 1 and (sources[0] / CAMERAS).is_file():
-            steps = [["panoless", "fit", str(sources[0].resolve()), "--output", "prediction", *fit]]
+            words = ["panoless", "fit", str(sources[0].resolve()), "--output", "prediction"]
+            steps = [[*words, "--preset", self.preset, "--json-progress"]]
         else:
-            words = ["panoless", "capture", *(str(each.resolve()) for each in sources), "--output", "dataset"]
-            steps = [[*words, "--object", self.object, "--json-progress"], [NEXT, "--output", "prediction", *fit]]
+            steps = photograph_steps([str(each.resolve()) for each in sources], self.object, self.preset)
         return self.run(context, LIGHT, [*steps, convert_step("{prediction}")])
+
+
+class PANOLESS_OT_example(JobOperator, bpy.types.Operator):
+    """Light the scene by three photographs of a mirror ball in a lobby, which come with panoless"""
+
+    bl_idname, bl_label = "panoless.example", "Try a Lobby"
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """As of photographs of one's own."""
+        return self.run(context, LIGHT, [*photograph_steps([EXAMPLE], "ball", "default"), convert_step("{prediction}")])
+
+
+def photograph_steps(sources: list[str], kind: str, preset: str) -> list[list[str]]:
+    """The commands from photographs to a prediction."""
+    capture = ["panoless", "capture", *sources, "--output", "dataset", "--object", kind, "--json-progress"]
+    return [capture, [NEXT, "--output", "prediction", "--preset", preset, "--json-progress"]]
 
 
 class PANOLESS_OT_import(JobOperator, bpy.types.Operator, ImportHelper):
@@ -69,11 +86,15 @@ class PANOLESS_OT_import(JobOperator, bpy.types.Operator, ImportHelper):
 
     filename_ext = ".json"
     filter_glob: StringProperty(default=PREDICTION_FILE, options={"HIDDEN"})
-    directory: StringProperty(subtype="DIR_PATH", options={"HIDDEN", "SKIP_SAVE"})
+    filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Of a file that was dropped at once, else by the file browser."""
+        return self.execute(context) if self.filepath else super().invoke(context, event)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Convert the folder and build the scene of it."""
-        path = Path(self.filepath) if self.filepath else Path(self.directory)
+        path = Path(self.filepath)
         folder = path if path.is_dir() else path.parent
         try:
             check_prediction(folder)
@@ -180,12 +201,12 @@ class PANOLESS_OT_benchmark(JobOperator, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Save a copy of the file, generate, perturb, fit, evaluate."""
         settings = context.scene.panoless
-        folder = work_folder(BENCHMARK)
         try:
+            folder = work_folder(BENCHMARK)
             folder.mkdir(parents=True, exist_ok=True)
             bpy.ops.wm.save_as_mainfile(filepath=str(folder / "scene.blend"), copy=True, check_existing=False)
         except (OSError, RuntimeError) as error:
-            return self.refuse(f"A copy of this file can't be written to {folder} ({error})")
+            return self.refuse(f"A copy of this file can't be written beside it ({error})")
         half = degrees(settings.bench_arc) / 2
         generate = ["shinypartial", "generate", "--scene", "scene.blend", "--object", context.object.name]
         for name, *values in (
@@ -243,6 +264,7 @@ class PANOLESS_FH_prediction(bpy.types.FileHandler):
 
 CLASSES = (
     PANOLESS_OT_light,
+    PANOLESS_OT_example,
     PANOLESS_OT_import,
     PANOLESS_OT_photograph,
     PANOLESS_OT_insert,

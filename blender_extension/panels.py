@@ -57,6 +57,7 @@ class PANOLESS_PT_light(Side, bpy.types.Panel):
         if not draw_progress(layout) and begun_folder(context.scene) is not None:
             layout.operator("panoless.continue_run", icon="PLAY")
         if PREFIX not in bpy.data.worlds:
+            layout.operator("panoless.example", icon="EXPERIMENTAL")
             return
         layout.use_property_split, layout.use_property_decorate = True, False
         column = layout.column()

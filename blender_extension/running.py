@@ -94,7 +94,10 @@ class JobOperator:
         """Read what has happened since the last time."""
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
-        ended = current is None or current.poll()
+        if current is None:
+            self._remove_timer(context)
+            return {"CANCELLED"}
+        ended = current.poll()
         if context.workspace is not None:
             context.workspace.status_text_set(None)  # Redraws the status bar.
         for window in context.window_manager.windows:
@@ -154,8 +157,10 @@ def take_in(scene: bpy.types.Scene, job: Job) -> list[str]:
 
 def stop() -> None:
     """End the job of this session at once; its folder continues it."""
+    global current
     if active() is not None:
         current.kill()
+    current = None
 
 
 class PANOLESS_OT_cancel(bpy.types.Operator):

@@ -93,6 +93,24 @@ def test_a_run_that_died_with_blender_is_found(blender: Any, programs: Path, bal
     assert begun_folder(blender.context.scene) == folder
 
 
+def test_another_file_stops_the_run_and_leaves_blender_free(
+    blender: Any, programs: Path, ball_dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from blender_extension import running
+
+    folder = work_folder("light")
+    folder.mkdir(parents=True)
+    (folder / WAIT).touch()
+    job = Job(program_at(""), folder, "light", fit_steps(ball_dataset))
+    job.start()
+    monkeypatch.setattr(running, "current", job)
+    assert not blender.ops.panoless.light.poll()
+    assert blender.ops.panoless.cancel.poll()
+    running.stop()
+    assert blender.ops.panoless.light.poll()
+    assert begun_folder(blender.context.scene) == folder
+
+
 def test_the_next_command_of_a_step_follows(programs: Path, tmp_path: Path, ball_dataset: Dataset) -> None:
     """As a capture names the fit with its options."""
     capture = f"""
