@@ -22,6 +22,7 @@ from shinypartial.core.errors import InputError
 from shinypartial.dataset.bundled import resolve_dataset
 from shinypartial.dataset.read import open_dataset, read_view
 from shinypartial.dataset.schema import Dataset, Frame, View
+from shinypartial.io.events import note
 from shinypartial.io.files import folder_lock
 from shinypartial.prediction.format import (
     DEFAULT_FOLDER,
@@ -272,8 +273,9 @@ def announce_compilation() -> None:
             if not self.made:
                 self.made = True
                 clear = "\r\x1b[2K" if sys.stderr.isatty() else ""
-                note = "some 20 seconds in all if none is there yet; later runs find them on disk"
-                print(f"{clear}Compiling kernels for this machine: {note} …", file=sys.stderr)
+                print(clear, end="", file=sys.stderr)
+                told = "some 20 seconds in all if none is there yet; later runs find them on disk"
+                note(f"Compiling kernels for this machine: {told} …")
 
         def on_end(self, event: object) -> None:
             pass

@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -11,14 +11,17 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import tyro
 
 from panoless.config import FitConfig, renamed_arguments, with_overrides
+from panoless.export.extension import Extension
 from panoless.photographs.options import CaptureOptions
 from panoless.presets import PRESETS
 from shinypartial.core.command_line import command_line
 from shinypartial.core.errors import InputError
 from shinypartial.core.program import Program
+from shinypartial.io.events import LongCommand, note, report_result
 from shinypartial.io.records import check_record
 
 if TYPE_CHECKING:
+    from panoless.api import Reconstruction
     from panoless.photographs.ball.find import FoundBall
     from panoless.photographs.make import Request
     from panoless.photographs.masks import Hint
@@ -26,7 +29,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Fit:
+class Fit(LongCommand):
     """Fit a dataset: its surface, an environment map and a visibility map; then export the prediction."""
 
     FIRST: ClassVar = (
@@ -53,7 +56,7 @@ class Fit:
     """Change tuned numbers, such as plane.max_vertices=64; docs/reference/fit-options.md lists them."""
     config: FitConfig = field(default_factory=FitConfig)
 
-    def run(self) -> None:
+    def work(self) -> None:
         """Fit, export and say what to do next."""
         from panoless.api import RUNS, fit
 
@@ -85,6 +88,11 @@ class Fit:
             print(f"Surroundings: {result.info.surroundings.sentence()}")
         if result.info.verdict:
             print(f"Verdict: {result.info.verdict.sentence()}")
+        report_result(
+            {"prediction": result.folder, "run": RUNS / result.folder.resolve().name},
+            [] if result.info.surroundings is None else [f"Surroundings: {result.info.surroundings.sentence()}"],
+            verdict=_stated(result),
+        )
         if viewer is not None:
             from panoless.viewer.server import serve
 
@@ -186,7 +194,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Capture:
+class Capture(LongCommand):
     """Make a dataset of photographs or a video: poses, masks and undistorted pictures; see docs/how-to/capture.md.
 
     Poses come from a COLMAP model or a transforms.json that is there, from a printed board, or from what is seen around
@@ -230,7 +238,7 @@ class Capture:
     """Turn pictures as their EXIF tag says; poses of other programs may be for pixels as they are stored."""
     options: CaptureOptions = CaptureOptions()
 
-    def run(self) -> None:
+    def work(self) -> None:
         """Make the dataset and say what was measured."""
         from panoless.photographs.make import Request, capture, check_options
         from shinypartial.dataset.read import DEFAULT_FOLDER
@@ -260,8 +268,7 @@ class Capture:
                 found=f"{len(self.sources)} sources without a mirror ball",
                 remedy="Name the folder; or add --object ball.",
             )
-        print("\n".join(capture(request).summary()))
-        print(f"Look at {request.output}/capture/masks.jpg. Next:", command_line("panoless", "fit", request.output))
+        _say_captured(request.output, "masks.jpg", capture(request).summary())
 
     def _balls(self, files: tuple[Path, ...], hints: "Mapping[str, Hint]") -> "dict[Path, FoundBall] | None":
         """Where a ball is photographed, those that were found to know it: that is stated, or less than eight
@@ -292,7 +299,7 @@ class Capture:
             ) from None
         if few:
             return balls
-        print("Note: these photographs show a round thing. If it is a mirror ball, --object ball is simpler.")
+        note("Note: these photographs show a round thing. If it is a mirror ball, --object ball is simpler.")
         return None
 
     def _capture_ball(self, files: tuple[Path, ...], request: "Request", balls: "dict[Path, FoundBall]") -> None:
@@ -303,11 +310,8 @@ class Capture:
         captured = capture_ball(
             BallRequest(files, request.output, self.focal_mm, request.hints, balls, self.background, model)
         )
-        print("\n".join(captured.summary()))
         light = ("--config.environment.range", "hdr") if captured.high_dynamic_range else ()
-        print(
-            f"Look at {request.output}/capture/ball.jpg. Next:", command_line("panoless", "fit", request.output, *light)
-        )
+        _say_captured(request.output, "ball.jpg", captured.summary(), *light)
 
     def _hints(self) -> "dict[str, Hint]":
         from panoless.photographs.masks import Hint, read_clicks
@@ -330,7 +334,7 @@ class Capture:
 
 
 @dataclass(frozen=True)
-class Light:
+class Light(LongCommand):
     """Photographs of a mirror ball to a light: an HDR lat-long, a Blender world and a page; see docs/how-to/ball.md."""
 
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional]
@@ -344,7 +348,7 @@ class Light:
     background: bool = False
     """What is seen past the ball is data for the map, too, beside what it mirrors."""
 
-    def run(self) -> None:
+    def work(self) -> None:
         """Capture, fit, convert, and say what to look at."""
         from panoless.api import light
         from panoless.photographs.masks import read_clicks
@@ -358,6 +362,9 @@ class Light:
         print(f"Look at {made.folder}/index.html. Written: {', '.join(made.files)}")
         if "scene.blend" not in made.files:
             print("No Blender world: pip install 'panoless[blender]' adds Blender's module.")
+        made_of = {"folder": made.folder, "dataset": made.folder / "dataset", "prediction": made.reconstruction.folder}
+        files = {name: made.folder / name for name in made.files if (made.folder / name).is_file()}
+        report_result(made_of | files, made.lines, verdict=_stated(made.reconstruction))
 
 
 @dataclass(frozen=True)
@@ -378,6 +385,19 @@ class PrintBoard:
         write_board(board, self.output)
         print(f"Print {self.output} at 100 % and measure: five squares are {5 * board.square_mm:g} mm.")
         print("Then: panoless capture FOLDER")
+
+
+def _say_captured(dataset: Path, picture: str, lines: Sequence[str], *options: str) -> None:
+    """What a capture made of photographs, and how a fit goes on."""
+    print("\n".join(lines))
+    print(f"Look at {dataset}/capture/{picture}. Next:", command_line("panoless", "fit", dataset, *options))
+    paths = {"dataset": dataset, "picture": dataset / "capture" / picture}
+    report_result(paths, lines, following=("panoless", "fit", dataset.resolve(), *options))
+
+
+def _stated(result: "Reconstruction") -> tuple[str, str, str] | None:
+    found = result.verdict
+    return None if found is None else (found.verdict, found.reason, found.remedy)
 
 
 def _name_of(sources: tuple[Path, ...]) -> str:
@@ -410,7 +430,7 @@ PROGRAM = Program(
     "The environment that a shiny object reflects, from photographs of one side of it.",
     {
         "From photographs": {"light": Light, "capture": Capture, "board": PrintBoard},
-        "From a dataset": {"fit": Fit, "view": View, "export": Export},
+        "From a dataset": {"fit": Fit, "view": View, "export": Export, "extension": Extension},
     },
 )
 

@@ -10,7 +10,6 @@ import hashlib
 import inspect
 import io
 import shutil
-import sys
 import time
 from collections.abc import Callable, Iterator, MutableMapping
 from contextlib import contextmanager
@@ -27,6 +26,7 @@ from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
 import panoless
+from shinypartial.io.events import begin_stage
 from shinypartial.io.files import atomic_write
 from shinypartial.io.progress import Progress
 
@@ -57,11 +57,9 @@ class Journal:
             stored = torch.load(path, weights_only=True)
             result, seconds = _decoded(stored["result"], met), float(stored["seconds"])
         except Exception:
-            if title:
-                print(title, file=sys.stderr)
+            begin_stage(title)
         else:
-            if title:
-                print(f"{title}: found before", file=sys.stderr)
+            begin_stage(title, found_before=True)
             self.seconds += seconds
             self._parts[-1].append(path)
             return result

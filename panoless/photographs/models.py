@@ -1,6 +1,5 @@
 """Poses that another program has found: a model of COLMAP, or nerfstudio's transforms.json."""
 
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -17,6 +16,7 @@ from panoless.photographs.posed import PosedView, Poses, as_rows, find_ground, l
 from shinypartial.core.conventions import PIXEL_CENTER
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.transforms import ALL_CAMERAS, CAMERA_MODELS, DISTORTION_FIELDS, frames_of
+from shinypartial.io.events import warn
 from shinypartial.io.files import read_json
 from shinypartial.io.images import PICTURE_SUFFIXES
 
@@ -152,7 +152,7 @@ def read_transforms(path: Path, frames: Frames) -> tuple[Poses, dict[str, Path]]
         if frame.mask is not None:
             masks[photograph.name] = frame.mask
     if left_out := [name for name in known if name not in used]:
-        print(f"poses: no photograph is read for {', '.join(left_out)} of {path}", file=sys.stderr)
+        warn(f"no photograph is read for {', '.join(left_out)} of {path}")
     return Poses(f"{path.name} of {path.parent}", "unknown", tuple(views)), masks
 
 

@@ -1,10 +1,10 @@
 """Stages that need not be repeated: what a stage was given and what it found lie in one file."""
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
+from shinypartial.io.events import StageBegun, begin_stage, emit
 from shinypartial.io.files import read_json, write_json
 from shinypartial.io.records import read_record, write_record
 
@@ -20,9 +20,10 @@ def stage(folder: Path, name: str, given: dict[str, Any], found_type: type[Found
     if path.exists():
         stored = read_json(path, f"what the stage {name} found")
         if isinstance(stored, dict) and stored.get("given") == given:
-            print(f"{name}: found before, in {path}", file=sys.stderr)
+            begin_stage(name, found_before=True)
             return read_record(found_type, stored.get("found"), str(path), remedy="Delete that file.")
         path.unlink()
+    emit(StageBegun(name, False))
     found = work()
     write_json(path, {"given": given, "found": write_record(found)})
     return found

@@ -2,7 +2,6 @@
 
 import mmap
 import struct
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from jaxtyping import Float, UInt8
 from panoless.photographs.lens import opencv
 from shinypartial.core.color import LINEAR_OF_CODES
 from shinypartial.core.errors import InputError
+from shinypartial.io.events import warn
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 #: Luminance of linear light (IEC 61966-2-1).
@@ -68,7 +68,7 @@ def _tell_missing(file: Path, decoded: int) -> None:
             remedy="Copy it from the camera again; its recording or its copy was cut off.",
         )
     if decoded < COMPLETE * announced:
-        print(f"frames: {file.name} ends after {decoded} of {announced} frames; these are used", file=sys.stderr)
+        warn(f"{file.name} ends after {decoded} of {announced} frames; these are used")
 
 
 def sharpest_frames(sharpness: Float[np.ndarray, "T"], count: int) -> list[int]:

@@ -1,6 +1,5 @@
 """The fit: views in, geometry and environment out. It never sees a score."""
 
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,6 +26,7 @@ from panoless.trust.verdict import judge
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import photographs_hash, read_ball_evidence
 from shinypartial.dataset.schema import BallEvidence, Dataset
+from shinypartial.io.events import note, warn
 from shinypartial.io.files import folder_lock
 from shinypartial.io.progress import format_seconds
 from shinypartial.prediction.format import Trust, dataset_hash
@@ -80,7 +80,7 @@ def _finished(
             _tell_repairs(views)
             state = begin(views, config)
         state.seconds, state.device = seconds, device_name(device)
-        print(f"Model: {state.selection.sentence}", file=sys.stderr)
+        note(f"Model: {state.selection.sentence}")
     state = state.to(device)
     photographs = state.selection.corrections.applied(views, config)
     if state.training is not None:
@@ -116,10 +116,9 @@ def _tell_repairs(views: Views) -> None:
     """A line on standard error where masks contradicted each other."""
     repairs = views.repairs
     if repairs.views:
-        print(
-            f"warning: the masks of {repairs.views} of {len(views.train)} views contradict the others: {repairs.holes} "
-            f"holes filled, {repairs.pieces} stray pieces left out.",
-            file=sys.stderr,
+        warn(
+            f"the masks of {repairs.views} of {len(views.train)} views contradict the others: {repairs.holes} holes "
+            f"filled, {repairs.pieces} stray pieces left out."
         )
 
 

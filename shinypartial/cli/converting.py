@@ -8,12 +8,13 @@ import tyro
 
 from shinypartial.cli.newest import announce_newest
 from shinypartial.conversion.layouts import LayoutName
+from shinypartial.io.events import LongCommand, report_result
 
-Target = Literal["blender", "cubemap", "sh", "sg", "glb", "mitsuba", "usd", "threejs", "mask", "room"]
+Target = Literal["blender", "cubemap", "sh", "sg", "glb", "mitsuba", "usd", "threejs", "mask", "room", "extension"]
 
 
 @dataclass(frozen=True)
-class Convert:
+class Convert(LongCommand):
     """Write the light and the surface of a prediction as files for Blender, game engines and web pages."""
 
     prediction: tyro.conf.Positional[Path | None] = None
@@ -21,7 +22,8 @@ class Convert:
     to: tuple[Target, ...] = field(kw_only=True)
     """What to write, one or more: `blender` world.exr and scene.blend; `cubemap` px.hdr to nz.hdr; `sh`
     harmonics.json; `sg` lobes.json; `glb` surface.glb; `mitsuba` scene.xml; `usd` scene.usda; `threejs` index.html;
-    `mask` mask.png of what was seen; `room` room.json of near surroundings."""
+    `mask` mask.png of what was seen; `room` room.json of near surroundings; `extension`
+    scene.json and what it names, for the Blender extension."""
     output: Path | None = None
     """Folder to write; PREDICTION-converted beside it when not given."""
     confidence: Literal["keep", "darken", "fill"] = "keep"
@@ -36,7 +38,7 @@ class Convert:
     feather_deg: float = 5.0
     """Width over which the mask falls to zero, inward from the border of what was seen."""
 
-    def run(self) -> None:
+    def work(self) -> None:
         """Write and say what."""
         from shinypartial.conversion.convert import ConversionOptions, convert
         from shinypartial.prediction.format import newest_prediction
@@ -44,8 +46,10 @@ class Convert:
         prediction = self.prediction or announce_newest("prediction", newest_prediction())
         output = self.output or prediction.resolve().with_name(f"{prediction.resolve().name}-converted")
         options = ConversionOptions(self.confidence, self.layout, self.degree, self.lobes, self.feather_deg)
-        for path in convert(prediction, self.to, output, options):
+        written = convert(prediction, self.to, output, options)
+        for path in written:
             print(f"Wrote {path}")
+        report_result({"folder": output} | {path.name: path for path in written})
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from typing import ClassVar, Literal
 import tyro
 
 from shinypartial.core.command_line import command_line
+from shinypartial.io.events import LongCommand, report_result
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class SceneOptions:
 
 
 @dataclass(frozen=True)
-class Generate:
+class Generate(LongCommand):
     """Render a benchmark dataset from a scene recipe; run again to continue where an earlier run stopped."""
 
     FIRST: ClassVar = (
@@ -100,7 +101,7 @@ class Generate:
     variation: tyro.conf.OmitArgPrefixes[SceneOptions] = SceneOptions()
     camera: tyro.conf.OmitArgPrefixes[CameraOptions] = CameraOptions()
 
-    def run(self) -> None:
+    def work(self) -> None:
         """Make the dataset and say what to do next."""
         from shinypartial.dataset.read import DEFAULT_FOLDER
         from shinypartial.generate.dataset import generate
@@ -121,6 +122,7 @@ class Generate:
         else:
             print(f"Complete: all {made.kept} views are in {made.root}")
         print("Next: panoless fit")
+        report_result({"dataset": made.root}, following=("panoless", "fit", made.root.resolve()))
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,11 @@ import tyro
 from shinypartial.cli.newest import announce_newest
 from shinypartial.core.command_line import command_line
 from shinypartial.core.errors import InputError
+from shinypartial.io.events import LongCommand, report_result
 
 
 @dataclass(frozen=True)
-class Evaluate:
+class Evaluate(LongCommand):
     """Score a prediction folder against its dataset and write PREDICTION/scores.json."""
 
     prediction: tyro.conf.Positional[Path | None] = None
@@ -26,10 +27,10 @@ class Evaluate:
     snapshots: bool = False
     """Score the snapshots below the prediction, for `shinypartial chart`, and then the prediction."""
 
-    def run(self) -> None:
+    def work(self) -> None:
         """Score and print the summary."""
         from shinypartial.evaluation.evaluate import evaluate
-        from shinypartial.prediction.format import newest_prediction, snapshot_folders
+        from shinypartial.prediction.format import SCORES, newest_prediction, snapshot_folders
         from shinypartial.report.page import summary_lines
 
         prediction = self.prediction or announce_newest("prediction", newest_prediction())
@@ -44,8 +45,10 @@ class Evaluate:
             print(f"Snapshot {snapshot.name}")
             evaluate(snapshot, self.dataset, protocol=self.protocol, oracle=self.oracle)
         evaluate(prediction, self.dataset, protocol=self.protocol, oracle=self.oracle)
-        print("\n".join(summary_lines(prediction)))
+        lines = summary_lines(prediction)
+        print("\n".join(lines))
         print("Next: shinypartial report")
+        report_result({"prediction": prediction, "scores": prediction / SCORES}, lines)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from shinypartial.conversion.extension import write_for_extension
 from shinypartial.conversion.gltf import write_glb
 from shinypartial.conversion.light import Confidence, Layout, cube_faces, harmonics_of, light_of, seen_mask
 from shinypartial.conversion.lobes import lobes_of
@@ -26,7 +27,7 @@ from shinypartial.io.images import write_exr_rgb, write_hdr, write_png
 from shinypartial.prediction.format import read_info
 from shinypartial.prediction.surface import surface_of
 
-Target = Literal["blender", "cubemap", "sh", "sg", "glb", "mitsuba", "usd", "threejs", "mask", "room"]
+Target = Literal["blender", "cubemap", "sh", "sg", "glb", "mitsuba", "usd", "threejs", "mask", "room", "extension"]
 
 WORLD, BLEND, HARMONICS, GLB = "world.exr", "scene.blend", "harmonics.json", "surface.glb"
 LOBES, MASK, MITSUBA, MITSUBA_SURFACE = "lobes.json", "mask.png", "scene.xml", "surface.ply"
@@ -77,7 +78,9 @@ def convert(
     if "room" in targets:
         write_json(output / ROOM, room_of(prediction))
         written.append(output / ROOM)
-    if set(targets) <= {"glb", "mask", "room"}:
+    if "extension" in targets:
+        written += write_for_extension(prediction, output)
+    if set(targets) <= {"glb", "mask", "room", "extension"}:
         return written
     light = np.maximum(light_of(prediction, options.confidence), 0)
     if "sh" in targets:

@@ -51,6 +51,20 @@ def from_memory_error() -> InputError:
     )
 
 
+def as_input_error(error: Exception) -> InputError | None:
+    """What a person can do about an error; None of one that only its programmer can mend."""
+    match error:
+        case InputError():
+            return error
+        case OSError():
+            return from_os_error(error)
+        case MemoryError():
+            return from_memory_error()
+        case RuntimeError() if any(words in str(error) for words in TORCH_OUT_OF_MEMORY):
+            return from_memory_error()
+    return None
+
+
 def run_command(command: Callable[[], None]) -> int:
     """Run a command; return 0, 2 for bad input (one message, no traceback) or 130 when interrupted.
 
@@ -58,22 +72,16 @@ def run_command(command: Callable[[], None]) -> int:
     """
     try:
         command()
-    except InputError as error:
-        message = error
     except BrokenPipeError:
         raise
-    except OSError as error:
-        message = from_os_error(error)
-    except MemoryError:
-        message = from_memory_error()
-    except RuntimeError as error:
-        if not any(words in str(error) for words in TORCH_OUT_OF_MEMORY):
-            raise
-        message = from_memory_error()
     except KeyboardInterrupt as stop:
         again = "Run the same command again: it continues after what it has finished."
         print("\nInterrupted.", again, *getattr(stop, "__notes__", ()), file=sys.stderr)
         return EXIT_INTERRUPTED
+    except Exception as error:
+        message = as_input_error(error)
+        if message is None:
+            raise
     else:
         return 0
     print(

@@ -1,12 +1,15 @@
-"""One progress line with an estimate of the time left; plain lines where there is no terminal."""
+"""One progress line with an estimate of the time left; plain lines where there is no terminal, events for programs."""
 
 import sys
 import time
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
+from shinypartial.io.events import StepsDone, emit, reporting
+
 PLAIN_LINE_INTERVAL_S = 10.0
 TERMINAL_INTERVAL_S = 0.1
+EVENT_INTERVAL_S = 0.5
 BAR_WIDTH = 24
 
 
@@ -50,12 +53,15 @@ class Progress:
         """Count `steps` more and show the line when it is due."""
         self.done += steps
         now = time.monotonic()
-        terminal = self.stream.isatty()
-        interval = TERMINAL_INTERVAL_S if terminal else PLAIN_LINE_INTERVAL_S
+        events, terminal = reporting(), self.stream.isatty()
+        interval = EVENT_INTERVAL_S if events else TERMINAL_INTERVAL_S if terminal else PLAIN_LINE_INTERVAL_S
         last = self.done >= self.total
         if not last and now - self._last_s < interval:
             return
         self._last_s = now
+        if events:
+            emit(StepsDone(self.label, self.done, self.total, self.seconds_left(now), note))
+            return
         line = self.line(now, note)
         if terminal:
             self.stream.write("\r\x1b[2K" + line + ("\n" if last else ""))
@@ -63,16 +69,18 @@ class Progress:
             self.stream.write(line + "\n")
         self.stream.flush()
 
+    def seconds_left(self, now_s: float) -> float | None:
+        """At monotonic time `now_s`, by the speed up to then; None before the first step."""
+        steps = self.done - self._start_done
+        return (now_s - self._start_s) / steps * max(self.total - self.done, 0) if steps else None
+
     def line(self, now_s: float, note: str = "") -> str:
         """The progress line at monotonic time `now_s`."""
         share = self.done / max(self.total, 1)
-        elapsed = now_s - self._start_s
-        steps = self.done - self._start_done
+        left = self.seconds_left(now_s)
         if self.done >= self.total:
-            time_text = f"took {format_seconds(elapsed)}"
-        elif steps:
-            time_text = f"{format_seconds(elapsed / steps * (self.total - self.done))} left"
+            time_text = f"took {format_seconds(now_s - self._start_s)}"
         else:
-            time_text = "estimating"
+            time_text = "estimating" if left is None else f"{format_seconds(left)} left"
         bar = "█" * int(share * BAR_WIDTH) + "░" * (BAR_WIDTH - int(share * BAR_WIDTH))
         return f"{self.label} {bar} {self.done}/{self.total}  {time_text}{'  ' + note if note else ''}"
