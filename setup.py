@@ -1,4 +1,4 @@
-"""What pyproject.toml cannot state: recipes of scenes inside the wheel, and a README without relative links."""
+"""What pyproject.toml cannot state: folders beside the packages in the wheel, and a README without relative links."""
 
 import re
 import shutil
@@ -7,19 +7,22 @@ from pathlib import Path
 from setuptools import setup
 from setuptools.command.build_py import build_py
 
-RECIPES = Path("blender_scenes")
+#: Folders of the checkout, and where a wheel has them.
+FOLDERS = {"blender_scenes": "shinypartial/data/blender_scenes", "blender_extension": "panoless/blender_extension"}
 PICTURE = re.compile(r"^!\[[^\]]*\]\((?!https?:)[^)]*\)\n+(\*.*?\n\n)?", re.MULTILINE | re.DOTALL)
 SITE = re.compile(r"^## Documentation\n.*?(?=^The method starts)", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[([^\]]+)\]\((?!https?:)[^)]*\)")
 
 
-class BuildWithRecipes(build_py):
-    """An editable install reads `blender_scenes/` where it is."""
+class BuildWithFolders(build_py):
+    """An editable install reads them where they are."""
 
     def run(self) -> None:
         super().run()
         if not self.editable_mode:
-            shutil.copytree(RECIPES, Path(self.build_lib) / "shinypartial/data" / RECIPES, dirs_exist_ok=True)
+            for folder, place in FOLDERS.items():
+                ignored = shutil.ignore_patterns("__pycache__")
+                shutil.copytree(folder, Path(self.build_lib) / place, ignore=ignored, dirs_exist_ok=True)
 
 
 def page(readme: str) -> str:
@@ -28,7 +31,7 @@ def page(readme: str) -> str:
 
 
 setup(
-    cmdclass={"build_py": BuildWithRecipes},
+    cmdclass={"build_py": BuildWithFolders},
     long_description=page(Path("README.md").read_text(encoding="utf-8")),
     long_description_content_type="text/markdown",
 )
