@@ -311,7 +311,7 @@ def config_from_dict(content: Any) -> FitConfig:
 
 def check_config(config: FitConfig) -> None:
     """Raise InputError for a value outside the range of its field, and for options that exclude each other."""
-    check_record(config, "the configuration", place=_option, remedy="See `panoless fit --help` for what it means.")
+    check_record(config, "the configuration", place=_option, remedy="See `panoless fit --help-all` for what it means.")
     linear = _works_in_unit_range(config)
     if config.surfels.shading != "mirror" and config.environment.solve:
         raise InputError(
