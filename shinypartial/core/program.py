@@ -7,7 +7,7 @@ import re
 import sys
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Union, get_type_hints
+from typing import Annotated, Any, Union, cast, get_type_hints
 
 import tyro
 
@@ -26,7 +26,7 @@ MARKERS = (tyro.conf.DisallowNone,)
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """Commands by title of their group and by name: dataclasses with a method `run`.
+    """Commands by title of their group and by name: dataclasses that run themselves.
 
     `FIRST`, if a command has it, names the fields that `--help` shows, with dots where they are nested, between spaces.
     `--help-all` shows all of them.
@@ -66,7 +66,7 @@ class Program:
             for name, kind in commands.items()
         ]
         return tyro.cli(
-            Union[tuple(kinds)],  # type: ignore[arg-type]  # noqa: UP007
+            cast(Any, Union[tuple(kinds)]),  # noqa: UP007
             args=arguments,
             prog=self.name,
             description=self.description,
@@ -111,7 +111,7 @@ def _shortened(kind: type, shown: Sequence[str]) -> type:
     hints, changed = get_type_hints(kind, include_extras=True), {}
     defaults: dict[str, Any] = {}
     for each in dataclasses.fields(kind):
-        hint, factory = hints[each.name], each.default_factory
+        hint, factory = hints[each.name], cast(Any, each.default_factory)
         below = [name.partition(".")[2] for name in shown if name.startswith(f"{each.name}.")]
         if each.name in shown:
             continue
@@ -124,4 +124,5 @@ def _shortened(kind: type, shown: Sequence[str]) -> type:
         if factory is not dataclasses.MISSING:
             defaults[each.name] = dataclasses.field(default_factory=factory)
     body = {"__annotations__": changed, "__doc__": kind.__doc__, "__module__": kind.__module__, **defaults}
-    return dataclasses.dataclass(frozen=True)(type(kind.__name__, (kind,), body))
+    # By keyword alone: a field without a default may stand behind one that is declared again.
+    return dataclasses.dataclass(frozen=True, kw_only=True)(type(kind.__name__, (kind,), body))
