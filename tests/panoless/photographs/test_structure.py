@@ -55,7 +55,10 @@ def test_each_stage_shows_its_steps(tmp_path: Path, capsys: pytest.CaptureFixtur
         assert any(line.startswith(stage) and end in line for line in shown.splitlines())
 
 
-def test_an_interruption_ends_the_program(tmp_path: Path) -> None:
+def test_an_interruption_ends_the_program(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    # A shell without job control starts background processes with interrupts ignored; this process may be one.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
     note = tmp_path / "pid"
     program = f"import os, pathlib, time; pathlib.Path({str(note)!r}).write_text(str(os.getpid())); time.sleep(100)"
 
