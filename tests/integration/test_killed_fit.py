@@ -131,7 +131,6 @@ SHORT = {
 }
 SHORT["auto"] = SHORT["revolution"]
 BELIEVED = "corrections.masks=off", "corrections.exposure=off", "corrections.lens=off", "poses.mode=off"
-QUICK = ("plane",)
 
 
 def short_config(kind: str) -> FitConfig:
@@ -150,9 +149,8 @@ def numbers(state: FitState) -> list[object]:
 
 
 @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="the system has no timers of processor time")
-@pytest.mark.parametrize(
-    "kind", [each if each in QUICK else pytest.param(each, marks=pytest.mark.slow) for each in (*FAMILIES, "auto")]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [*FAMILIES, "auto"])
 @pytest.mark.timeout(3600)
 # Python ignores an interruption within the callback of a weak reference; that part goes on to its end.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

@@ -164,6 +164,7 @@ def test_parts_that_pixels_distrust_are_mended(dented: tuple[Body, Views, FitSta
     assert distrusted_share(views, mended, FEW_PIXELS) < distrusted_share(views, stage, FEW_PIXELS) / 3
 
 
+@pytest.mark.slow
 def test_waves_narrower_than_the_first_cells_are_found_under_coarse_maps() -> None:
     """Their normals turn by 15° and more. Measured: 0.3° in the median; 8.3° without the rounds that look for them."""
     body, cameras = wavy_ball(0.03, 9.0), cameras_around(16, 64)
@@ -363,6 +364,7 @@ def test_held_out_views_refuse_cells_that_a_ball_does_not_need() -> None:
     assert max(surface.shape) < 34
 
 
+@pytest.mark.slow
 def test_the_same_views_give_the_same_surface() -> None:
     """A killed fit in closed form starts again, so it ends where the other would have."""
     views = body_views(sphere(), 8, 32)
