@@ -10,6 +10,7 @@ from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import SurfaceBuffers, beside_outline, buffers_from_arrays
 from panoless.kernels.rasterize import RasterCamera
 from shinypartial.core.conventions import PIXEL_CENTER
+from shinypartial.io.threads import in_threads
 
 CENTER = (PIXEL_CENTER, PIXEL_CENTER)
 
@@ -92,7 +93,7 @@ def mirrored(
     sphere: Sphere, camera: RasterCamera, pixels: Int[np.ndarray, "P"], places: list[tuple[float, float]]
 ) -> tuple[Float[np.ndarray, "P K 3"], Bool[np.ndarray, "P K"]]:
     """Where in the map rays through those places of pixels (flat indices) look, and which of them meet the sphere."""
-    found = [_mirrored_at(sphere, *pixel_rays(camera, pixels, place)) for place in places]
+    found = list(in_threads(lambda place: _mirrored_at(sphere, *pixel_rays(camera, pixels, place)), places))
     return np.stack([each[0] for each in found], 1), np.stack([each[1] for each in found], 1)
 
 

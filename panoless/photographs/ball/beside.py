@@ -25,6 +25,7 @@ SUPPORT_WIDTH, SUPPORT_FROM = 3.0, 0.4
 """Below the ball, in radii: what it stands on is near, and is left out."""
 BAND_PX = (1.2, 8.0)
 """Standard deviations of the Gaussians between which the band lies, in cells of the grid."""
+LOG_LIGHT = np.log((np.arange(256, dtype=np.float32) / 255) ** 2.2 + 0.004)
 VIEWS = 6
 OTHERS = 6
 LEAST_CELLS = 400
@@ -60,8 +61,7 @@ class PosedBall:
 
 def log_light(codes: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
     """Logarithms of a picture's luminance, about."""
-    gray = opencv().cvtColor(codes, opencv().COLOR_RGB2GRAY).astype(np.float32)
-    return np.log((gray / 255) ** 2.2 + 0.004)
+    return LOG_LIGHT[opencv().cvtColor(codes, opencv().COLOR_RGB2GRAY)]
 
 
 def agreement(balls: Sequence[PosedBall]) -> tuple[float, float]:

@@ -31,6 +31,7 @@ from shinypartial.dataset.schema import BACKGROUND, BallEvidence, Frame
 from shinypartial.dataset.write import write_transforms
 from shinypartial.io.files import folder_lock
 from shinypartial.io.images import write_exr_rgb, write_png
+from shinypartial.io.threads import in_threads
 
 REFRACTED = 0.35
 """Correlation with what glass would show, above which a ball is one of glass."""
@@ -151,11 +152,14 @@ def _captured(request: BallRequest) -> CapturedBall:
     _refuse_glass(beside, [posed.balls[i].name for i in members])
     shots = [[balls[k].shot for k in groups[i]] for i in members]
     light = exposed(shots)
-    frames = []
-    for i, each in zip(members, light, strict=True):
+
+    def write(view: tuple[int, Exposed]) -> Frame:
+        i, each = view
         covariance = _turned_covariance(adjusted.covariance[i], world) if len(members) > 1 else None
         camera = posed.lenses[i], adjusted.cones[i], turned[i]
-        frames.append(_write_view(posed.balls[i], *camera, covariance, each, request.output / "train"))
+        return _write_view(posed.balls[i], *camera, covariance, each, request.output / "train")
+
+    frames = list(in_threads(write, zip(members, light, strict=True)))
     agreed, distance = agreement(beside)
     evidence = _evidence(posed, focal, agreed, request.background)
     if request.background:
