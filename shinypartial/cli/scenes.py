@@ -85,7 +85,7 @@ class Generate(LongCommand):
     """Render a benchmark dataset from a scene recipe; run again to continue where an earlier run stopped."""
 
     FIRST: ClassVar = (
-        "scene object output resolution samples variation.world variation.surroundings_radii variation.roughness "
+        "scene object output resolution samples variation.world variation.roughness "
         "camera.path camera.train camera.test"
     )
     scene: str
