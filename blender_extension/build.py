@@ -20,31 +20,31 @@ BOUNCES = 16
 def build(scene: bpy.types.Scene, content: Content) -> list[str]:
     """Replace what an earlier import made in the scene; return what is missing, a sentence each."""
     missing = []
-    load_light(content.folder)
+    arrays, cameras = {name: content.arrays(f"{name}.npz") for name in ("surface", "walls")}, content.table["cameras"]
+    meshes = {name: None if each is None else mesh_of(name, each) for name, each in arrays.items()}
+    load_light(content.folder)  # What is damaged has been refused by now.
     make_world(scene)
     collection = _fresh_collection(scene)
     center, radius = _bounds(content)
-    mirror, seen = content.arrays("surface.npz"), content.table["cameras"]
-    if mirror is None:
+    if meshes["surface"] is None:
         missing.append("No mesh: this surface is a cloud of points")
     else:
-        _add(collection, MIRROR, _mirror_mesh(mirror, content.table["mirror"]))
-    if not seen:
+        _add_mirror(collection, meshes["surface"], content.table["mirror"])
+    if not cameras:
         missing.append("No cameras: the dataset of this prediction is not where it was")
-    for one in seen:
+    for one in cameras:
         _add_camera(collection, one, center, radius)
     if content.table["ground"] is not None:
         _add_ground(collection, content.table["ground"], radius)
-    if (walls := content.arrays("walls.npz")) is not None:
-        _add_walls(collection, walls)
+    if meshes["walls"] is not None:
+        _add_walls(collection, meshes["walls"])
     update_light(scene)
     settings = scene.panoless
     settings.prediction, settings.content = content.table["prediction"], str(content.folder)
     verdict = content.table["verdict"]
     settings.verdict = "" if verdict is None else f"{verdict['verdict']}: {verdict['reason']}"
-    cameras = photograph_cameras(scene)
     if cameras:
-        show_photograph(scene, cameras[len(cameras) // 2])
+        show_photograph(scene, photograph_cameras(scene)[len(cameras) // 2])
     _set_render(scene)
     return missing
 
@@ -139,8 +139,7 @@ def mesh_of(name: str, arrays: dict[str, np.ndarray]) -> bpy.types.Mesh:
     return mesh
 
 
-def _mirror_mesh(arrays: dict[str, np.ndarray], stated: dict) -> bpy.types.Mesh:
-    mesh = mesh_of(MIRROR, arrays)
+def _add_mirror(collection: bpy.types.Collection, mesh: bpy.types.Mesh, stated: dict) -> None:
     material, nodes, links = _empty_material(MIRROR)
     shader = nodes.new("ShaderNodeBsdfPrincipled")
     shader.inputs["Base Color"].default_value = (*stated["base_color"], 1)
@@ -148,7 +147,7 @@ def _mirror_mesh(arrays: dict[str, np.ndarray], stated: dict) -> bpy.types.Mesh:
     shader.inputs["Roughness"].default_value = stated["roughness"]
     links.new(shader.outputs["BSDF"], nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
     mesh.materials.append(material)
-    return mesh
+    _add(collection, MIRROR, mesh)
 
 
 def _add_camera(collection: bpy.types.Collection, one: dict, center: Vector, radius: float) -> None:
@@ -176,14 +175,13 @@ def _add_ground(collection: bpy.types.Collection, stated: dict, radius: float) -
     each = _add(collection, GROUND, mesh)
     turn = Vector((0, 0, 1)).rotation_difference(Vector(stated["normal"])).to_matrix().to_4x4()
     each.matrix_world = Matrix.Translation(stated["point"]) @ turn
-    each.is_shadow_catcher = True
+    each.is_shadow_catcher, each.display_type = True, "WIRE"  # Else it hides the photograph outside of renders.
     # The map has the ground already: in reflections it is seen there, and its light comes from there.
     each.visible_glossy = each.visible_diffuse = each.visible_shadow = False
 
 
-def _add_walls(collection: bpy.types.Collection, arrays: dict[str, np.ndarray]) -> None:
+def _add_walls(collection: bpy.types.Collection, mesh: bpy.types.Mesh) -> None:
     """A light that depends on where on the walls it leaves, as seen from the world's origin."""
-    mesh = mesh_of(WALLS, arrays)
     material, nodes, links = _empty_material(WALLS)
     light = nodes.new("ShaderNodeEmission")
     light.name = STRENGTH

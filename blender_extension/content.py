@@ -2,8 +2,10 @@
 """`scene.json` and the files beside it, which `shinypartial convert --to extension` writes. Without Blender."""
 
 import json
+import zlib
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -43,9 +45,12 @@ class Content:
         if name not in self.table["files"]:
             return None
         try:
-            with np.load(self.folder / name) as file:
-                return dict(file)
-        except (OSError, ValueError) as error:
+            with (self.folder / name).open("rb") as stream, np.load(stream) as file:
+                found = dict(file)
+            if not {"vertices", "corners", "sizes"} <= set(found):
+                raise ValueError("it holds no mesh")
+            return found
+        except (OSError, ValueError, BadZipFile, zlib.error) as error:
             raise Problem(f"{self.folder / name} is damaged ({error}). Import the prediction again") from None
 
 

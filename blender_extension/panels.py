@@ -10,7 +10,7 @@ from .light import PREFIX
 from .running import active, begun_folder
 
 #: Letters that fit into the sidebar's usual width.
-WIDTH = 42
+WIDTH = 36
 
 
 class Side:

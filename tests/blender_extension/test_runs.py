@@ -243,7 +243,7 @@ def test_a_damaged_prediction_is_one_message(
     assert "PanoLess" not in blender.data.worlds
 
 
-@pytest.mark.parametrize("change", ["version", "missing", "damaged"])
+@pytest.mark.parametrize("change", ["version", "missing", "damaged", "cut off"])
 def test_files_of_another_version_or_damaged_are_one_message(
     change: str, blender: Any, programs: Path, prediction: Path, tmp_path: Path
 ) -> None:
@@ -258,9 +258,11 @@ def test_files_of_another_version_or_damaged_are_one_message(
     elif change == "missing":
         (folder / "surface.npz").unlink()
     else:
-        (folder / "surface.npz").write_bytes(b"PK")
+        whole = (folder / "surface.npz").read_bytes()
+        (folder / "surface.npz").write_bytes(b"PK" if change == "damaged" else whole[: len(whole) // 2])
     with pytest.raises(Problem):
         build(blender.context.scene, Content(folder))
+    assert "PanoLess mirror" in blender.data.objects, "What was there stays."
 
 
 def test_no_photographs_are_one_message(blender: Any, programs: Path, tmp_path: Path) -> None:
