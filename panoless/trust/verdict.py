@@ -20,8 +20,8 @@ MATTER = "Photograph a shinier object: this one shows its own color."
 SHAPE = "Look at poses, masks and exposure first; parts that are concave or see themselves may be wrong as well."
 PART = "See where that is: a part may be matte, or a hollow may have been missed. A mesh tells by its confidence."
 SURPLUS = (
-    "If --model asked for this kind, the object may be of another; else look at the masks, which may lack a part of it, "
-    "or the shape has grown one that isn't there."
+    "If --model asked for this kind, the object may be of another; else look at the masks, which may lack a part of "
+    "it, or the shape has grown one that isn't there."
 )
 VIEWS = "Add views: at least five that see the object from different sides."
 AROUND = "Add views from between these and from farther around, and look at the visibility map."
