@@ -98,15 +98,15 @@ def find_ground(
     best = int(np.argmax(near))
     if near[best] < options.ground_points * len(points):
         return None
-    normal, offset = normals[best], offsets[best]
+    normal, offset = normals[best], float(offsets[best])
     for _ in range(3):
         on = points[np.abs(points @ normal - offset) < limit]
         middle = on.mean(0)
         normal = np.linalg.svd(on - middle, full_matrices=False)[2][2]
         offset = float(normal @ middle)
     side = float(np.sign(np.median(centers @ normal - offset)))
-    east, north, up = map(float, side * normal)
-    return GroundPlane((east, north, up), side * offset)
+    x, y, z = map(float, side * normal)
+    return GroundPlane((x, y, z), side * offset)
 
 
 def as_rows(matrix: Float[np.ndarray, "N N"]) -> Rows:

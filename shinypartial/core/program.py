@@ -7,7 +7,7 @@ import re
 import sys
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Union, cast, get_type_hints
+from typing import Annotated, Any, Union, get_type_hints
 
 import tyro
 
@@ -65,8 +65,9 @@ class Program:
             Annotated[kind, tyro.conf.subcommand(name, **({"default": defaults[name]} if name in defaults else {}))]
             for name, kind in commands.items()
         ]
+        union: Any = Union[tuple(kinds)]  # noqa: UP007
         return tyro.cli(
-            cast(Any, Union[tuple(kinds)]),  # noqa: UP007
+            union,
             args=arguments,
             prog=self.name,
             description=self.description,
@@ -108,10 +109,12 @@ def _first_sentence(kind: type) -> str:
 
 def _shortened(kind: type, shown: Sequence[str]) -> type:
     """The same dataclass with fields that a command line shows no more, but those."""
-    hints, changed = get_type_hints(kind, include_extras=True), {}
+    hints = get_type_hints(kind, include_extras=True)
+    changed: dict[str, Any] = {}
     defaults: dict[str, Any] = {}
     for each in dataclasses.fields(kind):
-        hint, factory = hints[each.name], cast(Any, each.default_factory)
+        hint = hints[each.name]
+        factory: Any = each.default_factory
         below = [name.partition(".")[2] for name in shown if name.startswith(f"{each.name}.")]
         if each.name in shown:
             continue

@@ -43,18 +43,19 @@ def surface_of(prediction: Path, *, clouds: bool = False) -> PredictedSurface | 
     table, faces = _read_ply(paths[0])
     if not faces and not clouds:
         return None
-    if table is None or not set("xyz") <= set(table.dtype.names):
+    names = set() if table is None else set(table.dtype.names or ())
+    if table is None or not set("xyz") <= names:
         raise _unusable(paths[0], "no vertices with x, y and z")
     vertices = np.stack([table[name] for name in "xyz"], 1).astype(np.float64)
     if not np.isfinite(vertices).all():
         raise _unusable(paths[0], "coordinates that are not finite")
     if not all(0 <= index < len(vertices) for face in faces for index in face):
         raise _unusable(paths[0], f"faces of other vertices than the {len(vertices)} that there are")
-    if {"nx", "ny", "nz"} <= set(table.dtype.names):
+    if {"nx", "ny", "nz"} <= names:
         normals = np.stack([table[name] for name in ("nx", "ny", "nz")], 1).astype(np.float64)
     else:
         normals = polygon_normals(vertices, faces)
-    confidence = table["confidence"].astype(np.float64) if "confidence" in table.dtype.names else None
+    confidence = table["confidence"].astype(np.float64) if "confidence" in names else None
     surface = PredictedSurface(vertices, normals, faces, confidence)
     if faces and not len(surface.triangles):
         raise _unusable(paths[0], "no face with an area")

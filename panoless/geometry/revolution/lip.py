@@ -201,8 +201,7 @@ def _lip_step(
     residual = shown(np.zeros_like(surface.profile)) - pixels.radiance
     small = own.difference_px * pixel * shifts
     jacobian = np.stack([shown(shift) - shown(-shift) for shift in small], -1) / (2 * own.difference_px)
-    variance = options.photometric.radiance_sigma**2
-    variance = variance + own.parameter_sigma_px**2 * (jacobian**2).sum(-1).mean(1)
+    variance = options.photometric.radiance_sigma**2 + own.parameter_sigma_px**2 * (jacobian**2).sum(-1).mean(1)
     weighted = jacobian * (robust_weight(residual, 3 * variance**0.5) / variance)[:, None, None]
     matrix = np.tensordot(weighted, jacobian, ((0, 1), (0, 1)))
     gradient = np.tensordot(weighted, residual, ((0, 1), (0, 1)))

@@ -223,8 +223,8 @@ def _focal(balls: Sequence[FoundBall], request: BallRequest) -> Focal:
     if request.focal_film_mm is not None:
         return stated
     logs, costs = FOCAL_LOGS, []
-    for log in logs:
-        moved = replace(stated, over_diagonal=stated.over_diagonal * float(np.exp(log)))
+    for trial in logs:
+        moved = replace(stated, over_diagonal=stated.over_diagonal * float(np.exp(trial)))
         of_balls = [cone_of(ball.rim.points, ball.lens(moved))[1] for ball in balls]
         costs.append([_cost(off) for off in of_balls])
     total = np.array(costs).sum(1) + (logs / stated.sigma) ** 2 / 2
