@@ -155,9 +155,10 @@ def test_a_perfect_mirror_shows_the_world_where_it_does_not_see_itself(name: str
 def test_the_frame_of_the_mirror_is_mirrored_and_is_no_part_of_the_mask() -> None:
     seen = see("mirror")
     normal = np.array(seen.spec.object.normal)
-    # A pixel that the frame fills in part would turn the normal if the frame were in the pass.
+    # A pixel that the frame fills in part would turn the normal if the frame were in the pass. Blender 5.3 keeps
+    # normals in steps of 1.53e-5.
     inside = seen.view.alpha > 0
-    np.testing.assert_allclose(seen.view.normals_world[inside], np.broadcast_to(normal, (inside.sum(), 3)), atol=1e-5)
+    np.testing.assert_allclose(seen.view.normals_world[inside], np.broadcast_to(normal, (inside.sum(), 3)), atol=2e-5)
     world = sample_latlong(world_radiance(seen.spec.world), seen.mirrored)
     difference = np.abs(np.clip(seen.view.radiance, 0, 1) - np.clip(world, 0, 1)).mean(-1)
     in_frame = seen.solid & (seen.view.self_reflection > 0)
