@@ -23,7 +23,7 @@ GPU_KINDS = ("OPTIX", "CUDA", "HIP", "METAL", "ONEAPI")
 
 def check_blender() -> None:
     """Raise InputError unless this Python can import bpy; imports nothing."""
-    version = f"{sys.version_info.major}.{sys.version_info.minor}"
+    version = "{}.{}".format(*sys.version_info[:2])
     if importlib.util.find_spec("bpy") is None:
         if version not in PYTHONS_OF_BPY:
             raise InputError(

@@ -46,10 +46,13 @@ def snippet() -> str:
     return next((block for block in blocks if "panoless.fit" in block), "")
 
 
+HANDLED = "config", "viewer", "json_progress"
+
+
 def test_every_option_of_the_command_is_a_keyword() -> None:
-    """And has the same default, but for the viewer; `model` is a configuration's field that the command takes alone."""
+    """With the same default, but for what a terminal shows; `model` is a field of the configuration."""
     keywords = inspect.signature(panoless.fit).parameters
-    options = {item.name: item.default for item in fields(Fit) if item.name not in ("config", "viewer")}
+    options = {item.name: item.default for item in fields(Fit) if item.name not in HANDLED}
     assert {name: keywords[name].default for name in options} == options
     assert keywords.keys() == {*options, "config", "model"}
 
@@ -132,15 +135,19 @@ def test_a_folder_goes_before_a_bundled_name(tmp_path: Path, monkeypatch: pytest
 
 
 def test_packages_carry_the_data_and_say_that_they_are_typed(tmp_path: Path) -> None:
-    """What setuptools would install holds every file of the bundled dataset."""
-    program = "from setuptools import setup; setup()"
+    """What setuptools would install holds every file of the bundled dataset, recipes and the extension for Blender."""
     arguments = ["-q", "egg_info", "--egg-base", str(tmp_path), "build_py", "--build-lib", str(tmp_path / "lib")]
-    subprocess.run([sys.executable, "-c", program, *arguments], cwd=ROOT, check=True, capture_output=True)
+    subprocess.run([sys.executable, "setup.py", *arguments], cwd=ROOT, check=True, capture_output=True)
     kept = {path.relative_to(TINY_VASE) for path in TINY_VASE.rglob("*") if path.is_file()}
     built = tmp_path / "lib" / "shinypartial" / "data" / "tiny-vase"
     assert {path.relative_to(built) for path in built.rglob("*") if path.is_file()} == kept
     for package in ("panoless", "shinypartial"):
         assert (tmp_path / "lib" / package / "py.typed").exists()
+    for place in (
+        "shinypartial/data/blender_scenes/vase/scene.toml",
+        "panoless/blender_extension/blender_manifest.toml",
+    ):
+        assert (tmp_path / "lib" / place).exists()
 
 
 def run_snippet(folder: Path) -> dict[str, object]:

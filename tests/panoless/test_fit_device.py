@@ -43,6 +43,7 @@ def shortest_config(preset: str) -> FitConfig:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["default", pytest.param("paper", marks=pytest.mark.slow), "paper-rho-weighted"])
 def test_a_fit_on_another_device_mixes_nothing_and_ends_the_same(
     preset: str, tmp_path: Path, sphere_dataset: Dataset, definition_only: None

@@ -70,6 +70,7 @@ def test_methods_that_work_between_zero_and_one_take_photographs_as_they_are(
     assert told.exposure == 1
 
 
+@pytest.mark.slow
 def test_a_darker_exposure_gives_the_same_surface_and_a_darker_map(tmp_path: Path) -> None:
     def fitted(factor: float) -> FitState:
         dataset = exposed_dataset(tmp_path / f"data-{factor}", factor, train=14)

@@ -120,6 +120,7 @@ def test_views_without_light_above_one_are_the_same_in_both_ranges(sphere_datase
         assert bool((usual.radiance[~dim] == 1).all())
 
 
+@pytest.mark.slow
 def test_a_tinted_mirror_with_its_tint_gives_the_map_of_an_untinted_one(finished: FinishedFit, tmp_path: Path) -> None:
     """Light above 1 is cut from the untinted views first, because a camera would cut it at another place.
 

@@ -171,6 +171,7 @@ def fit_in_pieces(dataset: Dataset, config: FitConfig, folder: Path, stops: tupl
 COMPARED = [pytest.param(preset, marks=pytest.mark.slow) for preset in ("ref-gaussian", "3dgs-dr")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["default", "paper", "paper-rho-weighted", *COMPARED])
 def test_an_interrupted_fit_ends_as_an_uninterrupted_one(preset: str, tmp_path: Path, sphere_dataset: Dataset) -> None:
     config = tiny_config(preset, iterations=40, count=120)
@@ -235,6 +236,7 @@ def test_geometry_rests_while_the_environment_warms_up(tmp_path: Path, sphere_da
     assert not torch.equal(training.environment, state.training.environment)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lambda_normal_consistency", [0.0, 0.05])
 def test_pixels_that_no_term_reads_change_nothing(
     tmp_path: Path, sphere_dataset: Dataset, lambda_normal_consistency: float
@@ -255,6 +257,7 @@ def test_pixels_that_no_term_reads_change_nothing(
     assert not tiles.all() or tiles.numel() <= 4
 
 
+@pytest.mark.slow
 def test_another_seed_is_another_fit(tmp_path: Path, sphere_dataset: Dataset) -> None:
     config = tiny_config(iterations=5, count=60)
     first, again, other = (
@@ -309,6 +312,7 @@ def test_a_loss_that_is_not_finite_stops_the_fit(tmp_path: Path, sphere_dataset:
     assert load_state(tmp_path / "run") is None
 
 
+@pytest.mark.slow
 def test_the_world_may_be_anywhere_and_of_any_size(tmp_path: Path, sphere_dataset: Dataset) -> None:
     """The same pictures of a world moved and scaled give the same fit, moved and scaled."""
     scale, shift = 50.0, torch.tensor([200.0, -30.0, 4.0])

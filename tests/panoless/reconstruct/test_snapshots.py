@@ -113,6 +113,7 @@ def test_the_last_snapshot_is_the_result(prediction: Path) -> None:
     assert (first / "environment.exr").read_bytes() != (prediction / "environment.exr").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["default", "paper"])
 def test_completing_the_last_snapshot_completes_the_fit(preset: str, tmp_path: Path, sphere_dataset: Dataset) -> None:
     """Also where the environment is what gradient descent left, and visibility what all iterations saw."""
@@ -161,6 +162,7 @@ def test_exporting_again_keeps_what_is_there(run: Path, prediction: Path, sphere
     assert export_snapshots(sphere_dataset, run, CONFIG, prediction) == exported_snapshots(prediction)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["default", "paper"])
 def test_a_killed_fit_has_the_same_snapshots(preset: str, tmp_path: Path, sphere_dataset: Dataset, monkeypatch) -> None:
     """The fit is killed right after snapshots that its checkpoint does not know yet."""

@@ -149,6 +149,7 @@ def test_a_bent_and_tilted_mirror_is_recovered(truth: HeightField) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slope", [0.45, -0.3])
 def test_a_dome_and_a_bowl_are_found_from_a_flat_start(slope: float) -> None:
     """Round convex mirrors turn rays by 50 degrees from edge to edge; a flat mirror explains nothing of that."""
@@ -170,6 +171,7 @@ def test_a_round_outline_bends_no_mirror() -> None:
     assert abs(height_field.heights(middle, 0)[0, 0]) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rim", [0.0, 0.1])
 def test_what_a_rim_hides_of_the_surroundings_is_left_out(rim: float) -> None:
     """Outlines tell nothing of a rim that stands back, and mirrored rays that meet it see black. Without one, none is
@@ -196,6 +198,7 @@ def test_a_tilt_that_photographs_do_not_tell_changes_nothing_for_them(truth: Hei
     np.testing.assert_allclose([bump @ without, bump @ left @ bump], [bump @ gradient, bump @ matrix @ bump])
 
 
+@pytest.mark.slow
 def test_bumps_too_short_for_the_grid_are_recovered_on_a_finer_one() -> None:
     """Held-out views ask for halved cells, and for none where the mirror is flat."""
     options = replace(OPTIONS, cells=5, rounds=(HeightFieldRound(64, 0.3, 20_000, 4),))

@@ -79,6 +79,7 @@ def test_an_open_vessel_is_found_with_its_lip_its_wall_and_the_map() -> None:
     assert map_error(photographs, surface, UPRIGHT) < 0.02
 
 
+@pytest.mark.slow
 def test_a_closed_vessel_is_found_with_the_dish_in_its_lid() -> None:
     """Measured: normals 0.15° in the median and 0.7° in the mean, by one thread as by two. The mean is of the corner of
     the dish, which is sharp.
@@ -102,6 +103,7 @@ def test_a_deep_cup_is_open_though_no_ray_leaves_it_at_once() -> None:
     assert opened.is_open
 
 
+@pytest.mark.slow
 def test_the_inside_of_a_plate_is_found_by_steps_under_coarse_maps() -> None:
     """No outline shows it. Measured: 1.0° in the median; 11° without these steps."""
     photographs = photograph(plate(), VIEWS, 96, elevations_deg=(20.0, 35.0, 50.0, 60.0))
@@ -130,6 +132,7 @@ def assert_equivariant(surface: SurfaceOfRevolution, errors: np.ndarray, turn: n
     assert abs(errors.mean() - normal_errors_deg(photographs, upright).mean()) < 0.1
 
 
+@pytest.mark.slow
 def test_a_world_turned_upside_down_changes_nothing() -> None:
     """The mouth is sought where it is: axis and lip turn with the world, and normals are as right."""
     photographs, surface = fitted(cut_bowl, True)

@@ -15,6 +15,7 @@ from tests.support.mirror_sphere import tiny_config
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", [pytest.param("default", marks=pytest.mark.slow), "paper"])
 def test_a_fit_ends_as_on_the_cpu(
     preset: str, tmp_path: Path, sphere_dataset: Dataset, device: torch.device, monkeypatch: pytest.MonkeyPatch
