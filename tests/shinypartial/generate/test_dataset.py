@@ -377,8 +377,8 @@ def test_another_python_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     from shinypartial.blender import runtime
 
     monkeypatch.setattr(runtime.importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setattr(runtime.sys, "version_info", (3, 13, 0))
-    with pytest.raises(InputError, match=r"Python 3\.11.*3\.13.*pip install 'panoless\[blender\]'"):
+    monkeypatch.setattr(runtime.sys, "version_info", (3, 12, 0))
+    with pytest.raises(InputError, match=r"Python 3\.11 or 3\.13.*3\.12.*pip install 'panoless\[blender\]'"):
         runtime.check_blender()
 
 
