@@ -5,7 +5,8 @@ L = Σ g c/Σ g² over the photographs in which it is not clipped; where all cli
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -38,9 +39,14 @@ class Exposed:
 
 def same_pose(shots: Sequence[Shot]) -> list[list[int]]:
     """Groups of photographs from one place that differ in exposure."""
+    sides = cache(lambda number: _sides(shots[number]))
     groups: list[list[int]] = []
-    for number, shot in enumerate(shots):
-        group = next((group for group in groups if is_bracket(shot, shots[group[0]])), None)
+
+    def together(one: int, two: int) -> bool:
+        return _differ(shots[one], shots[two]) and _alike(sides(one), sides(two))
+
+    for number in range(len(shots)):
+        group = next((group for group in groups if together(number, group[0])), None)
         if group is None:
             groups.append([number])
         else:
@@ -50,16 +56,24 @@ def same_pose(shots: Sequence[Shot]) -> list[list[int]]:
 
 def is_bracket(one: Shot, two: Shot) -> bool:
     """Whether two photographs show the same at different exposures."""
-    if one.size != two.size or abs(_stops(one, two)) < EQUAL_STOPS:
-        return False
-    align = opencv().createAlignMTB()
-    sides = []
-    for shot in (one, two):
-        gray = opencv().cvtColor(shot.codes(), opencv().COLOR_RGB2GRAY)
-        bitmap, sure = align.computeBitmaps(gray)
-        sides.append((bitmap > 0, sure > 0))
-    both = sides[0][1] & sides[1][1]
-    return bool(both.any()) and float((sides[0][0] == sides[1][0])[both].mean()) > SAME_PICTURE
+    return _differ(one, two) and _alike(_sides(one), _sides(two))
+
+
+def _differ(one: Shot, two: Shot) -> bool:
+    """Whether two photographs of one size were exposed differently."""
+    return one.size == two.size and abs(_stops(one, two)) >= EQUAL_STOPS
+
+
+def _sides(shot: Shot) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
+    """Which pixels are brighter than the median, and which are surely so or not."""
+    gray = opencv().cvtColor(shot.codes(), opencv().COLOR_RGB2GRAY)
+    bitmap, sure = opencv().createAlignMTB().computeBitmaps(gray)
+    return bitmap > 0, sure > 0
+
+
+def _alike(one: tuple[np.ndarray, np.ndarray], two: tuple[np.ndarray, np.ndarray]) -> bool:
+    both = one[1] & two[1]
+    return bool(both.any()) and float((one[0] == two[0])[both].mean()) > SAME_PICTURE
 
 
 def _stops(one: Shot, two: Shot) -> float:
@@ -70,7 +84,7 @@ def _stops(one: Shot, two: Shot) -> float:
 
 
 def _ratio(one: Shot, two: Shot) -> float:
-    first, second = (shot.radiance()[::4, ::4] for shot in (one, two))
+    first, second = (replace(shot, pixels=shot.pixels[::4, ::4]).radiance() for shot in (one, two))
     good = (first < one.clips_at) & (second < two.clips_at) & (first > DARKEST) & (second > DARKEST)
     return float(np.median(first[good] / second[good])) if good.sum() > 100 else 1.0
 
