@@ -17,6 +17,7 @@ from shinypartial.cli import main as benchmark
 from shinypartial.dataset.schema import Dataset
 from shinypartial.io.events import schema
 from shinypartial.prediction.format import read_info
+from tests.support.interrupts import heed_interrupts
 
 ROOT = Path(__file__).resolve().parents[2]
 SCHEMA = ROOT / "docs" / "reference" / "json-progress.schema.json"
@@ -50,8 +51,7 @@ def start(dataset: Dataset, place: Path) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        # A shell without job control starts background processes with interrupts ignored; this process may be one.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        preexec_fn=heed_interrupts,
     )
 
 

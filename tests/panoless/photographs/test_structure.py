@@ -14,6 +14,7 @@ from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import Poses
 from panoless.photographs.structure import poses_from_structure
 from shinypartial.core.errors import InputError
+from tests.support.interrupts import heed_interrupts
 
 FRAMES = Frames(
     tuple(Photograph(f"p_{i}", Path(f"p_{i}.png"), 80, 60, 1, 80, 60, blur=0.0, brightness=0.5) for i in range(8))
@@ -56,9 +57,9 @@ def test_each_stage_shows_its_steps(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_an_interruption_ends_the_program(tmp_path: Path, request: pytest.FixtureRequest) -> None:
-    # A shell without job control starts background processes with interrupts ignored; this process may be one.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    before = signal.getsignal(signal.SIGINT)
     request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
+    heed_interrupts()
     note = tmp_path / "pid"
     program = f"import os, pathlib, time; pathlib.Path({str(note)!r}).write_text(str(os.getpid())); time.sleep(100)"
 

@@ -22,6 +22,7 @@ from shinypartial.dataset.validate import validate
 from shinypartial.generate.dataset import generate
 from shinypartial.io.files import PARTIAL_PREFIX
 from shinypartial.scene import SceneSpec, load_scene, override
+from tests.support.interrupts import heed_interrupts
 from tests.support.tiny_scene import WORLD_HEIGHT, direction_colors, tiny_scene, write_recipe
 
 pytest.importorskip("bpy")
@@ -224,8 +225,7 @@ def start_long_run(tmp_path: Path, views: int) -> "subprocess.Popen[str]":
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "TMPDIR": str(tmp_path / "tmp")},
-        # A shell without job control starts background processes with interrupts ignored; this process may be one.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        preexec_fn=heed_interrupts,
     )
     deadline = time.monotonic() + LONG_ENOUGH_S
     while len(list(tmp_path.glob("out/*/r_???.exr"))) < 3 and time.monotonic() < deadline:
