@@ -136,13 +136,16 @@ def recorded(
 
 def masked_wrongly(picture: Picture, options: MaskErrors, is_empty: bool, random: np.random.Generator) -> Picture:
     """With another mask; ground truth stays."""
-    alpha = picture.alpha
+    alpha, (wobble, shift) = picture.alpha, random.spawn(2)  # Holes and blobs stay where they were.
     if options.erode_px:
         alpha = masks.eroded(alpha, options.erode_px)
     if options.dilate_px:
         alpha = masks.dilated(alpha, options.dilate_px)
+    if options.offset_px:
+        offset = shift.uniform(-options.offset_px, options.offset_px)
+        alpha = masks.dilated(alpha, offset) if offset > 0 else masks.eroded(alpha, -offset)
     if options.wobble_px:
-        alpha = masks.wobbling(alpha, options.wobble_px, random.spawn(1)[0])  # Holes and blobs stay where they were.
+        alpha = masks.wobbling(alpha, options.wobble_px, wobble)
     outlined = alpha
     if options.holes:
         alpha = masks.with_holes(outlined, options.holes, random)

@@ -57,6 +57,7 @@ AXES = (
     ),
     Axis("roughness", "Roughness", "", 0, (0.05, 0.1, 0.2, 0.3), "--roughness {level}", rendered=True),
     Axis("exposure", "Exposure drift, σ", " stops", 0, (0.05, 0.15, 0.3), "--sensor.exposure-sigma-stops {level}"),
+    Axis("masks-offset", "Masks off by view", " px", 0, (0.5, 1, 2), "--masks.offset-px {level}", kind="further"),
     Axis("masks-wobbling", "Masks that wander, σ", " px", 0, (0.5, 1, 2), "--masks.wobble-px {level}", kind="further"),
     Axis("noise", "Shot noise at radiance 1", "", 0, (0.01, 0.03, 0.1), "--sensor.shot-noise {level}", kind="further"),
     Axis(

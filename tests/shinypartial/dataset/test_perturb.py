@@ -28,7 +28,7 @@ from tests.support.truth_prediction import write_truth_prediction
 
 EVERYTHING = Perturbation(
     CameraErrors(1.0, 0.5, 0.01, 1.02, (1.0, 0.0)),
-    MaskErrors(erode_px=0.5, dilate_px=1.0, wobble_px=0.5, holes=0.1, stray=0.1, empty=0.2),
+    MaskErrors(erode_px=0.5, dilate_px=1.0, offset_px=0.7, wobble_px=0.5, holes=0.1, stray=0.1, empty=0.2),
     SensorErrors(0.4, -0.05, 0.01, False, 0.5, 0.2, 0.1, 0.02, 0.01, 2.0, False, 90),
     ViewChoice(keep=4, object_scale=0.9, cut=0.1),
     World(random_turn=True),
@@ -322,6 +322,15 @@ def test_a_larger_mask_is_black_without_a_background_and_shows_one_that_is_there
         assert ring.any()
         gray = float(srgb_to_linear(np.array(200 / 255)))
         np.testing.assert_allclose(view.radiance[ring], gray, rtol=0.01)
+
+
+def test_outlines_move_by_view_within_their_bound(sphere_dataset: Dataset, tmp_path: Path) -> None:
+    """Of a disk of area A, the radius √(A/π) changes by the drawn distance."""
+    perturb(sphere_dataset.root, tmp_path / "copy", Perturbation(masks=MaskErrors(offset_px=0.8)))
+    pairs = zip(open_dataset(tmp_path / "copy").train, sphere_dataset.train, strict=True)
+    moved = np.diff([[np.sqrt(read_view(each).alpha.sum() / np.pi) for each in pair] for pair in pairs])
+    assert np.abs(moved).max() < 0.85
+    assert moved.std() > 0.1
 
 
 def test_stray_blobs_fill_no_hole(sphere_dataset: Dataset, tmp_path: Path) -> None:
