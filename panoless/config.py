@@ -29,8 +29,8 @@ from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.options import PlaneOptions
 from panoless.geometry.revolution.options import RevolutionOptions
 from panoless.geometry.sphere.options import SphereOptions
-from panoless.geometry.surfels.options import SurfelOptions
 from panoless.selection.options import CorrectionOptions, SelectionOptions
+from panoless.splats.options import SurfelOptions
 from panoless.trust.options import TrustOptions
 from shinypartial.core.errors import InputError
 from shinypartial.io.records import (

@@ -31,13 +31,13 @@ from panoless.export.pictures import (
 )
 from panoless.export.render import Decomposition, render
 from panoless.geometry.registry import FAMILIES
-from panoless.geometry.surfels.shading.registry import LEFT_OUT
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.reconstruct.final_map import complete
 from panoless.reconstruct.recorder import timed
 from panoless.reconstruct.snapshots import read_snapshot, snapshot_folders
 from panoless.reconstruct.state import FitState
 from panoless.selection.candidates import Selection
+from panoless.splats.shading.registry import LEFT_OUT
 from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import latlong_directions

@@ -12,9 +12,9 @@ from panoless.capture.object_frame import ObjectFrame
 from panoless.config import FitConfig
 from panoless.environment.reflectance import Reflectance
 from panoless.geometry.base import Geometry
+from panoless.kernels.camera import RasterCamera
 from panoless.kernels.constants import ALPHA_FLOOR
-from panoless.kernels.rasterize import RasterCamera
-from panoless.kernels.reference.objective import compose
+from panoless.splats.kernels.reference.objective import compose
 
 
 @dataclass(frozen=True)

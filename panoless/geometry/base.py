@@ -21,7 +21,7 @@ from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays
 from panoless.environment.surroundings import Surroundings
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 
 Numbers = TypeVar("Numbers")
 SOLID_SURFACE_ALPHA = 0.9

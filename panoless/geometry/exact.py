@@ -32,10 +32,9 @@ from panoless.geometry.base import (
     observe_views,
     to_plain,
 )
+from panoless.kernels.camera import RasterCamera, reflection_directions_world
 from panoless.kernels.constants import SUB_PIXELS
 from panoless.kernels.cubemap import sample_cubemap
-from panoless.kernels.rasterize import RasterCamera
-from panoless.kernels.reference.objective import reflection_directions_world
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from panoless.geometry.height_field.kind import HeightFieldFamily
 from panoless.geometry.plane.kind import PlaneFamily
 from panoless.geometry.revolution.kind import RevolutionFamily
 from panoless.geometry.sphere.kind import SphereFamily
-from panoless.geometry.surfels.kind import SurfelFamily
+from panoless.splats.kind import SurfelFamily
 
 FAMILIES: dict[str, Family] = {
     family.kind: family

@@ -17,7 +17,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from panoless.kernels.rasterize import RasterBuffers, RasterCamera, rasterize
+from panoless.kernels.camera import RasterCamera
+from panoless.splats.kernels.rasterize import RasterBuffers, rasterize
 from tests.benchmarks.bench_rasterize import CASES, Vase, calibrated_vase, vase_camera
 from tests.support.surfel_scenes import IMAGES
 
@@ -196,10 +197,10 @@ def time_fit(surfels: Vase, camera: RasterCamera, device: torch.device) -> Row:
     from panoless.capture.views import TrainView, Views
     from panoless.config import FitConfig
     from panoless.geometry.base import Training
-    from panoless.geometry.surfels.mirror import SurfelMirror
-    from panoless.geometry.surfels.model import Surfels
-    from panoless.geometry.surfels.train import SurfelTrainer
     from panoless.selection.held_out import Unobserved
+    from panoless.splats.mirror import SurfelMirror
+    from panoless.splats.model import Surfels
+    from panoless.splats.train import SurfelTrainer
 
     with torch.no_grad():
         picture = drawn(placed(surfels, device), camera, True)

@@ -14,11 +14,11 @@ import numpy as np
 
 from panoless.capture.configured import configured_views
 from panoless.config import FitConfig
-from panoless.geometry.surfels.kind import SurfelFamily
-from panoless.geometry.surfels.mirror import SurfelMirror
-from panoless.geometry.surfels.placement import initial_surfels
 from panoless.presets import PRESETS
 from panoless.selection.held_out import Unobserved
+from panoless.splats.kind import SurfelFamily
+from panoless.splats.mirror import SurfelMirror
+from panoless.splats.placement import initial_surfels
 from shinypartial.dataset.bundled import bundled_dataset
 from shinypartial.dataset.read import open_dataset
 from shinypartial.io.files import write_json

@@ -26,14 +26,14 @@ import torch
 
 from panoless.capture.views import Views, cropped, views_of
 from panoless.config import FitConfig
-from panoless.geometry.surfels import train as train_module
-from panoless.geometry.surfels.kind import SurfelFamily
-from panoless.geometry.surfels.mirror import SurfelMirror
-from panoless.geometry.surfels.optimizer import SurfelOptimizer
-from panoless.geometry.surfels.placement import initial_surfels
-from panoless.geometry.surfels.train import SurfelTrainer
 from panoless.presets import PRESETS
 from panoless.selection.held_out import Unobserved
+from panoless.splats import train as train_module
+from panoless.splats.kind import SurfelFamily
+from panoless.splats.mirror import SurfelMirror
+from panoless.splats.optimizer import SurfelOptimizer
+from panoless.splats.placement import initial_surfels
+from panoless.splats.train import SurfelTrainer
 from shinypartial.core.camera import Camera
 from shinypartial.dataset.read import open_dataset, read_view
 

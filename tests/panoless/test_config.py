@@ -21,9 +21,9 @@ from panoless.config import (
     renamed_arguments,
     with_overrides,
 )
-from panoless.geometry.surfels.model import ShadedSurfels
 from panoless.photographs.options import CaptureOptions
 from panoless.presets import PRESETS
+from panoless.splats.model import ShadedSurfels
 from shinypartial.core.errors import InputError
 from shinypartial.io.records import write_record
 

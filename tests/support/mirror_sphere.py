@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from panoless.config import FitConfig
-from panoless.geometry.surfels.model import Surfels
 from panoless.presets import PRESETS
+from panoless.splats.model import Surfels
 from tests.support.synthetic_dataset import environment_radiance
 
 

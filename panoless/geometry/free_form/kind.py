@@ -39,10 +39,10 @@ from panoless.geometry.free_form.rendering import free_form_buffers, free_form_l
 from panoless.geometry.free_form.start import FirstSurfaces, first_surfaces, started
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import Trust, full_trust
-from panoless.geometry.surfels.mirror import SurfelMirror
-from panoless.geometry.surfels.placement import surfels_on_mesh
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from panoless.numeric.factorize import regularize
+from panoless.splats.mirror import SurfelMirror
+from panoless.splats.placement import surfels_on_mesh
 from shinypartial.io.records import read_record, write_record
 
 

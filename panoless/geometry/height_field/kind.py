@@ -22,9 +22,9 @@ from panoless.geometry.height_field.model import (
     visible_reflections,
 )
 from panoless.geometry.height_field.options import HeightFieldOptions
-from panoless.geometry.surfels.mirror import SurfelMirror
-from panoless.geometry.surfels.placement import places_within, surfels_at
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
+from panoless.splats.mirror import SurfelMirror
+from panoless.splats.placement import places_within, surfels_at
 from shinypartial.core.errors import InputError
 from shinypartial.io.records import read_record, write_record
 

@@ -15,9 +15,9 @@ from panoless.geometry.base import SOLID_SURFACE_ALPHA, Geometry, Mesh, Proposal
 from panoless.geometry.exact import ExactFamily, SeenByCenters, looked_up, mirrored_directions
 from panoless.geometry.plane.fit import fit_plane
 from panoless.geometry.plane.model import Plane, plane_buffers, unoccluded_share
-from panoless.geometry.surfels.mirror import SurfelMirror
-from panoless.geometry.surfels.placement import places_within, surfels_at
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
+from panoless.splats.mirror import SurfelMirror
+from panoless.splats.placement import places_within, surfels_at
 from shinypartial.core.errors import InputError
 
 UNOCCLUDED_SHARE = 0.99

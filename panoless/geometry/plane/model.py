@@ -13,7 +13,7 @@ from torch import Tensor
 from panoless.capture.rays import camera_rays, pose_of
 from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import SurfaceBuffers, buffers_from_arrays
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from panoless.numeric.polygon import projected_coverage
 from shinypartial.core.conventions import PIXEL_CENTER
 

@@ -23,8 +23,8 @@ from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_b
 from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
 from panoless.geometry.revolution.placement import surfels_on_revolution
 from panoless.geometry.revolution.render import mean_light
-from panoless.geometry.surfels.mirror import SurfelMirror
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
+from panoless.splats.mirror import SurfelMirror
 from shinypartial.core.errors import InputError
 from shinypartial.io.records import read_record, write_record
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from panoless.config import SurfelConfig
 from panoless.geometry.revolution.model import SurfaceOfRevolution
-from panoless.geometry.surfels.model import Surfels
-from panoless.geometry.surfels.placement import surfels_at
+from panoless.splats.model import Surfels
+from panoless.splats.placement import surfels_at
 
 
 def surfels_on_revolution(surface: SurfaceOfRevolution, config: SurfelConfig) -> Surfels:

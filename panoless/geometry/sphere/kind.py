@@ -20,10 +20,10 @@ from panoless.geometry.exact import ExactFamily, ExactGeometry
 from panoless.geometry.sphere.fit import fit_sphere
 from panoless.geometry.sphere.model import CENTER, Sphere, mirrored, parts_of_pixel, sphere_buffers
 from panoless.geometry.sphere.options import SphereOptions
-from panoless.geometry.surfels.mirror import SurfelMirror
-from panoless.geometry.surfels.placement import surfels_at
+from panoless.kernels.camera import RasterCamera
 from panoless.kernels.cubemap import sample_cubemap
-from panoless.kernels.rasterize import RasterCamera
+from panoless.splats.mirror import SurfelMirror
+from panoless.splats.placement import surfels_at
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import fibonacci_directions
 from shinypartial.io.records import read_record, write_record

@@ -16,10 +16,10 @@ from panoless.capture.views import load_views
 from panoless.config import FitConfig, check_config
 from panoless.environment.cubemap import look_up
 from panoless.export.render import render
-from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.presets import PRESETS
 from panoless.reconstruct.fit import fit
+from panoless.splats.mirror import SurfelMirror
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import read_view
 from shinypartial.dataset.schema import Dataset

@@ -26,10 +26,10 @@ from panoless.geometry.height_field.kind import HeightFieldMirror
 from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.revolution.kind import RevolutionMirror
 from panoless.geometry.revolution.model import SurfaceOfRevolution
-from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.reconstruct.state import FitState
 from panoless.selection.candidates import Candidate, Selection, Verdict
+from panoless.splats.mirror import SurfelMirror
 from shinypartial.core.color import to_display
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import cube_to_latlong as clamped_cube_to_latlong

@@ -12,7 +12,7 @@ from panoless.first_surface.completion import complete_surface, completed, hull_
 from panoless.first_surface.contact import Contact, outline_contact
 from panoless.first_surface.mesh import TriangleMesh
 from panoless.first_surface.visual_hull import HULL_HALF_SIDE, Hull, carve_hull
-from panoless.geometry.surfels.placement import initial_surfels
+from panoless.splats.placement import initial_surfels
 from shinypartial.core.errors import InputError
 
 CONFIG = SurfelConfig(count=800, hull_resolution=48)

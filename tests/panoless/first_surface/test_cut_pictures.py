@@ -15,8 +15,8 @@ from panoless.first_surface.mesh import TriangleMesh
 from panoless.first_surface.visual_hull import HULL_HALF_SIDE, Hull, carve_hull
 from panoless.geometry.plane.fit import fit_plane
 from panoless.geometry.revolution.fit import propose_revolution
-from panoless.geometry.surfels.placement import initial_surfels
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
+from panoless.splats.placement import initial_surfels
 from shinypartial.core.camera import Camera
 from tests.panoless.first_surface.test_visual_hull import RADIUS, RESOLUTION, SIDE, VOXEL, all_around, deviation
 from tests.support.synthetic_dataset import render_sphere, sphere_cameras

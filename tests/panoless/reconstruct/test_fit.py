@@ -16,22 +16,22 @@ from panoless.config import FitConfig
 from panoless.environment.cubemap import look_up
 from panoless.export.render import render
 from panoless.geometry.base import Geometry, Training
-from panoless.geometry.surfels import objective
-from panoless.geometry.surfels.kind import SurfelFamily
-from panoless.geometry.surfels.mirror import SurfelMirror
-from panoless.geometry.surfels.model import Surfels
-from panoless.geometry.surfels.objective import LossTerms
-from panoless.geometry.surfels.placement import initial_surfels
-from panoless.geometry.surfels.schedule import phase_of
-from panoless.geometry.surfels.train import SurfelTrainer, train_surfels
 from panoless.kernels.cubemap import cubemap_directions
-from panoless.kernels.objective import Objective
 from panoless.presets import PRESETS
 from panoless.reconstruct import fit as fit_module
 from panoless.reconstruct import recorder as recorder_module
 from panoless.reconstruct.fit import fit
 from panoless.reconstruct.state import FitState, load_state
 from panoless.selection.held_out import Unobserved
+from panoless.splats import objective
+from panoless.splats.kernels.objective import Objective
+from panoless.splats.kind import SurfelFamily
+from panoless.splats.mirror import SurfelMirror
+from panoless.splats.model import Surfels
+from panoless.splats.objective import LossTerms
+from panoless.splats.placement import initial_surfels
+from panoless.splats.schedule import phase_of
+from panoless.splats.train import SurfelTrainer, train_surfels
 from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import read_view

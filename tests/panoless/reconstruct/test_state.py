@@ -17,7 +17,6 @@ from panoless.geometry.height_field.kind import HeightFieldMirror
 from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.revolution.kind import RevolutionMirror
-from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.presets import PRESETS
 from panoless.reconstruct.state import (
     CHECKPOINT,
@@ -29,6 +28,7 @@ from panoless.reconstruct.state import (
     save_state,
 )
 from panoless.selection.candidates import Candidate, Selection, Verdict
+from panoless.splats.mirror import SurfelMirror
 from shinypartial.core.errors import InputError
 from shinypartial.prediction.format import Trust
 from tests.support.mirror_height_field import bumpy

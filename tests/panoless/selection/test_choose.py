@@ -17,13 +17,13 @@ from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.plane.model import Plane, unoccluded_share
 from panoless.geometry.registry import FAMILIES
 from panoless.geometry.revolution.kind import RevolutionFamily
-from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.reconstruct.fit import begin, fit
 from panoless.reconstruct.snapshots import SnapshotSchedule
 from panoless.selection import choose
 from panoless.selection.candidates import Candidate, Selection, Verdict
 from panoless.selection.choose import _is_near, choose_geometry, least_unexplained, much_less_unexplained
 from panoless.selection.options import CorrectionOptions
+from panoless.splats.mirror import SurfelMirror
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.perturb.masks import wobbling
 from shinypartial.dataset.schema import Dataset

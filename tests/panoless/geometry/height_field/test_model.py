@@ -20,8 +20,8 @@ from panoless.geometry.height_field.model import (
 from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.plane.model import plane_buffers, unoccluded_share
-from panoless.geometry.surfels.model import Surfels
-from panoless.kernels.reference.rasterize import rotation_matrices
+from panoless.splats.kernels.reference.rasterize import rotation_matrices
+from panoless.splats.model import Surfels
 from tests.support.mirror_height_field import bumpy
 from tests.support.mirror_plane import L_SHAPE, NORMAL, RECTANGLE, arc, mirror_views, plane_of, train_view
 

@@ -25,7 +25,7 @@ from panoless.geometry.revolution.silhouette import (
     silhouette_residuals,
 )
 from panoless.kernels.cubemap import cubemap_directions
-from panoless.kernels.reference.rasterize import rotation_matrices
+from panoless.splats.kernels.reference.rasterize import rotation_matrices
 from tests.support.mirror_revolution import TILTED, around, funnel, goblet, pillar_views, rays_of, revolution_views
 from tests.support.synthetic_dataset import environment_radiance
 
