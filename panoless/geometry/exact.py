@@ -26,8 +26,6 @@ from panoless.geometry.base import (
     Geometry,
     Proposal,
     ToldPoses,
-    Training,
-    TrainingObserver,
     from_plain,
     observe_views,
     to_plain,
@@ -133,16 +131,6 @@ class ExactFamily:
     def after_as_many_steps(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:
         """The same: none are taken."""
         return cast(Geometry, fitted)
-
-    def begin(self, views: Views, geometry: Geometry, config: FitConfig) -> Training | None:
-        """None: no steps are left to take."""
-        return None
-
-    def train(
-        self, views: Views, geometry: Geometry, training: Training, config: FitConfig, observer: TrainingObserver
-    ) -> tuple[Geometry, Training]:
-        """Never called, as `begin` gives nothing to train."""
-        raise ValueError("a kind in closed form is not trained")
 
 
 class SeenByCenters(ExactGeometry):

@@ -19,15 +19,7 @@ from panoless.environment.rays import Rays
 from panoless.environment.resolution import finest_resolution
 from panoless.environment.solve import solve_environment
 from panoless.environment.surroundings import FAR, Surroundings
-from panoless.geometry.base import (
-    SOLID_SURFACE_ALPHA,
-    Geometry,
-    Mesh,
-    SurfaceBuffers,
-    from_plain,
-    poses_from_plain,
-    to_plain,
-)
+from panoless.geometry.base import SOLID_SURFACE_ALPHA, Mesh, SurfaceBuffers, from_plain
 from panoless.geometry.exact import mirrored_directions, shade_centers
 from panoless.kernels.camera import RasterCamera
 from panoless.kernels.cubemap import sample_cubemap
@@ -53,16 +45,12 @@ class SurfelMirror:
     roughness: bool = False
     depth_blend: float = 0.5
     """λ_d of Eq. 3."""
-    started_on: Geometry | None = None
-    """The geometry that the surfels were placed on, if what it occludes stays occluded: the mirror in a frame."""
-    poses: Poses | None = None
-    """Of the training views, as the geometry has them that the surfels were placed on."""
 
     @classmethod
-    def of(cls, surfels: Surfels, config: FitConfig, started_on: Geometry | None = None) -> "SurfelMirror":
+    def of(cls, surfels: Surfels, config: FitConfig) -> "SurfelMirror":
         """Surfels as a configuration takes them."""
         loss = config.loss
-        return cls(surfels, config.surfels.curved, config.albedo, loss.roughness_weighted, loss.depth_blend, started_on)
+        return cls(surfels, config.surfels.curved, config.albedo, loss.roughness_weighted, loss.depth_blend)
 
     @property
     def num_parameters(self) -> int:
@@ -74,13 +62,18 @@ class SurfelMirror:
         """The number of surfels."""
         return self.surfels.count
 
+    @property
+    def poses(self) -> Poses | None:
+        """None: cameras are believed."""
+        return None
+
     def with_poses(self, poses: Poses | None) -> "SurfelMirror":
-        """The same surfels with the cameras there."""
-        return replace(self, poses=poses)
+        """Itself: surfels find no poses."""
+        return self
 
     def corrected(self, views: Views) -> Views:
-        """With their cameras where the geometry had them on which the surfels started."""
-        return views if self.poses is None else self.poses.moved(views)
+        """As they are."""
+        return views
 
     @property
     def surroundings(self) -> Surroundings:
@@ -92,8 +85,8 @@ class SurfelMirror:
         return self
 
     def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
-        """Those that the geometry it started on calls usable; all solid ones where there is none."""
-        return view.solid if self.started_on is None else self.started_on.usable_pixels(view)
+        """All solid ones."""
+        return view.solid
 
     def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
         """The rays of those of the pixels that surfels cover, less what is diffuse."""
@@ -166,10 +159,6 @@ class SurfelMirror:
         """With its surfels as they are when that share of the steps of its objective is taken."""
         return replace(self, surfels=surfels)
 
-    def to_surfels(self, config: FitConfig) -> "SurfelMirror":
-        """Itself."""
-        return self
-
     def mesh(self, frame: ObjectFrame) -> Mesh:
         """A cloud with the column names that Gaussian-splat viewers read.
 
@@ -192,30 +181,20 @@ class SurfelMirror:
         return replace(self, surfels=self.surfels.to(device))
 
     def state_dict(self) -> dict[str, Any]:
-        """The surfels' tensors, the switches, and the geometry that they started on."""
-        start = self.started_on
-        return {
-            **vars(self),
-            "surfels": self.surfels.detached().named(),
-            "started_on": None if start is None else (start.kind, start.state_dict()),
-            "poses": None if self.poses is None else to_plain(self.poses),
-        }
+        """The surfels' tensors, and the switches."""
+        return {**vars(self), "surfels": self.surfels.detached().named()}
 
     @classmethod
     def from_state_dict(cls, content: dict[str, Any]) -> "SurfelMirror":
         """The geometry that `state_dict` was taken from."""
-        from panoless.geometry.registry import FAMILIES
         from panoless.splats.shading.geometry import ShadedMirror
         from panoless.splats.shading.occlusion import Occluder
 
-        start = content["started_on"]
-        started_on = None if start is None else FAMILIES[start[0]].geometry.from_state_dict(start[1])
-        poses = poses_from_plain(content)
         kind, primitives = (ShadedMirror, ShadedSurfels) if "shading" in content else (cls, Surfels)
         if content.get("occluder") is not None:
             content = {**content, "occluder": from_plain(Occluder, content["occluder"])}
         surfels = primitives(**content["surfels"])
-        return kind(**{**content, "surfels": surfels, "started_on": started_on, "poses": poses})
+        return kind(**{**content, "surfels": surfels})
 
 
 def _columns(names: Sequence[str], matrix: Tensor) -> dict[str, Tensor]:

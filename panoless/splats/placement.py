@@ -30,23 +30,22 @@ def hull_surfels(views: Views, config: SurfelConfig, seed: int, options: FirstSu
     hull = carve_hull(views, config.hull_resolution, config.hull_votes, options)
     surface = complete_surface(hull, views, options) if config.initial == "thin-plate" else hull_surface(hull)
     facing = _faces_some_camera(surface, views)
-    return surfels_on_mesh(surface, config, hull.pixel, seed, facing, hull)
+    return surfels_on_mesh(surface, config, seed, facing, hull)
 
 
 def surfels_on_mesh(
     surface: TriangleMesh,
     config: SurfelConfig,
-    pixel: float,
     seed: int,
-    facing: Bool[np.ndarray, "T"] | None = None,
-    hull: Hull | None = None,
+    facing: Bool[np.ndarray, "T"],
+    hull: Hull,
 ) -> Surfels:
-    """Surfels over the triangles of a mesh that are `facing`, or all, curved as it is, and within a hull if given."""
+    """Surfels over the triangles of a mesh that are `facing`, curved as it is, and within a hull."""
     vertex_normals, tensors = surface.vertex_normals(), surface.shape_tensors()
-    areas = np.linalg.norm(surface.area_vectors(), axis=1) / 2 * (1.0 if facing is None else facing)
+    areas = np.linalg.norm(surface.area_vectors(), axis=1) / 2 * facing
     face_normals = unit(vertex_normals[surface.triangles].sum(1))
     bends, _ = _principal(tensors[surface.triangles].mean(1), _tangent_frames(face_normals))
-    radii, largest = _radii(areas, bends, pixel, config)
+    radii, largest = _radii(areas, bends, hull.pixel, config)
     rng = np.random.default_rng(seed)
     expected = np.cumsum(areas / radii.prod(1))
     # Stratified over the cumulative number, and more than are needed, so that they can be spread.
@@ -59,9 +58,7 @@ def surfels_on_mesh(
     points, faces, shares = points[chosen], faces[chosen], shares[chosen]
     normals, tensors = (np.einsum("kv,kv...->k...", shares, values[faces]) for values in (vertex_normals, tensors))
     bends, frames = _principal(tensors, _tangent_frames(unit(normals)))
-    scales = np.minimum(_reach(bends, pixel, config), largest)
-    if hull is not None:
-        scales = _within_hull(hull, points, frames, scales, config)
+    scales = _within_hull(hull, points, frames, np.minimum(_reach(bends, hull.pixel, config), largest), config)
     return surfels_at(points, frames, scales, _shape_operators(tensors, frames))
 
 
@@ -133,23 +130,6 @@ def _principal(
     bends, directions = np.linalg.eigh((shape + shape.transpose(0, 2, 1)) / 2)
     tangent_u = np.einsum("kiu,ku->ki", tangents, directions[:, :, 0])
     return bends, np.stack([tangent_u, np.cross(frames[:, :, 2], tangent_u), frames[:, :, 2]], 2)
-
-
-def places_within(
-    boundary: Float[np.ndarray, "N 2"], config: SurfelConfig, seed: int
-) -> tuple[Float[np.ndarray, "K 2"], float]:
-    """Points of a hexagonal grid within an boundary, and the radius of surfels there."""
-    from skimage.measure import points_in_poly
-
-    low, extent = boundary.min(0), np.ptp(boundary, 0)
-    x, y = boundary.T
-    area = abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
-    across = math.sqrt(area / config.count / math.sin(math.pi / 3))
-    up = across * math.sin(math.pi / 3)
-    shift = np.random.default_rng(seed).random(2) - 1
-    row, column = np.indices((math.ceil(extent[1] / up) + 2, math.ceil(extent[0] / across) + 2)).reshape(2, -1)
-    grid = low + np.stack([(column + row % 2 / 2 + shift[0]) * across, (row + shift[1]) * up], 1)
-    return grid[points_in_poly(grid, boundary)], config.tuned.overlap * math.sqrt(area / config.count)
 
 
 def random_surfels(config: SurfelConfig, seed: int) -> Surfels:

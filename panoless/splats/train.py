@@ -10,13 +10,13 @@ from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.environment.cubemap import initial_environment
 from panoless.environment.visibility import accumulate
-from panoless.geometry.base import Training, TrainingObserver
 from panoless.splats.density import DensityStatistics, grow_and_prune, reset_opacities
 from panoless.splats.kernels.adam import UNBOUNDED
 from panoless.splats.mirror import SurfelMirror
 from panoless.splats.objective import LossTerms, generator_of
 from panoless.splats.optimizer import SurfelOptimizer
 from panoless.splats.schedule import Schedule
+from panoless.splats.training import Training, TrainingObserver
 from shinypartial.core.errors import InputError
 from shinypartial.io.progress import Progress
 

@@ -55,6 +55,8 @@ FORBIDDEN = {
     "metrics read files": ("shinypartial/metrics/image.py", "import shinypartial.io.images"),
     "kernels import a room": ("panoless/kernels/constants.py", "import panoless.splats.model"),
     "kernels import the benchmark": ("panoless/kernels/constants.py", "import shinypartial.core.sphere"),
+    "a kind imports splatting": ("panoless/geometry/plane/kind.py", "import panoless.splats.model"),
+    "kernels of splatting import a room": ("panoless/splats/kernels/constants.py", "import panoless.capture.views"),
     "the core looks up": ("shinypartial/core/conventions.py", "import shinypartial.io.files"),
 }
 

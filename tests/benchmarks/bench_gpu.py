@@ -196,11 +196,11 @@ def time_fit(surfels: Vase, camera: RasterCamera, device: torch.device) -> Row:
     from panoless.capture.object_frame import ObjectFrame
     from panoless.capture.views import TrainView, Views
     from panoless.config import FitConfig
-    from panoless.geometry.base import Training
-    from panoless.selection.held_out import Unobserved
     from panoless.splats.mirror import SurfelMirror
     from panoless.splats.model import Surfels
     from panoless.splats.train import SurfelTrainer
+    from panoless.splats.training import Training
+    from tests.support.surfel_training import Unobserved
 
     with torch.no_grad():
         picture = drawn(placed(surfels, device), camera, True)

@@ -15,13 +15,12 @@ import numpy as np
 from panoless.capture.configured import configured_views
 from panoless.config import FitConfig
 from panoless.presets import PRESETS
-from panoless.selection.held_out import Unobserved
-from panoless.splats.kind import SurfelFamily
-from panoless.splats.mirror import SurfelMirror
-from panoless.splats.placement import initial_surfels
+from panoless.splats.start import first_mirror, first_training
+from panoless.splats.train import train_surfels
 from shinypartial.dataset.bundled import bundled_dataset
 from shinypartial.dataset.read import open_dataset
 from shinypartial.io.files import write_json
+from tests.support.surfel_training import Unobserved
 
 NOTED_EVERY = 100
 
@@ -67,9 +66,8 @@ def watch(preset: str, steps: int, count: int) -> Flatness:
         density=replace(config.density, stop=1.0, max_surfels=2 * count),
     )
     views, config = configured_views(open_dataset(bundled_dataset("tiny-vase")), config)
-    mirror = SurfelMirror.of(initial_surfels(views, config.surfels, config.seed), config)
-    family, noted = SurfelFamily(), _MemoryWatch()
-    geometry, _ = family.train(views, mirror, family.begin(views, mirror, config), config, noted)
+    mirror, noted = first_mirror(views, config), _MemoryWatch()
+    geometry, _ = train_surfels(views, mirror, first_training(views, mirror, config), config, noted)
     resident = np.array(noted.resident)
     half = len(resident) // 2
     slope = np.polyfit(np.arange(half, len(resident)) * NOTED_EVERY / 1000, resident[half:], 1)[0]

@@ -15,7 +15,6 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -25,17 +24,13 @@ import numpy as np
 import torch
 
 from panoless.capture.views import Views, cropped, views_of
-from panoless.config import FitConfig
 from panoless.presets import PRESETS
-from panoless.selection.held_out import Unobserved
 from panoless.splats import train as train_module
-from panoless.splats.kind import SurfelFamily
-from panoless.splats.mirror import SurfelMirror
 from panoless.splats.optimizer import SurfelOptimizer
-from panoless.splats.placement import initial_surfels
 from panoless.splats.train import SurfelTrainer
 from shinypartial.core.camera import Camera
 from shinypartial.dataset.read import open_dataset, read_view
+from tests.support.surfel_training import new_trainer
 
 CASES = ((200, 5_000), (400, 8_000), (800, 50_000))
 NUM_VIEWS = 16
@@ -90,13 +85,6 @@ def make_trainer(dataset: Path, size: int, count: int, preset: str) -> SurfelTra
     return new_trainer(views, config)
 
 
-def new_trainer(views: Views, config: FitConfig) -> SurfelTrainer:
-    """A trainer before its first step."""
-    mirror = SurfelMirror.of(initial_surfels(views, config.surfels, config.seed), config)
-    return SurfelTrainer(views, mirror, SurfelFamily().begin(views, mirror, config), config, Unobserved())
-
-
-@contextmanager
 def stage_clock() -> Iterator[dict[str, list[float]]]:
     """Record the wall seconds of every stage of a step."""
     seconds: dict[str, list[float]] = defaultdict(list)

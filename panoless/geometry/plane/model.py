@@ -1,6 +1,6 @@
 """A planar mirror: one plane with an boundary, and what a camera sees of it.
 
-A surface of one normal needs neither surfels nor blending: coverage and depth are exact.
+A surface of one normal needs no blending: coverage and depth are exact.
 """
 
 from dataclasses import dataclass

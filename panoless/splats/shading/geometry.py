@@ -40,7 +40,7 @@ class ShadedMirror(SurfelMirror):
         """Primitives of the configured method where surfels are; the surfels themselves where they mirror."""
         if config.surfels.shading not in SHADINGS:
             return mirror
-        random = config.surfels.initial == "random" and mirror.started_on is None
+        random = config.surfels.initial == "random"
         surfels = SHADINGS[config.surfels.shading].begun(mirror.surfels, random=random)
         return cls(**{**vars(mirror), "surfels": surfels, "curved": False, "shading": config.surfels.shading})
 

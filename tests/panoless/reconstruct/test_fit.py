@@ -15,21 +15,18 @@ from panoless.capture.views import Views, load_views
 from panoless.config import FitConfig
 from panoless.environment.cubemap import look_up
 from panoless.export.render import render
-from panoless.geometry.base import Geometry, Training
+from panoless.geometry.base import Geometry
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.presets import PRESETS
 from panoless.reconstruct import fit as fit_module
 from panoless.reconstruct import recorder as recorder_module
 from panoless.reconstruct.fit import fit
 from panoless.reconstruct.state import FitState, load_state
-from panoless.selection.held_out import Unobserved
 from panoless.splats import objective
 from panoless.splats.kernels.objective import Objective
-from panoless.splats.kind import SurfelFamily
 from panoless.splats.mirror import SurfelMirror
 from panoless.splats.model import Surfels
 from panoless.splats.objective import LossTerms
-from panoless.splats.placement import initial_surfels
 from panoless.splats.schedule import phase_of
 from panoless.splats.train import SurfelTrainer, train_surfels
 from shinypartial.core.camera import Camera
@@ -38,18 +35,9 @@ from shinypartial.dataset.read import read_view
 from shinypartial.dataset.schema import Dataset
 from tests.panoless.conftest import FinishedFit
 from tests.support.mirror_sphere import clipped_environment, tiny_config
+from tests.support.surfel_training import Unobserved, begin, new_trainer
 
 ROOT = Path(__file__).resolve().parents[3]
-
-
-def begin(views: Views, config: FitConfig) -> tuple[SurfelMirror, Training]:
-    """Surfels and training before the first step."""
-    mirror = SurfelMirror.of(initial_surfels(views, config.surfels, config.seed), config)
-    return mirror, SurfelFamily().begin(views, mirror, config)
-
-
-def trainer_of(views: Views, config: FitConfig) -> SurfelTrainer:
-    return SurfelTrainer(views, *begin(views, config), config, Unobserved())
 
 
 def surfels_of(state: FitState) -> Surfels:
@@ -270,7 +258,7 @@ def test_another_seed_is_another_fit(tmp_path: Path, sphere_dataset: Dataset) ->
 
 def test_every_epoch_sees_every_view_once(views: Views) -> None:
     config = tiny_config(count=60)
-    trainer = trainer_of(views, config)
+    trainer = new_trainer(views, config)
     count = len(views.train)
     orders = [[trainer._view_index(epoch * count + i) for i in range(count)] for epoch in range(3)]
     assert all(sorted(order) == list(range(count)) for order in orders)
@@ -282,7 +270,7 @@ def test_rates_and_sizes_are_those_of_the_scene_that_they_are_shares_of(views: V
     here = tiny_config("paper", count=60)
     assert here.scene_radius == "cameras"
     there = replace(here, scene_radius="object")
-    first, second = (trainer_of(views, config) for config in (here, there))
+    first, second = (new_trainer(views, config) for config in (here, there))
     ratios = [
         first._density.dense_share / second._density.dense_share,
         first._density.prune_share / second._density.prune_share,

@@ -12,7 +12,6 @@ from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import load_views
 from panoless.cli import main
 from panoless.export.prediction import export_prediction, export_snapshots
-from panoless.geometry.base import Training
 from panoless.reconstruct import recorder as recorder_module
 from panoless.reconstruct.final_map import complete
 from panoless.reconstruct.fit import fit
@@ -28,6 +27,7 @@ from panoless.selection.candidates import Selection
 from panoless.splats.mirror import SurfelMirror
 from panoless.splats.objective import LossTerms
 from panoless.splats.train import SurfelTrainer
+from panoless.splats.training import Training
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
 from shinypartial.prediction.format import SNAPSHOTS, prediction_folders, read_info

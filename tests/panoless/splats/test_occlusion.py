@@ -11,10 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from panoless.capture.views import Views
-from panoless.geometry.base import Proposal
 from panoless.kernels.camera import RasterCamera
-from panoless.selection.held_out import Unobserved
-from panoless.splats.kind import SurfelFamily
 from panoless.splats.mirror import SurfelMirror
 from panoless.splats.shading.base import points_at
 from panoless.splats.shading.geometry import ShadedMirror
@@ -22,6 +19,7 @@ from panoless.splats.shading.objective import ShadedObjective, occluder_of
 from panoless.splats.shading.occlusion import DepthMap, Occluder, OccluderOptions
 from panoless.splats.train import SurfelTrainer
 from tests.panoless.splats.test_shading import method_config, mirrors, shell, sphere, world
+from tests.support.surfel_training import Unobserved, new_trainer
 
 BALLS = torch.tensor([[-0.45, 0.0, 0.0, 0.4], [0.45, 0.1, 0.0, 0.4]])
 """Centers and radii of two balls that mirror each other."""
@@ -183,10 +181,7 @@ def test_other_methods_hold_no_light_of_the_object(name: str, views: Views) -> N
 def test_a_fit_that_is_continued_traces_what_it_traced_before(views: Views) -> None:
     """The grid is made at steps of its own; between them it comes from the checkpoint."""
     config = method_config("ref-gaussian", iterations=40, count=150)
-    family = SurfelFamily()
-    start = family.fit(views, Proposal(None, 0.0, 1.0), config)
-    begun = start, family.begin(views, start, config)
-    whole = SurfelTrainer(views, *begun, config, Unobserved())  # type: ignore[arg-type]
+    whole = new_trainer(views, config)
     for _ in range(21):
         whole.step()
     stopped, training = whole.current()

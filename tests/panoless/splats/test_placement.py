@@ -9,7 +9,6 @@ import torch
 from panoless.capture.views import Views
 from panoless.config import FitConfig, SurfelConfig
 from panoless.first_surface.visual_hull import HULL_HALF_SIDE, carve_hull
-from panoless.geometry.plane.kind import PlaneMirror
 from panoless.splats.kernels.reference.rasterize import rotation_matrices
 from panoless.splats.model import Surfels
 from panoless.splats.placement import (
@@ -17,7 +16,6 @@ from panoless.splats.placement import (
     _reach,
     initial_surfels,
 )
-from tests.support.mirror_plane import L_SHAPE, NORMAL, RECTANGLE, plane_of
 
 CONFIG = SurfelConfig(count=800, hull_resolution=48)
 SAG_PX, LEAST_RADIUS_PX = CONFIG.tuned.sag_px, CONFIG.tuned.least_radius_px
@@ -130,32 +128,6 @@ def test_select_and_named_keep_rows_together(hull: Surfels) -> None:
     assert list(chosen.named()) == list(hull.named())
     for name, value in chosen.named().items():
         assert torch.equal(value, hull.named()[name][index])
-
-
-@pytest.mark.parametrize("boundary", [L_SHAPE, RECTANGLE], ids=["L", "rectangle"])
-@pytest.mark.parametrize("count", [300, 3000])
-def test_surfels_on_a_plane_fill_its_outline(boundary: np.ndarray, count: int) -> None:
-    """Flat, on the plane, within the boundary, evenly, and about as many as asked for, wherever the grid begins."""
-    from matplotlib.path import Path as PolygonPath
-    from scipy.spatial import cKDTree
-
-    plane = plane_of(boundary)
-    shifted = [PlaneMirror(plane).to_surfels(config_of(count, seed)).surfels for seed in range(4)]
-    assert all(abs(surfels.count - count) < 0.1 * count for surfels in shifted)
-    assert not torch.equal(shifted[0].means[:100], shifted[1].means[:100])
-    surfels = shifted[0]
-    points = surfels.means.double().numpy()
-    np.testing.assert_allclose(points @ NORMAL, plane.offset, atol=1e-6)
-    coordinates = np.stack([points @ plane.tangent_u, points @ plane.tangent_v], 1)
-    assert PolygonPath(boundary).contains_points(coordinates, radius=1e-6).all()
-    normals = rotation_matrices(surfels.quats)[:, :, 2].numpy()
-    np.testing.assert_allclose(normals, np.tile(NORMAL, (surfels.count, 1)), atol=1e-6)
-    assert not surfels.curvatures.any()
-    # A hexagonal grid of spacing a has a cell of a² sin 60° a point.
-    x, y = boundary.T
-    area = abs((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()) / 2
-    spacing = (area / count / np.sin(np.pi / 3)) ** 0.5
-    np.testing.assert_allclose(cKDTree(points).query(points, 2)[0][:, 1], spacing, rtol=1e-3)
 
 
 @pytest.mark.parametrize("bend", [2.0, 200.0])

@@ -9,13 +9,10 @@ from torch import Tensor
 
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig, config_from_dict
-from panoless.geometry.base import Proposal
 from panoless.geometry.exact import shade_centers
 from panoless.kernels.camera import RasterCamera
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.presets import PRESETS
-from panoless.selection.held_out import Unobserved
-from panoless.splats.kind import SurfelFamily
 from panoless.splats.mirror import SurfelMirror
 from panoless.splats.model import ShadedSurfels
 from panoless.splats.schedule import Schedule
@@ -27,6 +24,7 @@ from panoless.splats.shading.occlusion import Occluder, OccluderOptions
 from panoless.splats.shading.registry import SHADINGS
 from panoless.splats.train import SurfelTrainer
 from tests.support.mirror_sphere import sphere_surfels, tiny_config
+from tests.support.surfel_training import new_trainer
 
 METHODS = [name for name, config in PRESETS.items() if config.surfels.shading != "mirror"]
 FULL = 12.0
@@ -222,9 +220,7 @@ def test_schedules_are_shares_of_the_steps(preset: str, views: Views) -> None:
 
 def trained(preset: str, views: Views) -> tuple[SurfelMirror, SurfelTrainer]:
     config = method_config(preset)
-    family = SurfelFamily()
-    start = family.fit(views, Proposal(None, 0.0, 1.0), config)
-    trainer = SurfelTrainer(views, start, family.begin(views, start, config), config, Unobserved())  # type: ignore[arg-type]
+    trainer = new_trainer(views, config)
     losses = [float(trainer.step().total.detach()) for _ in range(config.iterations)]
     assert all(torch.isfinite(torch.tensor(losses)))
     return trainer.current()[0], trainer
@@ -257,9 +253,7 @@ def test_a_method_learns_a_mirror_ball(preset: str, views: Views) -> None:
     """From our first surface, in 300 steps without density control and resets; the loss of the first and last views."""
     config = method_config(preset, iterations=300, count=400)
     config = replace(config, density=replace(config.density, enabled=False))
-    family = SurfelFamily()
-    start = family.fit(views, Proposal(None, 0.0, 1.0), config)
-    trainer = SurfelTrainer(views, start, family.begin(views, start, config), config, Unobserved())  # type: ignore[arg-type]
+    trainer = new_trainer(views, config)
     losses = [trainer.step().photometric for _ in range(config.iterations)]
     count = len(views.train)
     first, last = sum(losses[:count]) / count, sum(losses[-count:]) / count

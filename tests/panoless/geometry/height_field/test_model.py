@@ -161,27 +161,6 @@ def test_only_planes_do_not_bend() -> None:
     assert abs(tilt @ curved.bending() @ tilt) < 1e-12
 
 
-def test_surfels_of_a_flat_height_field_are_those_of_its_plane() -> None:
-    mirrors = HeightFieldMirror(flat_height_field(PLANE, 8)), PlaneMirror(PLANE)
-    found, expected = (mirror.to_surfels(CONFIG).surfels for mirror in mirrors)
-    for name, values in expected.named().items():
-        torch.testing.assert_close(getattr(found, name), values)
-
-
-def test_surfels_have_the_normals_heights_and_curvatures_of_a_quadratic() -> None:
-    """h = ½ pᵀ B p has the gradient B p and the bending B everywhere."""
-    bend = np.array([[0.1, 0.03], [0.03, -0.08]])
-    surfels = HeightFieldMirror(parabolic(8, bend)).to_surfels(CONFIG).surfels
-    means = surfels.means.numpy().astype(np.float64)
-    p = coordinates_of(means)
-    slope = p @ bend
-    expected = NORMAL - slope[:, :1] * PLANE.tangent_u - slope[:, 1:] * PLANE.tangent_v
-    norm = np.linalg.norm(expected, axis=1, keepdims=True)
-    assert np.allclose(means @ NORMAL - PLANE.offset, (p @ bend * p).sum(1) / 2, atol=1e-6)
-    assert np.allclose(normals_of(surfels), expected / norm, atol=1e-6)
-    assert np.allclose(surfels.curvatures.numpy() * norm, [0.1, 0.03, -0.08], atol=1e-6)
-
-
 def test_the_mesh_lies_on_the_height_field_within_the_outline() -> None:
     height_field = bumpy(plane_of(L_SHAPE), 0.02)
     points, faces = height_field.quadrilaterals()
