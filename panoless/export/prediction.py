@@ -151,7 +151,7 @@ def export_prediction(
         albedo=None if state.reflectance is None else state.reflectance.scattered_share,
         roughness=state.roughness,
         blur_px=state.blur_px,
-        left_out=LEFT_OUT.get(config.surfels.shading),
+        left_out=LEFT_OUT.get(config.splats.surfels.shading),
         iteration=state.iteration if snapshot else None,
     )
     write_info(folder, info)

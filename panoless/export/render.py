@@ -57,7 +57,7 @@ def render(
         if reflectance is not None:
             tint = reflectance.share(buffers.cosines(camera))
             scattered = buffers.alpha * reflectance.scattering(normals)
-        radiance, albedo = compose(buffers.albedo, specular, buffers.alpha, config.alpha_applied), buffers.albedo
+        radiance, albedo = compose(buffers.albedo, specular, buffers.alpha, config.splats.alpha_applied), buffers.albedo
         if encoding.srgb:
             alpha = buffers.alpha.clamp(min=ALPHA_FLOOR)
             radiance, albedo = (alpha * encoding.decoded((part / alpha).clamp(0, 1)) for part in (radiance, albedo))

@@ -72,7 +72,7 @@ def _solved(
             sigmoid = config.environment.activation == "sigmoid"
             environment = torch.sigmoid(training.environment) if sigmoid else training.environment
             shown = environment
-        if config.visibility == "online" and training is not None:
+        if config.splats.visibility == "online" and training is not None:
             visibility = visibility_from_evidence(training.evidence)
         else:
             agreed = agreement(rays, shown, encoding.saturation, config.confidence)

@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from panoless.config import DensityConfig
 from panoless.splats.kernels.reference.rasterize import rotation_matrices
 from panoless.splats.model import Surfels
+from panoless.splats.options import DensityConfig
 
 SPLIT_INTO = 2
 SPLIT_SHRINK = 0.8 * SPLIT_INTO

@@ -49,8 +49,10 @@ class SurfelMirror:
     @classmethod
     def of(cls, surfels: Surfels, config: FitConfig) -> "SurfelMirror":
         """Surfels as a configuration takes them."""
-        loss = config.loss
-        return cls(surfels, config.surfels.curved, config.albedo, loss.roughness_weighted, loss.depth_blend)
+        loss = config.splats.loss
+        return cls(
+            surfels, config.splats.surfels.curved, config.splats.albedo, loss.roughness_weighted, loss.depth_blend
+        )
 
     @property
     def num_parameters(self) -> int:
@@ -117,7 +119,7 @@ class SurfelMirror:
         A trial map says which surfels to trust, and held-out views how fine the map should be, unless the
         configuration does; then all rays are solved.
         """
-        most, own = config.environment.rays, config.surfels.tuned
+        most, own = config.environment.rays, config.splats.surfels.tuned
         observed = [(view, *self.observe_covered(view, pixels)) for view, pixels in at_most_pixels(views, most)]
         resolution, few = config.environment.solve_resolution, most * own.trial_share
         trial_resolution = resolution or own.trial_resolution

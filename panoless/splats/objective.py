@@ -102,8 +102,8 @@ def composited(
     iteration: int,
 ) -> tuple[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"]]:
     """A picture, premultiplied at the given pixels and empty elsewhere, and the photograph, both over a background."""
-    background = view.radiance.new_full((3, 1), float(config.loss.white_background))
-    if config.loss.random_background:
+    background = view.radiance.new_full((3, 1), float(config.splats.loss.white_background))
+    if config.splats.loss.random_background:
         background = torch.rand(3, 1, generator=generator_of(config.seed, iteration, 1)).to(view.radiance)
     image = background.expand(3, view.mask.numel()).clone()
     image[:, pixels] = color + (1 - alpha) * background
@@ -120,9 +120,9 @@ class MirrorObjective:
         self._phases = dict[tuple[bool, float], Phase]()
         self._targets: MutableMapping[TrainView, Target] = WeakIdKeyDictionary()
         switches = {
-            "albedo": config.albedo,
-            "curvatures": config.surfels.curved,
-            "roughness_logits": config.loss.roughness_weighted,
+            "albedo": config.splats.albedo,
+            "curvatures": config.splats.surfels.curved,
+            "roughness_logits": config.splats.loss.roughness_weighted,
         }
         always = {"means", "quats", "log_scales", "opacity_logits"}
         self.learned = frozenset(always | {name for name, learned in switches.items() if learned})
@@ -141,7 +141,7 @@ class MirrorObjective:
             raster = rasterize_surfels(
                 surfels,
                 view.camera,
-                curved=self.config.surfels.curved,
+                curved=self.config.splats.surfels.curved,
                 screen_offsets=offsets,
                 channels=phase.channels,
                 active_tiles=_active_tiles(target, phase),
@@ -151,7 +151,7 @@ class MirrorObjective:
             raster.alpha,
             raster.accumulated_depth,
             raster.median_depth,
-            raster.colors if self.config.albedo else None,
+            raster.colors if self.config.splats.albedo else None,
             environment,
             target.mirror,
             phase.terms,
@@ -163,9 +163,9 @@ class MirrorObjective:
             error = self._composited_error(view, raster, surfels, environment, pixels, iteration)
             total, photometric = total + error, float(error.detach())
         if phase.channels.distortion:
-            total = total + self.config.loss.lambda_distortion * raster.distortion.mean()
+            total = total + self.config.splats.loss.lambda_distortion * raster.distortion.mean()
         observed = None
-        if self.config.visibility == "online":
+        if self.config.splats.visibility == "online":
             with torch.no_grad():
                 directions = mirrored_directions(view.camera, pixels, raster.normals_camera.flatten(1)[:, pixels])
                 observed = Observed(directions, raster.alpha.flatten()[pixels])
@@ -212,11 +212,11 @@ class MirrorObjective:
         alpha = buffers.alpha.flatten()[pixels]
         directions = mirrored_directions(view.camera, pixels, buffers.normals_camera.flatten(1)[:, pixels])
         specular = look_up(environment, directions, self.config.environment.activation).T
-        if self.config.loss.roughness_weighted:
+        if self.config.splats.loss.roughness_weighted:
             specular = specular * (1 - self._roughness(view, surfels).flatten()[pixels]).square()
-        color = compose(buffers.colors.flatten(1)[:, pixels], specular, alpha, self.config.alpha_applied)
+        color = compose(buffers.colors.flatten(1)[:, pixels], specular, alpha, self.config.splats.alpha_applied)
         image, target = composited(color, alpha, pixels, view, self.config, iteration)
-        return photometric_paper(image, target, self.config.loss.lambda_ssim)
+        return photometric_paper(image, target, self.config.splats.loss.lambda_ssim)
 
     def _roughness(self, view: TrainView, surfels: Surfels) -> Float[Tensor, "H W"]:
         roughness = torch.sigmoid(surfels.roughness_logits)[:, None].expand(-1, 3).contiguous()

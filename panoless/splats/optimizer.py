@@ -7,9 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from panoless.config import RateConfig
 from panoless.splats.kernels.adam import UNBOUNDED, AdamTensor, adam_step
 from panoless.splats.model import Surfels
+from panoless.splats.options import RateConfig
 
 MOMENTUM = 0.9
 EPSILON = 1e-12

@@ -8,12 +8,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from panoless.capture.views import Views
-from panoless.config import SurfelConfig
 from panoless.first_surface.completion import complete_surface, hull_surface
 from panoless.first_surface.mesh import TriangleMesh, unit
 from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.first_surface.visual_hull import Hull, carve_hull
 from panoless.splats.model import Surfels
+from panoless.splats.options import SurfelConfig
 
 TIE_TOLERANCE = 1e-6
 INITIAL_OPACITY_LOGIT = 2.2
@@ -27,7 +27,7 @@ def hull_surfels(views: Views, config: SurfelConfig, seed: int, options: FirstSu
     `thin-plate` takes the completed hull, `hull` the hull itself. Axes follow the principal directions; a radius is
     at most that of `_reach`, so that strong curvature gets smaller surfels, and more of them.
     """
-    hull = carve_hull(views, config.hull_resolution, config.hull_votes, options)
+    hull = carve_hull(views, options.hull_resolution, options.hull_votes, options)
     surface = complete_surface(hull, views, options) if config.initial == "thin-plate" else hull_surface(hull)
     facing = _faces_some_camera(surface, views)
     return surfels_on_mesh(surface, config, seed, facing, hull)

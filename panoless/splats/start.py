@@ -17,7 +17,7 @@ from panoless.splats.training import Training
 @remembered(lambda *_: "Stage 1 of 1: surfels")
 def first_mirror(views: Views, config: FitConfig) -> SurfelMirror:
     """Surfels on the first surface or at random, as the configured method shades them."""
-    surfels = initial_surfels(views, config.surfels, config.seed, config.first_surface)
+    surfels = initial_surfels(views, config.splats.surfels, config.seed, config.first_surface)
     return ShadedMirror.begun(SurfelMirror.of(surfels, config), config)
 
 
@@ -28,6 +28,6 @@ def first_training(views: Views, mirror: SurfelMirror, config: FitConfig) -> Tra
     length = environment.shape[-1]
     if config.environment.solve and config.environment.activation == "clamp":
         with torch.no_grad():
-            rays = list(observe_views(views, mirror, config.surfels.tuned.initial_rays))
+            rays = list(observe_views(views, mirror, config.splats.surfels.tuned.initial_rays))
             environment = resample(solve_environment(rays, length // 2), length)
     return Training(environment, environment.new_zeros(6, length, length))

@@ -28,8 +28,8 @@ def train_surfels(
 ) -> tuple[SurfelMirror, Training]:
     """Take the steps that remain."""
     trainer = SurfelTrainer(views, mirror, training, config, observer)
-    progress = Progress(observer.title, config.iterations, training.iteration)
-    while trainer.iteration < config.iterations:
+    progress = Progress(observer.title, config.splats.iterations, training.iteration)
+    while trainer.iteration < config.splats.iterations:
         start = time.monotonic()
         terms = trainer.step()
         observer.after_step(trainer.iteration, time.monotonic() - start, trainer.current)
@@ -49,10 +49,10 @@ class SurfelTrainer:
         self.schedule = Schedule(config)
         self._epoch, self._order = -1, list[int]()
         self._brightest = max(1.0, *(float(view.radiance.max()) for view in views.train))
-        unit = views.camera_extent if config.scene_radius == "cameras" else 1.0
-        rates = replace(config.rates, means=config.rates.means * unit)
-        shares = config.density.dense_share * unit, config.density.prune_share * unit
-        self._density = replace(config.density, dense_share=shares[0], prune_share=shares[1])
+        unit = views.camera_extent if config.splats.scene_radius == "cameras" else 1.0
+        rates = replace(config.splats.rates, means=config.splats.rates.means * unit)
+        shares = config.splats.density.dense_share * unit, config.splats.density.prune_share * unit
+        self._density = replace(config.splats.density, dense_share=shares[0], prune_share=shares[1])
         self.optimizer = SurfelOptimizer(mirror.surfels, training.environment, rates)
         self.statistics = DensityStatistics.empty(mirror.surfels.count, mirror.surfels.means.device)
         if training.optimizer:
@@ -70,7 +70,7 @@ class SurfelTrainer:
         optimizer = {"adam": self.optimizer.state_dict(), "gradients": gradients}
         environment = self.optimizer.environment.detach()
         training = Training(environment, self.evidence, self.iteration, optimizer)
-        share = self.iteration / self.config.iterations
+        share = self.iteration / self.config.splats.iterations
         return self._mirror.at(self.optimizer.surfels.detached(), share, self._objective), training
 
     def step(self) -> LossTerms:
@@ -84,7 +84,7 @@ class SurfelTrainer:
         view = self.views.train[self._view_index(iteration)]
         surfels = self.optimizer.surfels
         offsets = None
-        if self.config.density.enabled:
+        if self.config.splats.density.enabled:
             offsets = torch.zeros_like(surfels.means[:, :2], requires_grad=True)
         step = self._objective.evaluate(view, surfels, self.optimizer.environment, iteration, offsets)
         step.terms.total.backward()  # type: ignore[no-untyped-call]
@@ -105,7 +105,9 @@ class SurfelTrainer:
             environment_bounds=(0, self._brightest) if self.config.environment.activation == "clamp" else UNBOUNDED,
         )
         if step.observed is not None:
-            accumulate(self.evidence, step.observed.directions, step.observed.alpha, self.config.visibility_alpha)
+            accumulate(
+                self.evidence, step.observed.directions, step.observed.alpha, self.config.splats.visibility_alpha
+            )
         self._control_density(iteration)
         if iteration % CURVE_EVERY == 0:
             self._record(iteration, step.terms)

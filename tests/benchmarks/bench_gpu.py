@@ -227,7 +227,7 @@ def time_fit(surfels: Vase, camera: RasterCamera, device: torch.device) -> Row:
     training = Training(environment, torch.zeros(6, length, length, device=device))
     views = Views((view,), ObjectFrame(torch.zeros(3).numpy(), 1.0), camera.near)
     trainer = SurfelTrainer(views, SurfelMirror(parameters), training, config, Unobserved())
-    warm = round(config.environment.warmup * config.iterations) + 1
+    warm = round(config.environment.warmup * config.splats.iterations) + 1
 
     def step() -> None:
         trainer._step(warm)

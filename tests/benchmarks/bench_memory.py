@@ -58,12 +58,16 @@ def watch(preset: str, steps: int, count: int) -> Flatness:
     config: FitConfig = PRESETS[preset]
     config = replace(
         config,
-        iterations=steps,
+        splats=replace(
+            config.splats,
+            iterations=steps,
+            surfels=replace(config.splats.surfels, count=count),
+            density=replace(config.splats.density, stop=1.0, max_surfels=2 * count),
+        ),
         downscale=2,
         least_object_px=0.0,
-        surfels=replace(config.surfels, count=count, hull_resolution=40),
+        first_surface=replace(config.first_surface, hull_resolution=40),
         environment=replace(config.environment, resolution=32, rays=100_000),
-        density=replace(config.density, stop=1.0, max_surfels=2 * count),
     )
     views, config = configured_views(open_dataset(bundled_dataset("tiny-vase")), config)
     mirror, noted = first_mirror(views, config), _MemoryWatch()

@@ -80,7 +80,7 @@ def resampled_views(dataset: Path, size: int, crop_margin_px: int, count: int = 
 def make_trainer(dataset: Path, size: int, count: int, preset: str) -> SurfelTrainer:
     """A fit right after its warm-up, when all terms act."""
     config = PRESETS[preset]
-    config = replace(config, surfels=replace(config.surfels, count=count))
+    config = replace(config, splats=replace(config.splats, surfels=replace(config.splats.surfels, count=count)))
     views = resampled_views(dataset, size, config.crop_margin_px)
     return new_trainer(views, config)
 
@@ -117,7 +117,7 @@ def stage_clock() -> Iterator[dict[str, list[float]]]:
 def measure(dataset: Path, size: int, count: int, steps: int, preset: str) -> StepTiming:
     """Time the steps of one case."""
     trainer = make_trainer(dataset, size, count, preset)
-    first = round(1.5 * trainer.config.environment.warmup * trainer.config.iterations)
+    first = round(1.5 * trainer.config.environment.warmup * trainer.config.splats.iterations)
     for iteration in range(first, first + WARM_UP_STEPS):
         trainer._step(iteration)
     wall, cpu = [], []

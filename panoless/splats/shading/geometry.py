@@ -38,11 +38,11 @@ class ShadedMirror(SurfelMirror):
     @classmethod
     def begun(cls, mirror: SurfelMirror, config: FitConfig) -> SurfelMirror:
         """Primitives of the configured method where surfels are; the surfels themselves where they mirror."""
-        if config.surfels.shading not in SHADINGS:
+        if config.splats.surfels.shading not in SHADINGS:
             return mirror
-        random = config.surfels.initial == "random"
-        surfels = SHADINGS[config.surfels.shading].begun(mirror.surfels, random=random)
-        return cls(**{**vars(mirror), "surfels": surfels, "curved": False, "shading": config.surfels.shading})
+        random = config.splats.surfels.initial == "random"
+        surfels = SHADINGS[config.splats.surfels.shading].begun(mirror.surfels, random=random)
+        return cls(**{**vars(mirror), "surfels": surfels, "curved": False, "shading": config.splats.surfels.shading})
 
     @property
     def num_parameters(self) -> int:

@@ -49,7 +49,8 @@ class ShadedObjective:
         offsets: Float[Tensor, "K 2"] | None,
     ) -> Step:
         """The objective over all pixels of the picture."""
-        primitives, loss, share = cast(ShadedSurfels, surfels), self._config.loss, iteration / self._config.iterations
+        primitives, loss = cast(ShadedSurfels, surfels), self._config.splats.loss
+        share = iteration / self._config.splats.iterations
         sigmoid = self._config.environment.activation == "sigmoid"
         light = torch.sigmoid(environment) if sigmoid else environment
         self._renew_occluder(primitives, iteration)
@@ -76,7 +77,7 @@ class ShadedObjective:
     def propagated(self, surfels: Surfels, iteration: int) -> Surfels:
         """As the method has it."""
         generator = generator_of(self._config.seed, iteration, 4)
-        share = iteration / self._config.iterations
+        share = iteration / self._config.splats.iterations
         return self._shading.propagated(cast(ShadedSurfels, surfels), share, generator)
 
     def restarts(self, iteration: int) -> bool:

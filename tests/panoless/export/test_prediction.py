@@ -68,12 +68,12 @@ def prediction(finished: FinishedFit, tmp_path_factory: pytest.TempPathFactory) 
 def test_the_readers_accept_the_prediction(prediction: Path, finished: FinishedFit) -> None:
     info = read_info(prediction)
     assert info.dataset_hash == dataset_hash(finished.dataset)
-    assert info.config["surfels"]["count"] == finished.config.surfels.count
+    assert info.config["splats"]["surfels"]["count"] == finished.config.splats.surfels.count
     assert info.primitives == finished.state.geometry.num_primitives
     files = (prediction / "surfels.ply", prediction / "environment.exr")
     assert info.model_bytes == sum(path.stat().st_size for path in files)
     assert info.iteration is None
-    assert sum(info.parameter_counts.values()) == 13 * finished.config.surfels.count + 6 * 3 * 24 * 24
+    assert sum(info.parameter_counts.values()) == 13 * finished.config.splats.surfels.count + 6 * 3 * 24 * 24
     assert info.peak_memory_bytes > 1e7
     assert set(info.seconds) >= {"read views", "initialize", "optimize", "solve environment"}
     assert all(len(series) == len(info.curves["iteration"]) for series in info.curves.values())

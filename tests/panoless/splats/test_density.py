@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from panoless.config import DensityConfig, RateConfig
 from panoless.splats.density import (
     PROPAGATED_OPACITY,
     PROPAGATION_GROWTH,
@@ -20,6 +19,7 @@ from panoless.splats.density import (
 from panoless.splats.kernels.reference.rasterize import rotation_matrices
 from panoless.splats.model import Surfels
 from panoless.splats.optimizer import SurfelOptimizer
+from panoless.splats.options import DensityConfig, RateConfig
 from tests.support.mirror_sphere import sphere_surfels
 
 CONFIG = DensityConfig(enabled=True, gradient_threshold=1e-3, dense_share=0.05)

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from panoless.config import RateConfig
 from panoless.splats.kernels.adam import AdamTensor, adam_step
 from panoless.splats.optimizer import EPSILON, MOMENTUM, SurfelOptimizer
+from panoless.splats.options import RateConfig
 from tests.support.mirror_sphere import sphere_surfels
 
 RATES = RateConfig()

@@ -7,22 +7,24 @@ import pytest
 import torch
 
 from panoless.capture.views import Views
-from panoless.config import FitConfig, SurfelConfig
+from panoless.config import FitConfig
+from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.first_surface.visual_hull import HULL_HALF_SIDE, carve_hull
 from panoless.splats.kernels.reference.rasterize import rotation_matrices
 from panoless.splats.model import Surfels
+from panoless.splats.options import SurfelConfig
 from panoless.splats.placement import (
     _radii,
     _reach,
     initial_surfels,
 )
 
-CONFIG = SurfelConfig(count=800, hull_resolution=48)
+CONFIG, FIRST = SurfelConfig(count=800), FirstSurfaceOptions(hull_resolution=48)
 SAG_PX, LEAST_RADIUS_PX = CONFIG.tuned.sag_px, CONFIG.tuned.least_radius_px
 
 
 def config_of(count: int, seed: int) -> FitConfig:
-    return replace(FitConfig(), surfels=SurfelConfig(count=count), seed=seed)
+    return replace(FitConfig(), splats=replace(FitConfig().splats, surfels=SurfelConfig(count=count)), seed=seed)
 
 
 VOXEL = 2 * HULL_HALF_SIDE / 47
@@ -30,7 +32,7 @@ VOXEL = 2 * HULL_HALF_SIDE / 47
 
 @pytest.fixture(scope="module")
 def hull(views: Views) -> Surfels:
-    return initial_surfels(views, CONFIG, seed=0)
+    return initial_surfels(views, CONFIG, 0, FIRST)
 
 
 def radial(surfels: Surfels, views: Views) -> tuple[torch.Tensor, torch.Tensor, float]:
@@ -159,8 +161,8 @@ def test_strong_curvature_gets_smaller_surfels_and_more_of_them_across_it_only()
 def test_no_surfel_reaches_far_out_of_the_hull(views: Views) -> None:
     """Disks at twice the radius stay within a pixel, or are as small as surfels start."""
     surfels, carved = (
-        initial_surfels(views, CONFIG, seed=0),
-        carve_hull(views, CONFIG.hull_resolution, CONFIG.hull_votes),
+        initial_surfels(views, CONFIG, 0, FIRST),
+        carve_hull(views, FIRST.hull_resolution, FIRST.hull_votes),
     )
     frames, radii = rotation_matrices(surfels.quats).double().numpy(), surfels.scales.double().numpy()
     points = surfels.means.double().numpy()

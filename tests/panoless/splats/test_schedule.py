@@ -17,20 +17,23 @@ PERIODIC = ("density_round", "opacity_reset", "propagation")
 def events(config: FitConfig, name: str) -> list[int]:
     """Iterations after which something happens."""
     ask = getattr(Schedule(config), name)
-    return [iteration for iteration in range(config.iterations) if ask(iteration)]
+    return [iteration for iteration in range(config.splats.iterations) if ask(iteration)]
 
 
 @pytest.mark.parametrize("name", PERIODIC)
 @pytest.mark.parametrize("times", [2, 3])
 def test_periodic_events_scale_with_the_length(name: str, times: int) -> None:
-    config = replace(PRESETS["paper"], iterations=4500)
-    longer = replace(config, iterations=4500 * times)
+    config = replace(PRESETS["paper"], splats=replace(PRESETS["paper"].splats, iterations=4500))
+    longer = replace(config, splats=replace(config.splats, iterations=4500 * times))
     assert events(longer, name) == [times * iteration for iteration in events(config, name)] != []
 
 
-@pytest.mark.parametrize("preset", [name for name, each in PRESETS.items() if each.surfels.shading == "mirror"])
+@pytest.mark.parametrize("preset", [name for name, each in PRESETS.items() if each.splats.surfels.shading == "mirror"])
 def test_phases_scale_with_the_length(preset: str) -> None:
-    short, long = (Schedule(replace(PRESETS[preset], iterations=iterations)) for iterations in (3000, 6000))
+    short, long = (
+        Schedule(replace(PRESETS[preset], splats=replace(PRESETS[preset].splats, iterations=iterations)))
+        for iterations in (3000, 6000)
+    )
     for iteration in range(3000):
         for name in ("geometry_moves", "lambda_silhouette"):
             assert getattr(long, name)(2 * iteration) == getattr(short, name)(iteration)
@@ -42,12 +45,12 @@ def test_phases_scale_with_the_length(preset: str) -> None:
 def test_the_paper_preset_has_the_published_schedule() -> None:
     config = PRESETS["paper"]
     schedule = Schedule(config)
-    assert config.iterations == 45_000
+    assert config.splats.iterations == 45_000
     assert events(config, "density_round") == list(range(500, 12_000, 100))
     assert events(config, "opacity_reset") == [3000, 6000, 9000]
     assert (schedule.lambda_silhouette(2999), schedule.lambda_silhouette(3000)) == (1.0, 0.0)
     assert schedule.geometry_moves(0)
-    assert (config.rates.square_memory, config.scene_radius) == (0.999, "cameras")
+    assert (config.splats.rates.square_memory, config.splats.scene_radius) == (0.999, "cameras")
     assert {schedule.rate_factor(iteration) for iteration in (0, 20_000, 44_999)} == {1.0}
 
 
@@ -68,41 +71,53 @@ def test_propagation_never_meets_a_reset() -> None:
     config = PRESETS["paper"]
     propagations = events(config, "propagation")
     assert propagations == [1000, 2000]
-    longer = replace(config, density=replace(config.density, propagate_until=1.0))
+    longer = replace(config, splats=replace(config.splats, density=replace(config.splats.density, propagate_until=1.0)))
     propagations = events(longer, "propagation")
     assert propagations == [1000, 2000, 4000, 5000, 7000, 8000, 10_000, 11_000]
     assert not set(propagations) & set(events(config, "opacity_reset"))
 
 
 def test_nothing_happens_without_density_control() -> None:
-    config = replace(PRESETS["paper"], iterations=4500, density=replace(PRESETS["paper"].density, enabled=False))
+    config = replace(
+        PRESETS["paper"],
+        splats=replace(
+            PRESETS["paper"].splats, iterations=4500, density=replace(PRESETS["paper"].splats.density, enabled=False)
+        ),
+    )
     assert [events(config, name) for name in PERIODIC] == [[], [], []]
 
 
 def test_propagation_can_be_turned_off() -> None:
-    config = replace(PRESETS["paper"], iterations=4500, density=replace(PRESETS["paper"].density, propagate_every=0.0))
+    config = replace(
+        PRESETS["paper"],
+        splats=replace(
+            PRESETS["paper"].splats,
+            iterations=4500,
+            density=replace(PRESETS["paper"].splats.density, propagate_every=0.0),
+        ),
+    )
     assert events(config, "propagation") == []
 
 
 def test_the_rates_are_constant_and_then_fall_to_the_drop_factor() -> None:
-    config = replace(PRESETS["default"], iterations=1000)
+    config = replace(PRESETS["default"], splats=replace(PRESETS["default"].splats, iterations=1000))
     factors = [Schedule(config).rate_factor(iteration) for iteration in range(1000)]
-    drop = round(config.rates.drop_at * 1000)
+    drop = round(config.splats.rates.drop_at * 1000)
     assert set(factors[:drop]) == {1.0}
     assert all(after <= before for before, after in pairwise(factors))
-    assert factors[-1] == pytest.approx(config.rates.drop_factor)
+    assert factors[-1] == pytest.approx(config.splats.rates.drop_factor)
 
 
 def test_even_the_shortest_fit_has_a_schedule() -> None:
     for iterations in (1, 2, 7):
         for config in PRESETS.values():
             for name in PERIODIC:
-                events(replace(config, iterations=iterations), name)
+                events(replace(config, splats=replace(config.splats, iterations=iterations)), name)
 
 
 @pytest.mark.parametrize("iterations", [450, 4500, 45000])
 def test_nothing_faint_is_pruned_right_after_a_reset(iterations: int) -> None:
-    config = replace(PRESETS["paper"], iterations=iterations)
+    config = replace(PRESETS["paper"], splats=replace(PRESETS["paper"].splats, iterations=iterations))
     schedule, resets = Schedule(config), events(config, "opacity_reset")
     assert resets
     steps = min(100, round(iterations * 3000 / 45000) // 2)

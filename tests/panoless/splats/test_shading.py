@@ -26,15 +26,17 @@ from panoless.splats.train import SurfelTrainer
 from tests.support.mirror_sphere import sphere_surfels, tiny_config
 from tests.support.surfel_training import new_trainer
 
-METHODS = [name for name, config in PRESETS.items() if config.surfels.shading != "mirror"]
+METHODS = [name for name, config in PRESETS.items() if config.splats.surfels.shading != "mirror"]
 FULL = 12.0
 """A logit that the sigmoid takes to 1 but for 6e-6."""
 
 
 def method_config(preset: str, iterations: int = 20, count: int = 200) -> FitConfig:
     config = tiny_config(preset, iterations, count)
-    surfels = replace(config.surfels, initial="thin-plate")
-    return replace(config, surfels=surfels, environment=replace(config.environment, resolution=16))
+    surfels = replace(config.splats.surfels, initial="thin-plate")
+    return replace(
+        config, splats=replace(config.splats, surfels=surfels), environment=replace(config.environment, resolution=16)
+    )
 
 
 def world(resolution: int = 16) -> Tensor:
@@ -202,8 +204,8 @@ def test_schedules_are_shares_of_the_steps(preset: str, views: Views) -> None:
     """At the published number of steps events fall where the papers' code has them; they scale with it."""
     config = PRESETS[preset]
     schedule = Schedule(config)
-    objective = ShadedObjective(SHADINGS[config.surfels.shading], views, config)
-    steps = range(0, config.iterations, 250)
+    objective = ShadedObjective(SHADINGS[config.splats.surfels.shading], views, config)
+    steps = range(0, config.splats.iterations, 250)
     rounds = [step for step in steps if schedule.propagation(step)]
     if preset == "gaussian-shader":
         assert not rounds
@@ -213,7 +215,7 @@ def test_schedules_are_shares_of_the_steps(preset: str, views: Views) -> None:
         assert rounds[-1] == last
         assert schedule.resting(rounds[0] + 1) == schedule.resting(rounds[0] + 200) == {"opacity_logits"}
         assert not schedule.resting(rounds[0] + 201)
-    restarts = [step for step in range(config.iterations) if step % 1000 == 0 and objective.restarts(step)]
+    restarts = [step for step in range(config.splats.iterations) if step % 1000 == 0 and objective.restarts(step)]
     assert restarts == ([18_000] if preset == "ref-gaussian" else [])
     assert config_from_dict(json.loads(json.dumps(asdict(config)))) == config
 
@@ -221,7 +223,7 @@ def test_schedules_are_shares_of_the_steps(preset: str, views: Views) -> None:
 def trained(preset: str, views: Views) -> tuple[SurfelMirror, SurfelTrainer]:
     config = method_config(preset)
     trainer = new_trainer(views, config)
-    losses = [float(trainer.step().total.detach()) for _ in range(config.iterations)]
+    losses = [float(trainer.step().total.detach()) for _ in range(config.splats.iterations)]
     assert all(torch.isfinite(torch.tensor(losses)))
     return trainer.current()[0], trainer
 
@@ -252,9 +254,9 @@ def test_logits_are_those_of_shares() -> None:
 def test_a_method_learns_a_mirror_ball(preset: str, views: Views) -> None:
     """From our first surface, in 300 steps without density control and resets; the loss of the first and last views."""
     config = method_config(preset, iterations=300, count=400)
-    config = replace(config, density=replace(config.density, enabled=False))
+    config = replace(config, splats=replace(config.splats, density=replace(config.splats.density, enabled=False)))
     trainer = new_trainer(views, config)
-    losses = [trainer.step().photometric for _ in range(config.iterations)]
+    losses = [trainer.step().photometric for _ in range(config.splats.iterations)]
     count = len(views.train)
     first, last = sum(losses[:count]) / count, sum(losses[-count:]) / count
     # 0.43 measured for 3dgs-dr, whose strength has far to go, 0.14 to 0.28 for the others.

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 
 from panoless.capture.rays import pixel_rays, reflect
-from panoless.config import FitConfig, SurfelConfig
+from panoless.config import FitConfig
 from panoless.geometry.height_field.kind import HeightFieldMirror
 from panoless.geometry.height_field.model import (
     HeightField,
@@ -22,10 +22,11 @@ from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.plane.model import plane_buffers, unoccluded_share
 from panoless.splats.kernels.reference.rasterize import rotation_matrices
 from panoless.splats.model import Surfels
+from panoless.splats.options import SurfelConfig
 from tests.support.mirror_height_field import bumpy
 from tests.support.mirror_plane import L_SHAPE, NORMAL, RECTANGLE, arc, mirror_views, plane_of, train_view
 
-CONFIG = replace(FitConfig(), surfels=SurfelConfig(count=300))
+CONFIG = replace(FitConfig(), splats=replace(FitConfig().splats, surfels=SurfelConfig(count=300)))
 PLANE = plane_of(RECTANGLE)
 
 

@@ -24,10 +24,13 @@ def test_a_fit_ends_as_on_the_cpu(
     config = tiny_config(preset, iterations=2, count=30)
     config = replace(
         config,
+        splats=replace(
+            config.splats,
+            density=replace(config.splats.density, enabled=False),
+        ),
         model="surfels",
+        first_surface=replace(config.first_surface, hull_resolution=16),
         downscale=2,
-        density=replace(config.density, enabled=False),
-        surfels=replace(config.surfels, hull_resolution=16),
         environment=replace(config.environment, resolution=8, solve_resolution=8, warmup=0.0),
     )
     monkeypatch.setattr(cubemap, "ROBUST_SCALES", (None,))
