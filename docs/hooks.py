@@ -98,7 +98,7 @@ def option_tables() -> Iterator[str]:
     loader.resolve_aliases()
     groups = sorted(option_groups(package["config.FitConfig"], "", tuned=False), key=lambda group: group[2])
     for group, prefix, tuned in groups:
-        place = "" if tuned else "--config."
+        place, prefix = "" if tuned else "--config.", prefix.replace("splats.", "")
         title = f"--set {prefix}…=" if tuned else f"--config.{prefix}…"
         yield f"\n### `{title}`\n\n{text_of(group)}\n\n| Option | Default | Meaning |\n| --- | --- | --- |"
         for item in group.attributes.values():
@@ -114,13 +114,13 @@ def option_groups(group: griffe.Class, prefix: str, *, tuned: bool) -> Iterator[
     for item in group.attributes.values():
         nested = nested_options(group, item)
         if nested is not None:
-            hidden = tuned or str(item.annotation).startswith("Tuned[")
+            hidden = tuned or str(item.annotation).startswith("Tuned[") or "Suppress" in str(item.annotation)
             yield from option_groups(nested, f"{prefix}{item.name}.", tuned=hidden)
 
 
 def nested_options(group: griffe.Class, item: griffe.Attribute) -> griffe.Class | None:
     """The class of options that a field holds, or None for a value."""
-    name = str(item.annotation).removeprefix("Tuned[").removesuffix("]")
+    name = re.sub(r"^(?:Tuned|Annotated)\[(\w+).*", r"\1", str(item.annotation))
     found = group.module.members.get(name) if name.endswith(("Config", "Options")) else None
     return found.final_target if found is not None and found.is_alias else found  # type: ignore[return-value]
 

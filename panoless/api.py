@@ -155,7 +155,7 @@ def fit(
     prediction = prediction_folder(data, config, output)
     run_folder = RUNS / prediction.resolve().name
     place = find_device(device)
-    schedule = snapshot_schedule(snapshots, snapshot_seconds, config.iterations)
+    schedule = snapshot_schedule(snapshots, snapshot_seconds, config.splats.iterations)
     refuse_run_folder(prediction, run_folder)
     with folder_lock(prediction):
         acquire_prediction(prediction)

@@ -144,7 +144,7 @@ class Export:
                 expected=f"a finished run in {folder}",
                 found=f"no {CHECKPOINT}"
                 if state is None
-                else f"{state.iteration} of {description.config.iterations} iterations",
+                else f"{state.iteration} of {description.config.splats.iterations} iterations",
                 remedy="Run the same `panoless fit` command again: it continues where it stopped.",
             )
         if self.snapshots and state.training is None:

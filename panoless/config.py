@@ -29,8 +29,8 @@ from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.options import PlaneOptions
 from panoless.geometry.revolution.options import RevolutionOptions
 from panoless.geometry.sphere.options import SphereOptions
-from panoless.geometry.surfels.options import SurfelOptions
 from panoless.selection.options import CorrectionOptions, SelectionOptions
+from panoless.splats.options import SplatConfig
 from panoless.trust.options import TrustOptions
 from shinypartial.core.errors import InputError
 from shinypartial.io.records import (
@@ -52,26 +52,6 @@ SPLIT_SUM = ("gaussian-shader", "ref-gaussian", "material-refgs")
 Model = Literal["auto", "sphere", "plane", "height_field", "revolution", "free_form", "surfels"]
 #: Values of --model that an earlier version had, and today's.
 RENAMED_MODELS = {"bent": "height_field"}
-
-
-@dataclass(frozen=True)
-class SurfelConfig:
-    """The set of surfels and how it starts."""
-
-    initial: Literal["thin-plate", "hull", "random"] = "thin-plate"
-    """`thin-plate`: on the visual hull where outlines touch the object, continued smoothly where none does;
-    `hull`: on the visual hull of the masks; `random`: uniformly in the normalized cube, as the paper's code does."""
-    count: Count = 6000
-    """Number of surfels at the start; denser where the first surface is strongly curved."""
-    curved: bool = True
-    """Give every surfel a linear normal field (three numbers of a shape operator) instead of one normal."""
-    hull_resolution: Annotated[int, Meta(ge=8)] = 96
-    """Voxels along a side of the cube in which the hull is carved; outlines count below the size of a voxel."""
-    hull_votes: Share = 0.96
-    """Least share of the views whose mask must keep a point of the hull; all views count unless they contradict."""
-    shading: Literal["mirror", "3dgs-dr", "gaussian-shader", "ref-gaussian", "material-refgs"] = "mirror"
-    """`mirror`: each pixel mirrors the environment; else as another method shades its primitives."""
-    tuned: Tuned[SurfelOptions] = field(default_factory=SurfelOptions)
 
 
 @dataclass(frozen=True)
@@ -106,136 +86,30 @@ class EnvironmentConfig:
 
 
 @dataclass(frozen=True)
-class LossConfig:
-    """Terms of the objective (paper Eqs. 9–14)."""
-
-    photometric: Literal["masked", "paper"] = "masked"
-    """`paper`: Eq. 9 over the whole image; `masked`: mean √(‖e‖² + ε²) over pixels that lie wholly on the object."""
-    robust_scale: NonNegative = 0.3
-    """Residual (linear radiance) beyond which a pixel loses its vote in `masked`; 0 lets all pixels vote."""
-    lambda_ssim: Share = 0.2
-    """Weight of D-SSIM in Eq. 9; read by `paper`."""
-    lambda_normal_consistency: NonNegative = 0.05
-    """Weight of the depth–normal term, Eq. 12."""
-    lambda_silhouette: NonNegative = 1.0
-    """Weight of the binary cross-entropy between alpha and mask, Eq. 13."""
-    silhouette_until: Share = 1.0
-    """Share of the iterations in which the silhouette term acts (the paper's 3000 of 45000)."""
-    lambda_distortion: NonNegative = 0.0
-    """Weight of the depth distortion of the surfel paper (Huang et al. 2024, Eq. 13)."""
-    depth_blend: Share = 0.5
-    """λ_d of Eq. 3: 0 takes the expected depth, 1 the median depth."""
-    roughness_weighted: bool = False
-    """Scale the specular term by a learned (1 − ρ)², the ablation of the paper's Table 3."""
-    random_background: bool = False
-    """Composite over a new random color at each step instead of black."""
-    white_background: bool = False
-    """Composite over white."""
-
-
-@dataclass(frozen=True)
-class DensityConfig:
-    """Adaptive density control (Kerbl et al. 2023; Huang et al. 2024) and normal propagation (Ye et al. 2024)."""
-
-    enabled: bool = False
-    """Clone, split, prune and reset."""
-    start: Share = 500 / 45000
-    """Share of the iterations after which it begins."""
-    stop: Share = 12000 / 45000
-    """Share of the iterations after which it ends."""
-    every: Share = 100 / 45000
-    """Share of the iterations between two rounds."""
-    gradient_threshold: NonNegative = 2e-4
-    """Mean screen-space gradient (per half image width) above which a surfel is cloned or split."""
-    dense_share: NonNegative = 0.01
-    """Surfels larger than this share of the scene's radius are split, smaller ones cloned."""
-    prune_share: Share = 0.5
-    """Surfels larger than this share of the scene's radius are removed."""
-    prune_opacity: Share = 0.1
-    """Surfels below this opacity are removed."""
-    reset_every: Share = 3000 / 45000
-    """Share of the iterations between two opacity resets."""
-    propagate_every: Share = 1000 / 45000
-    """Share of the iterations between two rounds of normal propagation; 0 turns it off."""
-    propagate_from: Share = 0.0
-    """Share of the iterations before which there is none."""
-    propagate_until: Share = 3000 / 45000
-    """Share of the iterations after which there is none: it widens outlines, which only the silhouette term undoes."""
-    opacities_rest: Share = 0.0
-    """Share of the iterations after each propagation in which opacities hold still."""
-    max_surfels: Count = 100_000
-    """Growth stops at this number."""
-
-
-@dataclass(frozen=True)
-class RateConfig:
-    """Learning rates of Adam, in the normalized frame; constant at first, then falling, which improves the normals."""
-
-    means: NonNegative = 1e-4
-    """In units of the scene's radius."""
-    quats: NonNegative = 2e-3
-    log_scales: NonNegative = 3e-3
-    opacity_logits: NonNegative = 2e-2
-    albedo: NonNegative = 2.5e-3
-    curvatures: NonNegative = 3e-2
-    roughness_logits: NonNegative = 1e-2
-    harmonics: NonNegative = 2.5e-3
-    strength_logits: NonNegative = 6e-3
-    base_color_logits: NonNegative = 7.5e-3
-    normal_residuals: NonNegative = 5e-3
-    indirect_harmonics: NonNegative = 7.5e-3
-    environment: NonNegative = 3e-2
-    drop_at: Share = 0.4
-    """Share of the iterations after which every rate falls geometrically."""
-    drop_factor: NonNegative = 0.01
-    """Factor of the rates at the last iteration."""
-    means_fall_until: Share = 0.0
-    """Share of the iterations over which the means' rate falls to a hundredth; 0: it does not."""
-    square_memory: Annotated[float, Meta(ge=0, lt=1)] = 0.99
-    """β₂ of Adam, the decay of the mean squared gradient that steps are divided by."""
-
-
-@dataclass(frozen=True)
 class FitConfig:
     """Everything that determines a fit, saved beside its result."""
 
     preset: str = "default"
     """Name of the preset that the values started from."""
-    iterations: Count = 1000
-    """Number of optimization steps (one view each)."""
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     """Seed of the initial surfels and of the order of views."""
     model: Annotated[Model, tyro.conf.arg(prefix_name=False)] = "auto"
     """`auto`: the simplest that explains held-out views; `sphere`: center and radius; `plane`: three numbers and a
     boundary; `height_field`: a smooth height over that plane; `revolution`: an axis and a profile; `free_form`: a
     closed smooth surface; `surfels`: curved."""
-    albedo: bool = False
-    """Learn a diffuse term A (Eq. 8); a perfect mirror has none."""
     tint: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
     """Known reflectance of the mirror in red, green and blue (linear): what it shows is tint · environment."""
     exposure: NonNegative = 0.0
     """Factor of all photographs by which a shape is chosen, fitted and judged; the map is solved from them as they are.
     0: that which gives a dark object the mean brightness `contrast.brightness`."""
-    alpha_applied: Literal["once", "paper"] = "once"
-    """`paper`: (A + L)·α as Eq. 10 is written, though A is blended already; `once`: A + L·α."""
     downscale: Count = 1
     """Average the training images over blocks of this many pixels a side."""
     least_object_px: NonNegative = 0.0
     """Smaller blocks, where the object (the root of its area) would have fewer pixels across."""
     crop_margin_px: Annotated[int, Meta(ge=-1)] = 12
     """Work on the mask's bounding box with this margin; −1 works on whole images."""
-    visibility: Literal["final", "online"] = "final"
-    """`online`: evidence of every iteration, as in the paper; `final`: how far rays of the converged geometry agree."""
-    scene_radius: Literal["object", "cameras"] = "object"
-    """What the means' rate and the sizes of density control are shares of: the radius of the object, or 1.1 × the
-    largest distance of a camera from the cameras' mean (Kerbl et al. 2023)."""
-    visibility_alpha: Share = 0.5
-    """τ: only pixels with alpha above it count as observations."""
-    surfels: SurfelConfig = field(default_factory=SurfelConfig)
+    splats: Annotated[SplatConfig, tyro.conf.arg(name="")] = field(default_factory=SplatConfig)
     environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
-    loss: LossConfig = field(default_factory=LossConfig)
-    density: DensityConfig = field(default_factory=DensityConfig)
-    rates: RateConfig = field(default_factory=RateConfig)
     mask_repair: Tuned[MaskRepairOptions] = field(default_factory=MaskRepairOptions)
     contrast: Tuned[ContrastOptions] = field(default_factory=ContrastOptions)
     first_surface: Tuned[FirstSurfaceOptions] = field(default_factory=FirstSurfaceOptions)
@@ -285,7 +159,7 @@ def with_overrides(config: FitConfig, overrides: Sequence[str]) -> FitConfig:
     for override in overrides:
         path, equals, text = override.partition("=")
         *sections, name = path.replace("-", "_").split(".")
-        place = content
+        place = content["splats"] if [*sections, name][0] in content["splats"] else content
         for section in sections:
             place = place.get(section, {}) if isinstance(place, dict) else {}
         if not equals or not isinstance(place, dict) or name not in place:
@@ -313,10 +187,10 @@ def check_config(config: FitConfig) -> None:
     """Raise InputError for a value outside the range of its field, and for options that exclude each other."""
     check_record(config, "the configuration", place=_option, remedy="See `panoless fit --help-all` for what it means.")
     linear = _works_in_unit_range(config)
-    if config.surfels.shading != "mirror" and config.environment.solve:
+    if config.splats.surfels.shading != "mirror" and config.environment.solve:
         raise InputError(
             expected="the map that the steps leave, where primitives are shaded as another method does",
-            found=f"--config.surfels.shading {config.surfels.shading} with a map that is solved for a mirror",
+            found=f"--config.surfels.shading {config.splats.surfels.shading} with a map that is solved for a mirror",
             remedy="Use that method's preset, or add --config.environment.no-solve.",
         )
     if config.environment.range == "hdr" and linear:
@@ -340,7 +214,7 @@ def _check_blurred_maps(config: FitConfig) -> None:
     exact = environment.range == "ldr" and config.model != "surfels"
     rough, soft = exact and material.roughness == "auto", exact and "auto" in (material.roughness, material.blur)
     for option, resolution, blurred in (
-        ("--config.environment.resolution", environment.resolution, config.surfels.shading in SPLIT_SUM),
+        ("--config.environment.resolution", environment.resolution, config.splats.surfels.shading in SPLIT_SUM),
         ("--config.environment.solve-resolution", environment.solve_resolution, rough),
         ("--set material.judged_resolution", material.judged_resolution, soft),
     ):
@@ -362,11 +236,11 @@ def can_be_exposed(config: FitConfig) -> bool:
 
 def _works_in_unit_range(config: FitConfig) -> bool:
     """Whether a diffuse color, a term of the loss, a sigmoid or another method's shading takes radiance as it is."""
-    of_paper = config.loss.photometric == "paper" or config.environment.activation == "sigmoid"
-    return config.albedo or of_paper or config.surfels.shading != "mirror"
+    of_paper = config.splats.loss.photometric == "paper" or config.environment.activation == "sigmoid"
+    return config.splats.albedo or of_paper or config.splats.surfels.shading != "mirror"
 
 
 def _option(path: str) -> str:
-    """The name on the command line of the field at `path`; numbers of a tuple have none of their own."""
-    names = [name.replace("_", "-") for name in path.split(".") if not name.isdigit()]
+    """The name on the command line of the field at `path`; numbers of a tuple and the room of splatting have none."""
+    names = [name.replace("_", "-") for name in path.split(".") if not name.isdigit() and name != "splats"]
     return "--model" if names == ["model"] else "--config." + ".".join(names)

@@ -1,6 +1,7 @@
 """What every test shares: array shapes checked at each call, reproducible examples, few threads, a dataset to read."""
 
 import os
+from itertools import chain
 from pathlib import Path
 
 # Read when torch and OpenMP start: several test processes on few cores wait for each other's threads. Set, not only by
@@ -24,8 +25,9 @@ COMPILED = ("cpu", "gpu")
 
 def checked_modules() -> list[str]:
     """The modules whose annotations are checked: all but the compiled kernels."""
-    rooms = _children("panoless", leave_out=("kernels",))
-    return ["shinypartial", "tests.support", *rooms, *_children("panoless.kernels", leave_out=COMPILED)]
+    rooms = [*_children("panoless", leave_out=("kernels", "splats")), *_children("panoless.splats", ("kernels",))]
+    kernels = (_children(each, leave_out=COMPILED) for each in ("panoless.kernels", "panoless.splats.kernels"))
+    return ["shinypartial", "tests.support", *rooms, *chain(*kernels)]
 
 
 def _children(package: str, leave_out: tuple[str, ...]) -> list[str]:

@@ -24,7 +24,7 @@ from panoless.capture.views import TrainView
 from panoless.environment.mirrored import MirroredRays
 from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import SOLID_SURFACE_ALPHA, SurfaceBuffers
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from panoless.numeric.robust import bounded_error, robust_weight
 from shinypartial.core.conventions import PIXEL_CENTER
 

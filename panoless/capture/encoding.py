@@ -96,5 +96,5 @@ LDR = RadianceEncoding()
 
 def encoding_of(config: FitConfig) -> RadianceEncoding:
     """The encoding that a configuration asks for."""
-    high, srgb = config.environment.range == "hdr", config.surfels.shading != "mirror"
+    high, srgb = config.environment.range == "hdr", config.splats.surfels.shading != "mirror"
     return RadianceEncoding(high, config.tint, srgb, config.exposure or 1.0)

@@ -11,8 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.object_frame import ObjectFrame
-from panoless.kernels.rasterize import RasterCamera
-from panoless.kernels.reference.objective import unit_rays
+from panoless.kernels.camera import RasterCamera, unit_rays
 from shinypartial.core.camera import Camera
 from shinypartial.core.conventions import PIXEL_CENTER
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from panoless.capture.masks import MASK_LEVEL, cut_sides, remembered
 from panoless.capture.rays import camera_rays, in_camera, pose_of, project
 from panoless.capture.views import TrainView, Views, concatenated
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from shinypartial.core.conventions import PIXEL_CENTER
 
 #: Within this distance the curve itself is measured; beyond, pixels are.

@@ -2,12 +2,11 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.background import Background
@@ -15,8 +14,7 @@ from panoless.capture.encoding import LDR, RadianceEncoding
 from panoless.capture.masks import MASK_LEVEL, estimate_object_frame, without_specks
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import pose_of, raster_camera, unit_rays_camera
-from panoless.kernels.objective import MirrorView
-from panoless.kernels.rasterize import RasterCamera, tiles_of
+from panoless.kernels.camera import RasterCamera
 from shinypartial.core.camera import Camera
 from shinypartial.core.conventions import SOLID_ALPHA
 from shinypartial.core.errors import InputError
@@ -80,23 +78,6 @@ class TrainView:
     def radiance_at(self, pixels: Int[Tensor, "P"]) -> Float[Tensor, "P 3"]:
         """What pixels (flat indices) show."""
         return self.radiance.flatten(1)[:, pixels.to(self.radiance.device)].T.contiguous()
-
-    @cached_property
-    def mirror(self) -> MirrorView:
-        """What the objective compares with."""
-        camera, rotation = self.camera, self.camera_to_world_rotation.contiguous()
-        intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
-        return MirrorView(self.radiance, self.mask, rotation, *intrinsics, solid_alpha=SOLID_ALPHA)
-
-    @cached_property
-    def solid_tiles(self) -> Bool[Tensor, "tile_rows tile_columns"]:
-        """Tiles of the rasterizer with a pixel that lies wholly on the object."""
-        return tiles_of(self.mask > SOLID_ALPHA)
-
-    @cached_property
-    def mask_tiles(self) -> Bool[Tensor, "tile_rows tile_columns"]:
-        """Tiles of the rasterizer within a pixel of the mask."""
-        return tiles_of(self.mask > 0, margin_px=1)
 
     @property
     def camera_to_world_rotation(self) -> Float[Tensor, "3 3"]:

@@ -31,13 +31,14 @@ from panoless.export.pictures import (
 )
 from panoless.export.render import Decomposition, render
 from panoless.geometry.registry import FAMILIES
-from panoless.geometry.surfels.shading.registry import LEFT_OUT
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.reconstruct.final_map import complete
 from panoless.reconstruct.recorder import timed
 from panoless.reconstruct.snapshots import read_snapshot, snapshot_folders
 from panoless.reconstruct.state import FitState
 from panoless.selection.candidates import Selection
+from panoless.splats.mirror import SurfelMirror
+from panoless.splats.shading.registry import LEFT_OUT
 from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import latlong_directions
@@ -107,7 +108,7 @@ def export_prediction(
     if not around.is_far:
         directions = latlong_directions(height)
         write_inverse_distance(folder, around.inverse_distance_from(viewpoint, directions) / state.frame.radius)
-    for kind in (*FAMILIES, *FORMER_KINDS):
+    for kind in (*FAMILIES, SurfelMirror.kind, *FORMER_KINDS):
         (folder / f"{kind}.ply").unlink(missing_ok=True)
     mesh_file = f"{state.geometry.kind}.ply"
     write_ply(folder / mesh_file, state.geometry.mesh(state.frame))
@@ -150,7 +151,7 @@ def export_prediction(
         albedo=None if state.reflectance is None else state.reflectance.scattered_share,
         roughness=state.roughness,
         blur_px=state.blur_px,
-        left_out=LEFT_OUT.get(config.surfels.shading),
+        left_out=LEFT_OUT.get(config.splats.surfels.shading),
         iteration=state.iteration if snapshot else None,
     )
     write_info(folder, info)
@@ -307,7 +308,6 @@ def _model_selection(selection: Selection) -> ModelSelection:
             held_out_error=each.held_out_error,
             verdict=str(each.verdict),
             reason=each.reason,
-            alternative_error=each.surfels_error,
             camera_turn_deg=each.camera_turn_deg,
             principal_point_px=each.principal_point_px,
             mask_offset_px=each.corrections.mask_offset_px or None,

@@ -12,9 +12,9 @@ from panoless.capture.object_frame import ObjectFrame
 from panoless.config import FitConfig
 from panoless.environment.reflectance import Reflectance
 from panoless.geometry.base import Geometry
+from panoless.kernels.camera import RasterCamera
 from panoless.kernels.constants import ALPHA_FLOOR
-from panoless.kernels.rasterize import RasterCamera
-from panoless.kernels.reference.objective import compose
+from panoless.splats.kernels.reference.objective import compose
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def render(
         if reflectance is not None:
             tint = reflectance.share(buffers.cosines(camera))
             scattered = buffers.alpha * reflectance.scattering(normals)
-        radiance, albedo = compose(buffers.albedo, specular, buffers.alpha, config.alpha_applied), buffers.albedo
+        radiance, albedo = compose(buffers.albedo, specular, buffers.alpha, config.splats.alpha_applied), buffers.albedo
         if encoding.srgb:
             alpha = buffers.alpha.clamp(min=ALPHA_FLOOR)
             radiance, albedo = (alpha * encoding.decoded((part / alpha).clamp(0, 1)) for part in (radiance, albedo))

@@ -16,6 +16,10 @@ class FirstSurfaceOptions:
     sculpture) at 400 px, by the normals of the first surface.
     """
 
+    hull_resolution: Annotated[int, Meta(ge=8)] = 96
+    """Voxels along a side of the cube in which the hull is carved; outlines count below the size of a voxel."""
+    hull_votes: Share = 0.96
+    """Least share of the views whose mask must keep a point of the hull; all views count unless they contradict."""
     coarse_voxels: Annotated[int, Meta(ge=2)] = 48
     """Voxels along a side of the grid on which carving starts; it is halved until it is fine enough. For speed."""
     band_voxels: NonNegative = 1.5

@@ -21,7 +21,7 @@ from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays
 from panoless.environment.surroundings import Surroundings
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 
 Numbers = TypeVar("Numbers")
 SOLID_SURFACE_ALPHA = 0.9
@@ -97,23 +97,6 @@ class Mesh:
         return cls(vertices, faces, dict(zip(("nx", "ny", "nz"), normals_world.T, strict=True)))
 
 
-@dataclass
-class Training:
-    """What an iterative fit needs to continue. `iteration` counts finished steps.
-
-    `environment` is the map as the optimizer holds it; `evidence` is what online visibility has accumulated.
-    """
-
-    environment: Float[Tensor, "6 3 L L"]
-    evidence: Float[Tensor, "6 L L"]
-    iteration: int = 0
-    optimizer: dict[str, Any] = field(default_factory=dict)
-
-    def to(self, device: torch.device) -> "Training":
-        """The same on a device; the optimizer's part follows its parameters when it is loaded."""
-        return Training(self.environment.to(device), self.evidence.to(device), self.iteration, self.optimizer)
-
-
 @runtime_checkable
 class Geometry(Protocol):
     """A mirror of one kind in the object frame, and how rays meet it. It is immutable."""
@@ -184,10 +167,6 @@ class Geometry(Protocol):
         """The specular radiance of pixels (flat indices) whose blended normals are given."""
         ...
 
-    def to_surfels(self, config: FitConfig) -> "Geometry":
-        """Surfels on the surface, as many as configured: the start of a free fit."""
-        ...
-
     def mesh(self, frame: ObjectFrame) -> Mesh:
         """The surface in world units."""
         ...
@@ -255,8 +234,8 @@ class Family(Protocol):
     needs_depth: ClassVar[bool]
     """Whether views have to come from different directions, which tell how far away the object is."""
     told_by_outlines: ClassVar[bool]
-    """Whether outlines tell the whole shape, so that what photographs leave unexplained is no doubt of it unless
-    surfels explain more: noise, or who holds the camera."""
+    """Whether outlines tell the whole shape, so that what photographs leave unexplained is no doubt of it but noise, or
+    who holds the camera."""
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """A shape that explains the silhouettes; None where they determine none.
@@ -280,7 +259,7 @@ class Family(Protocol):
         ...
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
-        """The geometry that explains silhouettes and photographs best; of an iterative kind, its start."""
+        """The geometry that explains silhouettes and photographs best."""
         ...
 
     def with_lens(
@@ -293,37 +272,6 @@ class Family(Protocol):
 
     def after_as_many_steps(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:
         """A fitted geometry after the steps of `with_lens` without these unknowns, for comparison."""
-        ...
-
-    def begin(self, views: Views, geometry: Geometry, config: FitConfig) -> Training | None:
-        """What an iterative fit starts from; None where `fit` has done everything."""
-        ...
-
-    def train(
-        self,
-        views: Views,
-        geometry: Geometry,
-        training: Training,
-        config: FitConfig,
-        observer: "TrainingObserver",
-    ) -> tuple[Geometry, Training]:
-        """Take the remaining steps; `observer` is told of each."""
-        ...
-
-
-@runtime_checkable
-class TrainingObserver(Protocol):
-    """Who is told of the steps of an iterative fit."""
-
-    title: str
-    """What the progress is called."""
-
-    def after_step(self, iteration: int, seconds: float, current: Callable[[], tuple[Geometry, Training]]) -> None:
-        """That many steps are finished, the last in so many seconds; `current` gives the state after it."""
-        ...
-
-    def record(self, point: dict[str, float]) -> None:
-        """Values of the curves at one iteration."""
         ...
 
 

@@ -26,16 +26,13 @@ from panoless.geometry.base import (
     Geometry,
     Proposal,
     ToldPoses,
-    Training,
-    TrainingObserver,
     from_plain,
     observe_views,
     to_plain,
 )
+from panoless.kernels.camera import RasterCamera, reflection_directions_world
 from panoless.kernels.constants import SUB_PIXELS
 from panoless.kernels.cubemap import sample_cubemap
-from panoless.kernels.rasterize import RasterCamera
-from panoless.kernels.reference.objective import reflection_directions_world
 
 
 @dataclass(frozen=True)
@@ -134,16 +131,6 @@ class ExactFamily:
     def after_as_many_steps(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:
         """The same: none are taken."""
         return cast(Geometry, fitted)
-
-    def begin(self, views: Views, geometry: Geometry, config: FitConfig) -> Training | None:
-        """None: no steps are left to take."""
-        return None
-
-    def train(
-        self, views: Views, geometry: Geometry, training: Training, config: FitConfig, observer: TrainingObserver
-    ) -> tuple[Geometry, Training]:
-        """Never called, as `begin` gives nothing to train."""
-        raise ValueError("a kind in closed form is not trained")
 
 
 class SeenByCenters(ExactGeometry):

@@ -6,7 +6,6 @@ from panoless.geometry.height_field.kind import HeightFieldFamily
 from panoless.geometry.plane.kind import PlaneFamily
 from panoless.geometry.revolution.kind import RevolutionFamily
 from panoless.geometry.sphere.kind import SphereFamily
-from panoless.geometry.surfels.kind import SurfelFamily
 
 FAMILIES: dict[str, Family] = {
     family.kind: family
@@ -16,7 +15,6 @@ FAMILIES: dict[str, Family] = {
         HeightFieldFamily(),
         RevolutionFamily(),
         FreeFormFamily(),
-        SurfelFamily(),
     )
 }
-"""In the order of model selection; the last one explains what no other does."""
+"""In the order of model selection."""

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 
 LEAST_ALPHA = 1e-6
 """Coverage below this is rounding."""

@@ -15,10 +15,11 @@ from panoless.environment.resolution import count_rays
 from panoless.environment.roughness import sharpened_map, with_smaller_lamps
 from panoless.environment.solve import solve_environment
 from panoless.environment.visibility import agreement, visibility_from_agreement, visibility_from_evidence
-from panoless.geometry.base import Geometry, Training, observe_views, pixel_areas, usable_views
+from panoless.geometry.base import Geometry, observe_views, pixel_areas, usable_views
 from panoless.journal import remembered
 from panoless.reconstruct.state import FitState
 from panoless.selection.material import Softness, as_perfect_mirror, earned_reflectance, earned_softness
+from panoless.splats.training import Training
 
 GRAY = 0.5
 
@@ -71,7 +72,7 @@ def _solved(
             sigmoid = config.environment.activation == "sigmoid"
             environment = torch.sigmoid(training.environment) if sigmoid else training.environment
             shown = environment
-        if config.visibility == "online" and training is not None:
+        if config.splats.visibility == "online" and training is not None:
             visibility = visibility_from_evidence(training.evidence)
         else:
             agreed = agreement(rays, shown, encoding.saturation, config.confidence)

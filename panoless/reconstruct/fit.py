@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import cast
 
 import torch
 
@@ -12,15 +13,18 @@ from panoless.capture.configured import configured_views
 from panoless.capture.views import Views
 from panoless.config import FitConfig, check_config
 from panoless.geometry.base import usable_views
-from panoless.geometry.registry import FAMILIES
 from panoless.journal import forget, journal_in
 from panoless.kernels.backend import gpu_kernels_installed
 from panoless.reconstruct.final_map import complete
 from panoless.reconstruct.recorder import Recorder, note_peak_memory, timed
 from panoless.reconstruct.snapshots import NO_SNAPSHOTS, SnapshotSchedule, require_snapshots
 from panoless.reconstruct.state import FitState, acquire_run, load_state, save_state
-from panoless.selection.choose import choose_geometry
+from panoless.selection.candidates import Candidate, Selection, Verdict
+from panoless.selection.choose import along_one_line, choose_geometry
 from panoless.selection.material import without_scattered_light
+from panoless.splats.mirror import SurfelMirror
+from panoless.splats.start import first_mirror, first_training
+from panoless.splats.train import train_surfels
 from panoless.trust.evidence import gather_evidence
 from panoless.trust.verdict import judge
 from shinypartial.core.errors import InputError
@@ -85,8 +89,8 @@ def _finished(
     photographs = state.selection.corrections.applied(views, config)
     if state.training is not None:
         views = usable_views(photographs, state.geometry)
-        family, recorder = FAMILIES[state.geometry.kind], Recorder(folder, schedule, state, before)
-        state.geometry, state.training = family.train(views, state.geometry, state.training, config, recorder)
+        mirror, recorder = cast(SurfelMirror, state.geometry), Recorder(folder, schedule, state, before)
+        state.geometry, state.training = train_surfels(views, mirror, state.training, config, recorder)
     with timed(state.seconds, "solve environment"):
         photographs, shown = complete(state, photographs, config)
     with timed(state.seconds, "judge"):
@@ -123,18 +127,28 @@ def _tell_repairs(views: Views) -> None:
 
 
 def begin(views: Views, config: FitConfig) -> FitState:
-    """The state before the first step: the geometry that the scene needs, and what its training starts from.
+    """The state before the map: the geometry that the scene needs, or the surfels that steps start from.
 
     Where that geometry shows that the object scatters light, another is chosen by photographs without it.
     """
+    if config.model == SurfelMirror.kind:
+        return _begin_surfels(views, config)
     geometry, selection = choose_geometry(views, config)
     corrected = selection.corrections.applied(views, config)
     shown = without_scattered_light(views, corrected, geometry, selection.held_out_error, config)
     if shown is not None:
         geometry, selection = choose_geometry(*shown)
         corrected = selection.corrections.applied(views, config)
-    training = FAMILIES[geometry.kind].begin(usable_views(corrected, geometry), geometry, config)
-    return FitState(geometry, views.object_frame, selection, training)
+    return FitState(geometry, views.object_frame, selection)
+
+
+def _begin_surfels(views: Views, config: FitConfig) -> FitState:
+    if views.object_frame.depth_is_open:
+        raise along_one_line()
+    mirror = first_mirror(views, config)
+    asked_for = Candidate(mirror.kind, Verdict.CHOSEN, "asked for")
+    training = first_training(views, mirror, config)
+    return FitState(mirror, views.object_frame, Selection(mirror.kind, (asked_for,)), training)
 
 
 def assess(state: FitState, views: Views, config: FitConfig, ball: BallEvidence | None = None) -> Trust:

@@ -1,4 +1,4 @@
-"""What is kept of an iterative fit while it runs: seconds, curves, checkpoints and snapshots."""
+"""What is kept of a fit of surfels while it runs: seconds, curves, checkpoints and snapshots."""
 
 import shutil
 import time
@@ -7,10 +7,11 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from panoless.geometry.base import Geometry, Training
 from panoless.journal import seconds_before
 from panoless.reconstruct.snapshots import SnapshotSchedule, snapshot_folders
 from panoless.reconstruct.state import FitState, save_state
+from panoless.splats.mirror import SurfelMirror
+from panoless.splats.training import Training
 from shinypartial.io.system import peak_memory_bytes, release_free_memory
 from shinypartial.prediction.format import SNAPSHOTS
 
@@ -38,7 +39,7 @@ class Recorder:
             if int(folder.name) > state.iteration:
                 shutil.rmtree(folder)
 
-    def after_step(self, iteration: int, seconds: float, current: Callable[[], tuple[Geometry, Training]]) -> None:
+    def after_step(self, iteration: int, seconds: float, current: Callable[[], tuple[SurfelMirror, Training]]) -> None:
         """Count the step, and save what is due."""
         stages, before = self._state.seconds, self._before
         stages["optimize"] = stages.get("optimize", 0.0) + seconds

@@ -14,9 +14,11 @@ from panoless.capture.object_frame import ObjectFrame
 from panoless.config import FitConfig, config_from_dict
 from panoless.environment.lobe import Lobe
 from panoless.environment.reflectance import Reflectance
-from panoless.geometry.base import Geometry, Training, from_plain, to_plain
+from panoless.geometry.base import Geometry, from_plain, to_plain
 from panoless.geometry.registry import FAMILIES
 from panoless.selection.candidates import Selection, selection_from_plain, selection_to_plain
+from panoless.splats.mirror import SurfelMirror
+from panoless.splats.training import Training
 from shinypartial.core.errors import InputError
 from shinypartial.io.files import PARTIAL_PREFIX, atomic_write, read_json, remove_partial_files, write_json
 from shinypartial.prediction.format import Trust
@@ -33,7 +35,7 @@ class FitState:
     frame: ObjectFrame
     selection: Selection
     training: Training | None = None
-    """What the steps of an iterative kind need to continue; None for a kind in closed form."""
+    """What the steps of a fit of surfels need to continue; None for a kind in closed form."""
     environment: Float[Tensor, "6 3 L L"] | None = None
     visibility: Float[Tensor, "6 L L"] | None = None
     seconds: dict[str, float] = field(default_factory=dict)
@@ -102,7 +104,9 @@ def load_state(folder: Path) -> FitState | None:
         return None
     try:
         content = torch.load(path, weights_only=True, map_location="cpu")
-        content["geometry"] = FAMILIES[content.pop("kind")].geometry.from_state_dict(content["geometry"])
+        kind = content.pop("kind")
+        geometry = SurfelMirror if kind == SurfelMirror.kind else FAMILIES[kind].geometry
+        content["geometry"] = geometry.from_state_dict(content["geometry"])
         content["frame"] = from_plain(ObjectFrame, content["frame"])
         content["selection"] = selection_from_plain(**content["selection"])
         content["training"] = None if content["training"] is None else Training(**content["training"])

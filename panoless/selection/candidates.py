@@ -17,7 +17,7 @@ class Verdict(StrEnum):
     REFUSED_BY_SILHOUETTES = "refused by silhouettes"
     REFUSED_BY_HELD_OUT_VIEWS = "refused by held-out views"
     LEFT_TOO_MUCH = "left too much unexplained"
-    """Refused, unless nothing else explains held-out views clearly better."""
+    """Refused, unless no other kind explains more."""
     NOT_PROPOSED = "not proposed"
 
 
@@ -34,8 +34,6 @@ class Candidate:
     """Intersection over union of silhouette and masks."""
     held_out_error: float | None = None
     """Mean of ‖e‖²/(‖e‖² + s²) over rays of held-out views, in [0, 1]."""
-    surfels_error: float | None = None
-    """The same of surfels that started on the candidate."""
     camera_turn_deg: float | None = None
     """By how much the cameras were turned, median over views; None where they were believed."""
     corrections: Corrections = NO_CORRECTIONS
@@ -79,10 +77,7 @@ def describe(candidate: Candidate) -> str:
         away = f"{distance:.2g} px away" if math.isfinite(distance) else "far away"
         parts.append(f"silhouettes {away}, overlap {candidate.overlap:.0%}")
     if candidate.held_out_error is not None:
-        text = f"held-out error {candidate.held_out_error:.4f}"
-        if candidate.surfels_error is not None:
-            text += f", {candidate.surfels_error:.4f} with surfels"
-        parts.append(text)
+        parts.append(f"held-out error {candidate.held_out_error:.4f}")
     if candidate.camera_turn_deg is not None:
         parts.append(f"cameras turned by {candidate.camera_turn_deg:.2g}°")
     if candidate.principal_point_px is not None:

@@ -1,10 +1,9 @@
-"""Which kind of geometry a scene needs: the simplest that explains held-out views as well as surfels do.
+"""Which kind of geometry a scene needs: the simplest that explains silhouettes and held-out views.
 
 A kind that is not needed costs accuracy, too: tilting a flat mirror and turning the environment the other way leaves
-every picture as it was, so surfels drift.
+every picture as it was.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -13,7 +12,6 @@ import numpy as np
 
 from panoless.alignment.align import pose_prior
 from panoless.alignment.search import PosedProposal, align_proposal, fit_at, fit_with_poses, proposed
-from panoless.capture.corrections import NO_CORRECTIONS
 from panoless.capture.silhouettes import silhouette_distance_px
 from panoless.capture.views import Views
 from panoless.config import FitConfig
@@ -22,34 +20,34 @@ from panoless.first_surface.visual_hull import contradiction_px
 from panoless.geometry.base import Family, Geometry, Proposal, usable_views
 from panoless.geometry.registry import FAMILIES
 from panoless.journal import remembered
-from panoless.selection.candidates import Candidate, Selection, Verdict
+from panoless.selection.candidates import Candidate, Selection, Verdict, describe
 from panoless.selection.corrections import with_corrections
 from panoless.selection.fitted import Fitted, is_refined, missed_share
-from panoless.selection.held_out import Trial, held_out_errors, is_clearly_lower, train_briefly
+from panoless.selection.held_out import held_out_errors, held_out_parts
 from panoless.selection.surroundings import brought_near, explains_clearly_more, on_floor, proposed_surroundings
 from shinypartial.core.errors import InputError
 
 ANY = "auto"
 LEAST = "leaves much unexplained, and nothing explains more"
-BENT = "a bend explains more than near surroundings do"
+BENT = "a bend explains clearly more"
+EXPLAINS = "explains held-out views"
 OTHER = "another kind is preferred"
+TOO_MUCH = "leaves too much unexplained"
 NONE_HELD_OUT = "too few views to hold one out"
 
 
-def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefly) -> tuple[Geometry, Selection]:
-    """The geometry of the scene and the evidence for it; of surfels it is the start.
+def choose_geometry(views: Views, config: FitConfig) -> tuple[Geometry, Selection]:
+    """The geometry of the scene and the evidence for it.
 
-    Candidates are examined from the simplest on. One is refused when it misses the silhouettes, or when surfels that
-    start on it explain held-out views clearly better. One that leaves more than right ones do is taken unless one after
+    Candidates are examined from the simplest on. One is refused when it misses the silhouettes, or when a kind that
+    refines it explains held-out views clearly better. One that leaves more than right ones do is taken unless one after
     it leaves much less, or at once where outlines tell its whole shape. One that leaves too much waits until all others
-    are refused. Surfels explain what is left; of the candidates that explained the silhouettes they start on the one
-    from which they explained held-out views best. `config.model` overrides.
-    Raises InputError when a kind is asked for and can't be proposed, and when views along one line show no kind that
-    these tell.
+    are refused; of those the one that leaves least is taken. `config.model` overrides.
+    Raises InputError when a kind is asked for and can't be proposed, and when the silhouettes refuse all kinds.
     """
     if config.model != ANY:
         return _fit_asked(views, config)
-    *families, last = FAMILIES.values()
+    families = list(FAMILIES.values())
     if views.object_frame.depth_is_open:
         families = [family for family in families if not family.needs_depth]
     table, refused = list[Candidate](), dict[str, list[PosedProposal]]()
@@ -57,37 +55,26 @@ def choose_geometry(views: Views, config: FitConfig, trial: Trial = train_briefl
     for family in families:
         source = _source(family)
         proposals = refused.get(source.kind, []) if family.refines else _proposals(source, views, config, asked=False)
-        candidate, geometry = _examine(family, proposals, views, config, trial)
+        candidate, geometry = _examine(family, proposals, views, config)
         table.append(candidate)
         refused[family.kind] = [each for each in proposals if _is_near(each, views, config, bent=True)]
         if geometry is None:
             continue
         explains = candidate.verdict == Verdict.CHOSEN
-        if explains and _bends_rather(
-            family, geometry, proposals, candidate.corrections.applied(views, config), config
-        ):
-            table[-1] = replace(candidate, verdict=Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason=BENT)
-            continue
+        corrected = candidate.corrections.applied(views, config)
+        if explains and _bends_rather(family, geometry, proposals, corrected, config):
+            table[-1] = candidate = replace(candidate, verdict=Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason=BENT)
+            explains = False
         fitted.append((candidate, geometry))
         if explains and (family.told_by_outlines or error_of(fitted[-1]) <= config.selection.doubted_error):
             break
     chosen = [each for each in fitted if each[0].verdict == Verdict.CHOSEN]
     if chosen:
         return _chosen(*much_less_unexplained(chosen, views, config), table)
-    waiting = least_unexplained(fitted, config)
-    if waiting is not None:
-        candidate, geometry = waiting
-        return _chosen(replace(candidate, verdict=Verdict.CHOSEN, reason=LEAST), geometry, table)
-    if views.object_frame.depth_is_open:
-        raise _along_one_line()
-    start, corrections = None, NO_CORRECTIONS
     if fitted:
-        candidate, start = min(reversed(fitted), key=lambda each: each[0].surfels_error or 0.0)
-        corrections = candidate.corrections
-    geometry = fit_at(last, corrections.applied(views, config), PosedProposal(Proposal(start, 0.0, 1.0)), config)
-    reason = "no simpler kind explains the views"
-    table.append(Candidate(last.kind, Verdict.CHOSEN, reason, corrections=corrections))
-    return geometry, Selection(last.kind, tuple(table))
+        candidate, geometry = least_unexplained(fitted, config)
+        return _chosen(replace(candidate, verdict=Verdict.CHOSEN, reason=LEAST), geometry, table)
+    raise along_one_line() if views.object_frame.depth_is_open else _refused_by_silhouettes(table)
 
 
 def _chosen(candidate: Candidate, geometry: Geometry, table: Sequence[Candidate]) -> tuple[Geometry, Selection]:
@@ -128,20 +115,13 @@ def _with_missed(each: tuple[Candidate, Geometry], views: Views, config: FitConf
     return missed + (1 - missed) * error_of(each)
 
 
-def least_unexplained(
-    fitted: Sequence[tuple[Candidate, Geometry]], config: FitConfig
-) -> tuple[Candidate, Geometry] | None:
-    """Of what was refused only because it leaves too much unexplained, the simplest that nothing else explains clearly
-    more than, surfels included; None where they do.
+def least_unexplained(fitted: Sequence[tuple[Candidate, Geometry]], config: FitConfig) -> tuple[Candidate, Geometry]:
+    """Of what leaves too much unexplained, the simplest than which nothing else explains clearly more. A kind that
+    another takes on counts only where no other was fitted.
     """
-    waiting = [each for each in fitted if each[0].verdict == Verdict.LEFT_TOO_MUCH and not is_refined(each[0].kind)]
-    if not waiting:
-        return None
+    waiting = [each for each in fitted if not is_refined(each[0].kind)] or fitted
     enough = min(map(error_of, waiting)) / (1 - config.selection.least_gain)
-    asked = (candidate.surfels_error for candidate, _ in fitted if candidate.surfels_error is not None)
-    surfels = min(asked, default=math.inf)
-    simplest = next(each for each in waiting if error_of(each) <= enough)
-    return None if surfels < (1 - config.selection.least_gain) * error_of(simplest) else simplest
+    return next(each for each in waiting if error_of(each) <= enough)
 
 
 def _source(family: Family) -> Family:
@@ -281,25 +261,39 @@ def _fit_around(
 def _bends_rather(
     family: Family, geometry: Geometry, proposals: Sequence[PosedProposal], views: Views, config: FitConfig
 ) -> bool:
-    """Whether a kind that refines this one explains held-out views clearly better in a far world than this one does in
-    near surroundings: a slight bend of a flat mirror shows much of what a near room shows.
+    """Whether a kind that refines this one explains held-out views clearly better in a far world.
+
+    In few steps where this one is in a far world, too. In near surroundings wholly fitted: a slight bend of a flat
+    mirror shows much of what a near room shows.
     """
-    if geometry.surroundings.is_far:
+    others = [other for other in FAMILIES.values() if other.refines == family.kind]
+    if held_out_parts(views) is None:
         return False
+    if geometry.surroundings.is_far:
+        return any(_bends_in_few_steps(other, geometry, views, config) for other in others)
     far = replace(config, surroundings=replace(config.surroundings, mode="off"))
-    for other in FAMILIES.values():
-        near = [each for each in proposals if _is_near(each, views, config, bent=True)]
-        fitted = _first_fit(other, near, views, far) if other.refines == family.kind else None
-        if fitted is not None and explains_clearly_more(views, fitted.geometry, geometry, config):
-            return True
-    return False
+    near = [each for each in proposals if _is_near(each, views, config, bent=True)]
+    fitted = (_first_fit(other, near, views, far) for other in others)
+    return any(each is not None and explains_clearly_more(views, each.geometry, geometry, config) for each in fitted)
+
+
+@remembered()
+def _bends_in_few_steps(other: Family, geometry: Geometry, views: Views, config: FitConfig) -> bool:
+    """With the cameras where the geometry has them, from the shape before the first step on."""
+    posed = geometry.corrected(views)
+    proposal = proposed(_source(other), posed, config)
+    start = None if proposal is None else other.before_steps(posed, proposal, config)
+    if proposal is None or start is None:
+        return False
+    bent = other.fit(posed, replace(proposal, fitted=start), config)
+    return explains_clearly_more(posed, bent, geometry.with_poses(None), config)
 
 
 @remembered(lambda _, config: f"Stage 1 of 1: {FAMILIES[config.model].label}")
 def _fit_asked(views: Views, config: FitConfig) -> tuple[Geometry, Selection]:
     family = FAMILIES[config.model]
     if views.object_frame.depth_is_open and family.needs_depth:
-        raise _along_one_line()
+        raise along_one_line()
     fitted = _best_fit(family, _proposals(_source(family), views, config, asked=True), views, config, asked=True)
     assert fitted is not None, "a kind that is asked for is proposed"
     asked_for = Candidate(
@@ -312,12 +306,23 @@ def _fit_asked(views: Views, config: FitConfig) -> tuple[Geometry, Selection]:
     return fitted.geometry, Selection(family.kind, (asked_for,))
 
 
-def _along_one_line() -> InputError:
+def along_one_line() -> InputError:
+    """What is said where views don't tell how far away the object is."""
     labels = " or ".join(family.label for family in FAMILIES.values() if not family.needs_depth)
     return InputError(
         expected=f"cameras that see the object from different directions, or {labels}",
         found="views along a single line",
         remedy="Add views from the sides; an arc of at least 30° is best.",
+    )
+
+
+def _refused_by_silhouettes(table: Sequence[Candidate]) -> InputError:
+    labels = ", ".join(family.label for family in FAMILIES.values())
+    return InputError(
+        expected=f"silhouettes of {labels}",
+        found="; ".join(f"{each.kind}: {describe(each)}" for each in table),
+        remedy="Look whether masks and cameras are right, and take more views of more sides: a free-form surface needs "
+        "5. --model surfels takes any silhouettes.",
     )
 
 
@@ -328,7 +333,7 @@ def _stage(family: Family, *_: object) -> str:
 
 @remembered(_stage)
 def _examine(
-    family: Family, proposals: Sequence[PosedProposal], views: Views, config: FitConfig, trial: Trial
+    family: Family, proposals: Sequence[PosedProposal], views: Views, config: FitConfig
 ) -> tuple[Candidate, Geometry | None]:
     """The evidence for one kind, and its geometry where the silhouettes do not refuse it."""
     if not proposals:
@@ -340,25 +345,16 @@ def _examine(
         evidence = said.silhouette_px, said.overlap
         return Candidate(family.kind, Verdict.REFUSED_BY_SILHOUETTES, "misses the silhouettes", *evidence), None
     geometry, start = fitted.geometry, fitted.start
-    options, evidence = config.selection, (start.proposal.silhouette_px, start.proposal.overlap)
+    evidence = start.proposal.silhouette_px, start.proposal.overlap
     views = fitted.corrections.applied(views, config)
-    asked_from = 0.0 if is_refined(family.kind) else options.explained_error
-    measured = held_out_errors(usable_views(views, geometry), config, geometry, trial, asked_from)
+    errors = held_out_errors(usable_views(views, geometry), config, geometry)
     found = {"corrections": fitted.corrections, **_found_cameras(geometry, views, config)}
-    if measured is None:
+    if errors is None:
         return Candidate(family.kind, Verdict.CHOSEN, NONE_HELD_OUT, *evidence, **found), geometry
-    own, free = measured
-    unexplained = float(own.mean()) > options.largest_error
-    better = free is not None and is_clearly_lower(free, own, options)
-    if better:
-        verdict, reason = Verdict.REFUSED_BY_HELD_OUT_VIEWS, "surfels are clearly better"
-    elif unexplained:
-        verdict, reason = Verdict.LEFT_TOO_MUCH, "leaves too much unexplained"
-    else:
-        no_more = "leaves next to nothing unexplained" if free is None else "surfels are no better"
-        verdict, reason = Verdict.CHOSEN, no_more
-    errors = float(own.mean()), None if free is None else float(free.mean())
-    return Candidate(family.kind, verdict, reason, *evidence, *errors, **found), geometry
+    error = float(errors.mean())
+    unexplained = error > config.selection.largest_error
+    verdict, reason = (Verdict.LEFT_TOO_MUCH, TOO_MUCH) if unexplained else (Verdict.CHOSEN, EXPLAINS)
+    return Candidate(family.kind, verdict, reason, *evidence, error, **found), geometry
 
 
 def _found_cameras(geometry: Geometry, views: Views, config: FitConfig) -> dict[str, Any]:

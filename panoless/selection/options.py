@@ -21,24 +21,21 @@ class SelectionOptions:
     bent_edge: Positive = 2.0
     """What a kind refines may be farther from the masks by this factor: its edge bends, too. Not tuned."""
     largest_error: NonNegative = 0.3
-    """A candidate that leaves more of the held-out views unexplained is refused even if surfels do no better, unless no
-    later kind explains more. Right ones leave a twentieth."""
+    """A candidate that leaves more of the held-out views unexplained is refused, unless no later kind explains more.
+    Right ones leave a twentieth."""
     doubted_error: NonNegative = 0.15
     """Where a candidate leaves more, those after it are asked, too, but after one that outlines tell wholly. Right ones
     of development scenes leave up to 0.143."""
     doubted_share: Share = 0.5
     """One of those is preferred where it leaves less than this share of that. Not tuned."""
     explained_error: Share = 0.03
-    """A candidate that no other kind takes on, and that leaves less of the held-out views unexplained, is chosen
-    without asking surfels. On sculpture and on other shapes of trial these leave 0.04 and more."""
+    """A kind that goes on from a fit doubts its masks where it leaves more of the held-out views unexplained."""
     least_gain: Share = 0.05
-    """Surfels have to lower the held-out error by this share to be preferred."""
+    """What is preferred has to lower the held-out error by this share."""
     standard_errors: NonNegative = 2.0
     """And by this many standard errors of the paired differences."""
     compared_rays: Count = 1_000_000
     """Most rays that held-out errors are computed from."""
-    trial_share: Share = 0.2
-    """Share of the configured iterations that surfels are given for the comparison."""
     trial_resolution: Count = 128
     """Texels along a face side of the compared maps."""
 

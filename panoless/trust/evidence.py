@@ -168,7 +168,8 @@ def _rim_px(
     """That of a capture; of a kind that outlines determine and of which no view is held out, how far these are off."""
     if ball is not None:
         return ball.rim_px
-    by_outlines = FAMILIES[geometry.kind].told_by_outlines
+    family = FAMILIES.get(geometry.kind)
+    by_outlines = family is not None and family.told_by_outlines
     return silhouette_px if by_outlines and light["unexplained"] is None else None
 
 

@@ -46,15 +46,17 @@ FORBIDDEN = {
     "the benchmark imports the method": ("shinypartial/evaluation/evaluate.py", "import panoless.config"),
     "a fit sees its scores": ("panoless/reconstruct/fit.py", "import shinypartial.metrics"),
     "a fit sees its scores through another module": (
-        "panoless/geometry/surfels/losses.py",
+        "panoless/splats/losses.py",
         "import shinypartial.evaluation.scores",
     ),
     "bpy outside its room": ("shinypartial/dataset/read.py", "import bpy"),
     "torch in the core": ("shinypartial/core/sphere.py", "import torch"),
     "Blender writes the dataset": ("shinypartial/blender/render.py", "import shinypartial.dataset.write"),
     "metrics read files": ("shinypartial/metrics/image.py", "import shinypartial.io.images"),
-    "kernels import a room": ("panoless/kernels/constants.py", "import panoless.geometry.surfels.model"),
+    "kernels import a room": ("panoless/kernels/constants.py", "import panoless.splats.model"),
     "kernels import the benchmark": ("panoless/kernels/constants.py", "import shinypartial.core.sphere"),
+    "a kind imports splatting": ("panoless/geometry/plane/kind.py", "import panoless.splats.model"),
+    "kernels of splatting import a room": ("panoless/splats/kernels/constants.py", "import panoless.capture.views"),
     "the core looks up": ("shinypartial/core/conventions.py", "import shinypartial.io.files"),
 }
 

@@ -117,7 +117,7 @@ def measure(dataset: Path, case: Case, steps: int, threads: int) -> Cost:
 
     trainer = _make_trainer(dataset, case, threads)
     prepared_peak = _peak_mib()
-    start = round(1.5 * trainer.config.environment.warmup * trainer.config.iterations)
+    start = round(1.5 * trainer.config.environment.warmup * trainer.config.splats.iterations)
     for iteration in range(start, start + WARM_UP_STEPS):
         trainer._step(iteration)
     iterations = range(start + WARM_UP_STEPS, start + WARM_UP_STEPS + steps)
@@ -155,7 +155,7 @@ def _make_trainer(dataset: Path, case: Case, threads: int) -> Any:
     config = PRESETS["default"]
     config = replace(
         config,
-        surfels=replace(config.surfels, count=case.surfels),
+        splats=replace(config.splats, surfels=replace(config.splats.surfels, count=case.surfels)),
         environment=replace(config.environment, resolution=case.texels),
     )
     views = resampled_views(dataset, case.pixels, config.crop_margin_px, case.views)

@@ -17,7 +17,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from panoless.kernels.rasterize import RasterBuffers, RasterCamera, rasterize
+from panoless.kernels.camera import RasterCamera
+from panoless.splats.kernels.rasterize import RasterBuffers, rasterize
 from tests.benchmarks.bench_rasterize import CASES, Vase, calibrated_vase, vase_camera
 from tests.support.surfel_scenes import IMAGES
 
@@ -195,11 +196,11 @@ def time_fit(surfels: Vase, camera: RasterCamera, device: torch.device) -> Row:
     from panoless.capture.object_frame import ObjectFrame
     from panoless.capture.views import TrainView, Views
     from panoless.config import FitConfig
-    from panoless.geometry.base import Training
-    from panoless.geometry.surfels.mirror import SurfelMirror
-    from panoless.geometry.surfels.model import Surfels
-    from panoless.geometry.surfels.train import SurfelTrainer
-    from panoless.selection.held_out import Unobserved
+    from panoless.splats.mirror import SurfelMirror
+    from panoless.splats.model import Surfels
+    from panoless.splats.train import SurfelTrainer
+    from panoless.splats.training import Training
+    from tests.support.surfel_training import Unobserved
 
     with torch.no_grad():
         picture = drawn(placed(surfels, device), camera, True)
@@ -226,7 +227,7 @@ def time_fit(surfels: Vase, camera: RasterCamera, device: torch.device) -> Row:
     training = Training(environment, torch.zeros(6, length, length, device=device))
     views = Views((view,), ObjectFrame(torch.zeros(3).numpy(), 1.0), camera.near)
     trainer = SurfelTrainer(views, SurfelMirror(parameters), training, config, Unobserved())
-    warm = round(config.environment.warmup * config.iterations) + 1
+    warm = round(config.environment.warmup * config.splats.iterations) + 1
 
     def step() -> None:
         trainer._step(warm)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 
 from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap
-from panoless.kernels.image import depth_normals, ssim
+from panoless.splats.kernels.image import depth_normals, ssim
 
 NUM_RAYS = 100_000
 FACE_SIZE = 128

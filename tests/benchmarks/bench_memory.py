@@ -14,14 +14,13 @@ import numpy as np
 
 from panoless.capture.configured import configured_views
 from panoless.config import FitConfig
-from panoless.geometry.surfels.kind import SurfelFamily
-from panoless.geometry.surfels.mirror import SurfelMirror
-from panoless.geometry.surfels.placement import initial_surfels
 from panoless.presets import PRESETS
-from panoless.selection.held_out import Unobserved
+from panoless.splats.start import first_mirror, first_training
+from panoless.splats.train import train_surfels
 from shinypartial.dataset.bundled import bundled_dataset
 from shinypartial.dataset.read import open_dataset
 from shinypartial.io.files import write_json
+from tests.support.surfel_training import Unobserved
 
 NOTED_EVERY = 100
 
@@ -59,17 +58,20 @@ def watch(preset: str, steps: int, count: int) -> Flatness:
     config: FitConfig = PRESETS[preset]
     config = replace(
         config,
-        iterations=steps,
+        splats=replace(
+            config.splats,
+            iterations=steps,
+            surfels=replace(config.splats.surfels, count=count),
+            density=replace(config.splats.density, stop=1.0, max_surfels=2 * count),
+        ),
         downscale=2,
         least_object_px=0.0,
-        surfels=replace(config.surfels, count=count, hull_resolution=40),
+        first_surface=replace(config.first_surface, hull_resolution=40),
         environment=replace(config.environment, resolution=32, rays=100_000),
-        density=replace(config.density, stop=1.0, max_surfels=2 * count),
     )
     views, config = configured_views(open_dataset(bundled_dataset("tiny-vase")), config)
-    mirror = SurfelMirror.of(initial_surfels(views, config.surfels, config.seed), config)
-    family, noted = SurfelFamily(), _MemoryWatch()
-    geometry, _ = family.train(views, mirror, family.begin(views, mirror, config), config, noted)
+    mirror, noted = first_mirror(views, config), _MemoryWatch()
+    geometry, _ = train_surfels(views, mirror, first_training(views, mirror, config), config, noted)
     resident = np.array(noted.resident)
     half = len(resident) // 2
     slope = np.polyfit(np.arange(half, len(resident)) * NOTED_EVERY / 1000, resident[half:], 1)[0]

@@ -10,7 +10,7 @@ other load on the machine meets each of them; compare ratios first, milliseconds
   the flags of its release build and with the tuned ones below. Its projection is torch and uses all threads, its
   blending uses one. Where a surfel has a low-pass disk it adds 0.3 square pixels to each footprint's covariance; its
   Gaussians are made so much smaller that a footprint seen from the front has the surfel's size.
-- **the definition**: `panoless/kernels/reference`, plain torch and dense, on the smallest picture only.
+- **the definition**: `panoless/splats/kernels/reference`, plain torch and dense, on the smallest picture only.
 
 A pair is a splat that contributes to a pixel, counted in pixels with alpha over one half: all of them for OpenSplat, a
 sample of 600 pixels of the picture for panoless.
@@ -33,7 +33,8 @@ import tyro
 from torch import Tensor
 
 from panoless.kernels.backend import Backend
-from panoless.kernels.rasterize import RasterBuffers, RasterCamera, rasterize
+from panoless.kernels.camera import RasterCamera
+from panoless.splats.kernels.rasterize import RasterBuffers, rasterize
 from shinypartial.core.errors import InputError
 from shinypartial.io.files import write_json
 from tests.benchmarks.bench_rasterize import CASES, Vase, calibrated_vase, vase_camera

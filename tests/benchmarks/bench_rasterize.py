@@ -17,7 +17,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from panoless.kernels.rasterize import RasterCamera, rasterize
+from panoless.kernels.camera import RasterCamera
+from panoless.splats.kernels.rasterize import rasterize
 from tests.benchmarks.lane_counts import count_lanes
 
 CASES = ((200, 5_000), (400, 20_000), (800, 50_000))
@@ -115,8 +116,8 @@ def coverage_and_pairs(surfels: Vase, camera: RasterCamera) -> tuple[float, floa
     """Fraction of the image with alpha over one half, and contributing surfels a covered pixel, from a sample of the
     pixels.
     """
-    from panoless.kernels.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-    from panoless.kernels.reference import rasterize as reference
+    from panoless.splats.kernels.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+    from panoless.splats.kernels.reference import rasterize as reference
 
     zeros = torch.zeros_like(surfels.means)
     parameters = (surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.colors, zeros, zeros[:, :2])

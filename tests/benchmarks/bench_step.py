@@ -15,7 +15,6 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -25,17 +24,13 @@ import numpy as np
 import torch
 
 from panoless.capture.views import Views, cropped, views_of
-from panoless.config import FitConfig
-from panoless.geometry.surfels import train as train_module
-from panoless.geometry.surfels.kind import SurfelFamily
-from panoless.geometry.surfels.mirror import SurfelMirror
-from panoless.geometry.surfels.optimizer import SurfelOptimizer
-from panoless.geometry.surfels.placement import initial_surfels
-from panoless.geometry.surfels.train import SurfelTrainer
 from panoless.presets import PRESETS
-from panoless.selection.held_out import Unobserved
+from panoless.splats import train as train_module
+from panoless.splats.optimizer import SurfelOptimizer
+from panoless.splats.train import SurfelTrainer
 from shinypartial.core.camera import Camera
 from shinypartial.dataset.read import open_dataset, read_view
+from tests.support.surfel_training import new_trainer
 
 CASES = ((200, 5_000), (400, 8_000), (800, 50_000))
 NUM_VIEWS = 16
@@ -85,18 +80,11 @@ def resampled_views(dataset: Path, size: int, crop_margin_px: int, count: int = 
 def make_trainer(dataset: Path, size: int, count: int, preset: str) -> SurfelTrainer:
     """A fit right after its warm-up, when all terms act."""
     config = PRESETS[preset]
-    config = replace(config, surfels=replace(config.surfels, count=count))
+    config = replace(config, splats=replace(config.splats, surfels=replace(config.splats.surfels, count=count)))
     views = resampled_views(dataset, size, config.crop_margin_px)
     return new_trainer(views, config)
 
 
-def new_trainer(views: Views, config: FitConfig) -> SurfelTrainer:
-    """A trainer before its first step."""
-    mirror = SurfelMirror.of(initial_surfels(views, config.surfels, config.seed), config)
-    return SurfelTrainer(views, mirror, SurfelFamily().begin(views, mirror, config), config, Unobserved())
-
-
-@contextmanager
 def stage_clock() -> Iterator[dict[str, list[float]]]:
     """Record the wall seconds of every stage of a step."""
     seconds: dict[str, list[float]] = defaultdict(list)
@@ -129,7 +117,7 @@ def stage_clock() -> Iterator[dict[str, list[float]]]:
 def measure(dataset: Path, size: int, count: int, steps: int, preset: str) -> StepTiming:
     """Time the steps of one case."""
     trainer = make_trainer(dataset, size, count, preset)
-    first = round(1.5 * trainer.config.environment.warmup * trainer.config.iterations)
+    first = round(1.5 * trainer.config.environment.warmup * trainer.config.splats.iterations)
     for iteration in range(first, first + WARM_UP_STEPS):
         trainer._step(iteration)
     wall, cpu = [], []

@@ -5,9 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from panoless.kernels.cpu import rasterize as cpu
-from panoless.kernels.cpu import records as rec
-from panoless.kernels.cpu.blend import CAP, CHUNK, FRAGMENT_ALPHA, FRAGMENT_SIZE, STOP, find_fragment, touched_blocks
+from panoless.kernels.camera import RasterCamera
 from panoless.kernels.cpu.compilation import LANE_CODE
 from panoless.kernels.cpu.simd import (
     LANES,
@@ -20,7 +18,17 @@ from panoless.kernels.cpu.simd import (
     where,
 )
 from panoless.kernels.cpu.simd_memory import load_lanes
-from panoless.kernels.rasterize import RasterCamera
+from panoless.splats.kernels.cpu import rasterize as cpu
+from panoless.splats.kernels.cpu import records as rec
+from panoless.splats.kernels.cpu.blend import (
+    CAP,
+    CHUNK,
+    FRAGMENT_ALPHA,
+    FRAGMENT_SIZE,
+    STOP,
+    find_fragment,
+    touched_blocks,
+)
 
 
 @dataclass(frozen=True)

@@ -150,7 +150,7 @@ def numbers(state: FitState) -> list[object]:
 
 @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="the system has no timers of processor time")
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [*FAMILIES, "auto"])
+@pytest.mark.parametrize("kind", [*FAMILIES, "surfels", "auto"])
 @pytest.mark.timeout(3600)
 # Python ignores an interruption within the callback of a weak reference; that part goes on to its end.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

@@ -13,23 +13,20 @@ from msgspec import Meta
 
 import panoless
 from panoless.cli import main
-from panoless.config import (
-    FitConfig,
-    RateConfig,
-    check_config,
-    config_from_dict,
-    renamed_arguments,
-    with_overrides,
-)
-from panoless.geometry.surfels.model import ShadedSurfels
+from panoless.config import FitConfig, check_config, config_from_dict, renamed_arguments, with_overrides
 from panoless.photographs.options import CaptureOptions
 from panoless.presets import PRESETS
+from panoless.splats.model import ShadedSurfels
+from panoless.splats.options import RateConfig, SplatConfig
 from shinypartial.core.errors import InputError
 from shinypartial.io.records import write_record
 
 ROOT = Path(panoless.__file__).parent
-SECTIONS = {item.name: item.default_factory for item in fields(FitConfig) if is_dataclass(item.default_factory)}  # type: ignore[arg-type]
-NAMES_OF_SECTIONS = {"config", "rates", "loss", "density", "surfels", "environment"}
+SECTIONS = {
+    item.name: item.default_factory
+    for item in (*fields(FitConfig), *fields(SplatConfig))
+    if is_dataclass(item.default_factory)  # type: ignore[arg-type]
+}
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -48,16 +45,16 @@ def test_presets_differ_beyond_their_name() -> None:
 def test_a_configuration_of_another_version_is_named(damage: str) -> None:
     content = asdict(PRESETS["default"])
     if damage == "missing":
-        del content["loss"]["lambda_ssim"]
+        del content["splats"]["loss"]["lambda_ssim"]
     else:
-        content["loss"]["lambda_of_the_future"] = 1.0
+        content["splats"]["loss"]["lambda_of_the_future"] = 1.0
     with pytest.raises(InputError, match=r"lambda_ssim|lambda_of_the_future"):
         config_from_dict(content)
 
 
 @cache
 def reads() -> set[tuple[str, str]]:
-    """(owner, name) of every attribute that any module but config.py reads: `config.loss.x` gives (loss, x)."""
+    """(owner, name) of every attribute that any module but config.py reads: `config.splats.loss.x` gives (loss, x)."""
     found = set()
     for path in ROOT.rglob("*.py"):
         if path.name == "config.py":
@@ -73,7 +70,7 @@ def reads() -> set[tuple[str, str]]:
 @pytest.mark.parametrize("section", ["", *SECTIONS])
 def test_every_option_is_read(section: str) -> None:
     kind = SECTIONS[section] if section else FitConfig
-    owners = {"config", section, "options"} if section else {"config"}
+    owners = {"config", "splats", section, "options"} if section else {"config"}
     looked_up_by_name = {item.name for item in fields(ShadedSurfels)} | {"environment"} if kind is RateConfig else set()
     seen = {name for owner, name in reads() if owner in owners}
     assert {item.name for item in fields(kind)} - looked_up_by_name - seen == set()  # type: ignore[arg-type]
@@ -85,8 +82,10 @@ def test_every_parameter_has_a_rate() -> None:
     assert rates - others == {item.name for item in fields(ShadedSurfels)} | {"environment"}
 
 
-def with_value(config: FitConfig, name: str, value: Any) -> FitConfig:
+def with_value(config: Any, name: str, value: Any) -> Any:
     section, _, leaf = name.rpartition(".")
+    if isinstance(config, FitConfig) and hasattr(config.splats, section or leaf):
+        return replace(config, splats=with_value(config.splats, name, value))
     if not section:
         return replace(config, **{leaf: value})
     return replace(config, **{section: replace(getattr(config, section), **{leaf: value})})
@@ -102,7 +101,7 @@ def test_presets_are_in_range(preset: str) -> None:
     [
         ("iterations", 0),
         ("surfels.count", 0),
-        ("surfels.hull_votes", 1.01),
+        ("first_surface.hull_votes", 1.01),
         ("environment.resolution", 1),
         ("environment.warmup", -0.1),
         ("loss.depth_blend", 2.0),
@@ -183,7 +182,7 @@ def test_unusual_values_are_allowed(name: str, value: float) -> None:
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
-        ("surfels.hull_resolution", 7, "--config.surfels.hull-resolution: a whole number of at least 8"),
+        ("surfels.count", 0, "--config.surfels.count: a whole number of at least 1"),
         ("tint", (1.0, 0.0, 1.0), "--config.tint: a number above 0"),
     ],
 )
@@ -195,8 +194,8 @@ def test_a_refusal_says_what_is_allowed(name: str, value: Any, expected: str) ->
 
 def test_a_stored_value_out_of_range_is_refused() -> None:
     content = write_record(PRESETS["default"])
-    content["surfels"]["count"] = 0
-    with pytest.raises(InputError, match=r"`surfels\.count`.*at least 1"):
+    content["splats"]["surfels"]["count"] = 0
+    with pytest.raises(InputError, match=r"`splats\.surfels\.count`.*at least 1"):
         config_from_dict(content)
     with pytest.raises(
         InputError,
@@ -232,7 +231,7 @@ def test_the_command_line_is_derived_from_the_same_fields(capsys: pytest.Capture
     text = capsys.readouterr().out
     for name in (
         "--model {auto,sphere,plane,height_field,revolution,free_form,surfels}",
-        "--config.surfels.hull-votes",
+        "--config.surfels.count",
         "--config.tint",
     ):
         assert name in text

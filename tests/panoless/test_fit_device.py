@@ -32,13 +32,15 @@ def definition_only(monkeypatch: pytest.MonkeyPatch) -> None:
 def shortest_config(preset: str) -> FitConfig:
     """Every path of a preset in a few steps."""
     config = tiny_config(preset, iterations=5, count=20)
-    density = replace(config.density, start=0.0, every=0.2, reset_every=0.5, propagate_every=0.34, gradient_threshold=0)
+    density = replace(
+        config.splats.density, start=0.0, every=0.2, reset_every=0.5, propagate_every=0.34, gradient_threshold=0
+    )
     return replace(
         config,
+        splats=replace(config.splats, density=density),
+        first_surface=replace(config.first_surface, hull_resolution=16),
         model="surfels",
         downscale=2,
-        density=density,
-        surfels=replace(config.surfels, hull_resolution=16),
         environment=replace(config.environment, resolution=4, solve_resolution=4),
     )
 

@@ -24,7 +24,7 @@ SCHEMA = ROOT / "docs" / "reference" / "json-progress.schema.json"
 SHORT = ["--model", "surfels", "--config.iterations", "30", "--config.surfels.count", "100"]
 SHORT += ["--config.environment.resolution", "16", "--config.environment.solve-resolution", "16", "--set"]
 SHORT += ["surroundings.mode=off", "material.reflectance=off", "corrections.masks=off", "trust.resolution=16"]
-SHORT += ["corrections.exposure=off", "corrections.lens=off", "surfels.hull_resolution=24"]
+SHORT += ["corrections.exposure=off", "corrections.lens=off", "first_surface.hull_resolution=24"]
 
 
 def checked(lines: Iterator[str] | list[str]) -> list[dict[str, Any]]:

@@ -16,7 +16,7 @@ from panoless.geometry.height_field.model import (
     visible_reflections,
 )
 from panoless.geometry.plane.model import Plane
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from tests.support.mirror_plane import train_view
 
 

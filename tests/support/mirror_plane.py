@@ -13,7 +13,7 @@ from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import pose_of, unit_rays_camera
 from panoless.capture.views import TrainView, Views
 from panoless.geometry.plane.model import Plane
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from shinypartial.core.camera import Camera, look_at
 from shinypartial.core.conventions import SOLID_ALPHA
 from shinypartial.dataset.read import open_dataset

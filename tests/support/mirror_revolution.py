@@ -14,8 +14,8 @@ from panoless.capture.rays import pose_of, unit_rays_camera
 from panoless.capture.views import Views
 from panoless.geometry.revolution.model import SurfaceOfRevolution
 from panoless.geometry.revolution.render import mean_light
+from panoless.kernels.camera import RasterCamera
 from panoless.kernels.cubemap import cubemap_directions
-from panoless.kernels.rasterize import RasterCamera
 from tests.support.mirror_plane import camera_at, train_view
 from tests.support.synthetic_dataset import environment_radiance
 

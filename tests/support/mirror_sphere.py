@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from panoless.config import FitConfig
-from panoless.geometry.surfels.model import Surfels
 from panoless.presets import PRESETS
+from panoless.splats.model import Surfels
 from tests.support.synthetic_dataset import environment_radiance
 
 
@@ -43,14 +43,18 @@ def tiny_config(preset: str = "default", iterations: int = 80, count: int = 300)
     they are; trust is judged under a coarse map.
     """
     config = PRESETS[preset]
-    density = replace(config.density, start=0.1, stop=0.9, every=0.2, reset_every=0.4, propagate_every=0.3)
+    density = replace(config.splats.density, start=0.1, stop=0.9, every=0.2, reset_every=0.4, propagate_every=0.3)
     return replace(
         config,
+        splats=replace(
+            config.splats,
+            iterations=iterations,
+            surfels=replace(config.splats.surfels, count=count),
+            density=density,
+        ),
         model="surfels",
-        iterations=iterations,
-        surfels=replace(config.surfels, count=count, hull_resolution=40),
+        first_surface=replace(config.first_surface, hull_resolution=40),
         environment=replace(config.environment, resolution=24, solve_resolution=24),
-        density=density,
         surroundings=replace(config.surroundings, mode="off"),
         material=replace(config.material, reflectance="off", roughness="off", blur="off"),
         trust=replace(config.trust, resolution=32),

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from panoless.kernels.splats import SplatImages, Splats, blend_splats
+from panoless.splats.kernels.splats import SplatImages, Splats, blend_splats
 
 SIZE = (18, 21)
 

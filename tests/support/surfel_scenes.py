@@ -8,7 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from panoless.kernels.backend import Backend
-from panoless.kernels.rasterize import RasterBuffers, RasterCamera, rasterize
+from panoless.kernels.camera import RasterCamera
+from panoless.splats.kernels.rasterize import RasterBuffers, rasterize
 
 IMAGES = ("colors", "normals_camera", "accumulated_depth", "alpha", "median_depth", "distortion")
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import TrainView, Views
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from shinypartial.core.camera import look_at
 from shinypartial.core.conventions import SOLID_ALPHA
 

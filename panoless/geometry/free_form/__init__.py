@@ -1,1 +1,1 @@
-"""A free-form mirror: the zero level of a tricubic B-spline. Imports the surfels that a free fit starts from."""
+"""A free-form mirror: the zero level of a tricubic B-spline. Imports no other kind."""

@@ -39,9 +39,7 @@ from panoless.geometry.free_form.rendering import free_form_buffers, free_form_l
 from panoless.geometry.free_form.start import FirstSurfaces, first_surfaces, started
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import Trust, full_trust
-from panoless.geometry.surfels.mirror import SurfelMirror
-from panoless.geometry.surfels.placement import surfels_on_mesh
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from panoless.numeric.factorize import regularize
 from shinypartial.io.records import read_record, write_record
 
@@ -169,12 +167,6 @@ class FreeFormMirror(ExactGeometry):
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
         """By intersection; alpha by a grid of rays at outlines."""
         return free_form_buffers(self.surface, camera, self.options)
-
-    def to_surfels(self, config: FitConfig) -> SurfelMirror:
-        """Surfels all over the surface, curved as it is."""
-        mesh, _ = self.surface.mesh(points_a_cell=1)
-        pixel = self.surface.spacing * self.options.surfel_pixel
-        return SurfelMirror.of(surfels_on_mesh(mesh, config.surfels, pixel, config.seed), config, self)
 
     def mesh(self, frame: ObjectFrame) -> Mesh:
         """Marching cubes, with the exact normals of the vertices and the trust there, `confidence` in [0, 1]."""

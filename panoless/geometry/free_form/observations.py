@@ -13,7 +13,7 @@ from panoless.capture.poses import Poses
 from panoless.capture.rays import camera_rays, pose_of
 from panoless.capture.silhouettes import mask_contours
 from panoless.capture.views import Views, concatenated, every_kth_pixel
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from shinypartial.core.conventions import PIXEL_CENTER, SOLID_ALPHA
 
 

@@ -307,8 +307,6 @@ class FreeFormOptions:
     times the time."""
     render_bounces: Count = 8
     """A ray that has not left after so many reflections shows where it goes then. Not tuned."""
-    surfel_pixel: Positive = 0.2
-    """The sag of surfels that start on the surface is told in pixels of so many cells. Not tuned."""
     wide_texels: Positive = 4.0
     """A pixel that mirrors so many texels has half a vote."""
     map_smoothness: Positive = 0.05

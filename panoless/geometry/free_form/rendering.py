@@ -15,8 +15,8 @@ from panoless.geometry.free_form.options import FreeFormOptions
 from panoless.geometry.free_form.photometric import Sights
 from panoless.geometry.free_form.spread import FinalRays
 from panoless.geometry.free_form.surface import LevelSet
+from panoless.kernels.camera import RasterCamera
 from panoless.kernels.cubemap import sample_cubemap
-from panoless.kernels.rasterize import RasterCamera
 
 
 def free_form_buffers(surface: LevelSet, camera: RasterCamera, options: FreeFormOptions) -> SurfaceBuffers:

@@ -49,7 +49,7 @@ def first_surfaces(views: Views, config: FitConfig) -> FirstSurfaces:
     """
     options, first = config.free_form, config.first_surface
     known = trusted_hull(
-        carve_hull(views, config.surfels.hull_resolution, config.surfels.hull_votes, first), views, first
+        carve_hull(views, config.first_surface.hull_resolution, config.first_surface.hull_votes, first), views, first
     )
 
     def level_set(mesh: TriangleMesh) -> LevelSet:

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -22,9 +21,7 @@ from panoless.geometry.height_field.model import (
     visible_reflections,
 )
 from panoless.geometry.height_field.options import HeightFieldOptions
-from panoless.geometry.surfels.mirror import SurfelMirror
-from panoless.geometry.surfels.placement import places_within, surfels_at
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from shinypartial.core.errors import InputError
 from shinypartial.io.records import read_record, write_record
 
@@ -65,22 +62,6 @@ class HeightFieldMirror(SeenByCenters):
         """Coverage by the mirror's edge; depth and normals by intersection."""
         return height_field_buffers(self.height_field, camera)
 
-    def to_surfels(self, config: FitConfig) -> SurfelMirror:
-        """Surfels over the places of the plane's, tilted and curved as the mirror is.
-
-        Curvatures are D²h/√(1 + |∇h|²), the shape operator but for terms of second order in the slope.
-        """
-        field = self.height_field
-        places, radius = places_within(field.plane.boundary, config.surfels, config.seed)
-        h, h_u, h_v, *bends = field.heights(places)
-        points = field.plane.points(places) + h[:, None] * field.plane.normal
-        norm, zero = np.sqrt(1 + h_u**2 + h_v**2), np.zeros_like(h)
-        normals = np.stack([-h_u, -h_v, zero + 1], 1) / norm[:, None]
-        tangents = np.stack([zero + 1, zero, h_u], 1) / np.sqrt(1 + h_u**2)[:, None]
-        frames = np.einsum("iw,pij->pwj", field.frame, np.stack([tangents, np.cross(normals, tangents), normals], 2))
-        scales, curvatures = np.full((len(places), 2), radius), np.stack(bends, 1) / norm[:, None]
-        return SurfelMirror.of(surfels_at(points, frames, scales, curvatures), config, self)
-
     def mesh(self, frame: ObjectFrame) -> Mesh:
         """Quadrilaterals within the boundary, with the exact normals of the spline."""
         points, faces = self.height_field.quadrilaterals()
@@ -112,7 +93,7 @@ class HeightFieldFamily(ExactFamily):
             raise InputError(
                 expected="a plane that a height field may bend, for --model height_field",
                 found="silhouettes that determine none",
-                remedy="Take --model auto or --model surfels.",
+                remedy="Take --model auto.",
             )
         return None
 

@@ -12,8 +12,8 @@ from panoless.capture.views import TrainView
 from panoless.geometry.base import SurfaceBuffers, buffers_from_arrays
 from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.model import Plane
+from panoless.kernels.camera import RasterCamera
 from panoless.kernels.height_field import first_hits
-from panoless.kernels.rasterize import RasterCamera
 from panoless.numeric.bspline import cubic_bsplines_at, with_halved_knots
 from panoless.numeric.polygon import depth_inside, projected_coverage, with_cut_sides
 

@@ -15,9 +15,7 @@ from panoless.geometry.base import SOLID_SURFACE_ALPHA, Geometry, Mesh, Proposal
 from panoless.geometry.exact import ExactFamily, SeenByCenters, looked_up, mirrored_directions
 from panoless.geometry.plane.fit import fit_plane
 from panoless.geometry.plane.model import Plane, plane_buffers, unoccluded_share
-from panoless.geometry.surfels.mirror import SurfelMirror
-from panoless.geometry.surfels.placement import places_within, surfels_at
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from shinypartial.core.errors import InputError
 
 UNOCCLUDED_SHARE = 0.99
@@ -63,14 +61,6 @@ class PlaneMirror(SeenByCenters):
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
         """Exact coverage and depth."""
         return plane_buffers(self.plane, camera)
-
-    def to_surfels(self, config: FitConfig) -> SurfelMirror:
-        """Flat surfels evenly within the boundary, on a hexagonal grid shifted by the seed."""
-        places, radius = places_within(self.plane.boundary, config.surfels, config.seed)
-        axes = np.stack([self.plane.tangent_u, self.plane.tangent_v, self.plane.normal], 1)
-        frames = np.broadcast_to(axes, (len(places), 3, 3))
-        scales, curvatures = np.full((len(places), 2), radius), np.zeros((len(places), 3))
-        return SurfelMirror.of(surfels_at(self.plane.points(places), frames, scales, curvatures), config, self)
 
     def mesh(self, frame: ObjectFrame) -> Mesh:
         """One polygon, with the normal of the plane at every vertex."""

@@ -1,6 +1,6 @@
 """A planar mirror: one plane with an boundary, and what a camera sees of it.
 
-A surface of one normal needs neither surfels nor blending: coverage and depth are exact.
+A surface of one normal needs no blending: coverage and depth are exact.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from torch import Tensor
 from panoless.capture.rays import camera_rays, pose_of
 from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import SurfaceBuffers, buffers_from_arrays
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from panoless.numeric.polygon import projected_coverage
 from shinypartial.core.conventions import PIXEL_CENTER
 

@@ -21,10 +21,8 @@ from panoless.geometry.revolution.fit import follow_views, propose_revolution, r
 from panoless.geometry.revolution.lip import beside_lip
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_buffers, revolution_rays
 from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
-from panoless.geometry.revolution.placement import surfels_on_revolution
 from panoless.geometry.revolution.render import mean_light
-from panoless.geometry.surfels.mirror import SurfelMirror
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from shinypartial.core.errors import InputError
 from shinypartial.io.records import read_record, write_record
 
@@ -91,10 +89,6 @@ class RevolutionMirror(ExactGeometry):
         """Mean over the pixels' areas, followed through all their reflections."""
         return mean_light(self.surface, environment, camera, pixels, self.options.rendering)
 
-    def to_surfels(self, config: FitConfig) -> SurfelMirror:
-        """Rings of surfels, curved as the surface is."""
-        return SurfelMirror.of(surfels_on_revolution(self.surface, config.surfels), config)
-
     def state_dict(self) -> dict[str, Any]:
         """All numbers as lists and plain values."""
         surface, options, poses = to_plain(self.surface), write_record(self.options), to_plain(self.poses)
@@ -132,7 +126,7 @@ class RevolutionFamily(ExactFamily):
             raise InputError(
                 expected="masks of a surface of revolution, for --model revolution",
                 found="no axis around which their silhouettes agree",
-                remedy="Take --model auto or --model surfels.",
+                remedy="Take --model auto.",
             )
         return None
 

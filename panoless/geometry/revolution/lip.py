@@ -28,7 +28,7 @@ from panoless.geometry.revolution.options import DEFAULTS, LipOptions, Revolutio
 from panoless.geometry.revolution.pixels import PixelBundles
 from panoless.geometry.revolution.profile import resample_profile
 from panoless.geometry.revolution.silhouette import ContourRays, adapted_scale, in_axis_frame, silhouette_residuals
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from panoless.numeric.bspline import cubic_bspline
 from panoless.numeric.gauss_newton import accept_step, damped_step
 from panoless.numeric.robust import robust_weight

@@ -1,4 +1,4 @@
-"""A surface of revolution: an axis and a profile, what a camera sees of it, and the same as surfels.
+"""A surface of revolution: an axis and a profile, and what a camera sees of it.
 
 Like a plane, it needs no blending: rays are intersected with the surface itself, and may be followed on from there.
 """
@@ -18,7 +18,7 @@ from panoless.environment.rays import Rays
 from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import SurfaceBuffers, buffers_from_arrays
 from panoless.geometry.revolution.options import DEFAULTS, MapOptions
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from panoless.kernels.revolution import first_hits, follow
 from shinypartial.core.sphere import pixel_footprint_sr
 
@@ -164,7 +164,7 @@ class SurfaceOfRevolution:
 
 
 def revolution_buffers(surface: SurfaceOfRevolution, camera: RasterCamera, samples: int = 4) -> SurfaceBuffers:
-    """The surface as surfels would be seen: depth and normal of the rays through pixel centers, alpha by `samples`²
+    """What is seen of the surface: depth and normal of the rays through pixel centers, alpha by `samples`²
     rays where neighbors disagree. Where only the center misses, depth and normal are those of a neighbor. The three
     depths agree.
     """

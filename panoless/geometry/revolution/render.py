@@ -19,8 +19,8 @@ from torch import Tensor
 from panoless.capture.rays import pixel_rays
 from panoless.geometry.revolution.model import SurfaceOfRevolution, trace_reflections
 from panoless.geometry.revolution.options import DEFAULTS, RenderingOptions
+from panoless.kernels.camera import RasterCamera
 from panoless.kernels.cubemap import sample_cubemap
-from panoless.kernels.rasterize import RasterCamera
 
 
 @dataclass(frozen=True)

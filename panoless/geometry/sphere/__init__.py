@@ -1,1 +1,1 @@
-"""A mirror ball: center and radius by its outlines. Imports nothing of other kinds but surfels."""
+"""A mirror ball: center and radius by its outlines. Imports no other kind."""

@@ -20,12 +20,9 @@ from panoless.geometry.exact import ExactFamily, ExactGeometry
 from panoless.geometry.sphere.fit import fit_sphere
 from panoless.geometry.sphere.model import CENTER, Sphere, mirrored, parts_of_pixel, sphere_buffers
 from panoless.geometry.sphere.options import SphereOptions
-from panoless.geometry.surfels.mirror import SurfelMirror
-from panoless.geometry.surfels.placement import surfels_at
+from panoless.kernels.camera import RasterCamera
 from panoless.kernels.cubemap import sample_cubemap
-from panoless.kernels.rasterize import RasterCamera
 from shinypartial.core.errors import InputError
-from shinypartial.core.sphere import fibonacci_directions
 from shinypartial.io.records import read_record, write_record
 
 MERIDIANS = 128
@@ -106,19 +103,6 @@ class SphereMirror(ExactGeometry):
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
         """By intersection; alpha by a grid of rays at the outline."""
         return sphere_buffers(self.sphere, camera, self.options.samples)
-
-    def to_surfels(self, config: FitConfig) -> SurfelMirror:
-        """Surfels all over it on a Fibonacci lattice, curved as it is."""
-        count, radius = config.surfels.count, self.sphere.radius
-        normals = fibonacci_directions(count)
-        helper = np.eye(3)[np.abs(normals).argmin(1)]
-        across = np.cross(helper, normals)
-        across /= np.linalg.norm(across, axis=1, keepdims=True)
-        frames = np.stack([across, np.cross(normals, across), normals], 2)
-        width = config.surfels.tuned.overlap * radius * float(np.sqrt(4 * np.pi / count))
-        scales, bends = np.full((count, 2), width), np.tile([-1 / radius, 0.0, -1 / radius], (count, 1))
-        points = self.sphere.center + radius * normals
-        return SurfelMirror.of(surfels_at(points, frames, scales, bends), config, self)
 
     def mesh(self, frame: ObjectFrame) -> Mesh:
         """Quadrilaterals between 128 meridians and 64 rings, with exact normals; triangles' worth at the poles."""

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from panoless.capture.rays import pixel_rays, pose_of, reflect
 from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import SurfaceBuffers, beside_outline, buffers_from_arrays
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from shinypartial.core.conventions import PIXEL_CENTER
 from shinypartial.io.threads import in_threads
 

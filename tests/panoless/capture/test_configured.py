@@ -11,10 +11,10 @@ from panoless.capture.encoding import encoding_of
 from panoless.capture.options import ContrastOptions
 from panoless.capture.views import load_views
 from panoless.config import FitConfig
-from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.presets import PRESETS
 from panoless.reconstruct.fit import fit
 from panoless.reconstruct.state import FitState
+from panoless.splats.mirror import SurfelMirror
 from shinypartial.dataset.read import open_dataset, read_view
 from shinypartial.dataset.schema import BallEvidence, Dataset
 from shinypartial.dataset.write import write_transforms, write_view

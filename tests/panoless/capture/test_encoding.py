@@ -16,10 +16,10 @@ from panoless.capture.views import load_views
 from panoless.config import FitConfig, check_config
 from panoless.environment.cubemap import look_up
 from panoless.export.render import render
-from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.presets import PRESETS
 from panoless.reconstruct.fit import fit
+from panoless.splats.mirror import SurfelMirror
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import read_view
 from shinypartial.dataset.schema import Dataset
@@ -75,7 +75,7 @@ def test_the_usual_light_changes_nothing() -> None:
     environment = torch.rand(6, 3, 4, 4)
     assert LDR.encoded(radiance) is radiance
     assert LDR.decoded(environment) is environment
-    mirrors = [config for config in PRESETS.values() if config.surfels.shading == "mirror"]
+    mirrors = [config for config in PRESETS.values() if config.splats.surfels.shading == "mirror"]
     assert all(encoding_of(config) == LDR for config in mirrors)
 
 
@@ -133,7 +133,7 @@ def test_a_tinted_mirror_with_its_tint_gives_the_map_of_an_untinted_one(finished
         view = read_view(one)
         write_view(one, replace(view, radiance=np.minimum(view.radiance, 1)))
         write_view(other, replace(view, radiance=np.minimum(view.radiance, 1) * np.array(tint, np.float32)))
-    config = replace(finished.config, iterations=10)
+    config = replace(finished.config, splats=replace(finished.config.splats, iterations=10))
     given_tint = replace(config, tint=tint)
     states = [fit(plain, config, tmp_path / "a"), fit(tinted, given_tint, tmp_path / "b")]
     maps = [state.environment for state in states]
@@ -169,7 +169,11 @@ def test_pictures_of_8_bits_have_no_high_dynamic_range(tmp_path: Path) -> None:
         replace(FitConfig(), tint=(1.0, 0.0, 1.0)),
         replace(FitConfig(), tint=(1.0, float("nan"), 1.0)),
         replace(PRESETS["paper"], environment=replace(PRESETS["paper"].environment, range="hdr")),
-        replace(FitConfig(), albedo=True, environment=replace(FitConfig().environment, range="hdr")),
+        replace(
+            FitConfig(),
+            splats=replace(FitConfig().splats, albedo=True),
+            environment=replace(FitConfig().environment, range="hdr"),
+        ),
         replace(FitConfig(), exposure=2.0, environment=replace(FitConfig().environment, range="hdr")),
         replace(FitConfig(), exposure=2.0, environment=replace(FitConfig().environment, solve=False)),
         replace(PRESETS["paper"], exposure=2.0),

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import camera_rays, pixel_rays, pose_of, project, raster_camera, reflect, unit_rays_camera
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from shinypartial.core.camera import Camera, look_at, ray_directions_world
 from shinypartial.core.camera import project as project_world
 

@@ -26,10 +26,10 @@ from panoless.geometry.height_field.kind import HeightFieldMirror
 from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.revolution.kind import RevolutionMirror
 from panoless.geometry.revolution.model import SurfaceOfRevolution
-from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.reconstruct.state import FitState
 from panoless.selection.candidates import Candidate, Selection, Verdict
+from panoless.splats.mirror import SurfelMirror
 from shinypartial.core.color import to_display
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import cube_to_latlong as clamped_cube_to_latlong
@@ -68,12 +68,12 @@ def prediction(finished: FinishedFit, tmp_path_factory: pytest.TempPathFactory) 
 def test_the_readers_accept_the_prediction(prediction: Path, finished: FinishedFit) -> None:
     info = read_info(prediction)
     assert info.dataset_hash == dataset_hash(finished.dataset)
-    assert info.config["surfels"]["count"] == finished.config.surfels.count
+    assert info.config["splats"]["surfels"]["count"] == finished.config.splats.surfels.count
     assert info.primitives == finished.state.geometry.num_primitives
     files = (prediction / "surfels.ply", prediction / "environment.exr")
     assert info.model_bytes == sum(path.stat().st_size for path in files)
     assert info.iteration is None
-    assert sum(info.parameter_counts.values()) == 13 * finished.config.surfels.count + 6 * 3 * 24 * 24
+    assert sum(info.parameter_counts.values()) == 13 * finished.config.splats.surfels.count + 6 * 3 * 24 * 24
     assert info.peak_memory_bytes > 1e7
     assert set(info.seconds) >= {"read views", "initialize", "optimize", "solve environment"}
     assert all(len(series) == len(info.curves["iteration"]) for series in info.curves.values())

@@ -7,15 +7,16 @@ import pytest
 import torch
 
 from panoless.capture.views import TrainView, Views
-from panoless.config import SurfelConfig
 from panoless.first_surface.completion import complete_surface, completed, hull_surface, thin_plate, trusted_hull
 from panoless.first_surface.contact import Contact, outline_contact
 from panoless.first_surface.mesh import TriangleMesh
+from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.first_surface.visual_hull import HULL_HALF_SIDE, Hull, carve_hull
-from panoless.geometry.surfels.placement import initial_surfels
+from panoless.splats.options import SurfelConfig
+from panoless.splats.placement import initial_surfels
 from shinypartial.core.errors import InputError
 
-CONFIG = SurfelConfig(count=800, hull_resolution=48)
+CONFIG = SurfelConfig(count=800)
 VOXEL = 2 * HULL_HALF_SIDE / 47
 
 
@@ -48,7 +49,7 @@ def masked(view: TrainView, pixel: tuple[int, int] | None) -> TrainView:
 def test_masks_that_contradict_each_other_leave_no_hull(views: Views) -> None:
     corners = tuple(masked(view, (0, 0) if i % 2 else (-1, -1)) for i, view in enumerate(views.train))
     with pytest.raises(InputError, match="no point in space"):
-        initial_surfels(replace(views, train=corners), CONFIG, seed=0)
+        initial_surfels(replace(views, train=corners), CONFIG, 0, FirstSurfaceOptions(hull_resolution=48))
 
 
 def test_a_vote_forgives_one_wrong_mask(views: Views) -> None:

@@ -9,14 +9,15 @@ import torch
 from panoless.capture.masks import cut_sides
 from panoless.capture.silhouettes import mask_contours
 from panoless.capture.views import TrainView, Views, cropped, views_of
-from panoless.config import SurfelConfig
 from panoless.first_surface.completion import complete_surface, hull_surface
 from panoless.first_surface.mesh import TriangleMesh
+from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.first_surface.visual_hull import HULL_HALF_SIDE, Hull, carve_hull
 from panoless.geometry.plane.fit import fit_plane
 from panoless.geometry.revolution.fit import propose_revolution
-from panoless.geometry.surfels.placement import initial_surfels
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
+from panoless.splats.options import SurfelConfig
+from panoless.splats.placement import initial_surfels
 from shinypartial.core.camera import Camera
 from tests.panoless.first_surface.test_visual_hull import RADIUS, RESOLUTION, SIDE, VOXEL, all_around, deviation
 from tests.support.synthetic_dataset import render_sphere, sphere_cameras
@@ -122,7 +123,7 @@ def test_every_kind_of_geometry_can_start_on_cut_views(every: int) -> None:
     assert np.isfinite(fit_plane(views, thorough=False).plane.offset)
     surface = propose_revolution(views)
     assert surface is None or np.isfinite(surface.surface.profile).all()
-    surfels = initial_surfels(views, SurfelConfig(count=300, hull_resolution=40), seed=0)
+    surfels = initial_surfels(views, SurfelConfig(count=300), 0, FirstSurfaceOptions(hull_resolution=40))
     points = surfels.means.double().numpy() * views.object_frame.radius + views.object_frame.center
     assert torch.isfinite(surfels.means).all()
     assert every == 1 or np.median(np.abs(np.linalg.norm(points[points[:, 0] > 0.3], axis=1) - 1)) < 0.05

@@ -13,7 +13,7 @@ from panoless.capture.silhouettes import mask_distance_px
 from panoless.capture.views import TrainView, Views
 from panoless.first_surface.completion import complete_surface, hull_surface
 from panoless.first_surface.visual_hull import HULL_HALF_SIDE, carve_hull, contradiction_px
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from shinypartial.dataset.perturb.masks import dilated, wobbling
 
 RADIUS = 0.6

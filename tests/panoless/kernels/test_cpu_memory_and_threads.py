@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from panoless.kernels.cpu import workers
-from panoless.kernels.cpu.buffers import take
 from panoless.kernels.cpu.workers import run_shared
+from panoless.splats.kernels.cpu.buffers import take
 
 
 @pytest.fixture

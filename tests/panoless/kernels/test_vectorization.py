@@ -5,8 +5,9 @@ import re
 import pytest
 from numba import float32, int32, int64, njit
 
-from panoless.kernels.cpu import cubemap, image
+from panoless.kernels.cpu import cubemap
 from panoless.kernels.cpu.compilation import VECTORIZED_LOOPS
+from panoless.splats.kernels.cpu import image
 
 LINE, ROWS, PLANES = float32[::1], float32[:, ::1], float32[:, :, ::1]
 CAMERA = (float32,) * 4

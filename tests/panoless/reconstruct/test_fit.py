@@ -15,41 +15,29 @@ from panoless.capture.views import Views, load_views
 from panoless.config import FitConfig
 from panoless.environment.cubemap import look_up
 from panoless.export.render import render
-from panoless.geometry.base import Geometry, Training
-from panoless.geometry.surfels import objective
-from panoless.geometry.surfels.kind import SurfelFamily
-from panoless.geometry.surfels.mirror import SurfelMirror
-from panoless.geometry.surfels.model import Surfels
-from panoless.geometry.surfels.objective import LossTerms
-from panoless.geometry.surfels.placement import initial_surfels
-from panoless.geometry.surfels.schedule import phase_of
-from panoless.geometry.surfels.train import SurfelTrainer, train_surfels
+from panoless.geometry.base import Geometry
 from panoless.kernels.cubemap import cubemap_directions
-from panoless.kernels.objective import Objective
 from panoless.presets import PRESETS
 from panoless.reconstruct import fit as fit_module
 from panoless.reconstruct import recorder as recorder_module
 from panoless.reconstruct.fit import fit
 from panoless.reconstruct.state import FitState, load_state
-from panoless.selection.held_out import Unobserved
+from panoless.splats import objective
+from panoless.splats.kernels.objective import Objective
+from panoless.splats.mirror import SurfelMirror
+from panoless.splats.model import Surfels
+from panoless.splats.objective import LossTerms
+from panoless.splats.schedule import phase_of
+from panoless.splats.train import SurfelTrainer, train_surfels
 from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.read import read_view
 from shinypartial.dataset.schema import Dataset
 from tests.panoless.conftest import FinishedFit
 from tests.support.mirror_sphere import clipped_environment, tiny_config
+from tests.support.surfel_training import Unobserved, begin, new_trainer
 
 ROOT = Path(__file__).resolve().parents[3]
-
-
-def begin(views: Views, config: FitConfig) -> tuple[SurfelMirror, Training]:
-    """Surfels and training before the first step."""
-    mirror = SurfelMirror.of(initial_surfels(views, config.surfels, config.seed), config)
-    return mirror, SurfelFamily().begin(views, mirror, config)
-
-
-def trainer_of(views: Views, config: FitConfig) -> SurfelTrainer:
-    return SurfelTrainer(views, *begin(views, config), config, Unobserved())
 
 
 def surfels_of(state: FitState) -> Surfels:
@@ -97,7 +85,7 @@ def test_unseen_views_are_rendered_better_than_by_the_start(finished: FinishedFi
 
     # Measured: a third on one processor, 0.60 to 0.62 on another.
     assert error(end.geometry, end.environment) < 0.8 * error(start, training.environment)
-    assert end.curves["iteration"] == list(range(0, config.iterations, 10))
+    assert end.curves["iteration"] == list(range(0, config.splats.iterations, 10))
 
 
 def test_normals_become_better_than_the_hull(finished: FinishedFit, views: Views) -> None:
@@ -117,7 +105,7 @@ def test_a_finished_fit_is_returned_at_once(finished: FinishedFit, monkeypatch: 
 
     monkeypatch.setattr(fit_module, "configured_views", forbidden)
     again = fit(finished.dataset, finished.config, finished.folder)
-    assert again.iteration == finished.config.iterations
+    assert again.iteration == finished.config.splats.iterations
     assert_same(again, finished.state)
 
 
@@ -184,7 +172,9 @@ def test_an_interrupted_fit_ends_as_an_uninterrupted_one(preset: str, tmp_path: 
 def test_the_paper_presets_run_all_their_paths(preset: str, tmp_path: Path, sphere_dataset: Dataset) -> None:
     """Random surfels, growth, pruning, resets, propagation and online visibility."""
     config = tiny_config(preset, iterations=60, count=400)
-    config = replace(config, density=replace(config.density, gradient_threshold=1e-6))
+    config = replace(
+        config, splats=replace(config.splats, density=replace(config.splats.density, gradient_threshold=1e-6))
+    )
     state = fit(sphere_dataset, config, tmp_path / "run")
     for name, value in surfels_of(state).named().items():
         assert torch.isfinite(value).all(), name
@@ -198,14 +188,14 @@ def test_the_paper_presets_run_all_their_paths(preset: str, tmp_path: Path, sphe
     assert all(math.isfinite(value) for series in state.curves.values() for value in series)
     silhouettes = state.curves["silhouette loss"]
     assert silhouettes[-1] == 0.0
-    assert (silhouettes[0] > 0) == (config.loss.lambda_silhouette > 0)
+    assert (silhouettes[0] > 0) == (config.splats.loss.lambda_silhouette > 0)
     consistencies = state.curves["normal consistency loss"]
-    assert (max(consistencies) > 0) == (config.loss.lambda_normal_consistency > 0)
+    assert (max(consistencies) > 0) == (config.splats.loss.lambda_normal_consistency > 0)
 
 
 def test_the_paper_method_learns(tmp_path: Path, sphere_dataset: Dataset) -> None:
     config = replace(tiny_config("paper", iterations=150, count=1000))
-    config = replace(config, density=replace(config.density, enabled=False))
+    config = replace(config, splats=replace(config.splats, density=replace(config.splats.density, enabled=False)))
     state = fit(sphere_dataset, config, tmp_path / "run")
     losses = state.curves["photometric loss"]
     # Measured 0.30 to 0.19.
@@ -215,13 +205,13 @@ def test_the_paper_method_learns(tmp_path: Path, sphere_dataset: Dataset) -> Non
 @pytest.mark.parametrize("preset", ["default", "paper", "paper-rho-weighted"])
 def test_what_is_not_learned_does_not_change(preset: str, tmp_path: Path, sphere_dataset: Dataset) -> None:
     config = tiny_config(preset, iterations=12, count=60)
-    config = replace(config, density=replace(config.density, enabled=False))
+    config = replace(config, splats=replace(config.splats, density=replace(config.splats.density, enabled=False)))
     before = begin(load_views(sphere_dataset, config.crop_margin_px), config)[0].surfels.named()
     after = surfels_of(fit(sphere_dataset, config, tmp_path / "run")).named()
     learned = {name for name in before if not torch.equal(before[name], after[name])}
-    assert ("albedo" in learned) == config.albedo
-    assert ("curvatures" in learned) == config.surfels.curved
-    assert ("roughness_logits" in learned) == config.loss.roughness_weighted
+    assert ("albedo" in learned) == config.splats.albedo
+    assert ("curvatures" in learned) == config.splats.surfels.curved
+    assert ("roughness_logits" in learned) == config.splats.loss.roughness_weighted
     assert {"means", "quats", "log_scales", "opacity_logits"} <= learned
 
 
@@ -243,8 +233,8 @@ def test_pixels_that_no_term_reads_change_nothing(
 ) -> None:
     """Without a silhouette term, tiles beside the object are left out: every step is the same to the last bit."""
     config = replace(tiny_config(iterations=12, count=120), crop_margin_px=-1)
-    loss = replace(config.loss, lambda_silhouette=0.0, lambda_normal_consistency=lambda_normal_consistency)
-    config = replace(config, loss=loss)
+    loss = replace(config.splats.loss, lambda_silhouette=0.0, lambda_normal_consistency=lambda_normal_consistency)
+    config = replace(config, splats=replace(config.splats, loss=loss))
     view = load_views(sphere_dataset, config.crop_margin_px).train[0]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(objective, "_active_tiles", lambda *_: None)
@@ -270,7 +260,7 @@ def test_another_seed_is_another_fit(tmp_path: Path, sphere_dataset: Dataset) ->
 
 def test_every_epoch_sees_every_view_once(views: Views) -> None:
     config = tiny_config(count=60)
-    trainer = trainer_of(views, config)
+    trainer = new_trainer(views, config)
     count = len(views.train)
     orders = [[trainer._view_index(epoch * count + i) for i in range(count)] for epoch in range(3)]
     assert all(sorted(order) == list(range(count)) for order in orders)
@@ -280,9 +270,9 @@ def test_every_epoch_sees_every_view_once(views: Views) -> None:
 def test_rates_and_sizes_are_those_of_the_scene_that_they_are_shares_of(views: Views) -> None:
     """The paper's code counts in the extent of its cameras, of which the object is a part."""
     here = tiny_config("paper", count=60)
-    assert here.scene_radius == "cameras"
-    there = replace(here, scene_radius="object")
-    first, second = (trainer_of(views, config) for config in (here, there))
+    assert here.splats.scene_radius == "cameras"
+    there = replace(here, splats=replace(here.splats, scene_radius="object"))
+    first, second = (new_trainer(views, config) for config in (here, there))
     ratios = [
         first._density.dense_share / second._density.dense_share,
         first._density.prune_share / second._density.prune_share,

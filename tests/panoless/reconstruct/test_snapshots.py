@@ -12,10 +12,6 @@ from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import load_views
 from panoless.cli import main
 from panoless.export.prediction import export_prediction, export_snapshots
-from panoless.geometry.base import Training
-from panoless.geometry.surfels.mirror import SurfelMirror
-from panoless.geometry.surfels.objective import LossTerms
-from panoless.geometry.surfels.train import SurfelTrainer
 from panoless.reconstruct import recorder as recorder_module
 from panoless.reconstruct.final_map import complete
 from panoless.reconstruct.fit import fit
@@ -28,6 +24,10 @@ from panoless.reconstruct.snapshots import (
 )
 from panoless.reconstruct.state import FitState, load_state
 from panoless.selection.candidates import Selection
+from panoless.splats.mirror import SurfelMirror
+from panoless.splats.objective import LossTerms
+from panoless.splats.train import SurfelTrainer
+from panoless.splats.training import Training
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
 from shinypartial.prediction.format import SNAPSHOTS, prediction_folders, read_info
@@ -35,7 +35,7 @@ from shinypartial.prediction.format import snapshot_folders as exported_snapshot
 from tests.support.mirror_sphere import sphere_surfels, tiny_config
 
 CONFIG = tiny_config(iterations=24, count=120)
-MARKS = snapshot_schedule(4, (), CONFIG.iterations)
+MARKS = snapshot_schedule(4, (), CONFIG.splats.iterations)
 
 
 class Killed(BaseException):
@@ -106,7 +106,7 @@ def test_a_snapshot_is_small(run: Path) -> None:
 
 def test_the_last_snapshot_is_the_result(prediction: Path) -> None:
     last = exported_snapshots(prediction)[-1]
-    assert int(last.name) == CONFIG.iterations
+    assert int(last.name) == CONFIG.splats.iterations
     for name in ("environment.exr", "visibility.exr", "surfels.ply", "test/r_000.exr", "test/r_000.png"):
         assert (last / name).read_bytes() == (prediction / name).read_bytes(), name
     first = exported_snapshots(prediction)[0]
@@ -117,7 +117,10 @@ def test_the_last_snapshot_is_the_result(prediction: Path) -> None:
 @pytest.mark.parametrize("preset", ["default", "paper"])
 def test_completing_the_last_snapshot_completes_the_fit(preset: str, tmp_path: Path, sphere_dataset: Dataset) -> None:
     """Also where the environment is what gradient descent left, and visibility what all iterations saw."""
-    config = replace(tiny_config(preset, iterations=6, count=120), visibility_alpha=0.0)
+    config = replace(
+        tiny_config(preset, iterations=6, count=120),
+        splats=replace(tiny_config(preset, iterations=6, count=120).splats, visibility_alpha=0.0),
+    )
     final = fit(sphere_dataset, config, tmp_path, snapshot_schedule(2, (), 6))
     views = load_views(sphere_dataset, config.crop_margin_px)
     early, late = (read_snapshot(folder) for folder in snapshot_folders(tmp_path))
@@ -260,7 +263,7 @@ def test_a_finished_run_without_snapshots_says_so(tmp_path: Path, sphere_dataset
     config = tiny_config(iterations=4, count=40)
     fit(sphere_dataset, config, tmp_path / "run")
     with pytest.raises(InputError, match="ran without"):
-        fit(sphere_dataset, config, tmp_path / "run", snapshot_schedule(2, (), config.iterations))
+        fit(sphere_dataset, config, tmp_path / "run", snapshot_schedule(2, (), config.splats.iterations))
     with pytest.raises(InputError, match="--snapshots"):
         export_snapshots(sphere_dataset, tmp_path / "run", config, tmp_path / "prediction")
 

@@ -12,12 +12,11 @@ import torch
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.poses import Poses
 from panoless.environment.reflectance import Reflectance
-from panoless.geometry.base import Geometry, Training, from_plain
+from panoless.geometry.base import Geometry, from_plain
 from panoless.geometry.height_field.kind import HeightFieldMirror
 from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.revolution.kind import RevolutionMirror
-from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.presets import PRESETS
 from panoless.reconstruct.state import (
     CHECKPOINT,
@@ -29,6 +28,8 @@ from panoless.reconstruct.state import (
     save_state,
 )
 from panoless.selection.candidates import Candidate, Selection, Verdict
+from panoless.splats.mirror import SurfelMirror
+from panoless.splats.training import Training
 from shinypartial.core.errors import InputError
 from shinypartial.prediction.format import Trust
 from tests.support.mirror_height_field import bumpy
@@ -117,21 +118,17 @@ def exact_kinds() -> list[Geometry]:
 
 @pytest.mark.parametrize("geometry", exact_kinds(), ids=lambda geometry: geometry.kind)
 def test_every_exact_kind_survives_the_disk(tmp_path: Path, geometry: Geometry) -> None:
-    """To the last bit, and what a camera sees of it; also as what surfels started on."""
+    """To the last bit, and what a camera sees of it."""
     camera = around(3, 24)[2]
     poses = Poses(np.full((3, 3), 0.01), np.full((3, 3), 1 / 3))
     geometry = geometry.with_poses(poses)
-    started = SurfelMirror(sphere_surfels(7), started_on=geometry, poses=poses)
-    for name, each in (("itself", geometry), ("start", started)):
-        (tmp_path / name).mkdir()
-        loaded = reloaded(tmp_path / name, some_state(True, each)).geometry
-        assert loaded.poses is not None
-        assert np.array_equal(loaded.poses.stacked, poses.stacked)
-        again = getattr(loaded, "started_on", loaded)
-        assert type(again) is type(geometry)
-        assert again.state_dict() == geometry.state_dict()
-        for field, values in vars(geometry.buffers(camera)).items():
-            assert torch.equal(getattr(again.buffers(camera), field), values), field
+    loaded = reloaded(tmp_path, some_state(True, geometry)).geometry
+    assert loaded.poses is not None
+    assert np.array_equal(loaded.poses.stacked, poses.stacked)
+    assert type(loaded) is type(geometry)
+    assert loaded.state_dict() == geometry.state_dict()
+    for field, values in vars(geometry.buffers(camera)).items():
+        assert torch.equal(getattr(loaded.buffers(camera), field), values), field
 
 
 def test_what_an_earlier_version_did_not_know_has_its_default() -> None:

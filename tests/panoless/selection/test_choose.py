@@ -14,10 +14,9 @@ from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.geometry.base import Family, Geometry, Proposal, usable_views
 from panoless.geometry.plane.kind import PlaneMirror
-from panoless.geometry.plane.model import Plane, unoccluded_share
+from panoless.geometry.plane.model import unoccluded_share
 from panoless.geometry.registry import FAMILIES
 from panoless.geometry.revolution.kind import RevolutionFamily
-from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.reconstruct.fit import begin, fit
 from panoless.reconstruct.snapshots import SnapshotSchedule
 from panoless.selection import choose
@@ -73,34 +72,8 @@ def framed(frame_height: float, bend: float = 0.0) -> Views:
     return reflecting_views(plane_of(RECTANGLE, frame_height), arc(12, size=SIZE_PX), bend)
 
 
-def no_trial(views: Views, config: FitConfig, start: Geometry) -> Geometry:
-    pytest.fail("nothing was to be fitted")
-
-
-def as_started(views: Views, config: FitConfig, start: Geometry) -> Geometry:
-    return start
-
-
 def verdicts(selection: Selection) -> dict[str, Verdict]:
     return {each.kind: each.verdict for each in selection.candidates}
-
-
-def dome(plane: Plane, bend: float, count: int) -> SurfelMirror:
-    """Surfels on a plane with the normals n + bend·(p₁ t_u + p₂ t_v) of the traced dome."""
-    from scipy.spatial.transform import Rotation
-
-    config = replace(CONFIG, surfels=replace(CONFIG.surfels, count=count))
-    flat = PlaneMirror(plane).to_surfels(config).surfels
-    points = flat.means.double().numpy()
-    tangents = np.stack([plane.tangent_u, plane.tangent_v])
-    normals = plane.normal + bend * (points @ tangents.T) @ tangents
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    first = plane.tangent_u - (normals @ plane.tangent_u)[:, None] * normals
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    frames = np.stack([first, np.cross(normals, first), normals], 2)
-    quats = torch.from_numpy(Rotation.from_matrix(frames).as_quat()[:, [3, 0, 1, 2]]).float()
-    curvatures = torch.tensor([-bend, 0.0, -bend]).expand(flat.count, 3).clone()
-    return SurfelMirror.of(replace(flat, quats=quats, curvatures=curvatures), config)
 
 
 @pytest.mark.parametrize(
@@ -151,80 +124,31 @@ def test_turned_cameras_change_no_choice_between_flat_and_bent(bend: float) -> N
 
 
 @pytest.mark.slow
-def test_right_surfels_beat_the_plane_of_a_bent_mirror_and_not_its_height_field(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """With the traced dome's own normals, however far they turn, here by 11°. A height field explains as much; where
-    there is none, surfels are left, and start where they explain most.
-    """
-    views, right = framed(0.0, 0.3), dome(plane_of(RECTANGLE), 0.3, 800)
-    geometry, selection = choose_geometry(views, CONFIG, lambda *_: right)
+def test_a_clear_bend_takes_heights() -> None:
+    """However far its normals turn, here by 11°; the table says what refused the plane and what was left."""
+    geometry, selection = choose_geometry(framed(0.0, 0.3), CONFIG)
     assert geometry.kind == selection.chosen == "height_field"
-    assert verdicts(selection) == {
-        "sphere": Verdict.NOT_PROPOSED,
-        "plane": Verdict.REFUSED_BY_HELD_OUT_VIEWS,
-        "height_field": Verdict.CHOSEN,
-    }
-    others = {kind: family for kind, family in FAMILIES.items() if kind != "height_field"}
-    monkeypatch.setattr(choose, "FAMILIES", others)
-    geometry, selection = choose_geometry(views, CONFIG, lambda *_: right)
-    assert verdicts(selection) == {
-        "sphere": Verdict.NOT_PROPOSED,
-        "plane": Verdict.REFUSED_BY_HELD_OUT_VIEWS,
-        "revolution": Verdict.REFUSED_BY_SILHOUETTES,
-        "free_form": Verdict.REFUSED_BY_HELD_OUT_VIEWS,
-        "surfels": Verdict.CHOSEN,
-    }
-    assert isinstance(geometry, SurfelMirror)
-    assert geometry.started_on is not None
-    errors = {each.kind: each.surfels_error for each in selection.candidates if each.surfels_error is not None}
-    assert len(errors) > 1
-    assert errors[geometry.started_on.kind] == min(errors.values())
-
-
-def test_surfels_that_explain_as_much_do_not_beat_the_plane() -> None:
-    """Flat surfels on the plane say the same as the plane does."""
-    geometry, selection = choose_geometry(framed(0.0), CONFIG, as_started)
-    assert geometry.kind == "plane"
-    _, row = selection.candidates
-    assert row.silhouette_px is not None
-    assert row.silhouette_px < 0.5
-    assert row.held_out_error == pytest.approx(row.surfels_error, abs=0.05)
-    assert f"held-out error {row.held_out_error:.4f}" in selection.sentence
-
-
-@pytest.mark.parametrize("bend", [0.2, pytest.param(0.3, marks=pytest.mark.slow)])
-def test_a_plane_that_explains_nothing_goes_even_if_the_trial_does_no_better(bend: float) -> None:
-    """A bent mirror in a flat boundary, and surfels that did not learn to bend: the plane goes, and heights come, also
-    where so few of them leave too much as well, because nothing explains more.
-    """
-    geometry, selection = choose_geometry(framed(0.0, bend), CONFIG, as_started)
-    assert geometry.kind == "height_field"
     errors = {each.kind: each.held_out_error for each in selection.candidates if each.held_out_error is not None}
     assert min(errors, key=lambda each: errors[each]) == "height_field"
     assert "plane: leaves too much unexplained" in selection.sentence
+    assert f"held-out error {errors['height_field']:.4f}" in selection.sentence
 
 
-def test_what_leaves_too_much_waits_for_kinds_that_explain_more() -> None:
-    """The simplest of those that explain most stays, unless surfels explain clearly more."""
+def test_of_kinds_that_leave_too_much_the_simplest_that_leaves_least_is_taken() -> None:
+    """A plane, which heights take on, counts only alone."""
 
-    def left(
-        kind: str, error: float, surfels: float | None, verdict: Verdict = Verdict.LEFT_TOO_MUCH
-    ) -> tuple[Candidate, Geometry]:
+    def left(kind: str, error: float) -> tuple[Candidate, Geometry]:
         geometry = PlaneMirror(plane_of(RECTANGLE))
-        return Candidate(kind, verdict, "", None, None, error, surfels), geometry
+        return Candidate(kind, Verdict.LEFT_TOO_MUCH, "", None, None, error), geometry
 
-    def kept(*fitted: tuple[Candidate, Geometry]) -> str | None:
-        found = least_unexplained(fitted, CONFIG)
-        return None if found is None else found[0].kind
+    def kept(*fitted: tuple[Candidate, Geometry]) -> str:
+        return least_unexplained(fitted, CONFIG)[0].kind
 
-    plane, bend = left("plane", 0.31, 0.5), left("height_field", 0.4, 0.5)
+    plane, bend = left("plane", 0.31), left("height_field", 0.4)
     assert kept(plane, bend) == "height_field"
-    assert kept(plane, bend, left("free_form", 0.39, 0.5)) == "height_field"
-    assert kept(plane, bend, left("free_form", 0.32, 0.5)) == "free_form"
-    assert kept(plane, bend, left("free_form", 0.32, 0.2)) is None
-    assert kept(plane, left("free_form", 0.2, 0.1, Verdict.REFUSED_BY_HELD_OUT_VIEWS)) is None
-    assert kept(left("free_form", 0.32, None)) == "free_form", "surfels that nobody asked explain nothing more"
+    assert kept(plane, bend, left("free_form", 0.39)) == "height_field"
+    assert kept(plane, bend, left("free_form", 0.32)) == "free_form"
+    assert kept(plane) == "plane"
 
 
 def test_what_is_doubted_stays_unless_another_leaves_much_less() -> None:
@@ -235,7 +159,7 @@ def test_what_is_doubted_stays_unless_another_leaves_much_less() -> None:
 
     def chosen(*errors: float, geometry: Geometry = whole) -> int:
         fitted = [
-            (Candidate(str(number), Verdict.CHOSEN, "", None, None, error, 0.5), geometry)
+            (Candidate(str(number), Verdict.CHOSEN, "", None, None, error), geometry)
             for number, error in enumerate(errors)
         ]
         return int(much_less_unexplained(fitted, views, CONFIG)[0].kind)
@@ -248,29 +172,15 @@ def test_what_is_doubted_stays_unless_another_leaves_much_less() -> None:
     assert chosen(0.2, 0.05, geometry=half) == 0, "what misses half of the object explains no more"
 
 
-def test_surfels_that_cover_nothing_do_not_beat_the_plane() -> None:
-    """What nobody sees explains nothing."""
-
-    def vanished(views: Views, config: FitConfig, start: Geometry) -> Geometry:
-        assert isinstance(start, SurfelMirror)
-        faint = replace(start.surfels, opacity_logits=start.surfels.opacity_logits - 20)
-        return replace(start, surfels=faint)
-
-    assert choose_geometry(framed(0.0), CONFIG, vanished)[0].kind == "plane"
-
-
 def test_a_box_is_refused_by_its_silhouettes() -> None:
-    """Before anything is fitted, as plane and as surface of revolution; the table says how far away they are. A free
-    form explains all of it, so surfels are not asked.
-    """
-    geometry, selection = choose_geometry(pillar_views(around(10, SIZE_PX)), CONFIG, no_trial)
+    """Before anything is fitted, as plane and as surface of revolution; the table says how far away they are."""
+    geometry, selection = choose_geometry(pillar_views(around(10, SIZE_PX)), CONFIG)
     assert geometry.kind == "free_form"
     refused = Verdict.REFUSED_BY_SILHOUETTES, Verdict.NOT_PROPOSED
     assert all(verdicts(selection)[kind] in refused for kind in ("sphere", "plane", "height_field", "revolution"))
     plane = selection.candidates[1]
     assert plane.verdict == Verdict.NOT_PROPOSED or plane.silhouette_px > 0.5 or plane.overlap < 0.98
-    assert selection.sentence.startswith("free_form (leaves next to nothing unexplained;")
-    assert selection.candidates[-1].surfels_error is None
+    assert selection.sentence.startswith("free_form (explains held-out views;")
 
 
 @pytest.mark.parametrize(
@@ -302,40 +212,39 @@ def test_a_fit_remembers_why_it_took_its_kind() -> None:
     """The table becomes part of the state, from which it goes into the prediction."""
     state = begin(framed(0.0), CONFIG)
     assert state.selection.chosen == state.geometry.kind
-    kinds = ["sphere", "plane", "height_field", "revolution", "free_form", "surfels"]
+    kinds = list(FAMILIES)
     assert [each.kind for each in state.selection.candidates] == kinds[: kinds.index(state.geometry.kind) + 1]
-    assert (state.training is None) == (state.geometry.kind != "surfels")
+    assert state.training is None
 
 
 def test_a_goblet_takes_the_surface_of_revolution() -> None:
-    """It leaves next to nothing of held-out views unexplained, so that surfels are not asked."""
-    geometry, selection = choose_geometry(revolution_views(goblet(), around(12, SIZE_PX)), CONFIG, as_started)
+    """It leaves next to nothing of held-out views unexplained."""
+    geometry, selection = choose_geometry(revolution_views(goblet(), around(12, SIZE_PX)), CONFIG)
     assert geometry.kind == "revolution"
-    assert selection.candidates[-1].reason == "leaves next to nothing unexplained"
+    assert selection.candidates[-1].held_out_error < 0.03
 
 
 def test_the_configuration_overrides_both_ways(views: Views) -> None:
     """Surfels for a flat mirror, a plane for a bent one and even for a sphere; nothing is compared."""
     chosen = {model: replace(CONFIG, model=model) for model in ("plane", "surfels")}
-    geometry, selection = choose_geometry(framed(0.0), chosen["surfels"], no_trial)
-    assert geometry.kind == "surfels"
-    assert selection.sentence == "surfels (asked for)"
-    assert getattr(geometry, "started_on", None) is None
+    state = begin(framed(0.0), chosen["surfels"])
+    assert state.geometry.kind == "surfels"
+    assert state.training is not None
+    assert state.selection.sentence == "surfels (asked for)"
     for shown in (framed(0.0, 0.3), views):
-        geometry, selection = choose_geometry(shown, chosen["plane"], no_trial)
+        geometry, selection = choose_geometry(shown, chosen["plane"])
         assert geometry.kind == "plane"
         assert selection.sentence == "plane (asked for)"
 
 
-def test_two_views_determine_no_plane() -> None:
-    """That is a reason for surfels, and an error only for who asks for a plane."""
+def test_what_silhouettes_refuse_altogether_is_an_error_that_says_why() -> None:
+    """Two views determine no plane and nothing else, whether one is asked for or not."""
     views = framed(0.0)
     two = replace(views, train=views.train[:2])
-    geometry, selection = choose_geometry(two, CONFIG, no_trial)
-    assert geometry.kind == "surfels"
-    assert verdicts(selection)["plane"] == Verdict.NOT_PROPOSED
+    with pytest.raises(InputError, match=r"plane: silhouettes determine none.* free_form: .*--model surfels"):
+        choose_geometry(two, CONFIG)
     with pytest.raises(InputError, match="at least 3 distinct places"):
-        choose_geometry(two, replace(CONFIG, model="plane"), no_trial)
+        choose_geometry(two, replace(CONFIG, model="plane"))
 
 
 def test_what_mirrors_the_frame_is_left_out() -> None:

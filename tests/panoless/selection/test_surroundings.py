@@ -18,7 +18,7 @@ from panoless.geometry.height_field.kind import HeightFieldFamily
 from panoless.geometry.height_field.model import flat_height_field
 from panoless.geometry.plane.kind import PlaneFamily
 from panoless.geometry.plane.model import Plane
-from panoless.kernels.rasterize import RasterCamera
+from panoless.kernels.camera import RasterCamera
 from panoless.selection.choose import _first_fit
 from panoless.selection.surroundings import brought_near, explains_clearly_more, on_floor, proposed_surroundings
 from tests.support.mirror_height_field import height_field_views

@@ -13,8 +13,9 @@ from panoless.capture.lens import LensChange, with_focal_factor
 from panoless.capture.options import ContrastOptions
 from panoless.capture.poses import Poses, StatedCameras, with_pose_covariances
 from panoless.capture.views import Views, views_of
-from panoless.config import FitConfig, SurfelConfig
+from panoless.config import FitConfig
 from panoless.environment.surroundings import Surroundings
+from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.geometry.base import Geometry
 from panoless.geometry.free_form import fit
 from panoless.geometry.free_form.equations import silhouette_rows
@@ -74,12 +75,15 @@ FEW_PIXELS = replace(
 COARSE = replace(OPTIONS.rounds[0], rays=5_000)
 SECOND = FreeFormRound(20, 32, 0.20, 1, 20_000, 100.0, 5)
 """A round on the grid of the first, by pixels' centers."""
-CONFIG = replace(FitConfig(), free_form=OPTIONS, surfels=SurfelConfig(hull_resolution=56))
+FIRST = FirstSurfaceOptions(hull_resolution=56)
+CONFIG = replace(FitConfig(), free_form=OPTIONS, first_surface=FIRST)
 VIEWS, SIZE_PX = 20, 64
 
 
-def fitted(views: Views, options: FreeFormOptions = OPTIONS, hull: SurfelConfig = CONFIG.surfels) -> LevelSet:
-    proposal = FreeFormFamily().propose(views, replace(CONFIG, free_form=options, surfels=hull), asked=True)
+def fitted(
+    views: Views, options: FreeFormOptions = OPTIONS, hull: FirstSurfaceOptions = CONFIG.first_surface
+) -> LevelSet:
+    proposal = FreeFormFamily().propose(views, replace(CONFIG, free_form=options, first_surface=hull), asked=True)
     assert proposal is not None
     return fit_free_form(views, started(views, proposal.shape, options), options)[0]
 
@@ -368,7 +372,10 @@ def test_held_out_views_refuse_cells_that_a_ball_does_not_need() -> None:
 def test_the_same_views_give_the_same_surface() -> None:
     """A killed fit in closed form starts again, so it ends where the other would have."""
     views = body_views(sphere(), 8, 32)
-    options, hull = replace(OPTIONS, rounds=(replace(COARSE, cells=14, steps=2),)), SurfelConfig(hull_resolution=28)
+    options, hull = (
+        replace(OPTIONS, rounds=(replace(COARSE, cells=14, steps=2),)),
+        FirstSurfaceOptions(hull_resolution=28),
+    )
     one, other = (fitted(views, options, hull) for _ in range(2))
     np.testing.assert_array_equal(one.coefficients, other.coefficients)
 
@@ -396,7 +403,6 @@ def test_the_kind_keeps_the_protocol(ring: tuple[Views, FreeFormMirror]) -> None
     light = geometry.shade(environment, view.camera, view.solid, buffers.normals_camera.flatten(1)[:, view.solid])
     error = (light - view.radiance.flatten(1)[:, view.solid].T).abs()
     assert float(error.median()) < 0.02
-    assert len(geometry.to_surfels(CONFIG).surfels.means) == CONFIG.surfels.count
     mesh = geometry.mesh(views.object_frame)
     assert np.abs(torus().value(mesh.vertices)).max() < 0.15
     assert set(mesh.columns) == {"nx", "ny", "nz", "confidence"}

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 
 from panoless.capture.rays import pixel_rays, reflect
-from panoless.config import FitConfig, SurfelConfig
+from panoless.config import FitConfig
 from panoless.geometry.height_field.kind import HeightFieldMirror
 from panoless.geometry.height_field.model import (
     HeightField,
@@ -20,12 +20,13 @@ from panoless.geometry.height_field.model import (
 from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.plane.model import plane_buffers, unoccluded_share
-from panoless.geometry.surfels.model import Surfels
-from panoless.kernels.reference.rasterize import rotation_matrices
+from panoless.splats.kernels.reference.rasterize import rotation_matrices
+from panoless.splats.model import Surfels
+from panoless.splats.options import SurfelConfig
 from tests.support.mirror_height_field import bumpy
 from tests.support.mirror_plane import L_SHAPE, NORMAL, RECTANGLE, arc, mirror_views, plane_of, train_view
 
-CONFIG = replace(FitConfig(), surfels=SurfelConfig(count=300))
+CONFIG = replace(FitConfig(), splats=replace(FitConfig().splats, surfels=SurfelConfig(count=300)))
 PLANE = plane_of(RECTANGLE)
 
 
@@ -159,27 +160,6 @@ def test_only_planes_do_not_bend() -> None:
     assert energy == pytest.approx((rows[0] - 2) * rows[1] * 0.2**2 * curved.spacing**4)
     tilt = np.add.outer(0.3 * np.arange(rows[0]), -0.2 * np.arange(rows[1])).ravel()
     assert abs(tilt @ curved.bending() @ tilt) < 1e-12
-
-
-def test_surfels_of_a_flat_height_field_are_those_of_its_plane() -> None:
-    mirrors = HeightFieldMirror(flat_height_field(PLANE, 8)), PlaneMirror(PLANE)
-    found, expected = (mirror.to_surfels(CONFIG).surfels for mirror in mirrors)
-    for name, values in expected.named().items():
-        torch.testing.assert_close(getattr(found, name), values)
-
-
-def test_surfels_have_the_normals_heights_and_curvatures_of_a_quadratic() -> None:
-    """h = ½ pᵀ B p has the gradient B p and the bending B everywhere."""
-    bend = np.array([[0.1, 0.03], [0.03, -0.08]])
-    surfels = HeightFieldMirror(parabolic(8, bend)).to_surfels(CONFIG).surfels
-    means = surfels.means.numpy().astype(np.float64)
-    p = coordinates_of(means)
-    slope = p @ bend
-    expected = NORMAL - slope[:, :1] * PLANE.tangent_u - slope[:, 1:] * PLANE.tangent_v
-    norm = np.linalg.norm(expected, axis=1, keepdims=True)
-    assert np.allclose(means @ NORMAL - PLANE.offset, (p @ bend * p).sum(1) / 2, atol=1e-6)
-    assert np.allclose(normals_of(surfels), expected / norm, atol=1e-6)
-    assert np.allclose(surfels.curvatures.numpy() * norm, [0.1, 0.03, -0.08], atol=1e-6)
 
 
 def test_the_mesh_lies_on_the_height_field_within_the_outline() -> None:

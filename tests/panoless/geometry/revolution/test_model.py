@@ -8,14 +8,12 @@ import torch
 
 from panoless.capture.rays import reflect
 from panoless.capture.silhouettes import mask_contours
-from panoless.config import SurfelConfig
 from panoless.geometry.revolution.fit import propose_revolution
 from panoless.geometry.revolution.interior import search_interior
 from panoless.geometry.revolution.model import RAY_EPSILON, SurfaceOfRevolution, revolution_buffers, trace_reflections
 from panoless.geometry.revolution.options import DEFAULTS
 from panoless.geometry.revolution.photometric import Photometry, photometric_equations
 from panoless.geometry.revolution.pixels import CENTER, PixelBundles, evenly
-from panoless.geometry.revolution.placement import surfels_on_revolution
 from panoless.geometry.revolution.profile import ProfileSplines, apply_step, resample_profile
 from panoless.geometry.revolution.silhouette import (
     EXTENTS,
@@ -25,7 +23,6 @@ from panoless.geometry.revolution.silhouette import (
     silhouette_residuals,
 )
 from panoless.kernels.cubemap import cubemap_directions
-from panoless.kernels.reference.rasterize import rotation_matrices
 from tests.support.mirror_revolution import TILTED, around, funnel, goblet, pillar_views, rays_of, revolution_views
 from tests.support.synthetic_dataset import environment_radiance
 
@@ -116,20 +113,6 @@ def test_a_body_turned_over_is_where_it_was() -> None:
     np.testing.assert_array_equal(first.met, second.met)
     np.testing.assert_allclose(first.points, second.points, atol=1e-9)
     np.testing.assert_allclose(over.turned_over().profile, body.profile, atol=1e-12)
-
-
-def test_surfels_of_a_ball_have_its_normals_and_curvature() -> None:
-    """Normals point from the center; both principal curvatures are −1/R, as for outward normals."""
-    surface, radius = ball(0.7), 0.7
-    surfels = surfels_on_revolution(surface, SurfelConfig(count=1500))
-    outward = (surfels.means.numpy() - surface.origin) / radius
-    middle = np.abs(outward @ surface.axis) < 0.95
-    normals = rotation_matrices(surfels.quats)[:, :, 2].numpy()
-    np.testing.assert_allclose(normals[middle], outward[middle], atol=5e-3)
-    curvatures = surfels.curvatures.numpy()[middle]
-    np.testing.assert_allclose(curvatures[:, [0, 2]], -1 / radius, rtol=0.02)
-    assert np.abs(curvatures[:, 1]).max() == 0
-    assert 0.8 < surfels.count / 1500 < 1.25
 
 
 def test_buffers_cover_what_the_rays_cover() -> None:

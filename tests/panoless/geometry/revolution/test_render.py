@@ -9,8 +9,8 @@ from panoless.capture.rays import pixel_rays
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_buffers, trace_reflections
 from panoless.geometry.revolution.options import RenderingOptions
 from panoless.geometry.revolution.render import mean_light
+from panoless.kernels.camera import RasterCamera
 from panoless.kernels.cubemap import cubemap_directions
-from panoless.kernels.rasterize import RasterCamera
 from tests.support.mirror_revolution import TILTED, around, bowl
 from tests.support.synthetic_dataset import environment_radiance
 

@@ -13,7 +13,7 @@ from panoless.capture.views import Photograph, Views, views_of
 from panoless.config import FitConfig
 from panoless.environment.options import SurroundingsOptions
 from panoless.environment.solve import solve_environment
-from panoless.geometry.base import Geometry, observe_views
+from panoless.geometry.base import observe_views
 from panoless.geometry.sphere.fit import Cones, OutlineRays, fit_sphere
 from panoless.geometry.sphere.kind import SphereFamily, SphereMirror
 from panoless.geometry.sphere.options import SphereOptions
@@ -52,10 +52,6 @@ def ball_views(count: int, radius: float = 0.0) -> Views:
 def in_world(views: Views, mirror: SphereMirror) -> tuple[Float[np.ndarray, "3"], float]:
     frame = views.object_frame
     return frame.to_world(mirror.sphere.center), mirror.sphere.radius * frame.radius
-
-
-def as_started(views: Views, config: FitConfig, start: Geometry) -> Geometry:
-    return start
 
 
 def fitted(views: Views, config: FitConfig = CONFIG) -> SphereMirror:
@@ -133,7 +129,7 @@ def test_one_photograph_is_unwrapped_exactly(radius: float) -> None:
     """Its rays are those of a ball of any size at the distance where it looks so large: a known radius scales both."""
     config = replace(CONFIG, sphere=replace(OPTIONS, radius=radius))
     views, (camera,) = ball_views(1, radius), sphere_cameras("train", 1, SIZE_PX)
-    geometry, selection = choose_geometry(views, config, as_started)
+    geometry, selection = choose_geometry(views, config)
     assert geometry.kind == selection.chosen == "sphere"
     view = views.train[0]
     rays = geometry.observe(view, view.solid)
@@ -190,22 +186,22 @@ def test_views_along_one_line_show_spheres_only(sphere_dataset) -> None:
     seen = photograph(camera)
     wide = replace(camera, fy=camera.fy / 2)
     with pytest.raises(InputError, match="single line"):
-        choose_geometry(views_of([replace(seen, camera=wide)]), CONFIG, as_started)
+        choose_geometry(views_of([replace(seen, camera=wide)]), CONFIG)
     with pytest.raises(InputError, match="single line"):
-        choose_geometry(views_of([seen]), replace(CONFIG, model="plane"), as_started)
+        choose_geometry(views_of([seen]), replace(CONFIG, model="plane"))
 
 
 def test_model_selection_takes_the_sphere() -> None:
-    _, selection = choose_geometry(ball_views(9), CONFIG, as_started)
+    _, selection = choose_geometry(ball_views(9), CONFIG)
     assert selection.chosen == "sphere"
     assert [each.verdict for each in selection.candidates] == [Verdict.CHOSEN]
 
 
 def test_of_two_views_none_is_held_out_and_no_error_is_stated() -> None:
-    _, selection = choose_geometry(ball_views(2), CONFIG, as_started)
+    _, selection = choose_geometry(ball_views(2), CONFIG)
     (candidate,) = selection.candidates
     assert candidate.verdict == Verdict.CHOSEN
-    assert candidate.held_out_error is candidate.surfels_error is None
+    assert candidate.held_out_error is None
     assert candidate.reason == "too few views to hold one out"
 
 
@@ -216,7 +212,7 @@ def test_noise_raises_no_doubt_of_a_sphere() -> None:
         replace(view, radiance=(view.radiance + 0.03 * torch.randn(view.radiance.shape, generator=noise)).clamp(0, 1))
         for view in views.train
     ]
-    mirror, selection = choose_geometry(replace(views, train=tuple(noisy)), CONFIG, as_started)
+    mirror, selection = choose_geometry(replace(views, train=tuple(noisy)), CONFIG)
     (candidate,) = selection.candidates
     assert mirror.kind == candidate.kind == "sphere"
     assert CONFIG.selection.doubted_error < candidate.held_out_error < CONFIG.selection.largest_error

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from panoless.kernels.cubemap import sample_cubemap
-from panoless.kernels.image import depth_normals, ssim
+from panoless.splats.kernels.image import depth_normals, ssim
 from tests.support.splat_scenes import blended, random_splats
 from tests.support.surfel_scenes import IMAGES, random_scene, tilted_camera
 from tests.support.triton_compilation import Launch, launch_of

@@ -38,10 +38,10 @@ def test_every_command_parses() -> None:
         else:
             preset = words[words.index("--preset") + 1]
             fit = tyro.cli(Fit, args=words[1:], default=Fit(preset=preset, config=PRESETS[preset]))
-            seen.add((preset, fit.config.iterations))
+            seen.add((preset, fit.config.splats.iterations))
     assert ("3dgs-dr", 60) in seen
     # Ours takes its own schedule.
-    assert ("default", PRESETS["default"].iterations) in seen
+    assert ("default", PRESETS["default"].splats.iterations) in seen
 
 
 def test_jobs_name_what_has_to_end_before_them_and_are_made_once() -> None:

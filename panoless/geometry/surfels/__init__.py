@@ -1,1 +1,0 @@
-"""Curved Gaussian surfels, fitted by gradient descent. Imports no other kind."""

@@ -1,0 +1,1 @@
+"""The operators of splatting in Numba, threaded and vectorized, for float32 tensors on the CPU."""

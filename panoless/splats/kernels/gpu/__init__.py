@@ -1,0 +1,1 @@
+"""The operators of splatting in Triton, for float32 tensors on a CUDA or ROCm device, or in its interpreter."""

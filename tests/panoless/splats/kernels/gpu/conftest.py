@@ -1,0 +1,3 @@
+"""The devices of the other Triton kernels."""
+
+from tests.panoless.kernels.gpu.conftest import device as device
