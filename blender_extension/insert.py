@@ -77,15 +77,24 @@ def over_photograph(scene: bpy.types.Scene, camera: bpy.types.Object) -> bool:
 
 
 def _empty_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
-    """The compositor's nodes, without any; before Blender 5 they belong to the scene."""
+    """The compositor's nodes, without any: before Blender 5 those of the scene, from 5.3 on those of an effect."""
+    if hasattr(scene, "compositor_effects"):
+        effect = scene.compositor_effects.get(NODES) or scene.compositor_effects.new(name=NODES)
+        effect.node_group = _fresh_group()
+        return effect.node_group
     if hasattr(scene, "compositing_node_group"):
-        if old := bpy.data.node_groups.get(NODES):
-            bpy.data.node_groups.remove(old)
-        scene.compositing_node_group = bpy.data.node_groups.new(NODES, "CompositorNodeTree")
+        scene.compositing_node_group = _fresh_group()
         return scene.compositing_node_group
     scene.use_nodes = True
     scene.node_tree.nodes.clear()
     return scene.node_tree
+
+
+def _fresh_group() -> bpy.types.NodeTree:
+    """A group of the compositor, without nodes."""
+    if old := bpy.data.node_groups.get(NODES):
+        bpy.data.node_groups.remove(old)
+    return bpy.data.node_groups.new(NODES, "CompositorNodeTree")
 
 
 def _product(tree: bpy.types.NodeTree) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket, bpy.types.NodeSocket]:
