@@ -12,8 +12,14 @@ from .light import STRENGTH, WALLS, light_nodes, load_light, make_world, update_
 from .program import Problem
 
 MIRROR, GROUND, CAMERA = "PanoLess mirror", "PanoLess ground", "PanoLess camera"
+#: The mirror as light meets it, which is in the photographs already.
+MET = "PanoLess mirror met by light"
+#: How far it lies below what cameras see, in radii of the object.
+MET_DEPTH = 1e-3
 #: Half a side of the ground, in radii of the object.
 GROUND_RADII = 12.0
+#: The photograph has its color; this only weighs shadows against mirrored images.
+GROUND_COLOR = 0.5, 0.5, 0.5
 BOUNCES = 16
 
 
@@ -29,7 +35,7 @@ def build(scene: bpy.types.Scene, content: Content) -> list[str]:
     if meshes["surface"] is None:
         missing.append("No mesh: this surface is a cloud of points")
     else:
-        _add_mirror(collection, meshes["surface"], content.table["mirror"])
+        _add_mirror(collection, meshes["surface"], content.table["mirror"], radius)
     if not cameras:
         missing.append("No cameras: the dataset of this prediction is not where it was")
     for one in cameras:
@@ -39,6 +45,7 @@ def build(scene: bpy.types.Scene, content: Content) -> list[str]:
     if meshes["walls"] is not None:
         _add_walls(collection, meshes["walls"])
     update_light(scene)
+    update_ground(scene)
     settings = scene.panoless
     settings.prediction, settings.content = content.table["prediction"], str(content.folder)
     verdict = content.table["verdict"]
@@ -71,6 +78,15 @@ def mirror_of(scene: bpy.types.Scene) -> bpy.types.Object | None:
 def ground_of(scene: bpy.types.Scene) -> bpy.types.Object | None:
     """The imported ground."""
     return next((each for each in scene.objects if each.get("panoless") == GROUND), None)
+
+
+def update_ground(scene: bpy.types.Scene) -> None:
+    """Apply the gloss of the scene's settings to the ground: 0 is matte, 1 mirrors as polished stone does."""
+    ground, gloss = ground_of(scene), scene.panoless.ground_gloss
+    for node in ground.active_material.node_tree.nodes if ground and ground.active_material else ():
+        if node.type == "BSDF_PRINCIPLED":
+            node.inputs["Roughness"].default_value = 1 - gloss
+            node.inputs["Specular IOR Level"].default_value = gloss / 2
 
 
 def object_sphere(each: bpy.types.Object) -> tuple[Vector, float]:
@@ -139,15 +155,29 @@ def mesh_of(name: str, arrays: dict[str, np.ndarray]) -> bpy.types.Mesh:
     return mesh
 
 
-def _add_mirror(collection: bpy.types.Collection, mesh: bpy.types.Mesh, stated: dict) -> None:
-    material, nodes, links = _empty_material(MIRROR)
-    shader = nodes.new("ShaderNodeBsdfPrincipled")
+def _add_mirror(collection: bpy.types.Collection, mesh: bpy.types.Mesh, stated: dict, radius: float) -> None:
+    """One for cameras, and one for light: that shadows and mirrors what is inserted, but leaves no second shadow and no
+    second image of itself on the ground of a photograph, which has both.
+    """
+    shader = _add_shader(mesh, MIRROR)
     shader.inputs["Base Color"].default_value = (*stated["base_color"], 1)
     shader.inputs["Metallic"].default_value = 1
     shader.inputs["Roughness"].default_value = stated["roughness"]
+    seen, met = _add(collection, MIRROR, mesh), _add(collection, MET, mesh)
+    seen.visible_glossy = seen.visible_diffuse = seen.visible_shadow = False
+    met.is_shadow_catcher, met.visible_camera, met.display_type, met.hide_select = True, False, "BOUNDS", True
+    met.parent = seen
+    below = met.modifiers.new(MET, "DISPLACE")
+    below.mid_level, below.strength = 0, -MET_DEPTH * radius
+
+
+def _add_shader(mesh: bpy.types.Mesh, name: str) -> bpy.types.Node:
+    """Blender's usual shader, as the material of a mesh."""
+    material, nodes, links = _empty_material(name)
+    shader = nodes.new("ShaderNodeBsdfPrincipled")
     links.new(shader.outputs["BSDF"], nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
     mesh.materials.append(material)
-    _add(collection, MIRROR, mesh)
+    return shader
 
 
 def _add_camera(collection: bpy.types.Collection, one: dict, center: Vector, radius: float) -> None:
@@ -172,6 +202,7 @@ def _add_ground(collection: bpy.types.Collection, stated: dict, radius: float) -
     side = GROUND_RADII * radius
     mesh = bpy.data.meshes.new(GROUND)
     mesh.from_pydata([(-side, -side, 0), (side, -side, 0), (side, side, 0), (-side, side, 0)], [], [(0, 1, 2, 3)])
+    _add_shader(mesh, GROUND).inputs["Base Color"].default_value = (*GROUND_COLOR, 1)
     each = _add(collection, GROUND, mesh)
     turn = Vector((0, 0, 1)).rotation_difference(Vector(stated["normal"])).to_matrix().to_4x4()
     each.matrix_world = Matrix.Translation(stated["point"]) @ turn

@@ -5,6 +5,7 @@ import bpy
 from mathutils import Matrix, Vector
 
 from .build import ground_of, mirror_of, object_sphere, photograph_cameras, show_photograph
+from .light import MIX_FIRST, MIX_RESULT, MIX_SECOND
 
 NODES = "PanoLess over the photograph"
 
@@ -52,6 +53,8 @@ def over_photograph(scene: bpy.types.Scene, camera: bpy.types.Object) -> bool:
     if image is None or not image.size[0]:
         return False
     scene.render.use_compositing = True
+    # What the ground loses and gains by what is inserted, as factors; renders then are of inserted objects only.
+    scene.view_layers[0].cycles.use_pass_shadow_catcher = True
     tree = _empty_tree(scene)
     picture, layers = tree.nodes.new("CompositorNodeImage"), tree.nodes.new("CompositorNodeRLayers")
     scale, over = tree.nodes.new("CompositorNodeScale"), tree.nodes.new("CompositorNodeAlphaOver")
@@ -61,25 +64,51 @@ def over_photograph(scene: bpy.types.Scene, camera: bpy.types.Object) -> bool:
     else:
         scale.space, scale.frame_method = "RENDER_SIZE", "STRETCH"
     tree.links.new(picture.outputs["Image"], scale.inputs["Image"])
+    first, second, product = _product(tree)
     colors = [each for each in over.inputs if each.type == "RGBA"]
     back = next((each for each in colors if each.name == "Background"), colors[0])
     front = next(each for each in colors if each != back)
-    tree.links.new(scale.outputs["Image"], back)
+    tree.links.new(scale.outputs["Image"], first)
+    tree.links.new(layers.outputs["Shadow Catcher"], second)
+    tree.links.new(product, back)
     tree.links.new(layers.outputs["Image"], front)
     tree.links.new(over.outputs["Image"], _output(tree))
     return True
 
 
 def _empty_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
-    """The compositor's nodes, without any; before Blender 5 they belong to the scene."""
+    """The compositor's nodes, without any: before Blender 5 those of the scene, from 5.3 on those of an effect."""
+    if hasattr(scene, "compositor_effects"):
+        effect = scene.compositor_effects.get(NODES) or scene.compositor_effects.new(name=NODES)
+        effect.node_group = _fresh_group()
+        return effect.node_group
     if hasattr(scene, "compositing_node_group"):
-        if old := bpy.data.node_groups.get(NODES):
-            bpy.data.node_groups.remove(old)
-        scene.compositing_node_group = bpy.data.node_groups.new(NODES, "CompositorNodeTree")
+        scene.compositing_node_group = _fresh_group()
         return scene.compositing_node_group
     scene.use_nodes = True
     scene.node_tree.nodes.clear()
     return scene.node_tree
+
+
+def _fresh_group() -> bpy.types.NodeTree:
+    """A group of the compositor, without nodes."""
+    if old := bpy.data.node_groups.get(NODES):
+        bpy.data.node_groups.remove(old)
+    return bpy.data.node_groups.new(NODES, "CompositorNodeTree")
+
+
+def _product(tree: bpy.types.NodeTree) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket, bpy.types.NodeSocket]:
+    """Two colors and their product."""
+    if hasattr(bpy.types, "CompositorNodeMixRGB"):
+        node = tree.nodes.new("CompositorNodeMixRGB")
+        inputs, result = list(node.inputs), node.outputs[0]
+    else:
+        node = tree.nodes.new("ShaderNodeMix")
+        node.data_type = "RGBA"
+        inputs = [node.inputs[place] for place in (0, MIX_FIRST, MIX_SECOND)]
+        result = node.outputs[MIX_RESULT]
+    node.blend_type, inputs[0].default_value = "MULTIPLY", 1
+    return inputs[1], inputs[2], result
 
 
 def _output(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:

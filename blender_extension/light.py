@@ -17,7 +17,7 @@ UNSEEN = [
     ("COLOR", "Color", "A color that shows what nobody saw"),
 ]
 #: Places among the sockets of a Mix node, which has one of each name for every kind of data.
-UNSEEN_COLOR, SEEN_COLOR, MIXED = 6, 7, 2
+MIX_FIRST, MIX_SECOND, MIX_RESULT = 6, 7, 2
 #: Rows of the world's map for sampling; Blender's own choice is slow for large ones.
 LARGEST_MAP = 8192
 
@@ -86,8 +86,8 @@ def light_nodes(tree: bpy.types.NodeTree, direction: bpy.types.NodeSocket) -> bp
         texture.image, texture.interpolation = bpy.data.images[image_name(name)], "Linear"
         tree.links.new(turn.outputs["Vector"], texture.inputs["Vector"])
     mix.data_type = "RGBA"
-    tree.links.new(tree.nodes["Light"].outputs["Color"], mix.inputs[SEEN_COLOR])
-    return mix.outputs[MIXED]
+    tree.links.new(tree.nodes["Light"].outputs["Color"], mix.inputs[MIX_SECOND])
+    return mix.outputs[MIX_RESULT]
 
 
 def mean_gray(light: bpy.types.Image, seen: bpy.types.Image) -> tuple[float, float, float]:
@@ -127,4 +127,4 @@ def update_light(scene: bpy.types.Scene) -> None:
         if settings.unseen in ("GRAY", "COLOR"):
             tree.links.new(tree.nodes["Seen"].outputs["Color"], mix.inputs[0])
             color = mean_gray(light, seen) if settings.unseen == "GRAY" else settings.unseen_color
-            mix.inputs[UNSEEN_COLOR].default_value = (*color, 1)
+            mix.inputs[MIX_FIRST].default_value = (*color, 1)

@@ -80,7 +80,7 @@ def photograph_steps(sources: list[str], kind: str, preset: str) -> list[list[st
 
 
 class PANOLESS_OT_import(JobOperator, bpy.types.Operator, ImportHelper):
-    """Import the prediction of a fit: mirror, cameras with their photographs, ground, near walls, light"""
+    """Import the folder of a fit or its prediction.json: mirror, cameras with photographs, ground, near walls, light"""
 
     bl_idname, bl_label = "panoless.import_prediction", "Import Prediction"
 
@@ -250,7 +250,7 @@ def viewport_of(context: bpy.types.Context):
 
 
 class PANOLESS_FH_prediction(bpy.types.FileHandler):
-    """Drop prediction.json into the viewport to import its folder."""
+    """Drop prediction.json into the viewport to import its folder. Blender matches suffixes, which folders lack."""
 
     bl_idname, bl_label = "PANOLESS_FH_prediction", "PanoLess Prediction"
     bl_import_operator = "panoless.import_prediction"

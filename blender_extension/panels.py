@@ -5,7 +5,7 @@ from textwrap import wrap
 
 import bpy
 
-from .build import photograph_cameras
+from .build import ground_of, photograph_cameras
 from .light import PREFIX
 from .running import active, begun_folder
 
@@ -85,6 +85,8 @@ class PANOLESS_PT_insert(Side, bpy.types.Panel):
         if camera is not None and camera in photograph_cameras(context.scene):
             self.layout.label(text=camera.name, icon="CAMERA_DATA")
         self.layout.operator("panoless.insert", icon="SHADING_RENDERED")
+        if ground_of(context.scene) is not None:
+            self.layout.prop(context.scene.panoless, "ground_gloss")
 
 
 class PANOLESS_PT_benchmark(Side, bpy.types.Panel):

@@ -6,6 +6,7 @@ from math import radians
 import bpy
 from bpy.props import EnumProperty, FloatProperty, FloatVectorProperty, IntProperty, StringProperty
 
+from .build import update_ground
 from .light import UNSEEN, update_light
 from .program import INSTALL, Problem, Program, find, program_at
 
@@ -16,6 +17,10 @@ WORLDS = [
 
 def _update(self: "SceneSettings", _context: bpy.types.Context) -> None:
     update_light(self.id_data)
+
+
+def _update_ground(self: "SceneSettings", _context: bpy.types.Context) -> None:
+    update_ground(self.id_data)
 
 
 def _forget_version(self: "Preferences", _context: bpy.types.Context) -> None:
@@ -72,6 +77,15 @@ class SceneSettings(bpy.types.PropertyGroup):
         default=(1, 0, 1),
         min=0,
         update=_update,
+    )
+    ground_gloss: FloatProperty(
+        name="Ground Gloss",
+        description="How clearly the ground mirrors inserted objects. 0: only their shadow; 1: as polished stone",
+        subtype="FACTOR",
+        default=0.7,
+        min=0,
+        max=1,
+        update=_update_ground,
     )
     bench_arc: FloatProperty(
         name="Arc",

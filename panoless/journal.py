@@ -146,10 +146,7 @@ def _name(thing: Any) -> str:
 
 def _encoded(value: Any, tensor: Callable[[Tensor], Any], place: Callable[[object], int | None]) -> Any:
     """A value as lists, plain values and what becomes of tensors; objects that have a `place` by that."""
-
-    def again(value: Any) -> Any:
-        return _encoded(value, tensor, place)
-
+    again = functools.partial(_encoded, tensor=tensor, place=place)
     if type(value) in (type(None), bool, int, float, str):
         return value
     if type(value) in (list, tuple):

@@ -3,6 +3,7 @@
 import ast
 import re
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -16,17 +17,32 @@ def source_files(root: Path = ROOT) -> list[Path]:
     return sorted(path for package in PACKAGES for path in (root / package).rglob("*.py"))
 
 
-def imported_names(source: str) -> set[str]:
+def source_texts() -> dict[Path, str]:
+    """The content of every Python file of both packages."""
+    return {path: path.read_text(encoding="utf-8") for path in source_files()}
+
+
+#: Of a source text, of which several tests read the same.
+parsed = cache(ast.parse)
+
+
+@cache
+def imported_names(source: str) -> frozenset[str]:
     """Top-level names of all modules that a source text imports, wherever and however it does."""
     names: set[str] = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Import):
             names |= {alias.name.split(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             names.add(node.module.split(".")[0])
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
+        elif isinstance(node, ast.Call) and _called(node) in ("import_module", "__import__"):
             names |= {str(a.value).split(".")[0] for a in node.args if isinstance(a, ast.Constant)}
-    return names
+    return frozenset(names)
+
+
+def _called(node: ast.Call) -> str:
+    """The last part of the name of what is called."""
+    return str(getattr(node.func, "attr", getattr(node.func, "id", "")))
 
 
 def undocumented(source: str) -> Iterator[str]:
@@ -34,7 +50,7 @@ def undocumented(source: str) -> Iterator[str]:
 
     Names with an underscore are private, also what lies within them; functions inside functions are details.
     """
-    tree = ast.parse(source)
+    tree = parsed(source)
     if not ast.get_docstring(tree):
         yield "the module"
     yield from _undocumented_below(tree, "")
@@ -77,7 +93,7 @@ def names_in_docstrings(tree: ast.Module) -> Iterator[tuple[str, str, bool]]:
 
 def unknown_in_docstrings(sources: Mapping[str, str]) -> Iterator[str]:
     """Names in docstrings that no code knows: for a class the code of its module, for others that of any module."""
-    trees = {module: ast.parse(source) for module, source in sources.items()}
+    trees = {module: parsed(source) for module, source in sources.items()}
     own = {module: code_names(tree) for module, tree in trees.items()}
     everywhere = set().union(*own.values(), *(module.split(".") for module in sources))
     for module, tree in trees.items():

@@ -8,7 +8,7 @@ from jaxtyping import TypeCheckError
 
 from shinypartial.core.sphere import directions_to_latlong
 from shinypartial.dataset.schema import View
-from tests.architecture.source import ROOT, source_files, undocumented, unknown_in_docstrings
+from tests.architecture.source import ROOT, source_files, source_texts, undocumented, unknown_in_docstrings
 from tests.conftest import checked_modules
 
 MAX_LINES = 450
@@ -16,12 +16,10 @@ EMPTY_NAMES = {"utils", "util", "helpers", "helper", "misc", "common", "stuff"}
 #: In docstrings: a library that nothing imports, and a folder of Python's.
 NAMES_OF_OTHERS = {"mlcroissant", "__pycache__"}
 
-every_file = pytest.mark.parametrize("path", source_files(), ids=lambda path: str(path.relative_to(ROOT)))
 
-
-@every_file
-def test_public_names_have_a_docstring(path: Path) -> None:
-    assert list(undocumented(path.read_text(encoding="utf-8"))) == []
+def test_public_names_have_a_docstring() -> None:
+    found = {path: list(undocumented(source)) for path, source in source_texts().items()}
+    assert {path: names for path, names in found.items() if names} == {}
 
 
 def test_a_missing_docstring_would_be_seen() -> None:
@@ -32,8 +30,7 @@ def test_a_missing_docstring_would_be_seen() -> None:
 def test_docstrings_name_what_is_there() -> None:
     """A class describes no field that it lacks."""
     sources = {
-        ".".join(path.relative_to(ROOT).with_suffix("").parts): path.read_text(encoding="utf-8")
-        for path in source_files()
+        ".".join(path.relative_to(ROOT).with_suffix("").parts): source for path, source in source_texts().items()
     }
     unknown = {line.rpartition(": ")[2]: line for line in unknown_in_docstrings(sources)}
     assert unknown.keys() <= NAMES_OF_OTHERS, unknown
@@ -45,22 +42,20 @@ def test_a_field_that_is_gone_would_be_seen() -> None:
     assert list(found) == ["one: Ab: c", "one: d: f"]
 
 
-@every_file
-def test_modules_are_short(path: Path) -> None:
-    lines = len(path.read_text(encoding="utf-8").splitlines())
-    assert lines <= MAX_LINES, f"{lines} lines: split it by topic."
+def test_modules_are_short() -> None:
+    lines = {path: len(source.splitlines()) for path, source in source_texts().items()}
+    long = {path: count for path, count in lines.items() if count > MAX_LINES}
+    assert long == {}, "Split them by topic."
 
 
-@every_file
-def test_file_names_say_what_is_inside(path: Path) -> None:
-    assert path.stem not in EMPTY_NAMES
+def test_file_names_say_what_is_inside() -> None:
+    assert [path for path in source_files() if path.stem in EMPTY_NAMES] == []
 
 
-@every_file
-def test_shapes_can_be_checked(path: Path) -> None:
+def test_shapes_can_be_checked() -> None:
     """Postponed annotations are strings, which a runtime check of shapes does not see."""
-    source = path.read_text(encoding="utf-8")
-    assert not ("jaxtyping" in source and "from __future__ import annotations" in source)
+    postponed = "from __future__ import annotations"
+    assert [path for path, source in source_texts().items() if "jaxtyping" in source and postponed in source] == []
 
 
 def test_tests_check_shapes_of_functions() -> None:

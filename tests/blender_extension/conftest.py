@@ -1,6 +1,7 @@
 """The extension in this process's Blender, and programs in the place of an installed panoless."""
 
 import os
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -31,7 +32,9 @@ def write_program(folder: Path, name: str, content: str) -> Path:
     return path
 
 
-KNOWING = "from tests.support.knowing_fit import main\nsys.exit(main(sys.argv[1:]))\n"
+#: Of no known version, which is said before anything is loaded.
+KNOWING = "if '--version' in sys.argv: sys.exit(2)\n"
+KNOWING += "from tests.support.knowing_fit import main\nsys.exit(main(sys.argv[1:]))\n"
 REAL = "from shinypartial.cli import main\nsys.exit(main())\n"
 
 
@@ -53,10 +56,16 @@ def ball_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     )
 
 
-@pytest.fixture
-def prediction(tmp_path: Path, ball_dataset: Dataset) -> Path:
+@pytest.fixture(scope="session")
+def known(tmp_path_factory: pytest.TempPathFactory, ball_dataset: Dataset) -> Path:
     """The truth of that dataset."""
-    return write_known_prediction(tmp_path / "known", ball_dataset)
+    return write_known_prediction(tmp_path_factory.mktemp("predictions") / "known", ball_dataset)
+
+
+@pytest.fixture
+def prediction(tmp_path: Path, known: Path) -> Path:
+    """A copy of it for a test to change."""
+    return Path(shutil.copytree(known, tmp_path / "known"))
 
 
 @pytest.fixture

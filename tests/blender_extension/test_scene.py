@@ -11,10 +11,11 @@ import pytest
 
 from shinypartial.conversion.extension import blender_camera, found_cameras
 from shinypartial.core.camera import Camera, look_at, project
+from shinypartial.core.color import srgb_to_linear
 from shinypartial.core.sphere import latlong_directions
 from shinypartial.dataset.read import read_view
 from shinypartial.dataset.schema import Dataset
-from shinypartial.io.images import write_png
+from shinypartial.io.images import read_exr, stack_channels, write_png
 from shinypartial.prediction.format import (
     FoundCamera,
     FoundFloor,
@@ -191,41 +192,101 @@ def test_the_ground_is_where_the_fit_found_it(blender: Any, prediction: Path) ->
     np.testing.assert_allclose(below.co.z, -1.25, atol=1e-2)
 
 
-def test_an_inserted_object_stands_beside_the_mirror_and_in_it(
-    blender: Any, prediction: Path, ball_dataset: Dataset, picture: Render
-) -> None:
-    """A red ball: on the ground, beside the mirror, seen in it, with a shadow, and the rest of the picture is the
-    photograph.
-    """
-    scene = imported(blender, prediction)
-    blender.ops.panoless.photograph(step="NEXT")
-    photograph = read_view(ball_dataset.train[ball_dataset_index(scene, ball_dataset)])
-    blender.ops.mesh.primitive_uv_sphere_add(radius=0.4)
-    ball = blender.context.object
-    red = blender.data.materials.new("red")
+def colored_ball(bpy: Any, *, radius: float, emission: float) -> Any:
+    """One that shines red and is black otherwise."""
+    bpy.ops.mesh.primitive_uv_sphere_add(radius=radius)
+    ball = bpy.context.object
+    red = bpy.data.materials.new("red")
     shader = red.node_tree.nodes["Principled BSDF"]
     shader.inputs["Base Color"].default_value = 0, 0, 0, 1
     shader.inputs["Emission Color"].default_value = 1, 0, 0, 1
-    shader.inputs["Emission Strength"].default_value = 50
+    shader.inputs["Emission Strength"].default_value = emission
+    shader.inputs["Specular IOR Level"].default_value = 0
     ball.data.materials.append(red)
+    return ball
+
+
+def composed(bpy: Any) -> np.ndarray:
+    """The picture that the compositor makes, linear."""
+    scene = bpy.context.scene
+    scene.cycles.samples, scene.cycles.use_denoising, scene.render.use_compositing = 128, False, True
+    settings = scene.render.image_settings
+    settings.file_format, settings.color_mode, settings.color_depth = "OPEN_EXR", "RGBA", "32"
+    path = Path(bpy.data.filepath).parent / "over.exr"
+    scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)
+    return stack_channels(read_exr(path), ("R", "G", "B"), path)
+
+
+def test_an_inserted_object_stands_beside_the_mirror_and_in_it(
+    blender: Any, prediction: Path, ball_dataset: Dataset, picture: Render
+) -> None:
+    """A red ball: on the ground, beside the mirror, seen in it."""
+    scene = imported(blender, prediction)
+    blender.ops.panoless.photograph(step="NEXT")
+    photograph = read_view(ball_dataset.train[ball_dataset_index(scene, ball_dataset)])
+    ball = colored_ball(blender, radius=0.4, emission=50)
     assert blender.ops.panoless.insert() == {"FINISHED"}
     blender.context.view_layer.update()
     np.testing.assert_allclose(ball.matrix_world.translation.z, -0.6, atol=1e-2)
     assert np.linalg.norm(ball.matrix_world.translation.xy) > 1.2
     scene.render.use_compositing = False
-    layers = picture(blender)
-    before = photograph.radiance
-    mirror = photograph.alpha > 0.99
-    red_gain = (layers[..., 0] - before[..., 0])[mirror]
-    assert (red_gain > 5).sum() > 3, "The mirror shows it."
-    outside = photograph.alpha == 0
-    assert ((layers[..., 3] > 0.05) & (layers[..., :3].max(-1) < 0.05) & outside).any(), "Its shadow."
+    red_gain = picture(blender)[..., 0] - photograph.radiance[..., 0]
+    assert (red_gain[photograph.alpha > 0.99] > 5).sum() > 3, "The mirror shows it."
 
-    scene.render.use_compositing = True
-    scene.render.image_settings.file_format = "PNG"
-    scene.render.filepath = str(Path(blender.data.filepath).parent / "over.png")
-    blender.ops.render.render(write_still=True)
-    assert Path(scene.render.filepath).is_file()
+
+def above_ground(bpy: Any, prediction: Path, folder: Path) -> Any:
+    """A camera of 48 × 48 pixels with a gray photograph, level, 1 above the ground; under a uniform sky."""
+    from mathutils import Vector
+
+    from blender_extension.build import _add_camera, show_photograph
+
+    write_environment_map(prediction, np.ones((64, 128, 3), np.float32))
+    scene = imported(bpy, prediction)
+    camera = Camera(look_at(np.array([0.0, -6.0, 0.0]), np.zeros(3)), 48.0, 48.0, 24.0, 24.0, 48, 48)
+    write_png(folder / "gray.png", np.full((48, 48, 3), 128, np.uint8))
+    _add_camera(scene.collection, asdict(blender_camera("gray", folder / "gray.png", camera)), Vector(), 1.0)
+    show_photograph(scene, scene.objects["PanoLess camera gray"])
+    return scene
+
+
+#: A photograph of this color, as light.
+GRAY = srgb_to_linear(np.array(128 / 255))
+
+
+def test_without_an_inserted_object_the_photograph_stays(blender: Any, prediction: Path, tmp_path: Path) -> None:
+    """All but the mirror: its shadow and its image on the ground are in the photograph already."""
+    from blender_extension.insert import over_photograph
+
+    scene = above_ground(blender, prediction, tmp_path)
+    assert over_photograph(scene, scene.camera)
+    pixels = composed(blender)
+    assert pixels[20, 24].min() > 1.5 * GRAY, "The mirror shows the sky."
+    np.testing.assert_allclose(pixels[35:], GRAY, rtol=1e-3)
+
+
+@pytest.mark.parametrize("gloss", [0.0, 1.0])
+def test_a_glossy_ground_mirrors_what_is_inserted(gloss: float, blender: Any, prediction: Path, tmp_path: Path) -> None:
+    """A ball floats 1 above the ground and shines red; its mirrored image lies 1 below. There the ground gains the red
+    and lacks the sky's green where it is glossy; else it lacks green in the shadow only, under the ball.
+    """
+    from blender_extension.insert import over_photograph
+
+    scene = above_ground(blender, prediction, tmp_path)
+    scene.objects["PanoLess mirror"].hide_render = scene.objects["PanoLess mirror met by light"].hide_render = True
+    scene.panoless.ground_gloss = gloss
+    colored_ball(blender, radius=0.4, emission=50)
+    assert over_photograph(scene, scene.camera)
+    red, green, _ = np.moveaxis(composed(blender) / GRAY, -1, 0)
+    image, aside, shadow = slice(38, 42), slice(2, 6), slice(31, 33)  # Rows, columns; rows 1 below the ball's center.
+    assert green[shadow, 22:26].mean() < 0.96
+    assert green[image, aside].mean() == pytest.approx(1, abs=0.02)
+    if gloss:
+        assert green[image, 22:26].mean() < 0.75, "Measured: 0.69."
+        assert red[image, 22:26].mean() > 8 * red[image, aside].mean(), "Measured: 15 times."
+    else:
+        assert green[image, 22:26].mean() > 0.97
+        assert red[image, 22:26].mean() < 1.5 * red[image, aside].mean()
 
 
 def ball_dataset_index(scene: Any, dataset: Dataset) -> int:
@@ -247,8 +308,10 @@ def test_confidence_is_an_image_and_a_color_of_vertices(blender: Any, prediction
 
 
 def test_a_second_import_replaces_the_first(blender: Any, prediction: Path) -> None:
-    names = [{each.name for each in imported(blender, prediction).objects} for _ in range(2)]
-    assert names[0] == names[1]
+    """A folder is as good as its prediction.json; the file browser ends one that was entered with a slash."""
+    names = {each.name for each in imported(blender, prediction).objects}
+    assert blender.ops.panoless.import_prediction(filepath=f"{prediction}/") == {"FINISHED"}
+    assert {each.name for each in blender.context.scene.objects} == names
 
 
 def test_the_scene_outlives_its_files(blender: Any, prediction: Path, tmp_path: Path, picture: Render) -> None:

@@ -28,7 +28,8 @@ SIZES = [
     "--config.environment.resolution", "8",
     "--config.environment.solve-resolution", "8",
 ]  # fmt: skip
-TINY = [*SIZES, "--set", "surroundings.mode=off", "material.reflectance=off"]
+TINY = [*SIZES, "--set", "surroundings.mode=off", "material.reflectance=off", "trust.resolution=16"]
+TINY += ["corrections.masks=off", "corrections.exposure=off", "corrections.lens=off"]
 
 
 @pytest.fixture(autouse=True)

@@ -40,7 +40,8 @@ def command(dataset: Dataset, output: str) -> list[str]:
     options = ["--model", "surfels", "--config.iterations", str(ITERATIONS), "--config.surfels.count", "100"]
     options += ["--config.surfels.hull-resolution", "24", "--config.environment.resolution", "16"]
     options += ["--config.environment.solve-resolution", "16"]
-    options += ["--set", "surroundings.mode=off", "material.reflectance=off"]
+    options += ["--set", "surroundings.mode=off", "material.reflectance=off", "trust.resolution=16"]
+    options += ["corrections.masks=off", "corrections.exposure=off", "corrections.lens=off"]
     return ["fit", str(dataset.root), "--output", output, *options]
 
 

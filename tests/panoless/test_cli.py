@@ -88,7 +88,7 @@ def test_a_tuned_number_deep_inside_can_be_set() -> None:
     assert config.selection.least_gain == 0.1
 
 
-@pytest.mark.parametrize(("preset", "form"), [*((preset, "{} {}") for preset in PRESETS), ("paper", "{}={}")])
+@pytest.mark.parametrize(("preset", "form"), [("fast", "{} {}"), ("paper", "{} {}"), ("paper", "{}={}")])
 def test_a_preset_sets_the_defaults(
     preset: str, form: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -112,7 +112,6 @@ BAD_USAGE = {
     "unknown option": ["fit", "--config.loss.lambda-magic", "1"],
     "not a number": ["fit", "--config.iterations", "many"],
     "not whole": ["fit", "--config.surfels.count", "1.5"],
-    "not a model": ["fit", "--model", "cube"],
     "not a choice": ["fit", "--config.environment.activation", "tanh"],
 }
 

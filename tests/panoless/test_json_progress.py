@@ -95,6 +95,20 @@ def test_a_whole_fit_in_lines(
     assert last["lines"]
 
 
+@pytest.mark.slow
+def test_a_whole_light_in_lines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of the photographs that come with the package."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["light", "lobby-ball", "--output", "light", "--json-progress"]) == 0
+    *events, last = checked(capsys.readouterr().out.splitlines())
+    assert (events[0]["command"], last["event"]) == ("light", "result")
+    assert all(Path(path).exists() for path in last["paths"].values())
+    assert {"folder", "dataset", "prediction", "light.hdr", "light.exr"} <= last["paths"].keys()
+    assert last["verdict"] is not None
+
+
 @pytest.mark.parametrize("command", ["fit", "capture", "light"])
 def test_bad_input_in_lines(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([command, str(tmp_path / "nothing"), "--json-progress"]) == 2

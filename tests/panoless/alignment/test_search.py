@@ -70,6 +70,7 @@ def test_true_cameras_are_left_alone(family: Family, views: Views) -> None:
     assert align_proposal(family, views, proposal, CONFIG) is None
 
 
+@pytest.mark.slow
 def test_turned_cameras_of_a_flat_mirror_are_found() -> None:
     """By outlines alone to a tenth of their error, and better by what is mirrored; the normal comes out right."""
     views, family = flat_views(), PlaneFamily()

@@ -119,7 +119,7 @@ def test_a_wrong_focal_length_is_found_and_a_true_one_believed(factor: float) ->
         assert 0 < found.focal_uncertainty < 0.003
 
 
-@pytest.mark.parametrize("k1", [0.0, -0.15, 0.15])
+@pytest.mark.parametrize("k1", [0.0, pytest.param(-0.15, marks=pytest.mark.slow), 0.15])
 def test_a_distortion_is_found_and_a_pinhole_believed(k1: float) -> None:
     """Of a ball that outlines tell, to a third. A ball shows another focal length nearly as well, which is believed."""
     family = FAMILIES["sphere"]

@@ -74,6 +74,7 @@ def test_a_flat_mirror_in_a_room_tells_how_near_it_is() -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_convex_mirror_in_a_far_world_is_not_put_into_a_room() -> None:
     """A flat mirror in near surroundings shows more of the sphere than in far ones, too, as a plane takes it for."""
     plane = plane_of(disc(24))

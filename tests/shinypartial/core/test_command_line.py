@@ -4,12 +4,11 @@ import re
 import shlex
 from pathlib import Path
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from shinypartial.core.command_line import command_line
-from tests.architecture.source import ROOT, source_files
+from tests.architecture.source import source_texts
 
 #: Words of a command in a text with a place in braces; those in suites are run, and names of theirs have no spaces.
 UNQUOTED = re.compile(r"\b(?:panoless|shinypartial) [a-z-]+ [^\"'`]*\{(?!\{)")
@@ -25,13 +24,9 @@ def test_plain_words_stay_plain() -> None:
     assert command_line("panoless", "fit", Path("chrome pot")) == "panoless fit 'chrome pot'"
 
 
-@pytest.mark.parametrize(
-    "path",
-    [each for each in source_files() if "suites" not in each.parts],
-    ids=lambda path: str(path.relative_to(ROOT)),
-)
-def test_no_command_is_put_together_without_quotes(path: Path) -> None:
-    found = [line.strip() for line in path.read_text(encoding="utf-8").splitlines() if UNQUOTED.search(line)]
+def test_no_command_is_put_together_without_quotes() -> None:
+    texts = [source for path, source in source_texts().items() if "suites" not in path.parts]
+    found = [line.strip() for source in texts for line in source.splitlines() if UNQUOTED.search(line)]
     assert not [line for line in found if "bundled_names" not in line and "--dataset {DATA}" not in line]
 
 

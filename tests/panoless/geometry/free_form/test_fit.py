@@ -125,6 +125,7 @@ def test_a_body_is_recovered_from_its_visual_hull(body: Body) -> None:
     assert np.quantile(errors, 0.9) < 0.6
 
 
+@pytest.mark.slow
 def test_a_ring_is_recovered_though_it_sees_itself(ring: tuple[Views, FreeFormMirror]) -> None:
     views, geometry = ring
     errors = normal_errors_deg(geometry.surface, torus(), views, cameras_around(7, 60)[1::2])
@@ -132,6 +133,7 @@ def test_a_ring_is_recovered_though_it_sees_itself(ring: tuple[Views, FreeFormMi
     assert np.quantile(errors, 0.9) < 1.2
 
 
+@pytest.mark.slow
 def test_the_hole_of_a_ring_stays_open(ring: tuple[Views, FreeFormMirror]) -> None:
     """The mesh of a torus is closed and its Euler characteristic is zero."""
     mesh, normals = ring[1].surface.mesh()
@@ -524,6 +526,7 @@ def test_flat_faces_that_no_outline_shows_are_found_by_a_descent() -> None:
     assert error_deg(replace(OPTIONS, descent=DescentOptions())) < 3.0 < 12.0 < error_deg(OPTIONS)
 
 
+@pytest.mark.slow
 def test_outlines_hold_faces_that_maps_of_few_texels_would_turn() -> None:
     """After two rounds of the descent from a rounded plate, by the mean of normals: 3.3° held, 17° by pixels alone."""
     body = block(exponent=10.0)
