@@ -18,11 +18,11 @@ from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, fro
 from panoless.geometry.exact import ExactFamily, ExactGeometry
 from panoless.geometry.revolution.deblurred_map import pixel_footprints
 from panoless.geometry.revolution.fit import follow_views, propose_revolution, refine_revolution
-from panoless.geometry.revolution.lip import beside_lip
+from panoless.geometry.revolution.lip import CLEARANCE_PX, beside_lip
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_buffers, revolution_rays
 from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
 from panoless.geometry.revolution.placement import surfels_on_revolution
-from panoless.geometry.revolution.render import mean_light
+from panoless.geometry.revolution.render import SAMPLES, mean_light
 from panoless.geometry.surfels.mirror import SurfelMirror
 from panoless.kernels.rasterize import RasterCamera
 from shinypartial.core.errors import InputError
@@ -59,7 +59,7 @@ class RevolutionMirror(ExactGeometry):
         """Solid pixels, but for those beside the lip of an open wall, which mix two surfaces."""
         if not self.surface.is_open:
             return view.solid
-        mixed = torch.from_numpy(beside_lip(view.camera, self.surface, self.options.lip.clearance_px).ravel())
+        mixed = torch.from_numpy(beside_lip(view.camera, self.surface, CLEARANCE_PX).ravel())
         return view.solid[~mixed.to(view.solid.device)[view.solid]]
 
     def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
@@ -70,7 +70,6 @@ class RevolutionMirror(ExactGeometry):
             pixels,
             occlusion_test=self.occlusion_test,
             weighted=len(pixels) == len(view.solid),
-            options=self.options.map,
         )[0]
 
     def footprints(self, views: Views, max_pixels: int) -> Footprints:
@@ -79,7 +78,7 @@ class RevolutionMirror(ExactGeometry):
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
         """By intersection; alpha by 4×4 rays where neighbors disagree."""
-        return revolution_buffers(self.surface, camera, self.options.rendering.samples)
+        return revolution_buffers(self.surface, camera, SAMPLES)
 
     def shade(
         self,
@@ -89,7 +88,7 @@ class RevolutionMirror(ExactGeometry):
         normals_camera: Float[Tensor, "3 P"],
     ) -> Float[Tensor, "P 3"]:
         """Mean over the pixels' areas, followed through all their reflections."""
-        return mean_light(self.surface, environment, camera, pixels, self.options.rendering)
+        return mean_light(self.surface, environment, camera, pixels)
 
     def to_surfels(self, config: FitConfig) -> SurfelMirror:
         """Rings of surfels, curved as the surface is."""
@@ -125,7 +124,7 @@ class RevolutionFamily(ExactFamily):
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """Axis and outer profile by silhouettes."""
-        found = propose_revolution(views, config.revolution)
+        found = propose_revolution(views)
         if found is not None:
             return Proposal(found.surface, float(np.median(found.median_px)), float(np.median(found.iou)))
         if asked:
