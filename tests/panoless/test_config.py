@@ -147,7 +147,7 @@ def test_every_number_has_a_range_at_its_field(options: type) -> None:
 
 
 @pytest.mark.parametrize(
-    "override", ["surroundings.checked_views=0", "material.rays=0", "plane.start_grid=1", "height_field.cells=-1"]
+    "override", ["surroundings.checked_views=0", "material.rays=0", "plane.max_vertices=2", "height_field.cells=-1"]
 )
 def test_a_tuned_number_out_of_range_is_refused(override: str) -> None:
     with pytest.raises(InputError, match=override.partition("=")[0]):

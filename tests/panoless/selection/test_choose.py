@@ -47,7 +47,7 @@ def coarse_config() -> FitConfig:
         # The traced dome has flat edges, so it looks like a flat mirror in a near room.
         surroundings=replace(config.surroundings, mode="off"),
         corrections=CorrectionOptions(masks="off", exposure="off", lens="off"),
-        height_field=replace(config.height_field, rounds=config.height_field.rounds[:3]),
+        height_field=replace(config.height_field, rounds=3),
         revolution=replace(config.revolution, rounds=1),
         free_form=replace(
             config.free_form,
