@@ -23,7 +23,6 @@ from panoless.environment.options import (
     SurroundingsOptions,
     halves_whole,
 )
-from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.geometry.free_form.options import FreeFormOptions
 from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.options import PlaneOptions
@@ -238,7 +237,6 @@ class FitConfig:
     rates: RateConfig = field(default_factory=RateConfig)
     mask_repair: Tuned[MaskRepairOptions] = field(default_factory=MaskRepairOptions)
     contrast: Tuned[ContrastOptions] = field(default_factory=ContrastOptions)
-    first_surface: Tuned[FirstSurfaceOptions] = field(default_factory=FirstSurfaceOptions)
     sphere: Tuned[SphereOptions] = field(default_factory=SphereOptions)
     plane: Tuned[PlaneOptions] = field(default_factory=PlaneOptions)
     height_field: Tuned[HeightFieldOptions] = field(default_factory=HeightFieldOptions)

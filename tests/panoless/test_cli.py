@@ -21,7 +21,6 @@ from shinypartial.prediction.format import read_info
 TUNED = (
     "mask_repair",
     "contrast",
-    "first_surface",
     "sphere",
     "plane",
     "height_field",

@@ -47,18 +47,16 @@ def first_surfaces(views: Views, config: FitConfig) -> FirstSurfaces:
     Outlines don't tell how far an object bulges between their contacts: a stone does, a box does not. Plates are
     solved once, without what holds them inside the hull, which hardly changes their disagreement.
     """
-    options, first = config.free_form, config.first_surface
-    known = trusted_hull(
-        carve_hull(views, config.surfels.hull_resolution, config.surfels.hull_votes, first), views, first
-    )
+    options = config.free_form
+    known = trusted_hull(carve_hull(views, config.surfels.hull_resolution, config.surfels.hull_votes), views)
 
     def level_set(mesh: TriangleMesh) -> LevelSet:
         return level_set_of(mesh, options.start_cells, options.margin)
 
     disagreement = _disagreement(views, options, options.start_pixels, options.start_resolution)
-    plates = {tension: level_set(completed(known, first, tension, rounds=1)) for tension in options.start_tensions}
+    plates = {tension: level_set(completed(known, tension, rounds=1)) for tension in options.start_tensions}
     best = min(plates, key=lambda tension: disagreement(plates[tension]))
-    plain, hull = level_set(completed(known, first, best)), level_set(known.surface)
+    plain, hull = level_set(completed(known, best)), level_set(known.surface)
     return FirstSurfaces(plain, hull, tuple(plates.values()), known.hull.left_out == 0)
 
 

@@ -44,7 +44,7 @@ class SurfelFamily:
         if proposal.shape is not None:
             start = cast(SurfelMirror, proposal.shape.to_surfels(config).with_poses(proposal.shape.poses))
             return ShadedMirror.begun(start, config).to(views.train[0].mask.device)
-        surfels = initial_surfels(views, config.surfels, config.seed, config.first_surface)
+        surfels = initial_surfels(views, config.surfels, config.seed)
         return ShadedMirror.begun(SurfelMirror.of(surfels, config), config)
 
     def poses_by_outlines(self, views: Views, proposal: Proposal, config: FitConfig) -> ToldPoses | None:
