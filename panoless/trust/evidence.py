@@ -18,14 +18,14 @@ from torch import Tensor
 
 from panoless.capture.contrast import Contrast
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
-from panoless.capture.encoding import encoding_of
+from panoless.capture.encoding import SATURATED, encoding_of
 from panoless.capture.masks import MASK_LEVEL
 from panoless.capture.silhouettes import mask_distance_px, silhouette_distance_px
 from panoless.capture.views import TrainView, Views, at_most_pixels, split_held_out
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints, thinned
 from panoless.environment.resolution import densest_resolution
-from panoless.environment.sharpening import deblur_map
+from panoless.environment.sharpening import HARD, MIDDLE, SMOOTHNESS, TRIAL_STEPS, deblur_map
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, overlap, pixel_areas, usable_views
 from panoless.geometry.registry import FAMILIES
@@ -43,8 +43,6 @@ PART_CELLS = 24
 """Along a side of the grid whose cells are places that are explained or not."""
 PART_UNEXPLAINED = 0.6
 """A place is not explained from this share of the light on that a matte object would leave unexplained."""
-SATURATED = 0.998
-"""Share of the largest radiance from which a pixel is saturated."""
 SHIFT_SCALE_PX = 0.5
 """Distance of outlines after a shift (px) beyond which they lose their say in it, or…"""
 SHIFT_MEDIANS = 3.0
@@ -289,10 +287,8 @@ def _predicting_map(areas: Sequence[PixelFootprints], config: FitConfig) -> Floa
     """
     rays = [each.rays() for each in areas]
     environment = solve_environment(rays, min(config.trust.resolution, densest_resolution(rays)))
-    options = replace(config.footprint_map, steps=config.footprint_map.trial_steps)
-    saturation, smoothness = encoding_of(config).saturation, options.smoothness[options.middle]
-    lamps = replace(options.hard, saturated_weight=1.0)
-    return deblur_map(Footprints(list(areas)), environment, saturation, smoothness, options, lamps)
+    saturation, lamps = encoding_of(config).saturation, replace(HARD, saturated_weight=1.0)
+    return deblur_map(Footprints(list(areas)), environment, saturation, SMOOTHNESS[MIDDLE], lamps, steps=TRIAL_STEPS)
 
 
 @dataclass

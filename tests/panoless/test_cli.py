@@ -26,14 +26,12 @@ TUNED = (
     "height_field",
     "revolution",
     "free_form",
-    "footprint_map",
     "poses",
     "surroundings",
     "material",
     "corrections",
     "selection",
     "trust",
-    "confidence",
     "surfels.tuned",
 )
 TINY = ["--config.iterations", "4", "--config.surfels.count", "40", "--config.surfels.hull-resolution", "24"]

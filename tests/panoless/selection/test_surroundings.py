@@ -25,14 +25,7 @@ from tests.support.mirror_height_field import height_field_views
 from tests.support.mirror_plane import RECTANGLE, arc, camera_at, disc, plane_of, reflecting_views
 from tests.support.synthetic_dataset import environment_radiance
 
-OPTIONS = SurroundingsOptions(
-    rays=10_000,
-    judged_rays=10_000,
-    resolutions=(8, 8, 16, 16, 32, 32, 32),
-    refined_floor_rays=10_000,
-    refined_floor_resolutions=(16, 32, 32, 32),
-)
-CONFIG = FitConfig(surroundings=OPTIONS)
+CONFIG = FitConfig(surroundings=SurroundingsOptions(rays=10_000))
 FAR_VIEWS = reflecting_views(plane_of(RECTANGLE), arc(10, size=48))
 
 
