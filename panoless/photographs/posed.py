@@ -83,7 +83,7 @@ def find_ground(points: Float[np.ndarray, "P 3"], poses: Float[np.ndarray, "V 4 
     """The plane near most points that all cameras look down on, by consensus of three points each (RANSAC).
 
     Its normal toward the cameras is at less than 78° from their mean upward direction, from which that of a wall before
-    them is at more than 90°. None where fewer than `ground_points` of the points lie on it.
+    them is at more than 90°. None where fewer than `GROUND_POINTS` of the points lie on it.
     """
     centers, up = poses[:, :3, 3], -poses[:, :3, 1].mean(0)
     if len(points) < 3:
