@@ -4,7 +4,7 @@ A shape that believes in a far world bends until it agrees with a near one as we
 that is. A shape from silhouettes alone knows of no light, so it tells the distance at once.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -90,7 +90,12 @@ def proposed_surroundings(family: Family, views: Views, proposal: Proposal, conf
 
 
 def on_floor(
-    views: Views, near: Geometry, follow: Callable[[Geometry, Surroundings], Geometry | None], config: FitConfig
+    views: Views,
+    near: Geometry,
+    follow: Callable[[Geometry, Surroundings], Geometry | None],
+    config: FitConfig,
+    *,
+    resolutions: Sequence[int] = REFINED_FLOOR_RESOLUTIONS,
 ) -> Geometry:
     """A fit above a floor that a shape from silhouettes told, or above that floor as the fit tells it, tilts included,
     if held-out views are clearly better explained.
@@ -103,7 +108,7 @@ def on_floor(
         kept, held_out = split_held_out(leaving_rays(posed, near, REFINED_FLOOR_RAYS))
         if not kept or not held_out:
             return near
-        found = found_surroundings(joined(kept), near.surroundings, REFINED_FLOOR_RESOLUTIONS, tilts=True)
+        found = found_surroundings(joined(kept), near.surroundings, resolutions, tilts=True)
         of_found, before = (_errors(kept, held_out, each) for each in (found, near.surroundings))
     if not is_clearly_lower(of_found, before, selection):
         return near

@@ -108,7 +108,7 @@ def test_nothing_softer_is_asked_for_where_a_sharp_map_explains_all(
             found.append(softness)
             return np.full(5, sharp if softness.roughness is None else sharp / 2) + np.linspace(0, 1e-6, 5)
 
-        def searched(self, softness: Callable[[float], Softness], bounds: tuple[float, float]) -> float:
+        def searched(self, softness: Callable[[float], Softness], bounds: tuple[float, float], trials: int) -> float:
             return 0.1
 
     monkeypatch.setattr(_SoftnessTrial, "of", lambda *_: Trial())
