@@ -91,7 +91,7 @@ def rooms(package: str) -> Iterator[str]:
 
 
 def option_tables() -> Iterator[str]:
-    """Tables of all fields of `FitConfig`, from the source: name, default, meaning. Tuned numbers come last."""
+    """Tables of all fields of `FitConfig`, from the source: name, default, meaning. Those of stages come last."""
     loader = griffe.GriffeLoader(search_paths=[ROOT])
     loader.load("shinypartial")
     package = loader.load("panoless")
@@ -109,7 +109,7 @@ def option_tables() -> Iterator[str]:
 
 
 def option_groups(group: griffe.Class, prefix: str, *, tuned: bool) -> Iterator[tuple[griffe.Class, str, bool]]:
-    """A class of options and those that it nests, how their fields are named, and whether they are tuned numbers."""
+    """A class of options and those that it nests, how their fields are named, and whether they are of a stage."""
     yield group, prefix, tuned
     for item in group.attributes.values():
         nested = nested_options(group, item)

@@ -53,7 +53,7 @@ class Fit(LongCommand):
     set: Annotated[
         tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="OPTION=VALUE [OPTION=VALUE ...]")
     ] = ()
-    """Change tuned numbers, such as plane.max_vertices=64; docs/reference/fit-options.md lists them."""
+    """Change options of a stage, such as plane.max_vertices=64; docs/reference/fit-options.md lists them."""
     config: FitConfig = field(default_factory=FitConfig)
 
     def work(self) -> None:

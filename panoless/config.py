@@ -17,13 +17,10 @@ from panoless.alignment.options import PoseOptions
 from panoless.capture.options import ContrastOptions, MaskRepairOptions
 from panoless.environment.options import (
     COARSEST,
-    ConfidenceOptions,
-    FootprintMapOptions,
     MaterialOptions,
     SurroundingsOptions,
     halves_whole,
 )
-from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.geometry.free_form.options import FreeFormOptions
 from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.options import PlaneOptions
@@ -46,7 +43,7 @@ from shinypartial.io.records import (
 
 Options = TypeVar("Options")
 Tuned = Annotated[Options, tyro.conf.Suppress]
-"""Tuned numbers of a stage, which `--set` changes: too many for the help of a command."""
+"""Options of a stage, which `--set` changes: too many for the help of a command."""
 SPLIT_SUM = ("gaussian-shader", "ref-gaussian", "material-refgs")
 """The shadings that blur the map for rough parts."""
 Model = Literal["auto", "sphere", "plane", "height_field", "revolution", "free_form", "surfels"]
@@ -112,14 +109,11 @@ class FitConfig:
     environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
     mask_repair: Tuned[MaskRepairOptions] = field(default_factory=MaskRepairOptions)
     contrast: Tuned[ContrastOptions] = field(default_factory=ContrastOptions)
-    first_surface: Tuned[FirstSurfaceOptions] = field(default_factory=FirstSurfaceOptions)
     sphere: Tuned[SphereOptions] = field(default_factory=SphereOptions)
     plane: Tuned[PlaneOptions] = field(default_factory=PlaneOptions)
     height_field: Tuned[HeightFieldOptions] = field(default_factory=HeightFieldOptions)
     revolution: Tuned[RevolutionOptions] = field(default_factory=RevolutionOptions)
     free_form: Tuned[FreeFormOptions] = field(default_factory=FreeFormOptions)
-    footprint_map: Tuned[FootprintMapOptions] = field(default_factory=FootprintMapOptions)
-    confidence: Tuned[ConfidenceOptions] = field(default_factory=ConfidenceOptions)
     poses: Tuned[PoseOptions] = field(default_factory=PoseOptions)
     surroundings: Tuned[SurroundingsOptions] = field(default_factory=SurroundingsOptions)
     material: Tuned[MaterialOptions] = field(default_factory=MaterialOptions)
@@ -166,7 +160,7 @@ def with_overrides(config: FitConfig, overrides: Sequence[str]) -> FitConfig:
             raise InputError(
                 expected="--set OPTION=VALUE with an option of the configuration, such as plane.max_vertices=64",
                 found=override,
-                remedy="The reference of options lists them all.",
+                remedy="The reference of options lists them all; any other number is a constant beside its formula.",
             )
         try:
             place[name] = json.loads(text)
@@ -216,7 +210,7 @@ def _check_blurred_maps(config: FitConfig) -> None:
     for option, resolution, blurred in (
         ("--config.environment.resolution", environment.resolution, config.splats.surfels.shading in SPLIT_SUM),
         ("--config.environment.solve-resolution", environment.solve_resolution, rough),
-        ("--set material.judged_resolution", material.judged_resolution, soft),
+        ("--set material.resolution", material.resolution, soft),
     ):
         if blurred and not halves_whole(resolution):
             raise InputError(

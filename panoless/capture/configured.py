@@ -31,7 +31,7 @@ def of_ball(config: FitConfig, ball: BallEvidence, views: int) -> FitConfig:
         poses=replace(config.poses, mode="off"),
         corrections=corrections,
         surroundings=surroundings,
-        material=replace(config.material, roughness="off", blur="off", least_scattering_error=1.0),
+        material=replace(config.material, roughness="off", blur="off", scattering="off"),
         sphere=replace(config.sphere, operator_deg=PHOTOGRAPHER_DEG),
     )
 

@@ -10,6 +10,15 @@ from torch import Tensor
 from panoless.capture.options import ContrastOptions
 from panoless.capture.views import Views
 
+LARGEST_EXPOSURE = 100.0
+"""More than so many times brighter nothing is made: darker photographs show noise."""
+MEDIANS = 6.0
+"""Radiance counts as it is up to the median brightness over this, and as its logarithm above."""
+LEAST_KNEE = 0.002
+"""But up to this at least (linear radiance), below which photographs show noise."""
+EXPLAINED = 0.15
+"""Error of held-out views, in logarithms, below which a shape that was fitted to radiance stays."""
+
 
 @dataclass(frozen=True)
 class Contrast:
@@ -22,7 +31,7 @@ class Contrast:
     knee: float | None = None
 
     @classmethod
-    def of(cls, views: Views, options: ContrastOptions) -> "Contrast":
+    def of(cls, views: Views, options: ContrastOptions, *, least_knee: float = LEAST_KNEE) -> "Contrast":
         """What views ask for: logarithms where the median brightness of the object's pixels is far below the mean.
 
         The share of the two does not depend on the exposure, but for what that saturates.
@@ -31,7 +40,7 @@ class Contrast:
         median = float(brightness.median()) if len(brightness) else 0.0
         if not len(brightness) or median >= options.dark_share * float(brightness.mean()):
             return cls()
-        return cls(max(median / options.medians, options.least_knee))
+        return cls(max(median / MEDIANS, least_knee))
 
     def shown(self, radiance: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:
         """What stands for radiance; below 0 there is none."""
@@ -59,7 +68,7 @@ def exposure_of(views: Views, options: ContrastOptions) -> float:
     """
     brightness = _brightness(views)
     mean = float(brightness.mean()) if len(brightness) else 0.0
-    return min(max(options.brightness / mean, 1.0), options.largest_exposure) if 0 < mean < options.dark else 1.0
+    return min(max(options.brightness / mean, 1.0), LARGEST_EXPOSURE) if 0 < mean < options.dark else 1.0
 
 
 def exposed(views: Views, exposure: float) -> Views:

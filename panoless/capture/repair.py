@@ -22,6 +22,28 @@ from panoless.capture.silhouettes import mask_distance
 from panoless.capture.views import MaskRepairs, TrainView, Views
 from shinypartial.core.conventions import SOLID_ALPHA
 
+GRIDS = (48, 96)
+"""Points along a side of the grids that views vote on, which contain the object: on the finer one, mended masks vote on
+the masks as they were."""
+LEAST_VIEWS = 20
+"""With fewer views a gap of the object may be seen by one of them alone."""
+CONTRADICTED_SHARE = 0.04
+"""A point counts as the object's where no more than this share of the other views sees it beside their masks."""
+NEAR_VIEWS = 4
+"""Of so many views nearest in direction, none may see a point beside its mask that a view lacks."""
+MARGIN = 0.8
+"""What stands out lies farther than this beside the masks of the others, in spacings of the first grid."""
+LEAST_RADIUS = 1.0
+"""Parts in which no larger disk fits are left alone, in spacings."""
+LEAST_RADIUS_PX = 3.0
+"""The same in pixels, where these are wider than a third of a spacing."""
+LARGEST_LENGTH = 6.0
+"""Parts longer than so many times the radius of that disk are left alone: wrong poses make crescents."""
+LEAST_SHARE = 0.75
+"""Share that parts which are not long have of all that is as wide and contradicts, at least."""
+ROUNDS = 4
+"""Most rounds on each grid: masks that were mended tell more about others."""
+
 Image = Bool[np.ndarray, "H W"]
 #: The grid holds the ball about the object with this much more than its radius.
 SPARE = 1.1
@@ -29,7 +51,7 @@ SPARE = 1.1
 SQUARE = np.ones((3, 3), bool)
 
 
-def with_repaired_masks(views: Views, options: MaskRepairOptions) -> Views:
+def with_repaired_masks(views: Views, options: MaskRepairOptions, *, grids: tuple[int, int] = GRIDS) -> Views:
     """The views with masks from which nothing as large as a blob is missing, and nothing stands out, by what the others
     say.
 
@@ -38,20 +60,20 @@ def with_repaired_masks(views: Views, options: MaskRepairOptions) -> Views:
     mended. What is missing is filled first: holes in other masks look as if a view showed too much. In each round the
     mended masks vote on the masks as they were, in the last rounds on a finer grid.
     """
-    if options.mode == "off" or len(views.train) < options.least_views:
+    if options.mode == "off" or len(views.train) < LEAST_VIEWS:
         return views
     said, inside = views, [view.mask.cpu().numpy() >= MASK_LEVEL for view in views.train]
-    margin = options.margin * _Grid.of(views, options.cells).spacing
-    for cells in (options.cells, options.fine_cells):
+    margin = MARGIN * _Grid.of(views, grids[0]).spacing
+    for cells in grids:
         grid, lacked, stood_out = _Grid.of(said, cells), 0, 0
-        radii = [max(options.least_radius * grid.spacing_px(view), options.least_radius_px) for view in said.train]
-        for _ in range(options.rounds):
-            votes = _Votes.of(views, grid, margin, options)
+        radii = [max(LEAST_RADIUS * grid.spacing_px(view), LEAST_RADIUS_PX) for view in said.train]
+        for _ in range(ROUNDS):
+            votes = _Votes.of(views, grid, margin)
             gaps = [~each & votes.shown(index) for index, each in enumerate(inside)]
             beyond = [each & ~votes.allowed(index) for index, each in enumerate(inside)]
-            lacking, excess = (_Contradicted.of(regions, radii, options) for regions in (gaps, beyond))
+            lacking, excess = (_Contradicted.of(regions, radii) for regions in (gaps, beyond))
             is_settled = lacking.area <= lacked and excess.area <= stood_out
-            if is_settled or lacking.area + excess.area < options.least_share * (lacking.wide + excess.wide):
+            if is_settled or lacking.area + excess.area < LEAST_SHARE * (lacking.wide + excess.wide):
                 break
             if lacking.area > lacked:
                 excess = excess.without_any()
@@ -96,16 +118,15 @@ class _Votes:
     beyond: Bool[np.ndarray, "V P"]
     nearest: Int[np.ndarray, "V K"]
     """The views that look from nearest to each."""
-    options: MaskRepairOptions
 
     @classmethod
-    def of(cls, views: Views, grid: _Grid, margin: float, options: MaskRepairOptions) -> "_Votes":
+    def of(cls, views: Views, grid: _Grid, margin: float) -> "_Votes":
         away = [mask_distance(view).distances(grid.points).cpu().numpy() for view in views.train]
         centers = np.array([view.position for view in views.train])
         sights = centers / np.linalg.norm(centers, axis=1, keepdims=True)
-        order = np.argsort(-(sights @ sights.T) - 2 * np.eye(len(sights)), axis=1)[:, 1 : 1 + options.near_views]
+        order = np.argsort(-(sights @ sights.T) - 2 * np.eye(len(sights)), axis=1)[:, 1 : 1 + NEAR_VIEWS]
         outside, beyond = (np.array([each > farther for each in away]) for farther in (0.0, margin))
-        return cls(views, grid, outside, beyond, order, options)
+        return cls(views, grid, outside, beyond, order)
 
     def shown(self, index: int) -> Image:
         """Where a view has to show the object: nearly all others, and all those nearest, have it inside their masks."""
@@ -128,7 +149,7 @@ class _Votes:
 
     def _is_inside(self, own: Bool[np.ndarray, "P"], times: Int[np.ndarray, "P"]) -> Bool[np.ndarray, "P"]:
         """Whether no more of the others than may be wrong are among those of all views."""
-        wrong = int(self.options.contradicted_share * (len(self.views.train) - 1))
+        wrong = int(CONTRADICTED_SHARE * (len(self.views.train) - 1))
         found: np.ndarray = times - own <= wrong
         return found
 
@@ -168,7 +189,7 @@ class _Contradicted:
         return _Contradicted([np.zeros_like(blob) for blob in self.blobs], 0, 0, self.wide)
 
     @classmethod
-    def of(cls, regions: Sequence[Image], radii: Sequence[float], options: MaskRepairOptions) -> "_Contradicted":
+    def of(cls, regions: Sequence[Image], radii: Sequence[float]) -> "_Contradicted":
         """`radii` are those of the least disk in the pixels of each view."""
         from scipy.ndimage import find_objects, label
 
@@ -179,7 +200,7 @@ class _Contradicted:
             for number, box in enumerate(find_objects(parts), start=1):
                 part = parts == number
                 longest = max(side.stop - side.start for side in box)
-                if longest <= options.largest_length * depth[part].max():
+                if longest <= LARGEST_LENGTH * depth[part].max():
                     blob |= part
                     count += 1
             wide += int(opened.sum())

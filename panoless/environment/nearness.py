@@ -5,6 +5,7 @@ the rows B of `Surroundings.rows` and the residuals e under the map that explain
 mean of what its rays ask for, and only the rest moves the walls: k ← k − (Bᵀ W (1 − Π) B)⁻¹ Bᵀ W (1 − Π) e.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -14,12 +15,26 @@ from jaxtyping import Bool, Float
 
 from panoless.environment.following import FollowingMap
 from panoless.environment.mirrored import radiance_of, slopes_of
-from panoless.environment.options import SurroundingsOptions
 from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
 from panoless.environment.surroundings import FAR, Floor, Surroundings
 from panoless.numeric.gauss_newton import damped_step
 from panoless.numeric.robust import bounded_error, robust_weight
+
+ROBUST_SCALE = 0.15
+"""Residual (linear radiance) beyond which a ray loses its vote."""
+RESOLUTIONS = (8, 8, 16, 16, 16, 32, 32, 32, 64, 64, 64)
+"""Texels along a face side of the maps of all steps."""
+STRETCH = 1.7
+"""Factor of a step: it lets each texel follow by the mean of its rays, as a map does not quite."""
+LEAST_SHARE = 1e-3
+"""Share of the mean diagonal that is added to the diagonal, for walls that no ray tells."""
+FLOOR_DEPTHS = (0.45, 0.55, 0.65, 0.8, 1.0)
+"""Of what the object may stand on below its center, in radii of the object: those that are tried first."""
+FLOOR_REACHES = (2.5, 4.0, 8.0)
+"""How far that may reach, in radii of the object."""
+FLOOR_RESOLUTION = 16
+"""Texels along a face side of the maps that tell which of these explains most."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +65,6 @@ class Linearized:
         seen: LeavingRays,
         surroundings: Surroundings,
         resolution: int,
-        options: SurroundingsOptions,
         free: Bool[np.ndarray, "D"] | slice = slice(None),
     ) -> "Linearized":
         """With the map solved there; over those of the unknowns that are free."""
@@ -58,17 +72,17 @@ class Linearized:
         directions, environment = rays.directions.numpy().astype(np.float64), solve_environment([rays], resolution)
         residual = radiance_of(environment, directions) - seen.radiance
         rows = surroundings.rows(slopes_of(environment, directions), seen.points, seen.directions)[..., free]
-        following = FollowingMap.of(directions, robust_weight(residual, options.robust_scale), resolution)
+        following = FollowingMap.of(directions, robust_weight(residual, ROBUST_SCALE), resolution)
         gradient, matrix = following.equations(rows, residual)
-        return cls(_cost(residual, options), gradient, matrix)
+        return cls(_cost(residual), gradient, matrix)
 
-    def step(self, least_share: float) -> Float[np.ndarray, "D"]:
-        """−(H + λ)⁻¹ g, λ that share of the mean diagonal; none where no ray tells anything."""
-        return damped_step(self.gradient, self.matrix, least_share)
+    def step(self) -> Float[np.ndarray, "D"]:
+        """−(H + λ)⁻¹ g, λ a small share of the mean diagonal; none where no ray tells anything."""
+        return damped_step(self.gradient, self.matrix, LEAST_SHARE)
 
-    def pull(self, least_share: float) -> float:
+    def pull(self) -> float:
         """The share of the cost that a step promises: ½ gᵀ(H + λ)⁻¹g over it."""
-        return float(-self.gradient @ self.step(least_share)) / 2 / max(self.cost, 1e-30)
+        return float(-self.gradient @ self.step()) / 2 / max(self.cost, 1e-30)
 
 
 def upward(rights: Float[np.ndarray, "V 3"], ups: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "3"]:
@@ -79,19 +93,17 @@ def upward(rights: Float[np.ndarray, "V 3"], ups: Float[np.ndarray, "V 3"]) -> F
     return up if (ups @ up).sum() > 0 else -up
 
 
-def with_floor(
-    seen: LeavingRays, up: Float[np.ndarray, "3"], options: SurroundingsOptions
-) -> tuple[Surroundings, float]:
+def with_floor(seen: LeavingRays, up: Float[np.ndarray, "3"]) -> tuple[Surroundings, float]:
     """A level disk below the object in a far world: of a grid of depths and reaches, what explains the rays best; and
     the share of the cost in a far world that it leaves.
     """
 
     def cost(surroundings: Surroundings) -> float:
         rays = seen.rays(surroundings)
-        environment = solve_environment([rays], options.floor_resolution)
-        return _cost(radiance_of(environment, rays.directions.numpy().astype(np.float64)) - seen.radiance, options)
+        environment = solve_environment([rays], FLOOR_RESOLUTION)
+        return _cost(radiance_of(environment, rays.directions.numpy().astype(np.float64)) - seen.radiance)
 
-    grid = product(options.floor_depths, options.floor_reaches)
+    grid = product(FLOOR_DEPTHS, FLOOR_REACHES)
     tried = [Surroundings(np.zeros(1), Floor(up, depth, reach)) for depth, reach in grid]
     costs = [cost(each) for each in tried]
     best = int(np.argmin(costs))
@@ -99,20 +111,20 @@ def with_floor(
 
 
 def found_surroundings(
-    seen: LeavingRays, start: Surroundings, options: SurroundingsOptions, *, tilts: bool = False
+    seen: LeavingRays, start: Surroundings, resolutions: Sequence[int] = RESOLUTIONS, *, tilts: bool = False
 ) -> Surroundings:
     """After a step under a map of each of the resolutions. A floor stays level unless it `tilts`, too: wrong normals
     ask for tilts.
     """
-    for resolution in options.resolutions:
+    for resolution in resolutions:
         free = np.ones(start.num_unknowns, bool)
         if start.floor is not None and not tilts:
             free[len(start.coefficients) : -1] = False
         change = np.zeros(start.num_unknowns)
-        change[free] = Linearized.at(seen, start, resolution, options, free).step(options.least_share)
-        start = start.after(options.stretch * change)
+        change[free] = Linearized.at(seen, start, resolution, free).step()
+        start = start.after(STRETCH * change)
     return start
 
 
-def _cost(residual: Float[np.ndarray, "P C"], options: SurroundingsOptions) -> float:
-    return options.robust_scale**2 * float(bounded_error(residual, options.robust_scale).sum()) / 2
+def _cost(residual: Float[np.ndarray, "P C"]) -> float:
+    return ROBUST_SCALE**2 * float(bounded_error(residual, ROBUST_SCALE).sum()) / 2

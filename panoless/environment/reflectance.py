@@ -12,11 +12,15 @@ from torch.nn.functional import normalize
 
 from panoless.capture.encoding import SATURATED
 from panoless.environment.cubemap import flat_texels
-from panoless.environment.options import MaterialOptions
 from panoless.environment.rays import Rays
 from panoless.numeric.robust import robust_weight
 from shinypartial.core.harmonics import project, real_harmonics
 from shinypartial.core.sphere import cube_directions, cube_solid_angles
+
+ROBUST_SCALE = 0.1
+"""Residual (linear radiance) beyond which a ray loses its vote; narrower scales lose the rays of a strong color."""
+ROUNDS = 12
+"""Gauss–Newton steps."""
 
 LEAST = 0.02
 """Of a reflectance at normal incidence, about that of water; no metal has less."""
@@ -106,11 +110,11 @@ def _harmonics_of(values: Float[np.ndarray, "N C"], resolution: int) -> Float[np
 
 def find_reflectance(
     rays: Rays,
-    options: MaterialOptions,
+    resolution: int,
     lamps: Float[np.ndarray, "9"] | None = None,
     metal: Reflectance | None = None,
 ) -> Reflectance:
-    """F₀ in (0, 1] by min Σ w ‖c − F(θ) E‖² over it and the texels E of a map together.
+    """F₀ in (0, 1] by min Σ w ‖c − F(θ) E‖² over it and the texels E of a map of some resolution together.
 
     Where the harmonics of `lamps` are given (see `lamp_light`), min Σ w ‖c − F(θ) E − ρ I(n) − q L(n)‖² over the albedo
     ρ and q ≥ 0, too, with F₀ + ρ ≤ 1: I is the light of E that falls on a surface with the normal n, over π, and q L
@@ -120,21 +124,21 @@ def find_reflectance(
     which the texels are eliminated: all that counts is how a direction looks at different angles. A plane in a far
     world shows each direction at one angle and tells nothing; F₀ stays 1 and ρ zero there.
     """
-    texels = _Texels.of(rays, options)
+    texels = _Texels.of(rays, resolution)
     if metal is None:
-        metal = texels.found(options, Reflectance(np.ones(3)))
-    return metal if lamps is None else texels.found(options, metal, lamps)
+        metal = texels.found(resolution, Reflectance(np.ones(3)))
+    return metal if lamps is None else texels.found(resolution, metal, lamps)
 
 
-def left_unexplained(rays: Rays, reflectance: Reflectance, options: MaterialOptions) -> Float[np.ndarray, "P 3"]:
+def left_unexplained(rays: Rays, reflectance: Reflectance, resolution: int) -> Float[np.ndarray, "P 3"]:
     """c − F(θ) E − D(n) with each texel of E the robust mean of the trusted rays; others are only predicted."""
-    texels, weight = _Texels.of(rays, options), rays.initial_weight().double().cpu().numpy()
+    texels, weight = _Texels.of(rays, resolution), rays.initial_weight().double().cpu().numpy()
     texels = texels.without(texels.basis @ reflectance.scattered)
     residual = texels.radiance
-    for _ in range(options.rounds):
+    for _ in range(ROUNDS):
         share, light, _ = texels.solved(reflectance.at_normal, weight)
         residual = texels.radiance - share * light
-        weight = texels.trust * robust_weight(residual, options.robust_scale)
+        weight = texels.trust * robust_weight(residual, ROBUST_SCALE)
     return residual
 
 
@@ -151,9 +155,9 @@ class _Texels:
     """Harmonics of the normals."""
 
     @classmethod
-    def of(cls, rays: Rays, options: MaterialOptions) -> "_Texels":
+    def of(cls, rays: Rays, resolution: int) -> "_Texels":
         return cls(
-            flat_texels(rays.directions.double().cpu().numpy(), options.resolution),
+            flat_texels(rays.directions.double().cpu().numpy(), resolution),
             rays.radiance.double().cpu().numpy(),
             rays.initial_weight().double().cpu().numpy(),
             grazing(cosines_of_incidence(rays)).double().cpu().numpy()[:, None],
@@ -185,22 +189,20 @@ class _Texels:
         values = np.where(np.isnan(values), np.nanmean(values, 0), values)
         return LAMBERT[:, None] * _harmonics_of(np.maximum(values, 0), resolution)
 
-    def found(
-        self, options: MaterialOptions, start: Reflectance, lamps: Float[np.ndarray, "9"] | None = None
-    ) -> Reflectance:
+    def found(self, resolution: int, start: Reflectance, lamps: Float[np.ndarray, "9"] | None = None) -> Reflectance:
         """F₀ = 1 − m − ρ from a metal on, and ρ and q where lamps are given; m is the share of light that is lost."""
         weight, matte = self.trust, np.zeros((2, 9, 3))
         lost, shares = 1 - start.at_normal, np.zeros((2, 3))
-        for _ in range(options.rounds):
+        for _ in range(ROUNDS):
             at_normal = np.maximum(1 - lost - shares[0], LEAST)
             shown = self.without(self.basis @ (shares[:, None] * matte).sum(0))
             share, light, squares = shown.solved(at_normal, weight)
             residual = shown.radiance - share * light
-            weight = self.trust * robust_weight(residual, options.robust_scale)
+            weight = self.trust * robust_weight(residual, ROBUST_SCALE)
             slopes = [(self.grazing - 1) * light]
             if lamps is not None:
                 unseen = LAMBERT[:, None] * np.repeat(lamps[:, None], 3, 1)
-                matte = np.stack([self.falling(light, options.resolution), unseen])
+                matte = np.stack([self.falling(light, resolution), unseen])
                 slopes += [self.basis @ matte[0] + slopes[0], self.basis @ matte[1]]
             slopes = [each - share * self.summed(weight[:, None] * share * each) / squares for each in slopes]
             for channel in range(3):

@@ -11,7 +11,23 @@ from panoless.capture.encoding import SATURATED
 from panoless.environment.fill import fill_unobserved
 from panoless.environment.footprints import PixelFootprints
 from panoless.environment.lobe import Lobe
-from panoless.environment.options import MaterialOptions
+
+SHARPENING_ROUNDS = 20
+"""Steps that sharpen the exported map of a rough mirror. Further ones amplify noise."""
+STEP_POWER = 1.5
+"""Exponent of a step: 1 is the method's, more goes faster."""
+SHARPENING_SCALE = 0.16
+"""Robust scale of radiance errors, as that of footprints."""
+LIT = 0.95
+"""Share of the largest value from which a texel of the start is saturated."""
+LAMP_BORDER_RAD = 0.0123
+"""By so much lamps are smaller at the start than what they saturate: a texel of 128."""
+LAMP_LIGHT = 3.0
+"""Their radiance at the start, in largest values of views."""
+INERTIA = 1e-4
+"""Added above and below the bar of a step, in rays times radiance, so that what no pixel sees stays."""
+LEAST_LIGHT = 1e-3
+"""Radiance at the start of what is darker: zero would stay zero."""
 
 
 def sharpened_map(
@@ -19,8 +35,7 @@ def sharpened_map(
     areas: Sequence[PixelFootprints],
     lobe: Lobe,
     saturation: Float[Tensor, "3"],
-    options: MaterialOptions,
-    rounds: int,
+    rounds: int = SHARPENING_ROUNDS,
 ) -> Float[Tensor, "6 3 L L"]:
     """min_{E ≥ 0} Σ w ‖min(s, A B E) − c‖² from a map of what the mirror shows on, by multiplicative steps
     (Daube-Witherspoon and Muehllehner 1986)
@@ -32,32 +47,32 @@ def sharpened_map(
     is saturated, too. What no pixel sees stays.
     """
     resolution, saturation = environment.shape[-1], saturation.to(environment)
-    environment = environment.clamp(min=options.least_light)
+    environment = environment.clamp(min=LEAST_LIGHT)
     for _ in range(rounds):
         shown = lobe.blurred(environment)
         asked, found = torch.zeros_like(environment), torch.zeros_like(environment)
         for each in areas:
             seen = each.seen(shown)
-            weight = each.weights(seen, saturation, options.sharpening_scale, SATURATED)
+            weight = each.weights(seen, saturation, SHARPENING_SCALE, SATURATED)
             asked += each.spread(weight * each.radiance, resolution)
             found += each.spread(weight * seen, resolution)
-        ratio = (lobe.gathered(asked) + options.inertia) / (lobe.gathered(found) + options.inertia)
-        environment = environment * ratio**options.step_power
+        ratio = (lobe.gathered(asked) + INERTIA) / (lobe.gathered(found) + INERTIA)
+        environment = environment * ratio**STEP_POWER
     return environment
 
 
 def with_smaller_lamps(
-    environment: Float[Tensor, "6 3 L L"], saturation: Float[Tensor, "3"], options: MaterialOptions
+    environment: Float[Tensor, "6 3 L L"], saturation: Float[Tensor, "3"]
 ) -> Float[Tensor, "6 3 L L"]:
     """A start for a sharpened map: what a lobe saturates about a lamp is filled from around, and the lamp is brighter.
 
-    Of each region in which a channel is saturated, texels within `lamp_border_rad` of its border are filled, but for
+    Of each region in which a channel is saturated, texels within `LAMP_BORDER_RAD` of its border are filled, but for
     the innermost ones of a region that is no wider. Photographs that end at s do not tell a lamp from a smaller and
     brighter one; of all that explain them, steps lead to one near to where they start.
     """
     most = saturation.to(environment)[:, None, None]
-    lit = environment >= options.lit * most
-    texels = max(round(options.lamp_border_rad * environment.shape[-1] * 2 / torch.pi), 1)
+    lit = environment >= LIT * most
+    texels = max(round(LAMP_BORDER_RAD * environment.shape[-1] * 2 / torch.pi), 1)
     depth, inner = lit.float(), lit.float()
     for _ in range(texels):
         inner = -max_pool2d(-inner, 3, 1, 1)
@@ -71,4 +86,4 @@ def with_smaller_lamps(
         ],
         1,
     )
-    return torch.where(core, (options.lamp_light * most).expand_as(environment), torch.where(lit, around, environment))
+    return torch.where(core, (LAMP_LIGHT * most).expand_as(environment), torch.where(lit, around, environment))

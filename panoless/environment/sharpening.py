@@ -13,22 +13,81 @@ L = (1 + 1/w) S.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from panoless.capture.encoding import SATURATED
 from panoless.environment.cubemap import by_face, by_texel, resample
 from panoless.environment.fill import texel_neighbors
 from panoless.environment.footprints import Footprints, PixelFootprints, counting_saturated, in_patches, thinned
-from panoless.environment.options import DEFAULTS, FootprintMapOptions, LampOptions
 from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap, scatter_cubemap
 from panoless.numeric.conjugate_gradients import conjugate_gradients
 from panoless.numeric.robust import bounded_error
+
+
+@dataclass(frozen=True)
+class Lamps:
+    """How far pixels that lamps saturate count."""
+
+    saturated_weight: float
+    """Of a saturated pixel, where that of another is 1."""
+    robust_scales: tuple[float, ...]
+    """Of radiance errors, in rounds in each of which weights are computed again."""
+
+
+SOFT = Lamps(0.5, (0.3, 0.25, 0.2, 0.16))
+"""Where lamps and windows are little brighter than what saturates: their borders are pixels in between, which wide
+scales keep."""
+HARD = Lamps(0.25, (0.16, 0.16, 0.16, 0.16))
+"""Where they are much brighter, and saturate pixels that they hardly touch."""
+LEAST_HARD_GAIN = 0.02
+"""Share of the error of unsaturated held-out pixels that hard lamps have to lower."""
+ROBUST_SCALE = 0.16
+"""Of errors of held-out pixels (linear radiance), and where the scales of lamps end."""
+SMOOTHNESS = (0.01, 0.05, 0.25)
+"""Weights λ of differences between neighboring texels, in pixels, among which held-out pixels choose, from the middle
+one on."""
+MIDDLE = len(SMOOTHNESS) // 2
+HELD_OUT = 5
+"""Of so many pixels one is held out."""
+LEAST_GAIN = 0.002
+"""Share of the error of held-out pixels by which a map of twice the resolution has to lower it."""
+LEAST_UNSATURATED_GAIN = 0.005
+"""The same of unsaturated pixels alone, where all together are explained no worse."""
+LEAST_TOLD = 1.0
+"""Pixels on a texel of the coarsest map from which their footprints tell where the map starts."""
+PULL = 0.002
+"""Weight ε of the start, in pixels."""
+STEPS = 6
+"""Conjugate-gradient steps of a round."""
+TRIAL_STEPS = 2
+"""The same in maps that only choose resolution and smoothness, as many steps do."""
+TRIAL_PIXELS = 500_000
+"""From about so many pixels at most these maps are made: those that look at some patches of the sky."""
+TRIAL_PATCHES = 8
+"""Patches along a face side, of which some are chosen."""
+LIT = 0.95
+"""Share of the largest value from which a texel of the start is saturated."""
+CEILING = 4.0
+"""Largest radiance of the map, in those of views."""
+COARSE_PIXELS = 200_000
+"""About so many pixels at most tell how bright the inside of saturated regions is."""
+COARSE_RESOLUTION = 8
+"""Texels along a face side of what is added there."""
+COARSE_ROUNDS = 2
+"""Rounds of it."""
+COARSE_STEPS = 6
+"""Conjugate-gradient steps of such a round."""
+COARSE_PULL = 0.2
+"""Weight of what is added, in pixels."""
+COARSE_SCALE = 1.0
+"""Robust scale there: while a lamp is far too dark, pixels that see it in part must keep their votes."""
 
 MOVES = ((1, 0), (0, 1), (0, -1))
 """Steps to a finer map, a smoother one and a sharper one, as they are tried."""
@@ -42,7 +101,7 @@ class Sharpness:
     """Texels along a face side."""
     smoothness: float
     """λ, in pixels."""
-    lamps: LampOptions
+    lamps: Lamps
     """How saturated pixels are believed."""
 
 
@@ -51,64 +110,66 @@ def sharpest_map(
     rays: Sequence[Rays],
     resolutions: Sequence[int],
     saturation: Float[Tensor, "3"],
-    options: FootprintMapOptions = DEFAULTS,
 ) -> Float[Tensor, "6 3 L L"]:
     """The map of all pixels: `rays` are their centers, also of those without footprints. The resolutions that it may
     have go from coarse to fine; the coarsest has enough pixels a texel to say where footprints tell it. E₀ is solved
     from them twice: the second time, where they do, from a map of footprints. Under that fewer rays look as if they
     were wrong.
     """
-    chosen = chosen_sharpness(footprints.smooth, resolutions, saturation, options)
+    chosen = chosen_sharpness(footprints.smooth, resolutions, saturation)
     told = footprints.smooth[0].radiance.new_zeros(6, 1, resolutions[0], resolutions[0])
     for each in footprints.smooth:
         told += each.spread(each.initial_weight()[:, None], resolutions[0])
-    told = (told >= options.least_told).float()
-    level = options.saturated * saturation
+    told = (told >= LEAST_TOLD).float()
+    level = SATURATED * saturation
     believed = [
         counting_saturated(each, chosen.lamps.saturated_weight, level, sample_cubemap(told, each.directions)[:, 0])
         for each in rays
     ]
-    start, quick = solve_environment(believed, chosen.resolution), replace(options, steps=options.trial_steps)
-    seen = deblur_map(Footprints(footprints.smooth), start, saturation, chosen.smoothness, quick, chosen.lamps)
+    start = solve_environment(believed, chosen.resolution)
+    seen = deblur_map(
+        Footprints(footprints.smooth), start, saturation, chosen.smoothness, chosen.lamps, steps=TRIAL_STEPS
+    )
     seen = seen.minimum(saturation.to(seen)[:, None, None])
     told = resample(told, chosen.resolution) > 0.5
     start = solve_environment(believed, chosen.resolution, torch.where(told, seen, start))
-    return deblur_map(footprints, start, saturation, chosen.smoothness, options, chosen.lamps)
+    return deblur_map(footprints, start, saturation, chosen.smoothness, chosen.lamps)
 
 
 def chosen_sharpness(
     areas: Sequence[PixelFootprints],
     resolutions: Sequence[int],
     saturation: Float[Tensor, "3"],
-    options: FootprintMapOptions = DEFAULTS,
+    *,
+    trial_pixels: int = TRIAL_PIXELS,
 ) -> Sharpness:
     """What explains every fifth pixel best by the others. From the coarsest map on, a finer, a smoother and a sharper
-    one are tried as long as one is better, a finer one by the share `least_gain`, or of unsaturated pixels by
-    `least_unsaturated_gain`. One that is as fine as a refused one is not tried again.
+    one are tried as long as one is better, a finer one by the share `LEAST_GAIN`, or of unsaturated pixels by
+    `LEAST_UNSATURATED_GAIN`. One that is as fine as a refused one is not tried again.
 
     Held-out pixels that are saturated count as they do in the map; at the borders of lamps they prefer blur. Which kind
     of lamps there is, unsaturated pixels tell before that: those beside lamps that are shown too large. Saturated ones
     always prefer larger lamps.
     """
 
-    def sharpness(place: tuple[int, int], lamps: LampOptions) -> Sharpness:
-        return Sharpness(resolutions[place[0]], options.smoothness[place[1]], lamps)
+    def sharpness(place: tuple[int, int], lamps: Lamps) -> Sharpness:
+        return Sharpness(resolutions[place[0]], SMOOTHNESS[place[1]], lamps)
 
-    trial, here, lamps = _Trial(areas, saturation, options), (0, options.middle), options.soft
+    trial, here, lamps = _Trial(areas, saturation, trial_pixels), (0, MIDDLE), SOFT
     best = trial.made(sharpness(here, lamps))
     if trial.is_saturated:
-        hard = trial.made(sharpness(here, options.hard))
-        if hard.unsaturated_error < (1 - options.least_hard_gain) * best.unsaturated_error:
-            lamps, best = options.hard, hard
+        hard = trial.made(sharpness(here, HARD))
+        if hard.unsaturated_error < (1 - LEAST_HARD_GAIN) * best.unsaturated_error:
+            lamps, best = HARD, hard
     tried, moves, sizes = {here}, list(MOVES), len(resolutions)
     while moves:
         (finer, smoother), *moves = moves
         there = here[0] + finer, here[1] + smoother
-        if there in tried or there[0] >= sizes or not 0 <= there[1] < len(options.smoothness):
+        if there in tried or there[0] >= sizes or not 0 <= there[1] < len(SMOOTHNESS):
             continue
         tried.add(there)
         found = trial.made(sharpness(there, lamps))
-        if found.is_better(best, options) if finer else found.error < best.error:
+        if found.is_better(best) if finer else found.error < best.error:
             best, here, moves = found, there, list(MOVES)
         elif finer:
             sizes = there[0]
@@ -125,11 +186,11 @@ class _Tried:
     unsaturated_error: float
     """Of the unsaturated ones."""
 
-    def is_better(self, coarser: "_Tried", options: FootprintMapOptions) -> bool:
+    def is_better(self, coarser: "_Tried") -> bool:
         """Whether a finer map explains more: of all pixels; or of the unsaturated ones, and no less of all."""
-        if self.error < coarser.error * (1 - options.least_gain):
+        if self.error < coarser.error * (1 - LEAST_GAIN):
             return True
-        enough = coarser.unsaturated_error * (1 - options.least_unsaturated_gain)
+        enough = coarser.unsaturated_error * (1 - LEAST_UNSATURATED_GAIN)
         return self.error <= coarser.error and self.unsaturated_error < enough
 
 
@@ -137,15 +198,14 @@ class _Trial:
     """What the pixels in some patches of the sky say, of which some are held out."""
 
     def __init__(
-        self, areas: Sequence[PixelFootprints], saturation: Float[Tensor, "3"], options: FootprintMapOptions
+        self, areas: Sequence[PixelFootprints], saturation: Float[Tensor, "3"], pixels: int = TRIAL_PIXELS
     ) -> None:
-        areas = in_patches(areas, options.trial_pixels, options.trial_patches)
-        self.kept = [each.without(options.held_out, index % options.held_out) for index, each in enumerate(areas)]
-        self.asked = [each.every(options.held_out, index % options.held_out) for index, each in enumerate(areas)]
-        self.saturation, self.options = saturation, replace(options, steps=options.trial_steps)
-        self.level = options.saturated * saturation
+        areas = in_patches(areas, pixels, TRIAL_PATCHES)
+        self.kept = [each.without(HELD_OUT, index % HELD_OUT) for index, each in enumerate(areas)]
+        self.asked = [each.every(HELD_OUT, index % HELD_OUT) for index, each in enumerate(areas)]
+        self.saturation, self.level = saturation, SATURATED * saturation
         self.is_saturated = any(bool(each.reaches(self.level).any()) for each in areas)
-        self._starts: dict[tuple[int, LampOptions], Tensor] = {}
+        self._starts: dict[tuple[int, Lamps], Tensor] = {}
 
     def made(self, sharpness: Sharpness) -> _Tried:
         """Of the map that is so sharp."""
@@ -154,15 +214,15 @@ class _Trial:
             rays = [counting_saturated(each.rays(), lamps.saturated_weight, self.level) for each in self.kept]
             self._starts[key] = solve_environment(rays, sharpness.resolution)
         start, footprints = self._starts[key], Footprints(self.kept)
-        environment = deblur_map(footprints, start, self.saturation, sharpness.smoothness, self.options, lamps)
+        environment = deblur_map(footprints, start, self.saturation, sharpness.smoothness, lamps, steps=TRIAL_STEPS)
         return _Tried(*self._errors(environment, lamps))
 
-    def _errors(self, environment: Float[Tensor, "6 3 L L"], lamps: LampOptions) -> tuple[float, float]:
+    def _errors(self, environment: Float[Tensor, "6 3 L L"], lamps: Lamps) -> tuple[float, float]:
         """Of all pixels that are asked, and of the unsaturated ones."""
         summed = torch.zeros(2, 2)
         for each in self.asked:
             error = each.seen(environment).minimum(self.saturation.to(environment)) - each.radiance
-            badly = bounded_error(error, self.options.robust_scale)
+            badly = bounded_error(error, ROBUST_SCALE)
             weight = counting_saturated(each, lamps.saturated_weight, self.level).initial_weight()
             for part, counted in zip(summed, (weight, weight * ~each.reaches(self.level)), strict=True):
                 part += torch.stack([(counted * badly).sum(), counted.sum()]).cpu()
@@ -175,30 +235,31 @@ def deblur_map(
     environment: Float[Tensor, "6 3 L L"],
     saturation: Float[Tensor, "3"],
     smoothness: float,
-    options: FootprintMapOptions = DEFAULTS,
-    lamps: LampOptions = DEFAULTS.soft,
+    lamps: Lamps = SOFT,
+    *,
+    steps: int = STEPS,
 ) -> Float[Tensor, "6 3 L L"]:
     """The map E₀ of pixel centers, sharpened; texels that no footprint touches stay. Views are clipped at `saturation`.
 
-    It lies between 0 and that, or `ceiling` times that in channels in which pixels are saturated. Before each round,
+    It lies between 0 and that, or `CEILING` times that in channels in which pixels are saturated. Before each round,
     pixels that bend the light much, or reflect it often, and so see wide parts of it, tell how bright the inside of
     saturated regions is, coarsely.
     """
     if not footprints.smooth:
         return environment
     saturation = saturation.to(environment)
-    level = options.saturated * saturation
+    level = SATURATED * saturation
     areas = [counting_saturated(each, lamps.saturated_weight, level) for each in footprints.smooth]
     lit = torch.stack([(each.radiance >= level).any(0) for each in areas]).any(0)
-    highest = (saturation * torch.where(lit, options.ceiling, 1.0))[:, None, None]
-    inner = _eroded(environment >= options.lit * saturation[:, None, None])
+    highest = (saturation * torch.where(lit, CEILING, 1.0))[:, None, None]
+    inner = _eroded(environment >= LIT * saturation[:, None, None])
     others = None
     if footprints.trace_others is not None and inner.any():
-        others = PixelFootprints.joined(thinned(footprints.trace_others(), options.coarse_pixels))
+        others = PixelFootprints.joined(thinned(footprints.trace_others(), COARSE_PIXELS))
     for scale in lamps.robust_scales:
         if others is not None:
-            environment = _brightened(environment, others, inner, saturation, options).minimum(highest)
-        change = _sharpening(environment, areas, saturation, smoothness, scale, options)
+            environment = _brightened(environment, others, inner, saturation).minimum(highest)
+        change = _sharpening(environment, areas, saturation, smoothness, scale, steps)
         environment = (environment + change).clamp(min=0).minimum(highest)
     return environment
 
@@ -209,17 +270,17 @@ def _sharpening(
     saturation: Float[Tensor, "3"],
     smoothness: float,
     scale: float,
-    options: FootprintMapOptions,
+    steps: int,
 ) -> Float[Tensor, "6 3 L L"]:
     """The change of a map that explains pixels best, as they and its differences weigh under that map."""
-    equations = _Equations.at(environment, areas, saturation, scale, options.pull, options.saturated)
+    equations = _Equations.at(environment, areas, saturation, scale, PULL)
     agreeing = _Smoothness.at(environment, equations.total, smoothness, scale)
     return conjugate_gradients(
         lambda image: equations.product(image) + agreeing.product(image),
         torch.zeros_like(environment),
         equations.right_side - agreeing.product(environment),
-        1 / (options.pull + equations.total + agreeing.diagonal),
-        options.steps,
+        1 / (PULL + equations.total + agreeing.diagonal),
+        steps,
     )
 
 
@@ -241,14 +302,13 @@ class _Equations:
         saturation: Float[Tensor, "3"],
         scale: float,
         pull: float,
-        saturated: float,
     ) -> "_Equations":
         """Weighed by what is seen of a map."""
         resolution = environment.shape[-1]
         products, residual, total = [], torch.zeros_like(environment), torch.zeros_like(environment)
         for each in areas:
             seen = each.seen(environment)
-            weights = each.weights(seen, saturation, scale, saturated)
+            weights = each.weights(seen, saturation, scale, SATURATED)
             products.append(each.normal_product(weights, resolution))
             residual += each.spread((each.radiance - seen) * weights, resolution)
             total += each.spread(weights, resolution)
@@ -301,7 +361,6 @@ def _brightened(
     areas: PixelFootprints,
     inner: Float[Tensor, "6 3 L L"],
     saturation: Float[Tensor, "3"],
-    options: FootprintMapOptions,
 ) -> Float[Tensor, "6 3 L L"]:
     """The map plus what a coarse one adds within saturated regions; nothing there falls below saturation for it.
 
@@ -315,21 +374,21 @@ def _brightened(
         return inner * resample(coarse, resolution)
 
     def coarser(image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "6 C M M"]:
-        return scatter_cubemap(by_texel(inner * image), texels, options.coarse_resolution)
+        return scatter_cubemap(by_texel(inner * image), texels, COARSE_RESOLUTION)
 
     def change_of(environment: Float[Tensor, "6 3 L L"]) -> Float[Tensor, "6 3 L L"]:
-        equations = _Equations.at(environment, [areas], saturation, options.coarse_scale, 0.0, options.saturated)
+        equations = _Equations.at(environment, [areas], saturation, COARSE_SCALE, 0.0)
         right_side = coarser(equations.right_side)
         found = conjugate_gradients(
-            lambda coarse: options.coarse_pull * coarse + coarser(equations.product(finer(coarse))),
+            lambda coarse: COARSE_PULL * coarse + coarser(equations.product(finer(coarse))),
             torch.zeros_like(right_side),
             right_side,
-            1 / (options.coarse_pull + coarser(equations.total)),
-            options.coarse_steps,
+            1 / (COARSE_PULL + coarser(equations.total)),
+            COARSE_STEPS,
         )
         return finer(found)
 
-    for _ in range(options.coarse_rounds):
+    for _ in range(COARSE_ROUNDS):
         environment = (environment + change_of(environment)).maximum(lowest)
     return environment
 

@@ -9,15 +9,20 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from panoless.environment.options import ConfidenceOptions
 from panoless.environment.rays import Rays
 from panoless.kernels.cubemap import cubemap_solid_angles, sample_cubemap, scatter_cubemap
 from panoless.numeric.robust import robust_weight
 from shinypartial.core.color import linear_to_srgb
 
+VOTE_SCALE = 0.05
+"""Residual (linear radiance) beyond which a ray does not agree with the map."""
+HALVING_DISAGREEMENT = 0.05
+"""Mean difference of rays from the map (sRGB, 0 to 1) that halves the confidence."""
+HALVING_CONTRAST = 0.1
+"""Difference of a texel's neighbors (linear radiance) that halves it."""
+
 SATURATING_QUANTILE = 0.9
-"""Of the observed texels, from which evidence counts as full. Not tuned."""
-DEFAULTS = ConfidenceOptions()
+"""Of the observed texels, from which evidence counts as full."""
 
 
 @dataclass(frozen=True)
@@ -64,9 +69,8 @@ def agreement(
     rays: Sequence[Rays],
     environment: Float[Tensor, "6 3 L L"],
     saturation: Float[Tensor, "3"] | None = None,
-    options: ConfidenceOptions = DEFAULTS,
 ) -> Agreement:
-    """Weigh each ray by t (1 + ‖e‖²/s²)⁻², t its trust and s the `vote_scale`; average its sRGB residual by texel.
+    """Weigh each ray by t (1 + ‖e‖²/s²)⁻², t its trust and s the `VOTE_SCALE`; average its sRGB residual by texel.
 
     Rays end at `saturation`, if given: there a map may be brighter and agrees.
     """
@@ -77,7 +81,7 @@ def agreement(
     for batch in rays:
         seen = sample_cubemap(environment, batch.directions).minimum(saturation)
         trust = batch.initial_weight()
-        weight = trust * robust_weight(seen - batch.radiance, options.vote_scale)
+        weight = trust * robust_weight(seen - batch.radiance, VOTE_SCALE)
         difference = (_srgb(seen) - _srgb(batch.radiance)).abs().mean(1)
         summed = scatter_cubemap(torch.stack([weight, weight * difference, trust], 1), batch.directions, resolution)
         votes += summed[:, 0]
@@ -99,7 +103,7 @@ def _srgb(radiance: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
     return torch.from_numpy(linear_to_srgb(radiance.clamp(min=0).cpu().numpy())).to(radiance.device)
 
 
-def visibility_from_agreement(found: Agreement, options: ConfidenceOptions = DEFAULTS) -> Float[Tensor, "6 L L"]:
+def visibility_from_agreement(found: Agreement) -> Float[Tensor, "6 L L"]:
     """Confidence in [0, 1]: v/(1 + v) · s · 1/(1 + d/d½) · 1/(1 + c/c½), with v the votes a mean-sized texel would
     have had, s the share that agrees, d the disagreement and c the contrast, and d½ and c½ those that halve it.
 
@@ -110,6 +114,4 @@ def visibility_from_agreement(found: Agreement, options: ConfidenceOptions = DEF
     relative = cubemap_solid_angles(found.votes.shape[-1]).to(found.votes)
     votes = found.votes / (relative / relative.mean())
     sure = votes / (1 + votes) * found.share
-    return (
-        sure / (1 + found.disagreement / options.halving_disagreement) / (1 + found.contrast / options.halving_contrast)
-    )
+    return sure / (1 + found.disagreement / HALVING_DISAGREEMENT) / (1 + found.contrast / HALVING_CONTRAST)

@@ -13,9 +13,28 @@ from jaxtyping import Float
 from panoless.capture.views import Views
 from panoless.first_surface.contact import outline_contact
 from panoless.first_surface.mesh import TriangleMesh
-from panoless.first_surface.options import DEFAULTS, FirstSurfaceOptions
 from panoless.first_surface.visual_hull import Hull
 from panoless.numeric.factorize import factorize
+
+CONTACT_PX = 3.9
+"""Standard deviation (px) of a hull vertex from a silhouette's cone, and of its contact from the contour generator
+along the ray."""
+TRUST_FLOOR = 1e-7
+"""Trust added to every vertex, so that the plate is determined where nothing is trusted."""
+PLATE_LENGTH_PX = 5.0
+"""Details of the trusted hull shorter than this are smoothed."""
+PIXELS_A_VOXEL = 4.5
+"""Lengths are in pixels, or in voxels divided by this where the grid is coarser than the images."""
+OBSTACLE_PX = 0.25
+"""A plate that leaves the hull by more than this is put back on it, as if a silhouette touched it there."""
+OBSTACLE_TRUST = 0.5
+"""Trust in such a point."""
+OBSTACLE_ROUNDS = 3
+"""Solutions of the plate with ever more such points."""
+PROJECTION_STEPS = 3
+"""Newton steps by which points outside the hull are moved onto it."""
+LEAST_SLOPE = 0.5
+"""Lower bound of |∇h| in such a step, dimensionless: 1 for a distance."""
 
 LEAST_AREA = 1e-3
 """Of the mean area of a vertex: a smaller one counts as this."""
@@ -39,50 +58,46 @@ class TrustedHull:
     pixel: float
 
 
-def trusted_hull(hull: Hull, views: Views, options: FirstSurfaceOptions = DEFAULTS) -> TrustedHull:
+def trusted_hull(hull: Hull, views: Views) -> TrustedHull:
     """By the contact of silhouettes; a hull that none touches is all that is known."""
     surface = hull_surface(hull)
-    pixel = max(hull.pixel, hull.voxel / options.pixels_a_voxel)
-    contact = outline_contact(surface, views, options)
-    touched = contact.trust(options.contact_px * pixel, options.least_trust)
-    trust = (touched if touched.any() else np.ones_like(touched)) + options.trust_floor
+    pixel = max(hull.pixel, hull.voxel / PIXELS_A_VOXEL)
+    contact = outline_contact(surface, views)
+    touched = contact.trust(CONTACT_PX * pixel)
+    trust = (touched if touched.any() else np.ones_like(touched)) + TRUST_FLOOR
     return TrustedHull(hull, surface, trust, pixel)
 
 
-def complete_surface(hull: Hull, views: Views, options: FirstSurfaceOptions = DEFAULTS) -> TriangleMesh:
+def complete_surface(hull: Hull, views: Views) -> TriangleMesh:
     """The hull where outlines touch the object, continued as a thin plate that stays inside the hull."""
-    return completed(trusted_hull(hull, views, options), options)
+    return completed(trusted_hull(hull, views))
 
 
-def completed(
-    known: TrustedHull, options: FirstSurfaceOptions = DEFAULTS, tension: float = 0.0, rounds: int | None = None
-) -> TriangleMesh:
+def completed(known: TrustedHull, tension: float = 0.0, rounds: int = OBSTACLE_ROUNDS) -> TriangleMesh:
     """What is trusted, continued as a thin plate under tension that stays inside the hull.
 
     The plate is an obstacle problem: vertices that it would lift out of the hull are put on the hull, and held there
-    while it is solved again, `obstacle_rounds` times if `rounds` does not say how often; what is left outside is moved
+    while it is solved again, `rounds` times; what is left outside is moved
     onto the hull.
     """
     trust, target, inside = known.trust, known.surface.vertices, known.surface.vertices
-    for _ in range(options.obstacle_rounds if rounds is None else rounds):
-        plate = thin_plate(known.surface, trust, options.plate_length_px * known.pixel, target, tension)
-        inside = _move_inside(known.hull, plate.vertices, options)
-        out = np.linalg.norm(inside - plate.vertices, axis=1) > options.obstacle_px * known.hull.pixel
-        trust = np.where(out, np.maximum(trust, options.obstacle_trust), trust)
+    for _ in range(rounds):
+        plate = thin_plate(known.surface, trust, PLATE_LENGTH_PX * known.pixel, target, tension)
+        inside = _move_inside(known.hull, plate.vertices)
+        out = np.linalg.norm(inside - plate.vertices, axis=1) > OBSTACLE_PX * known.hull.pixel
+        trust = np.where(out, np.maximum(trust, OBSTACLE_TRUST), trust)
         target = np.where(out[:, None], inside, target)
     return TriangleMesh(inside, known.surface.triangles)
 
 
-def _move_inside(
-    hull: Hull, points: Float[np.ndarray, "P 3"], options: FirstSurfaceOptions
-) -> Float[np.ndarray, "P 3"]:
+def _move_inside(hull: Hull, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
     """Points outside the hull on its surface, the others where they are: Newton steps along the gradient, from within
     the cube that holds the hull.
     """
     points = np.clip(points, -hull.half_side, hull.half_side)
-    for _ in range(options.projection_steps):
+    for _ in range(PROJECTION_STEPS):
         value, gradient = hull.sample(points)
-        step = np.maximum(value, 0) / np.maximum((gradient**2).sum(1), options.least_slope**2)
+        step = np.maximum(value, 0) / np.maximum((gradient**2).sum(1), LEAST_SLOPE**2)
         points = points - step[:, None] * gradient
     return points
 

@@ -10,7 +10,15 @@ from jaxtyping import Float
 from panoless.capture.silhouettes import mask_distance
 from panoless.capture.views import TrainView, Views
 from panoless.first_surface.mesh import TriangleMesh, unit
-from panoless.first_surface.options import DEFAULTS, FirstSurfaceOptions
+
+LEAST_TRUST = 0.01
+"""Trust in a hull vertex below this is none."""
+NEIGHBOR_VIEW_DEG = 12.0
+"""Views are compared for a contact over about this angle between their directions."""
+NEIGHBOR_HEIGHT_DEG = 8.0
+"""…and over about this difference of their heights above the tangent plane."""
+CONTACT_VIEWS = 150
+"""Views that tell contacts, at most: as well as all of a long video."""
 
 
 @dataclass(frozen=True)
@@ -24,13 +32,13 @@ class Contact:
     margin: Float[np.ndarray, "V"]
     offset: Float[np.ndarray, "V"]
 
-    def trust(self, tolerance: float, least: float = FirstSurfaceOptions.least_trust) -> Float[np.ndarray, "V"]:
-        """Near 1 where the hull is the object's own surface, near 0 where it is only a bound of it; 0 below `least`."""
+    def trust(self, tolerance: float) -> Float[np.ndarray, "V"]:
+        """Near 1 where the hull is the object's own surface, near 0 where it is only a bound of it, or none."""
         trust = np.exp(-(self.offset**2 + self.margin**2) / (2 * tolerance**2))
-        return np.where(trust < least, 0.0, trust)
+        return np.where(trust < LEAST_TRUST, 0.0, trust)
 
 
-def outline_contact(surface: TriangleMesh, views: Views, options: FirstSurfaceOptions = DEFAULTS) -> Contact:
+def outline_contact(surface: TriangleMesh, views: Views) -> Contact:
     """Where along its ray each vertex is touched by the outline that comes nearest to it.
 
     Let m(θ) be a point's distance inside the cone of a camera whose direction stands θ over the tangent plane.
@@ -39,7 +47,7 @@ def outline_contact(surface: TriangleMesh, views: Views, options: FirstSurfaceOp
     without those whose picture doesn't show the point.
     """
     normals = surface.vertex_normals()
-    stride = math.ceil(len(views.train) / options.contact_views)
+    stride = math.ceil(len(views.train) / CONTACT_VIEWS)
     chosen = views.train[::stride]
     measured = [_margin_and_height(view, surface, normals) for view in chosen]
     margins, heights = (np.stack(columns, 1) for columns in zip(*measured, strict=True))
@@ -48,7 +56,7 @@ def outline_contact(surface: TriangleMesh, views: Views, options: FirstSurfaceOp
     rows = np.arange(len(nearest))
     angle = np.arccos(np.clip(directions @ directions.T, -1, 1))[nearest]
     above = heights - heights[rows, nearest][:, None]
-    view_scale, height_scale = np.radians((options.neighbor_view_deg, options.neighbor_height_deg))
+    view_scale, height_scale = np.radians((NEIGHBOR_VIEW_DEG, NEIGHBOR_HEIGHT_DEG))
     known = np.isfinite(margins)
     weights = known * np.exp(-((angle / view_scale) ** 2 + (above / height_scale) ** 2) / 2)
     weights /= np.maximum(weights.sum(1, keepdims=True), np.finfo(float).tiny)

@@ -17,9 +17,26 @@ from torch import Tensor
 from panoless.capture.rays import camera_rays, pose_of
 from panoless.capture.silhouettes import MaskDistance, mask_distance
 from panoless.capture.views import Views
-from panoless.first_surface.options import DEFAULTS, FirstSurfaceOptions
 from shinypartial.core.conventions import PIXEL_CENTER
 from shinypartial.core.errors import InputError
+
+COARSE_VOXELS = 48
+"""Voxels along a side of the grid on which carving starts; it is halved until it is fine enough."""
+BAND_VOXELS = 1.5
+"""|h|, in voxels, below which the surface may pass through a voxel's refined cells: half its diagonal and some to
+spare."""
+TESTED_RAYS = 4000
+"""Rays through silhouettes that tell whether the views agree."""
+RAY_SAMPLES = 128
+"""Points tested along each of them."""
+LARGEST_GAP_PX = 10.0
+"""A ray that passes the hull at more than this distance counts as one at this distance."""
+WORTHWHILE_PX = 0.25
+"""Views are left out as contradictory if that closes the rays' mean gap by more than this."""
+CONTRADICTION_PX = 0.5
+"""Where the median ray passes the hull at more than this, cameras are a little off."""
+LEAST_VOTES = 0.6
+"""The share of the views that has to agree at least where they are."""
 
 HULL_HALF_SIDE = 1.1
 """Half the side of the cube in which the hull is carved, in normalized units, unless the object reaches further."""
@@ -81,7 +98,7 @@ def largest_distances(
     return torch.cat(blocks, 1)
 
 
-def carve_hull(views: Views, resolution: int, votes: float, options: FirstSurfaceOptions = DEFAULTS) -> Hull:
+def carve_hull(views: Views, resolution: int, votes: float) -> Hull:
     """Visual hull of as many views as agree, but at least the share `votes` of them, on about `resolution`³ points.
 
     Those are points of the usual cube; a larger one, for an object that reaches out of it, has the same spacing.
@@ -95,24 +112,24 @@ def carve_hull(views: Views, resolution: int, votes: float, options: FirstSurfac
     outlines, half_side, pixel = _outlines_and_cube(views)
     resolution = math.ceil(resolution * half_side / HULL_HALF_SIDE)
     allowed = math.floor((1 - votes) * len(views.train))
-    levels = max(0, round(math.log2(resolution / options.coarse_voxels)))
+    levels = max(0, round(math.log2(resolution / COARSE_VOXELS)))
     device = outlines[0].distance_px.device
     count = math.ceil((resolution - 1) / 2**levels) + 1
     points = _grid_points(np.arange(count**3), count, half_side, device)
-    tested = _points_on_rays(outlines, half_side, options)
+    tested = _points_on_rays(outlines, half_side)
 
     def hulls(most: int) -> Iterator[Hull]:
         grids = largest_distances(outlines, points, most + 1).view(-1, count, count, count).cpu().numpy()
         return (Hull(grid, half_side, pixel) for grid in grids)
 
-    wrong, hull = _least_wrong(list(hulls(allowed)), tested, options)
-    most = math.floor((1 - min(votes, options.least_votes)) * len(views.train)) if votes < 1 else allowed
-    if most > allowed and _passed_by_px(hull, tested) > options.contradiction_px:
+    wrong, hull = _least_wrong(list(hulls(allowed)), tested)
+    most = math.floor((1 - min(votes, LEAST_VOTES)) * len(views.train)) if votes < 1 else allowed
+    if most > allowed and _passed_by_px(hull, tested) > CONTRADICTION_PX:
         met = ((k, each) for k, each in enumerate(hulls(most)) if _passed_by_px(each, tested) <= 0)
         wrong, hull = next(met, (wrong, hull))
     distance = hull.distance
     for _ in range(levels):
-        distance = _refine(distance, half_side, outlines, wrong, options.band_voxels)
+        distance = _refine(distance, half_side, outlines, wrong)
     for axis in range(3):
         # A hull that leaves the cube is cut off there.
         border = np.moveaxis(distance, axis, 0)[[0, -1]]
@@ -126,7 +143,7 @@ def carve_hull(views: Views, resolution: int, votes: float, options: FirstSurfac
     return Hull(distance, half_side, pixel, wrong)
 
 
-def contradiction_px(views: Views, options: FirstSurfaceOptions = DEFAULTS) -> float:
+def contradiction_px(views: Views) -> float:
     """How far rays through all outlines pass by the hull of all views, in the median and in pixels; at least 0.
 
     Outlines of one thing that true cameras see touch the hull, whatever its shape. Those that err by themselves, and
@@ -134,11 +151,11 @@ def contradiction_px(views: Views, options: FirstSurfaceOptions = DEFAULTS) -> f
     they err by. What all err by alike, as masks that are too large, contradicts nothing.
     """
     outlines, half_side, pixel = _outlines_and_cube(views)
-    count = math.ceil(options.coarse_voxels * half_side / HULL_HALF_SIDE)
+    count = math.ceil(COARSE_VOXELS * half_side / HULL_HALF_SIDE)
     points = _grid_points(np.arange(count**3), count, half_side, outlines[0].distance_px.device)
     grid = largest_distances(outlines, points, 1)[0].view(count, count, count).cpu().numpy()
     hull = Hull(grid, half_side, pixel)
-    return max(0.0, _passed_by_px(hull, _points_on_rays(outlines, half_side, options)))
+    return max(0.0, _passed_by_px(hull, _points_on_rays(outlines, half_side)))
 
 
 def _outlines_and_cube(views: Views) -> tuple[list[MaskDistance], float, float]:
@@ -161,7 +178,6 @@ def _refine(
     half_side: float,
     outlines: Sequence[MaskDistance],
     wrong: int,
-    band_voxels: float,
 ) -> Float[np.ndarray, "M M M"]:
     """The hull function on a grid of half the spacing, evaluated where it is small and else interpolated."""
     count = 2 * distance.shape[0] - 1
@@ -175,21 +191,19 @@ def _refine(
     fine = np.ascontiguousarray(fine)
     # Signed distances are 1-Lipschitz, up to perspective, and so are their maxima.
     spacing = 2 * half_side / (distance.shape[0] - 1)
-    near = np.nonzero(np.abs(fine.ravel()) < band_voxels * spacing)[0]
+    near = np.nonzero(np.abs(fine.ravel()) < BAND_VOXELS * spacing)[0]
     points = _grid_points(near, count, half_side, outlines[0].distance_px.device)
     fine.ravel()[near] = largest_distances(outlines, points, wrong + 1)[wrong].cpu().numpy()
     return fine
 
 
-def _least_wrong(
-    hulls: Sequence[Hull], tested: Float[np.ndarray, "R S 3"], options: FirstSurfaceOptions
-) -> tuple[int, Hull]:
+def _least_wrong(hulls: Sequence[Hull], tested: Float[np.ndarray, "R S 3"]) -> tuple[int, Hull]:
     """How many views to leave out, and the hull of the others: the fewest with which rays through outlines touch it."""
     gaps = []
     for hull in hulls:
         nearest = hull.at(tested).min(1)
-        gaps.append(float((nearest / hull.pixel).clip(0, options.largest_gap_px).mean()) if len(nearest) else 0.0)
-    return next((k, hulls[k]) for k, gap in enumerate(gaps) if gap <= gaps[-1] + options.worthwhile_px)
+        gaps.append(float((nearest / hull.pixel).clip(0, LARGEST_GAP_PX).mean()) if len(nearest) else 0.0)
+    return next((k, hulls[k]) for k, gap in enumerate(gaps) if gap <= gaps[-1] + WORTHWHILE_PX)
 
 
 def _passed_by_px(hull: Hull, tested: Float[np.ndarray, "R S 3"]) -> float:
@@ -197,12 +211,10 @@ def _passed_by_px(hull: Hull, tested: Float[np.ndarray, "R S 3"]) -> float:
     return float(np.median(hull.at(tested).min(1))) / hull.pixel if len(tested) else 0.0
 
 
-def _points_on_rays(
-    outlines: Sequence[MaskDistance], half_side: float, options: FirstSurfaceOptions
-) -> Float[np.ndarray, "R S 3"]:
+def _points_on_rays(outlines: Sequence[MaskDistance], half_side: float) -> Float[np.ndarray, "R S 3"]:
     """Points in the cube along the rays of pixels just inside the outlines."""
     points = []
-    rays_a_view = max(1, options.tested_rays // len(outlines))
+    rays_a_view = max(1, TESTED_RAYS // len(outlines))
     for outline in outlines:
         camera, (rotation, center) = outline.camera, pose_of(outline.camera)
         distance = outline.distance_px.cpu().numpy()
@@ -210,6 +222,6 @@ def _points_on_rays(
         chosen = np.linspace(0, len(rows) - 1, min(rays_a_view, len(rows))).round().astype(int)
         rays = camera_rays(camera, columns[chosen] + PIXEL_CENTER, rows[chosen] + PIXEL_CENTER) @ rotation
         reach = np.linalg.norm(center) + half_side * np.array([-1.0, 1.0]) * math.sqrt(3)
-        depths = np.linspace(max(reach[0], camera.near), reach[1], options.ray_samples)
+        depths = np.linspace(max(reach[0], camera.near), reach[1], RAY_SAMPLES)
         points.append(center + depths[:, None] * (rays / np.linalg.norm(rays, axis=1, keepdims=True))[:, None])
     return np.concatenate(points)

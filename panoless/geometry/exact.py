@@ -74,7 +74,7 @@ class ExactGeometry:
             return solve_environment(rays, resolution or densest_resolution(rays)), rays
         resolutions = (resolution,) if resolution else RESOLUTIONS
         widened = footprints.widened(views.blur_px)
-        return sharpest_map(widened, rays, resolutions, encoding.saturation, config.footprint_map), rays
+        return sharpest_map(widened, rays, resolutions, encoding.saturation), rays
 
     def shade(
         self,

@@ -1,5 +1,6 @@
 """A ChArUco board under the object: to print, and as the measure of cameras."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,11 @@ from shinypartial.core.board import BOARDS, CELLS_OF_MARKER, CELLS_OF_SQUARE, MM
 from shinypartial.core.errors import InputError
 from shinypartial.io.files import atomic_write, write_text
 from shinypartial.io.images import read_png
+
+BOARD_FRAMES = 8
+"""Frames in which a board that nobody named is looked for: half of them must show it."""
+CORNER_BLURS_PX = (1.5, 0.7, 0.7)
+"""Rounds in which corners are located by the print around them, each with a blur of both (px)."""
 
 #: From the board's axes (x right, y down, z into it) to the world's: x right, y up the sheet, z out of it.
 BOARD_TO_WORLD = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -104,7 +110,7 @@ def recognized_board(frames: Frames, folder: Path, options: CaptureOptions) -> B
     world is the same.
     """
     photographs = frames.photographs
-    some = replace(frames, photographs=photographs[:: -(-len(photographs) // options.board_frames)])
+    some = replace(frames, photographs=photographs[:: -(-len(photographs) // BOARD_FRAMES)])
     best, most = None, 0
     for board in (BOARDS["A4"], BOARDS["A3"]):
         seen = [len(each.corners) for each in find_board(board, some, folder)]
@@ -133,7 +139,14 @@ def find_board(board: Board, frames: Frames, folder: Path) -> list[Sighting]:
     return sightings
 
 
-def poses_from_board(board: Board, frames: Frames, folder: Path, options: CaptureOptions) -> Poses:
+def poses_from_board(
+    board: Board,
+    frames: Frames,
+    folder: Path,
+    options: CaptureOptions,
+    *,
+    corner_blurs_px: Sequence[float] = CORNER_BLURS_PX,
+) -> Poses:
     """Poses, one focal length and k1 by least squares over all corners (Zhang 2000); the world is the board's, in m.
 
     The origin is the board's corner, +z out of the paper. Raises InputError for pictures of several sizes, and where
@@ -161,7 +174,7 @@ def poses_from_board(board: Board, frames: Frames, folder: Path, options: Captur
     lens = Lens(float(start), float(start), size[0] / 2, size[1] / 2, *size)
     sightings, adjusted = _robust(board, sightings, lens, options, OUTLIER_ROUNDS)
     pictures = {one.name: folder / f"{one.name}.png" for one in frames.photographs}
-    for blur_px in options.corner_blurs_px:
+    for blur_px in corner_blurs_px:
         known = dict(zip((sighting.name for sighting in sightings), adjusted.poses, strict=True))
         near = {
             sighting.name: known.get(sighting.name, _rough_pose(board, sighting, adjusted.lens)) for sighting in seen

@@ -14,6 +14,11 @@ from panoless.photographs.lens import Lens, opencv
 from panoless.photographs.options import CaptureOptions
 from shinypartial.core.board import CELLS_OF_SQUARE, MM, Board
 
+CORNER_WINDOW = 0.7
+"""Half side of the window around a corner, in squares of the board."""
+CORNER_REACH = 0.15
+"""How far a corner may be from where the present pose has it, in squares: a marker's cell is 0.11."""
+
 #: Pixels of the board's picture for each of its cells, and white cells that are added around it.
 PIXELS_OF_CELL, PAPER_CELLS = 6, 3
 #: Cells at the edge of the board that are left out, because blur brings in what lies beside it.
@@ -59,7 +64,7 @@ def locate_corners(
     expected = cv2.projectPoints(points, turn, board_to_camera[:3, 3], matrix, distortion)[0][:, 0]
     depth = float(board_to_camera[2] @ np.append(points.mean(0), 1.0))
     square_px = lens.fx * board.square_mm * MM / max(depth, TINY)
-    half = max(round(options.corner_window * square_px), 3)
+    half = max(round(CORNER_WINDOW * square_px), 3)
     # What lies farther from the corners than two windows is not looked at.
     low = np.clip(np.floor(expected.min(0)).astype(int) - 2 * half, 0, [lens.width - 1, lens.height - 1])
     high = np.clip(np.ceil(expected.max(0)).astype(int) + 2 * half, low + 1, [lens.width, lens.height])
@@ -67,7 +72,7 @@ def locate_corners(
     picture, known = _expected_picture(board, lens, camera_to_board, square_px / CELLS_OF_SQUARE, low, high)
     shifts, match = _shifts(_blurred(part, blur_px), _blurred(picture, blur_px), known, expected - low, half)
     inside = (expected > half).all(1) & (expected < np.array([lens.width, lens.height]) - 1 - half).all(1)
-    near = np.linalg.norm(shifts, axis=1) < options.corner_reach * square_px
+    near = np.linalg.norm(shifts, axis=1) < CORNER_REACH * square_px
     kept: Bool[np.ndarray, "P"] = inside & near & (match > options.least_match)
     return Sighting(name, np.flatnonzero(kept), (expected + shifts)[kept])
 

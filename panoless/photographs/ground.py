@@ -17,7 +17,7 @@ from scipy import ndimage
 from panoless.capture.masks import MAIN_SHARE, largest_pieces
 from panoless.photographs.hull import carve, cube, nearest_point, outline, pixels_of
 from panoless.photographs.lens import opencv
-from panoless.photographs.masks import EDGE_PX, averaged, enlarged
+from panoless.photographs.masks import EDGE_PX, HULL_SPARE, TOLERATED, averaged, enlarged
 from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import GroundPlane
 from shinypartial.core.camera import Camera
@@ -25,6 +25,30 @@ from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import tangents
 from shinypartial.io.images import write_png
 from shinypartial.io.progress import Progress
+
+SIDE_PX = 640
+"""Masks by the ground are found in pictures averaged to no more than this."""
+REACH = 0.5
+"""Half side of the square of ground that is looked at, as a share of the distance of the cameras."""
+CANDIDATES = 8
+"""Views of which each texel takes the one with which most others agree."""
+DIFFERENCE = 0.1
+"""Codes of one place of the ground differ by less, of 1, between views that agree."""
+AGREEING = 4
+"""So many views must agree on a texel of the ground."""
+AGREEING_SHARE = 0.15
+"""So must this share of the views that reach it; what the object hides in most views is known from the others."""
+WINDOW_PX = 7
+"""Side of a window that shows the ground, or does not."""
+WIDE_PX = 17
+"""Side of a window near it that has to show it, too, because a small one can look like it by chance."""
+NOISE = 0.06
+"""Contrast, in codes of 1, that a plain window counts as having."""
+LARGEST_LEFT = 0.1
+"""A window shows the ground where less than this share of the contrast is left."""
+CLEARED = (0.12, 0.15, 0.3)
+"""A point of space is the object for sure, likely, or perhaps, where ground is seen at it in a smaller share of the
+views."""
 
 GIVE_MASKS = (
     "Give a folder of masks (--masks), a model (--segmenter), a rectangle about the object in a frame or two "
@@ -84,7 +108,7 @@ def sheet_about(cameras: Sequence[Camera], ground: GroundPlane, options: Capture
     normal = np.array(ground.normal)
     target = nearest_point(cameras)
     foot = target - (normal @ target - ground.offset) * normal
-    half = options.ground_reach * float(np.median([np.linalg.norm(each.position_world - foot) for each in cameras]))
+    half = REACH * float(np.median([np.linalg.norm(each.position_world - foot) for each in cameras]))
     right, down = tangents(normal)
     step = 2 * half / options.ground_texels
     first = foot - (half - step / 2) * (right + down)
@@ -107,7 +131,7 @@ def laid_out(
 
 
 def pattern_of(
-    colors: Float[np.ndarray, "V N N 3"], seen: Bool[np.ndarray, "V N N"], options: CaptureOptions
+    colors: Float[np.ndarray, "V N N 3"], seen: Bool[np.ndarray, "V N N"]
 ) -> tuple[Float[np.ndarray, "N N 3"], Bool[np.ndarray, "N N"]]:
     """The sheet's own color, and where enough views agree on one.
 
@@ -115,28 +139,26 @@ def pattern_of(
     """
     most = np.zeros(seen.shape[1:], np.int32)
     pattern = np.zeros(colors.shape[1:], np.float32)
-    for each in np.linspace(0, len(colors) - 1, min(options.ground_candidates, len(colors))).round().astype(int):
+    for each in np.linspace(0, len(colors) - 1, min(CANDIDATES, len(colors))).round().astype(int):
         count, total = np.zeros(most.shape, np.int32), np.zeros(pattern.shape, np.float32)
         for color, where in zip(colors, seen, strict=True):
             near = where & seen[each]
             for channel in range(3):
-                near &= np.abs(color[..., channel] - colors[each, ..., channel]) < options.ground_difference
+                near &= np.abs(color[..., channel] - colors[each, ..., channel]) < DIFFERENCE
             count += near
             total += np.where(near[..., None], color, 0)
         better = count > most
         pattern[better], most[better] = (total / np.maximum(count, 1)[..., None])[better], count[better]
-    return pattern, (most >= options.ground_agreeing) & (most >= options.ground_share * seen.sum(0))
+    return pattern, (most >= AGREEING) & (most >= AGREEING_SHARE * seen.sum(0))
 
 
-def gains_of(
-    colors: Float[np.ndarray, "V N N 3"], seen: Bool[np.ndarray, "V N N"], options: CaptureOptions
-) -> Float[np.ndarray, "V 3"]:
+def gains_of(colors: Float[np.ndarray, "V N N 3"], seen: Bool[np.ndarray, "V N N"]) -> Float[np.ndarray, "V 3"]:
     """Factors that make the sheet as bright in each view as in all of them, a channel each."""
-    pattern, known = pattern_of(colors, seen, options)
+    pattern, known = pattern_of(colors, seen)
     gains = np.ones((len(colors), 3), np.float32)
     for number, (color, where) in enumerate(zip(colors, seen, strict=True)):
-        both = known & where & (np.abs(color - pattern).max(-1) < 2 * options.ground_difference)
-        both &= np.minimum(pattern, color).min(-1) > options.ground_difference
+        both = known & where & (np.abs(color - pattern).max(-1) < 2 * DIFFERENCE)
+        both &= np.minimum(pattern, color).min(-1) > DIFFERENCE
         if both.any():
             gains[number] = np.median(pattern[both] / color[both], axis=0)
     return gains
@@ -149,7 +171,6 @@ def evidence_of(
     sheet: Sheet,
     pattern: Float[np.ndarray, "N N 3"],
     known: Bool[np.ndarray, "N N"],
-    options: CaptureOptions,
 ) -> Evidence:
     """Compare a view with what it would show of the sheet alone, which may be a pixel off.
 
@@ -163,11 +184,8 @@ def evidence_of(
     around = np.ones((3, 3), np.uint8)
     low, high = cv2.erode(expected, around), cv2.dilate(expected, around)
     left = np.maximum(np.maximum(low - color, color - high), 0)
-    wide, shown = (
-        told & _matches(color, expected, left, told, width, options)
-        for width in (options.ground_wide_px, options.ground_window_px)
-    )
-    spread = 2 * ((options.ground_wide_px - options.ground_window_px) // 2 + 1) + 1
+    wide, shown = (told & _matches(color, expected, left, told, width) for width in (WIDE_PX, WINDOW_PX))
+    spread = 2 * ((WIDE_PX - WINDOW_PX) // 2 + 1) + 1
     shown &= cv2.dilate(wide.astype(np.uint8), np.ones((spread, spread), np.uint8)) > 0
     return Evidence(camera, shown, told, left.max(-1))
 
@@ -178,7 +196,6 @@ def _matches(
     left: Float[np.ndarray, "H W 3"],
     told: Bool[np.ndarray, "H W"],
     width: int,
-    options: CaptureOptions,
 ) -> Bool[np.ndarray, "H W"]:
     """Where little is `left` in a window of that width, beside the contrast of what is seen or expected there."""
     cv2 = opencv()
@@ -188,8 +205,8 @@ def _matches(
         found: np.ndarray = cv2.blur(np.where(told[..., None], values, 0), (width, width)) / share
         return found
 
-    contrast = mean(color**2) - mean(color) ** 2 + mean(expected**2) - mean(expected) ** 2 + options.ground_noise**2
-    matched: np.ndarray = mean(left**2).sum(-1) < options.ground_match * contrast.sum(-1)
+    contrast = mean(color**2) - mean(color) ** 2 + mean(expected**2) - mean(expected) ** 2 + NOISE**2
+    matched: np.ndarray = mean(left**2).sum(-1) < LARGEST_LEFT * contrast.sum(-1)
     return matched
 
 
@@ -209,19 +226,19 @@ def ground_masks(
     whole: Mapping[str, Camera], folder: Path, ground: GroundPlane, picture: Path, options: CaptureOptions
 ) -> dict[str, UInt8[np.ndarray, "_ _"]]:
     """Masks of all views, and the ground as a `picture`. Raises InputError where nothing stands on it."""
-    side, downscaled, blocks = averaged(whole, folder, options.ground_side_px)
+    side, downscaled, blocks = averaged(whole, folder, SIDE_PX)
     cameras, pictures = list(downscaled.values()), list(blocks.values())
     progress = Progress("masks by the ground", len(whole))
     sheet = sheet_about(cameras, ground, options)
     colors, reached = laid_out(pictures, cameras, sheet)
     sparse = (slice(None), slice(None, None, SPARSE), slice(None, None, SPARSE))
-    gains = gains_of(colors[sparse], reached[sparse], options)
+    gains = gains_of(colors[sparse], reached[sparse])
     colors *= gains[:, None, None]
-    pattern, known = pattern_of(colors, reached, options)
+    pattern, known = pattern_of(colors, reached)
     write_png(picture, np.rint(255 * np.where(known[..., None], pattern, 0)).clip(0, 255).astype(np.uint8))
     seen = []
     for each, camera, gain in zip(pictures, cameras, gains, strict=True):
-        seen.append(evidence_of(each, camera, gain, sheet, pattern, known, options))
+        seen.append(evidence_of(each, camera, gain, sheet, pattern, known))
         progress.advance()
     found = _object_points(seen, ground, sheet, options)
     outlines = [[outline(view.camera, points, found.spacing) for points in found.sets] for view in seen]
@@ -248,7 +265,7 @@ def _object_points(seen: Sequence[Evidence], ground: GroundPlane, sheet: Sheet, 
     for last in (False, True):
         points = cube(center, half, count)
         share = np.where(points @ normal > ground.offset, cleared(seen, points), 1.0)
-        pieces, found = ndimage.label((share < options.ground_cleared[-1]).reshape(count, count, count))
+        pieces, found = ndimage.label((share < CLEARED[-1]).reshape(count, count, count))
         if not found:
             raise InputError(
                 expected="an object that stands before the ground in most photographs",
@@ -256,10 +273,10 @@ def _object_points(seen: Sequence[Evidence], ground: GroundPlane, sheet: Sheet, 
                 remedy=GIVE_MASKS,
             )
         largest = (pieces == 1 + np.argmax(np.bincount(pieces.ravel())[1:])).ravel()
-        sets = tuple(points[largest & (share < limit)] for limit in options.ground_cleared)
+        sets = tuple(points[largest & (share < limit)] for limit in CLEARED)
         if not last:
             low, high = sets[-1].min(0), sets[-1].max(0)
-            center, half = (low + high) / 2, options.hull_spare / 2 * float((high - low).max())
+            center, half = (low + high) / 2, HULL_SPARE / 2 * float((high - low).max())
     return _Points(sets, 2 * half / count, center, half)
 
 
@@ -306,7 +323,7 @@ def _agreed(
 ) -> list[Bool[np.ndarray, "_ _"]]:
     """Masks by the hull of these where the view itself cannot tell, as before the far end of the room."""
     views = [(view.camera, mask) for view, mask in zip(seen, masks, strict=True)]
-    allowed = int(options.tolerated * len(views))
+    allowed = int(TOLERATED * len(views))
     points = carve(views, found.center, found.half_side, options.hull_voxels, allowed)
     agreed = []
     for view, mask in zip(seen, masks, strict=True):

@@ -198,12 +198,12 @@ def _poses(request: Request, frames: Frames, pictures: Path, work: Path) -> tupl
         if board:
             found, remedy = poses_from_board(board, frames, pictures, request.options), "Show the board in each frame."
         elif model:
-            found = read_colmap(model, frames, request.options)
+            found = read_colmap(model, frames)
             remedy = "Names of pictures must be those that the model knows."
         elif read:
             found, remedy = read, "Names of pictures must be those of file_path."
         else:
-            found, remedy = poses_from_structure(frames, pictures, masks, work / "structure", request.options), REMEDY
+            found, remedy = poses_from_structure(frames, pictures, masks, work / "structure"), REMEDY
         poses = without_the_rest(found, frames, request.options, remedy)
         cameras = tuple(view.camera for view in poses.views)
         target = nearest_point(cameras)

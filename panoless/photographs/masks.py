@@ -25,6 +25,21 @@ from shinypartial.io.images import read_png
 from shinypartial.io.progress import Progress
 from shinypartial.io.records import read_record
 
+HULL_SPARE = 1.3
+"""Half side of the hull's cube over the radius that rectangles or masks suggest."""
+TOLERATED = 0.1
+"""Share of the masks that may be left out of the hull, where the others contradict them."""
+LEAST_FILLED = 0.95
+"""Share of the masks, in the median view, that the outline of their hull must fill."""
+BAND = 0.03
+"""Half width of the band about an outline in which the edge is looked for, as a share of √area."""
+BAND_OF_TURN = 0.1
+"""So much more of √area, times the sine of the angle from the neighbor, where an outline is a neighboring view's."""
+VOTERS = 5
+"""So many views, itself and its neighbors, decide on a mask before its edge is searched again."""
+CLICK_PX = 2
+"""Radius of what a click marks, in pixels of those pictures."""
+
 Box = tuple[float, float, float, float]
 Points = tuple[tuple[float, float], ...]
 #: Codes of GrabCut's trimaps.
@@ -88,16 +103,16 @@ def hull_of(
 ) -> tuple[Float[np.ndarray, "P 3"], float]:
     """Points of the hull of masks, and their spacing; as few masks are left out as let it fill the others."""
     frame = estimate_object_frame(views)
-    half_side = options.hull_spare * frame.radius
+    half_side = HULL_SPARE * frame.radius
     inside = [(camera, mask >= MASK_LEVEL) for camera, mask in views]
     spacing = 2 * half_side / options.hull_voxels
-    for wrong in range(int(options.tolerated * len(views)) + 1):
+    for wrong in range(int(TOLERATED * len(views)) + 1):
         points = carve(inside, frame.center, half_side, options.hull_voxels, wrong)
         filled = [
             np.count_nonzero(outline(camera, points, spacing) & mask) / np.count_nonzero(mask)
             for camera, mask in inside
         ]
-        if np.median(filled) >= options.least_filled:
+        if np.median(filled) >= LEAST_FILLED:
             break
     return points, spacing
 
@@ -185,7 +200,7 @@ def find_masks(
     known = {name: hint.scaled(side) for name, hint in hints.items()}
     for name, hint in known.items():
         trimap = np.full(pictures[name].shape[:2], PERHAPS_OBJECT, np.uint8)
-        masks[name] = _cut(pictures[name], _hinted(trimap, hint, options), SEED_ITERATIONS)
+        masks[name] = _cut(pictures[name], _hinted(trimap, hint), SEED_ITERATIONS)
         if not masks[name].any():
             raise InputError(
                 expected=f"the object by --box or --clicks in {name}",
@@ -193,12 +208,12 @@ def find_masks(
                 remedy="Draw the rectangle some pixels larger than the object, add clicks, or give --masks.",
             )
         progress.advance()
-    _spread(names, cameras, pictures, masks, options, progress)
+    _spread(names, cameras, pictures, masks, progress)
     for _ in range(options.rounds):
         ball = _ball(cameras, masks)
-        voted = {name: _voted(name, cameras, masks, ball, options) for name in names}
-        bands = {name: _band(voted[name], options.band) for name in names}
-        bands |= {name: _hinted(bands[name], hint, options) for name, hint in known.items()}
+        voted = {name: _voted(name, cameras, masks, ball) for name in names}
+        bands = {name: _band(voted[name], BAND) for name in names}
+        bands |= {name: _hinted(bands[name], hint) for name, hint in known.items()}
         masks = {name: _cut(pictures[name], bands[name], ITERATIONS) for name in names}
         progress.advance(steps=len(names))
     found = {}
@@ -226,7 +241,7 @@ def enlarged(mask: Bool[np.ndarray, "_ _"], camera: Camera, side: int) -> Float[
     return whole
 
 
-def _hinted(trimap: UInt8[np.ndarray, "H W"], hint: Hint, options: CaptureOptions) -> UInt8[np.ndarray, "H W"]:
+def _hinted(trimap: UInt8[np.ndarray, "H W"], hint: Hint) -> UInt8[np.ndarray, "H W"]:
     """The trimap with what is told surely: nothing beyond the rectangle, and disks about clicks."""
     found = trimap.copy()
     left, top, right, bottom = (max(round(value), 0) for value in hint.bounds)
@@ -235,7 +250,7 @@ def _hinted(trimap: UInt8[np.ndarray, "H W"], hint: Hint, options: CaptureOption
     found[~within] = AROUND
     for points, code in ((hint.on, OBJECT), (hint.off, AROUND)):
         for x, y in points:
-            opencv().circle(found, (round(x - 0.5), round(y - 0.5)), options.click_px, code, -1)
+            opencv().circle(found, (round(x - 0.5), round(y - 0.5)), CLICK_PX, code, -1)
     return found
 
 
@@ -252,7 +267,6 @@ def _spread(
     cameras: Mapping[str, Camera],
     pictures: Mapping[str, UInt8[np.ndarray, "_ _ 3"]],
     masks: dict[str, Bool[np.ndarray, "_ _"]],
-    options: CaptureOptions,
     progress: Progress,
 ) -> None:
     """A mask for each view, in the order in which they are near to one that has it."""
@@ -262,7 +276,7 @@ def _spread(
         pairs = [(float(rays[new] @ rays[old]), new, old) for new in names if new not in masks for old in masks]
         cosine, name, neighbor = max(pairs)
         moved = moved_mask(masks[neighbor], cameras[neighbor], cameras[name], ball)
-        trimap = _band(moved, options.band + options.band_of_turn * float(np.sqrt(max(1 - cosine**2, 0))))
+        trimap = _band(moved, BAND + BAND_OF_TURN * float(np.sqrt(max(1 - cosine**2, 0))))
         masks[name] = _cut(pictures[name], trimap, ITERATIONS)
         progress.advance()
 
@@ -272,13 +286,12 @@ def _voted(
     cameras: Mapping[str, Camera],
     masks: Mapping[str, Bool[np.ndarray, "_ _"]],
     ball: tuple[Float[np.ndarray, "3"], float],
-    options: CaptureOptions,
 ) -> Bool[np.ndarray, "_ _"]:
     """What most of a view's own mask and those of its neighbors, moved into it, contain."""
     center, _ = ball
     ray = _unit(cameras[name].position_world - center)
     near = sorted(masks, key=lambda other: -float(_unit(cameras[other].position_world - center) @ ray))
-    votes = [moved_mask(masks[other], cameras[other], cameras[name], ball) for other in near[: options.voters]]
+    votes = [moved_mask(masks[other], cameras[other], cameras[name], ball) for other in near[:VOTERS]]
     return np.mean(votes, 0) > 0.5
 
 

@@ -11,7 +11,6 @@ from jaxtyping import Float
 from panoless.photographs.certainty import SeenPoints
 from panoless.photographs.frames import Frames, Photograph
 from panoless.photographs.lens import INSTALL, Lens, lens_of_model
-from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import PosedView, Poses, as_rows, find_ground, lens_for, with_covariances
 from shinypartial.core.conventions import PIXEL_CENTER
 from shinypartial.core.errors import InputError
@@ -52,12 +51,12 @@ def is_model(folder: Path) -> bool:
     return any((folder / f"cameras{end}").exists() and (folder / f"images{end}").exists() for end in (".txt", ".bin"))
 
 
-def read_colmap(folder: Path, frames: Frames, options: CaptureOptions) -> Poses:
+def read_colmap(folder: Path, frames: Frames) -> Poses:
     """Poses of the frames that a COLMAP model knows, by the names of their files; its world is kept.
 
     Raises InputError for a folder that is no model, and for cameras with other kinds of distortion.
     """
-    return poses_of(_opened(folder), frames, f"the COLMAP model {folder}", options)
+    return poses_of(_opened(folder), frames, f"the COLMAP model {folder}")
 
 
 def read_rotations(folder: Path, files: Sequence[Path]) -> dict[Path, Float[np.ndarray, "3 3"]]:
@@ -87,7 +86,7 @@ def _opened(folder: Path) -> Any:
         ) from None
 
 
-def poses_of(model: Any, frames: Frames, origin: str, options: CaptureOptions) -> Poses:
+def poses_of(model: Any, frames: Frames, origin: str) -> Poses:
     """Poses of a pycolmap reconstruction, and the ground that its points lie on."""
     images = {image.name: image for image in model.images.values() if image.has_pose}
     views, seen = [], []
@@ -111,7 +110,7 @@ def poses_of(model: Any, frames: Frames, origin: str, options: CaptureOptions) -
         found = np.array([point.xy for point in shown]).reshape(-1, 2) - PIXEL_CENTER
         seen.append(SeenPoints(lens, pose, which, places[which], found))
     cameras = np.array([view.camera_to_world for view in views]).reshape(-1, 4, 4)
-    poses = Poses(origin, "unknown", tuple(views), ground=find_ground(places, cameras, options) if views else None)
+    poses = Poses(origin, "unknown", tuple(views), ground=find_ground(places, cameras) if views else None)
     return with_covariances(poses, seen, known_points=False) if all(len(each.numbers) for each in seen) else poses
 
 

@@ -13,6 +13,11 @@ from panoless.photographs.options import CaptureOptions
 from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
 
+GROUND_THICKNESS = 0.005
+"""Points so near to a plane lie on it, as a share of the distance of the cameras."""
+GROUND_POINTS = 0.3
+"""Share of the points of structure from motion that make a plane the ground."""
+
 Rows = tuple[tuple[float, ...], ...]
 
 
@@ -74,19 +79,17 @@ class Poses:
     """The board's plane, or that of most points that poses were found from."""
 
 
-def find_ground(
-    points: Float[np.ndarray, "P 3"], poses: Float[np.ndarray, "V 4 4"], options: CaptureOptions
-) -> GroundPlane | None:
+def find_ground(points: Float[np.ndarray, "P 3"], poses: Float[np.ndarray, "V 4 4"]) -> GroundPlane | None:
     """The plane near most points that all cameras look down on, by consensus of three points each (RANSAC).
 
     Its normal toward the cameras is at less than 78° from their mean upward direction, from which that of a wall before
-    them is at more than 90°. None where fewer than `ground_points` of the points lie on it.
+    them is at more than 90°. None where fewer than `GROUND_POINTS` of the points lie on it.
     """
     centers, up = poses[:, :3, 3], -poses[:, :3, 1].mean(0)
     if len(points) < 3:
         return None
     reach = float(np.median(np.linalg.norm(centers - np.median(points, 0), axis=1)))
-    limit = options.ground_thickness * reach
+    limit = GROUND_THICKNESS * reach
     first, second, third = np.random.default_rng(0).choice(points, (3, PLANES_TRIED))
     normals = np.cross(second - first, third - first)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
@@ -96,7 +99,7 @@ def find_ground(
     upward = (np.abs(sides) == len(centers)) & (np.sign(sides) * (normals @ up) > LEAST_UPWARD * np.linalg.norm(up))
     near = (np.abs(points @ normals.T - offsets) < limit).sum(0) * upward
     best = int(np.argmax(near))
-    if near[best] < options.ground_points * len(points):
+    if near[best] < GROUND_POINTS * len(points):
         return None
     normal, offset = normals[best], float(offsets[best])
     for _ in range(3):

@@ -9,6 +9,10 @@ from panoless.photographs.options import CaptureOptions
 from panoless.photographs.video import luminance
 from shinypartial.core.errors import InputError
 
+LEAST_CONTRAST = 0.1
+"""Standard deviation of light at the border of the median frame, as a share of its mean, that shows whether the camera
+moved."""
+
 #: Frames are looked at in so many cells a side, of which the outermost are their border.
 CELLS, BORDER_CELLS = 24, 3
 TINY = 1e-9
@@ -45,7 +49,7 @@ class StillCheck:
         middle = np.median(borders, axis=0)
         contrast = float(middle.std())
         change = float(np.sqrt(np.median(np.mean((borders - middle) ** 2, axis=1))))
-        if contrast > options.least_contrast and change < options.least_change * contrast:
+        if contrast > LEAST_CONTRAST and change < options.least_change * contrast:
             raise InputError(
                 expected="a camera that moves around the object, before surroundings at rest",
                 found=f"borders that change by {change / contrast:.0%} of their contrast: the camera stood still",

@@ -15,7 +15,6 @@ from jaxtyping import Float
 from panoless.photographs.frames import Frames, Photograph
 from panoless.photographs.mapping import Job
 from panoless.photographs.models import poses_of, pycolmap_module
-from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import LEVEL, Poses, as_rows
 from shinypartial.core.camera import Similarity
 from shinypartial.core.errors import InputError
@@ -23,6 +22,11 @@ from shinypartial.io.files import write_json
 from shinypartial.io.images import read_png, write_png
 from shinypartial.io.progress import Progress
 from shinypartial.io.records import write_record
+
+EXHAUSTIVE_FRAMES = 60
+"""Up to so many frames, all pairs are matched; else neighbors in time."""
+NEIGHBORS = 12
+"""So many neighbors, where frames are matched with these."""
 
 REMEDY = (
     "Put textured things, such as newspaper, or a printed board (`panoless board`) under the object and around it, "
@@ -43,7 +47,6 @@ def poses_from_structure(
     folder: Path,
     masks: dict[str, Path],
     work: Path,
-    options: CaptureOptions,
     program: Sequence[str] = PROGRAM,
 ) -> Poses:
     """Poses of the frames in the largest model that hangs together; what masks mark is left out.
@@ -63,7 +66,7 @@ def poses_from_structure(
         names=names,
         masks=(work / "masks").resolve() if masks else None,
         one_camera=len({(photograph.width, photograph.height) for photograph in frames.photographs}) == 1,
-        neighbors=None if len(names) <= options.exhaustive_frames else options.neighbors,
+        neighbors=None if len(names) <= EXHAUSTIVE_FRAMES else NEIGHBORS,
         work=work.resolve(),
         model=(work / "model").resolve(),
     )
@@ -77,7 +80,7 @@ def poses_from_structure(
         )
     model = colmap.Reconstruction(str(job.model))
     in_frames = Frames(tuple(_as_frame(photograph) for photograph in frames.photographs))
-    return upright_world(poses_of(model, in_frames, "structure from motion", options))
+    return upright_world(poses_of(model, in_frames, "structure from motion"))
 
 
 def _run(program: Sequence[str], job: Path, log: Path, frames: int) -> None:

@@ -75,8 +75,8 @@ def _solved(
         if config.splats.visibility == "online" and training is not None:
             visibility = visibility_from_evidence(training.evidence)
         else:
-            agreed = agreement(rays, shown, encoding.saturation, config.confidence)
-            visibility = visibility_from_agreement(agreed, config.confidence)
+            agreed = agreement(rays, shown, encoding.saturation)
+            visibility = visibility_from_agreement(agreed)
         return encoding.decoded(environment), visibility
 
 
@@ -84,8 +84,8 @@ def _of_rough_mirror(
     roughness: float, geometry: Geometry, views: Views, config: FitConfig, resolution: int
 ) -> Float[Tensor, "6 3 L L"]:
     """The sharpened map. It starts from one of pixel centers: footprints, which sharpen as well, would do so twice."""
-    areas, options = pixel_areas(views, geometry, config.environment.rays), config.material
+    areas = pixel_areas(views, geometry, config.environment.rays)
     saturation = encoding_of(config).saturation
-    start = with_smaller_lamps(solve_environment([each.rays() for each in areas], resolution), saturation, options)
+    start = with_smaller_lamps(solve_environment([each.rays() for each in areas], resolution), saturation)
     lobe = Lobe.of(roughness, resolution)
-    return sharpened_map(start, areas, lobe, saturation, options, options.sharpening_rounds)
+    return sharpened_map(start, areas, lobe, saturation)

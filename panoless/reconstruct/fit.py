@@ -159,7 +159,7 @@ def assess(state: FitState, views: Views, config: FitConfig, ball: BallEvidence 
     corrections = state.selection.corrections
     with torch.no_grad():
         found = gather_evidence(views, state.geometry, state.visibility, config, corrections, state.roughness, ball)
-    return judge(found, config.trust)
+    return judge(found)
 
 
 def find_device(name: str) -> torch.device:

@@ -19,16 +19,46 @@ from panoless.capture.views import TrainView, Views, split_held_out
 from panoless.config import FitConfig
 from panoless.environment.footprints import PixelFootprints, thinned
 from panoless.environment.lobe import Lobe
-from panoless.environment.options import MaterialOptions
 from panoless.environment.rays import Rays, joined_rays
 from panoless.environment.reflectance import Reflectance, find_reflectance, lamp_light, left_unexplained, unsaturated
 from panoless.environment.resolution import ERROR_SCALE
-from panoless.environment.roughness import sharpened_map
+from panoless.environment.roughness import SHARPENING_ROUNDS, sharpened_map
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, pixel_areas, usable_views
 from panoless.journal import remembered
 from panoless.numeric.robust import bounded_error
 from panoless.selection.held_out import held_out_parts, is_clearly_lower
+
+RAYS = 100_000
+"""About so many pixels of all views tell the reflectance."""
+LARGEST_REFLECTANCE = 0.97
+"""Of the channel that is mirrored least, above which held-out views do not decide."""
+LEAST_GAIN = 0.02
+"""Share by which a reflectance has to lower the held-out error."""
+LEAST_ALBEDO = 0.02
+"""Share of scattered light, in the channel that has most of it, from which held-out views decide."""
+LEAST_SCATTERING_GAIN = 0.1
+"""Share by which scattered light has to lower the held-out error."""
+FIRST_BLUR_PX = 0.5
+"""Standard deviation of the blur that is tried first (px)."""
+BLURS_PX = (0.25, 2.0)
+"""Among these it is searched for (px)."""
+FIRST_ROUGHNESS = 0.085
+"""The roughness that is tried first."""
+LEAST_ROUGHNESS_GAIN = 0.01
+"""Share by which that has to lower the held-out error, also that of a sharp map which its lobe smooths afterwards."""
+LEAST_UNEXPLAINED = 0.01
+"""Held-out error of a sharp map from which anything softer is tried."""
+ROUGHNESSES = (0.06, 0.3)
+"""Among these a roughness is searched for."""
+TRIALS = 6
+"""So many are tried in the search, which tells it to 15 %, and in that of a blur."""
+JUDGED_PIXELS = 60_000
+"""About so many pixels at most make a map under which roughness is judged: two or three a texel."""
+JUDGED_ROUNDS = 8
+"""Steps that sharpen it for the first question; the search takes those of the exported map."""
+LEAST_SCATTERING_ERROR = 0.05
+"""Held-out error of a fit from which the shape is looked for again without scattered light, where there is some."""
 
 
 @remembered()
@@ -43,33 +73,33 @@ def earned_reflectance(views: Views, geometry: Geometry, config: FitConfig) -> R
     if options.reflectance == "off" or encoding.high_dynamic_range or config.tint != NO_TINT:
         return None
     with torch.no_grad():
-        rays = list(observe_views(views, geometry, options.rays))
+        rays = list(observe_views(views, geometry, RAYS))
         seen = [unsaturated(each, encoding.saturation) for each in rays]
         kept, held_out = split_held_out(seen)
         if not held_out or not any(len(each.radiance) for each in kept):
             return None
         lamps = lamp_light(joined_rays(rays), encoding.saturation, options.resolution)
         known, perfect = joined_rays(kept), Reflectance(np.ones(3))
-        metal = find_reflectance(known, options)
-        matte = find_reflectance(known, options, lamps, metal)
+        metal = find_reflectance(known, options.resolution)
+        matte = find_reflectance(known, options.resolution, lamps, metal)
         earned = perfect
-        for found, least in ((metal, options.least_gain), (matte, options.least_scattering_gain)):
-            if min(found.tint) > options.largest_reflectance and found.albedo.max() < options.least_albedo:
+        for found, least in ((metal, LEAST_GAIN), (matte, LEAST_SCATTERING_GAIN)):
+            if min(found.tint) > LARGEST_REFLECTANCE and found.albedo.max() < LEAST_ALBEDO:
                 continue
-            other, best = (_errors(kept, held_out, each, options) for each in (found, earned))
+            other, best = (_errors(kept, held_out, each, options.resolution) for each in (found, earned))
             if is_clearly_lower(other, best, replace(config.selection, least_gain=least)):
                 earned = found
         if earned is perfect:
             return None
-        return find_reflectance(joined_rays(seen), options, lamps if earned is matte else None)
+        return find_reflectance(joined_rays(seen), options.resolution, lamps if earned is matte else None)
 
 
 def _errors(
-    known: Sequence[Rays], held_out: Sequence[Rays], reflectance: Reflectance, options: MaterialOptions
+    known: Sequence[Rays], held_out: Sequence[Rays], reflectance: Reflectance, resolution: int
 ) -> Float[np.ndarray, "V"]:
     """Mean of ‖e‖²/(‖e‖² + s²) of each held-out view under the map of the others."""
     unknown = [replace(rays, trust=torch.zeros_like(rays.radiance[:, 0])) for rays in held_out]
-    residual = left_unexplained(joined_rays([*known, *unknown]), reflectance, options)
+    residual = left_unexplained(joined_rays([*known, *unknown]), reflectance, resolution)
     ends = np.cumsum([len(rays.radiance) for rays in (*known, *unknown)])
     parts = np.split(bounded_error(residual, ERROR_SCALE), ends[:-1])[len(known) :]
     return np.array([np.average(part) if len(part) else 0.0 for part in parts])
@@ -115,7 +145,7 @@ def without_scattered_light(
     `corrected` are the same views as the geometry was fitted to. They tell the light and where the cameras stand; what
     their exposures and their lens differ by is small beside what is scattered, and is left to the next choice.
     """
-    if error < config.material.least_scattering_error:
+    if config.material.scattering == "off" or error < LEAST_SCATTERING_ERROR:
         return None
     usable = usable_views(corrected, geometry)
     found = earned_reflectance(usable, geometry, config)
@@ -136,7 +166,15 @@ class Softness:
 
 
 @remembered()
-def earned_softness(views: Views, geometry: Geometry, config: FitConfig) -> Softness:
+def earned_softness(
+    views: Views,
+    geometry: Geometry,
+    config: FitConfig,
+    *,
+    first_roughness: float = FIRST_ROUGHNESS,
+    roughnesses: tuple[float, float] = ROUGHNESSES,
+    trials: int = TRIALS,
+) -> Softness:
     """Roughness of the object or blur of the pictures, if held-out views are clearly better explained by one of them.
     Views are those of usable pixels.
 
@@ -158,25 +196,25 @@ def earned_softness(views: Views, geometry: Geometry, config: FitConfig) -> Soft
         trial = _SoftnessTrial.of(views, geometry, config)
         if trial is None:
             return Softness()
-        rounds, clearly = options.judged_rounds, replace(config.selection, least_gain=options.least_roughness_gain)
+        rounds, clearly = JUDGED_ROUNDS, replace(config.selection, least_gain=LEAST_ROUGHNESS_GAIN)
         sharp = trial.errors(Softness(), rounds)
-        if sharp.mean() < options.least_unexplained:
+        if sharp.mean() < LEAST_UNEXPLAINED:
             return Softness()
-        smoothing = Softness(roughness=options.first_roughness)
+        smoothing = Softness(roughness=first_roughness)
         smoothed = trial.errors(Softness(), rounds, smoothing)
         asked = []
         if options.roughness == "auto":
             asked.append(smoothing)
         if options.blur == "auto":
-            asked.append(Softness(blur_px=options.first_blur_px))
+            asked.append(Softness(blur_px=FIRST_BLUR_PX))
         errors = [trial.errors(each, rounds) for each in asked]
         best = int(np.argmin([each.mean() for each in errors]))
-        is_more_than_smooth = errors[best].mean() < (1 - options.least_roughness_gain) * smoothed.mean()
+        is_more_than_smooth = errors[best].mean() < (1 - LEAST_ROUGHNESS_GAIN) * smoothed.mean()
         if not is_more_than_smooth or not is_clearly_lower(errors[best], sharp, clearly):
             return Softness()
         if asked[best].roughness is None:
-            return Softness(blur_px=trial.searched(lambda value: Softness(blur_px=value), options.blurs_px))
-        return Softness(roughness=trial.searched(lambda value: Softness(roughness=value), options.roughnesses))
+            return Softness(blur_px=trial.searched(lambda value: Softness(blur_px=value), BLURS_PX, trials))
+        return Softness(roughness=trial.searched(lambda value: Softness(roughness=value), roughnesses, trials))
 
 
 @dataclass(frozen=True)
@@ -187,22 +225,21 @@ class _SoftnessTrial:
     held_out: list[list[PixelFootprints]]
     start: Float[Tensor, "6 3 L L"]
     saturation: Float[Tensor, "3"]
-    options: MaterialOptions
 
     @classmethod
     def of(cls, views: Views, geometry: Geometry, config: FitConfig) -> "_SoftnessTrial | None":
         """None where there are too few views."""
-        parts, options = held_out_parts(views), config.material
+        parts = held_out_parts(views)
         if parts is None:
             return None
         known, *held_out = (
-            thinned(pixel_areas(each, geometry, config.environment.rays), options.judged_pixels)
+            thinned(pixel_areas(each, geometry, config.environment.rays), JUDGED_PIXELS)
             for each in (parts[0], *(replace(views, train=(view,)) for view in parts[1].train))
         )
         if not known:
             return None
-        start = solve_environment([each.rays() for each in known], options.judged_resolution)
-        return cls(known, held_out, start, encoding_of(config).saturation, options)
+        start = solve_environment([each.rays() for each in known], config.material.resolution)
+        return cls(known, held_out, start, encoding_of(config).saturation)
 
     @remembered()
     def errors(self, softness: Softness, rounds: int, smoothing: Softness = Softness()) -> Float[np.ndarray, "V"]:
@@ -210,9 +247,9 @@ class _SoftnessTrial:
         the lobe of another one then smooths.
         """
         lobe, smoother = (Lobe.of(each.roughness, self.start.shape[-1]) for each in (softness, smoothing))
-        blur_px, options = softness.blur_px or 0.0, self.options
+        blur_px = softness.blur_px or 0.0
         known = [each.widened(blur_px) for each in self.known]
-        found = sharpened_map(self.start, known, lobe, self.saturation, options, rounds)
+        found = sharpened_map(self.start, known, lobe, self.saturation, rounds)
         shown, found_errors = smoother.blurred(lobe.blurred(found)), []
         for view in self.held_out:
             wider = [each.widened(blur_px) for each in view]
@@ -220,15 +257,14 @@ class _SoftnessTrial:
             found_errors.append(float(bounded_error(torch.cat(error), ERROR_SCALE).mean()) if error else 0.0)
         return np.array(found_errors)
 
-    def searched(self, softness: Callable[[float], Softness], bounds: tuple[float, float]) -> float:
+    def searched(self, softness: Callable[[float], Softness], bounds: tuple[float, float], trials: int) -> float:
         """The value between bounds that leaves the least error after the steps of the exported map; by logarithms."""
         from scipy.optimize import minimize_scalar
 
-        options = self.options
         found = minimize_scalar(
-            lambda logarithm: float(self.errors(softness(math.exp(logarithm)), options.sharpening_rounds).mean()),
+            lambda logarithm: float(self.errors(softness(math.exp(logarithm)), SHARPENING_ROUNDS).mean()),
             bounds=np.log(bounds),
             method="bounded",
-            options={"maxiter": options.roughness_trials},
+            options={"maxiter": trials},
         )
         return math.exp(found.x)

@@ -4,7 +4,7 @@ A shape that believes in a far world bends until it agrees with a near one as we
 that is. A shape from silhouettes alone knows of no light, so it tells the distance at once.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,13 +14,37 @@ from jaxtyping import Float
 from panoless.capture.views import Views, every_kth_pixel, split_held_out
 from panoless.config import FitConfig
 from panoless.environment.nearness import LeavingRays, Linearized, found_surroundings, upward, with_floor
-from panoless.environment.options import SurroundingsOptions
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
 from panoless.environment.surroundings import FAR, SHARPEST, Surroundings
 from panoless.geometry.base import Family, Geometry, Proposal, usable_views
 from panoless.journal import remembered
 from panoless.selection.held_out import is_clearly_lower
+
+CHECKED_VIEWS = 10
+"""So many views tell whether to look closer…"""
+CHECKED_RAYS = 20_000
+"""…by about so many pixels…"""
+CHECKED_RESOLUTION = 8
+"""…and a first step under a map of so many texels along a face side."""
+LEAST_PULL = 0.0003
+"""Share of the cost that this step has to promise: 0.02 to 0.06 in rooms, up to 0.0001 in far worlds."""
+FIRST_INVERSE_DISTANCE = 0.1
+"""1/D, in inverse radii of the object, in which a fit is tried first that a far world leaves pulled like that."""
+LARGEST_FLOOR_COST = 0.99
+"""Share of the cost in a far world that a floor may leave where it is looked at closer."""
+LEAST_FLOOR_GAIN = 0.02
+"""Share by which a floor has to lower the held-out error of a shape from silhouettes."""
+REFINED_FLOOR_RESOLUTIONS = (64, 64, 128, 128, 128)
+"""Texels along a face side of the maps of all steps by which a fit tells its floor again."""
+REFINED_FLOOR_RAYS = 200_000
+"""About so many pixels of all views tell it: three of them a texel."""
+LEAST_REFINED_FLOOR_GAIN = 0.005
+"""Share by which that has to lower the held-out error."""
+JUDGED_RAYS = 400_000
+"""About so many pixels of all views tell whether a fit in near surroundings explains more than a far one."""
+JUDGED_RESOLUTION = 64
+"""Texels along a face side of the map that predicts held-out views."""
 
 NEARER = 1e-2
 """By which 1/D is changed to tell where a ray leaves the object; not tuned."""
@@ -41,48 +65,51 @@ def proposed_surroundings(family: Family, views: Views, proposal: Proposal, conf
         geometry = family.before_steps(views, proposal, config)
         if geometry is None:
             return FAR
-        if options.mode == "auto" and not _asks_for_near(views, geometry, options):
+        if options.mode == "auto" and not _asks_for_near(views, geometry, floor=options.floor == "auto"):
             return FAR
         seen = leaving_rays(views, geometry, options.rays)
         kept, held_out = split_held_out(seen)
         if not kept or not held_out:
             return FAR
         rays = joined(kept)
-        sphere = found_surroundings(rays, FAR.with_degree(0), options)
+        sphere = found_surroundings(rays, FAR.with_degree(0))
         if options.degree > 0:
-            sphere = found_surroundings(rays, sphere.with_degree(options.degree), options)
+            sphere = found_surroundings(rays, sphere.with_degree(options.degree))
         tried = [sphere] if sphere.coefficients[0] > 0 else []
         if options.floor == "auto":
-            level, _ = with_floor(rays, _up(views), options)
-            tried.append(found_surroundings(rays, level.with_degree(options.degree), options))
-        best, of_best = FAR, _errors(kept, held_out, FAR, options)
+            level, _ = with_floor(rays, _up(views))
+            tried.append(found_surroundings(rays, level.with_degree(options.degree)))
+        best, of_best = FAR, _errors(kept, held_out, FAR)
         for each in tried:
-            errors = _errors(kept, held_out, each, options)
+            errors = _errors(kept, held_out, each)
             always = options.mode == "on" and best.is_far
-            least = config.selection.least_gain if each.floor is None else options.least_floor_gain
+            least = config.selection.least_gain if each.floor is None else LEAST_FLOOR_GAIN
             if always or is_clearly_lower(errors, of_best, replace(config.selection, least_gain=least)):
                 best, of_best = each, errors
     return best
 
 
 def on_floor(
-    views: Views, near: Geometry, follow: Callable[[Geometry, Surroundings], Geometry | None], config: FitConfig
+    views: Views,
+    near: Geometry,
+    follow: Callable[[Geometry, Surroundings], Geometry | None],
+    config: FitConfig,
+    *,
+    resolutions: Sequence[int] = REFINED_FLOOR_RESOLUTIONS,
 ) -> Geometry:
     """A fit above a floor that a shape from silhouettes told, or above that floor as the fit tells it, tilts included,
     if held-out views are clearly better explained.
     """
-    options = config.surroundings
     if near.surroundings.floor is None:
         return near
-    selection = replace(config.selection, least_gain=options.least_refined_floor_gain)
-    finer = replace(options, resolutions=options.refined_floor_resolutions)
+    selection = replace(config.selection, least_gain=LEAST_REFINED_FLOOR_GAIN)
     with torch.no_grad():
         posed = views if near.poses is None else near.poses.moved(views)
-        kept, held_out = split_held_out(leaving_rays(posed, near, options.refined_floor_rays))
+        kept, held_out = split_held_out(leaving_rays(posed, near, REFINED_FLOOR_RAYS))
         if not kept or not held_out:
             return near
-        found = found_surroundings(joined(kept), near.surroundings, finer, tilts=True)
-        of_found, before = (_errors(kept, held_out, each, options) for each in (found, near.surroundings))
+        found = found_surroundings(joined(kept), near.surroundings, resolutions, tilts=True)
+        of_found, before = (_errors(kept, held_out, each) for each in (found, near.surroundings))
     if not is_clearly_lower(of_found, before, selection):
         return near
     again = follow(near, found)
@@ -105,13 +132,12 @@ def brought_near(
     near surroundings, `follow` takes the fit on in a wide sphere and then in one half as wide, as long as held-out
     views are explained clearly better.
     """
-    options, best = config.surroundings, far
-    inverse = options.first_inverse_distance
-    if options.mode == "off":
+    best, inverse = far, FIRST_INVERSE_DISTANCE
+    if config.surroundings.mode == "off":
         return far
     with torch.no_grad():
         posed = views if far.poses is None else far.poses.moved(views)
-        if not _is_pulled(_few_rays(posed, far, options), options):
+        if not _is_pulled(_few_rays(posed, far)):
             return far
     while inverse < SHARPEST:
         near = follow(best, Surroundings(np.array([inverse])))
@@ -121,24 +147,24 @@ def brought_near(
     return best
 
 
-def _few_rays(views: Views, geometry: Geometry, options: SurroundingsOptions) -> LeavingRays:
+def _few_rays(views: Views, geometry: Geometry) -> LeavingRays:
     """Of some of the views: those that tell whether to look closer."""
-    some = replace(views, train=views.train[:: -(-len(views.train) // options.checked_views)])
-    return joined(leaving_rays(some, geometry, options.checked_rays))
+    some = replace(views, train=views.train[:: -(-len(views.train) // CHECKED_VIEWS)])
+    return joined(leaving_rays(some, geometry, CHECKED_RAYS))
 
 
-def _is_pulled(rays: LeavingRays, options: SurroundingsOptions) -> bool:
+def _is_pulled(rays: LeavingRays) -> bool:
     """Whether a step toward near surroundings, under a coarse map, promises enough."""
-    step = Linearized.at(rays, FAR.with_degree(0), options.checked_resolution, options)
-    return step.pull(options.least_share) >= options.least_pull
+    step = Linearized.at(rays, FAR.with_degree(0), CHECKED_RESOLUTION)
+    return step.pull() >= LEAST_PULL
 
 
-def _asks_for_near(views: Views, geometry: Geometry, options: SurroundingsOptions) -> bool:
+def _asks_for_near(views: Views, geometry: Geometry, *, floor: bool) -> bool:
     """Whether a step toward a sphere promises enough, or a floor leaves little enough."""
-    rays = _few_rays(views, geometry, options)
-    if _is_pulled(rays, options):
+    rays = _few_rays(views, geometry)
+    if _is_pulled(rays):
         return True
-    return options.floor == "auto" and with_floor(rays, _up(views), options)[1] < options.largest_floor_cost
+    return floor and with_floor(rays, _up(views))[1] < LARGEST_FLOOR_COST
 
 
 def explains_clearly_more(views: Views, near: Geometry, far: Geometry, config: FitConfig) -> bool:
@@ -146,15 +172,15 @@ def explains_clearly_more(views: Views, near: Geometry, far: Geometry, config: F
 
     Both have seen all views, one of them with one number more.
     """
-    options, errors = config.surroundings, []
+    errors = []
     for geometry in (near, far):
         with torch.no_grad():
             seen = usable_views(views, geometry)
-            rays = [geometry.observe(*chosen) for chosen in every_kth_pixel(seen, options.judged_rays)]
+            rays = [geometry.observe(*chosen) for chosen in every_kth_pixel(seen, JUDGED_RAYS)]
             kept, held_out = split_held_out(rays)
             if not kept or not held_out:
                 return False
-            environment = solve_environment(kept, options.judged_resolution)
+            environment = solve_environment(kept, JUDGED_RESOLUTION)
         errors.append(np.array([prediction_error([batch], environment) for batch in held_out]))
     return is_clearly_lower(errors[0], errors[1], config.selection)
 
@@ -185,9 +211,7 @@ def joined(parts: list[LeavingRays]) -> LeavingRays:
     return LeavingRays(points, directions, radiance)
 
 
-def _errors(
-    kept: list[LeavingRays], held_out: list[LeavingRays], surroundings: Surroundings, options: SurroundingsOptions
-) -> Float[np.ndarray, "V"]:
+def _errors(kept: list[LeavingRays], held_out: list[LeavingRays], surroundings: Surroundings) -> Float[np.ndarray, "V"]:
     """Mean ‖e‖²/(‖e‖² + s²) of each held-out view under the map of the others."""
-    environment = solve_environment([each.rays(surroundings) for each in kept], options.judged_resolution)
+    environment = solve_environment([each.rays(surroundings) for each in kept], JUDGED_RESOLUTION)
     return np.array([prediction_error([each.rays(surroundings)], environment) for each in held_out])

@@ -10,7 +10,6 @@ from torch import Tensor
 from panoless.capture.views import Views
 from panoless.first_surface.completion import complete_surface, hull_surface
 from panoless.first_surface.mesh import TriangleMesh, unit
-from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.first_surface.visual_hull import Hull, carve_hull
 from panoless.splats.model import Surfels
 from panoless.splats.options import SurfelConfig
@@ -21,7 +20,7 @@ INITIAL_ROUGHNESS_LOGIT = -2.2
 RANDOM_OPACITY = 0.1
 
 
-def hull_surfels(views: Views, config: SurfelConfig, seed: int, options: FirstSurfaceOptions) -> Surfels:
+def hull_surfels(views: Views, config: SurfelConfig, seed: int) -> Surfels:
     """Surfels over the part of the first surface that faces some camera, curved as it is, within the outlines.
 
     `thin-plate` takes the completed hull, `hull` the hull itself. Axes follow the principal directions; a radius is
@@ -144,11 +143,9 @@ def random_surfels(config: SurfelConfig, seed: int) -> Surfels:
     return surfels_at(points, frames, np.full((config.count, 2), scale), np.zeros((config.count, 3)), logit)
 
 
-def initial_surfels(
-    views: Views, config: SurfelConfig, seed: int, options: FirstSurfaceOptions = FirstSurfaceOptions()
-) -> Surfels:
+def initial_surfels(views: Views, config: SurfelConfig, seed: int) -> Surfels:
     """The surfels that a fit starts from, on the device of the views."""
-    surfels = random_surfels(config, seed) if config.initial == "random" else hull_surfels(views, config, seed, options)
+    surfels = random_surfels(config, seed) if config.initial == "random" else hull_surfels(views, config, seed)
     return surfels.to(views.train[0].mask.device)
 
 

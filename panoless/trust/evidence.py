@@ -18,21 +18,43 @@ from torch import Tensor
 
 from panoless.capture.contrast import Contrast
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
-from panoless.capture.encoding import encoding_of
+from panoless.capture.encoding import SATURATED, encoding_of
 from panoless.capture.masks import MASK_LEVEL
 from panoless.capture.silhouettes import mask_distance_px, silhouette_distance_px
 from panoless.capture.views import TrainView, Views, at_most_pixels, split_held_out
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints, thinned
 from panoless.environment.resolution import densest_resolution
-from panoless.environment.sharpening import deblur_map
+from panoless.environment.sharpening import HARD, MIDDLE, SMOOTHNESS, TRIAL_STEPS, deblur_map
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, overlap, pixel_areas, usable_views
 from panoless.geometry.registry import FAMILIES
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.robust import NORMAL_MEDIAN, bounded_error, robust_scale, robust_weight
-from panoless.trust.options import TrustOptions
 from shinypartial.dataset.schema import BallEvidence
+
+SCALE = 0.1
+"""Scale s of errors ‖e‖²/(‖e‖² + s²) of linear radiance."""
+CELLS = 48
+"""Along a side of the grid on which a matte surface has its colors."""
+LEAST_NOISE = 1e-3
+"""Standard deviation of noise that no sensor goes below."""
+PART_CELLS = 24
+"""Along a side of the grid whose cells are places that are explained or not."""
+PART_UNEXPLAINED = 0.6
+"""A place is not explained from this share of the light on that a matte object would leave unexplained."""
+SHIFT_SCALE_PX = 0.5
+"""Distance of outlines after a shift (px) beyond which they lose their say in it, or…"""
+SHIFT_MEDIANS = 3.0
+"""…so many times the median distance."""
+SHIFT_ROUNDS = 5
+"""Rounds of such weights."""
+WELL_INSIDE_PX = 4.0
+"""Pixels as far inside and outside the masks tell whether the surface covers them."""
+VIEWED_WITHIN_RAD = math.radians(15.0)
+"""What is as near to the direction of a camera was seen from it."""
+VIEWED_DIRECTIONS = 4000
+"""Of the sphere, among which these are counted."""
 
 LIGHT_FIGURES = ("unexplained", "one_color", "matte", "unexplained_part", "noise", "error_in_noise", "rank_correlation")
 """What comes from held-out light."""
@@ -123,16 +145,15 @@ def gather_evidence(
     The shape and the cameras of a `ball` that was captured are known before. So held-out light counts where the map is
     rather sure than not: what stands near the ball, and who photographs it, is left to the visibility.
     """
-    options = config.trust
     found = usable_views(views, geometry).train
     used = [index for index, view in enumerate(views.train) if len(view.solid)]
     seen = tuple(views.train[index] for index in used)
     views, usable = replace(views, train=seen), replace(views, train=tuple(found[index] for index in used))
     solid, kept = (max(each.num_solid, 1) for each in (views, usable))
-    looked_at = [_evenly(part, options.views) for part in split_held_out(usable.train)]
+    looked_at = [_evenly(part, config.trust.views) for part in split_held_out(usable.train)]
     surfaces = [[(view, geometry.buffers(view.camera)) for view in part] for part in looked_at]
     light = _light(usable, surfaces, geometry, visibility, config, by_confidence=ball is not None)
-    silhouettes = [_silhouette(*each, options) for part in surfaces for each in part]
+    silhouettes = [_silhouette(*each) for part in surfaces for each in part]
     distance, shift, overlap, missed, surplus = np.array(silhouettes).reshape(-1, 5).T
     focal = np.array([view.camera.fx for part in looked_at for view in part])
     return Evidence(
@@ -144,11 +165,11 @@ def gather_evidence(
         missed=float(missed.mean()) if len(missed) else 0.0,
         surplus=float(surplus.mean()) if len(surplus) else 0.0,
         left_out=1 - kept / solid,
-        saturated=_saturated(seen, encoding_of(config).saturation, options),
+        saturated=_saturated(seen, encoding_of(config).saturation),
         coverage=float((visibility > 0).float().mean()),
         camera_turn_deg=_median(np.array([_turn_deg(*each) for each in zip(seen, usable.train, strict=True)])),
         views=len(seen),
-        viewed=_viewed(seen, options),
+        viewed=_viewed(seen),
         mask_offset_px=corrections.mask_offset_px,
         exposure_stops=corrections.exposure_stops or 0.0,
         white_balance_stops=corrections.white_balance_stops or 0.0,
@@ -182,15 +203,15 @@ def _median(values: Float[np.ndarray, "V"]) -> float:
     return float(np.median(values)) if len(values) else 0.0
 
 
-def _viewed(views: Sequence[TrainView], options: TrustOptions) -> float:
+def _viewed(views: Sequence[TrainView]) -> float:
     """Share of all directions that lie near that of a camera, as seen from the object."""
     if not views:
         return 0.0
-    height = (2 * np.arange(options.viewed_directions) + 1) / options.viewed_directions - 1
-    turn, across = np.pi * (1 + 5**0.5) * np.arange(options.viewed_directions), np.sqrt(1 - height**2)
+    height = (2 * np.arange(VIEWED_DIRECTIONS) + 1) / VIEWED_DIRECTIONS - 1
+    turn, across = np.pi * (1 + 5**0.5) * np.arange(VIEWED_DIRECTIONS), np.sqrt(1 - height**2)
     directions = np.stack([across * np.cos(turn), across * np.sin(turn), height], 1)
     cameras = np.stack([view.position / np.linalg.norm(view.position) for view in views])
-    return float(((directions @ cameras.T).max(1) > math.cos(options.viewed_within_rad)).mean())
+    return float(((directions @ cameras.T).max(1) > math.cos(VIEWED_WITHIN_RAD)).mean())
 
 
 def _turn_deg(said: TrainView, found: TrainView) -> float:
@@ -209,7 +230,7 @@ def _light(
     by_confidence: bool,
 ) -> dict[str, float | None]:
     """The figures that come from held-out light; None where there are too few views."""
-    nothing, options = dict.fromkeys(LIGHT_FIGURES), config.trust
+    nothing = dict.fromkeys(LIGHT_FIGURES)
     kept, held_out = surfaces
     if not kept or not held_out:
         return nothing
@@ -217,7 +238,7 @@ def _light(
     tested = replace(views, train=tuple(view for view, _ in held_out))
     environment = _predicting_map(_seen_areas(solved, geometry, config), config)
     contrast, device = Contrast.of(views, config.contrast), views.train[0].mask.device
-    places, parts = _Cells.empty(options.cells, 3, device), _Cells.empty(options.part_cells, 1, device)
+    places, parts = _Cells.empty(CELLS, 3, device), _Cells.empty(PART_CELLS, 1, device)
     for view, surface in kept:
         places.add(view, surface, view.solid, contrast.shown(view.radiance_at(view.solid)))
     errors, confidence, explained, plain = [], [], _Mean(), {"one_color": _Mean(), "matte": _Mean()}
@@ -227,17 +248,17 @@ def _light(
         error = contrast.shown(seen) - contrast.shown(areas.radiance)
         confidence.append(sample_cubemap(visibility[:, None], rays.directions)[:, 0])
         weight = rays.initial_weight() * (confidence[-1] > SURE if by_confidence else 1)
-        explained.add(bounded_error(error, options.scale), weight)
+        explained.add(bounded_error(error, SCALE), weight)
         errors.append(error)
-    for (view, surface), (_, pixels) in zip(held_out, at_most_pixels(tested, options.rays), strict=True):
+    for (view, surface), (_, pixels) in zip(held_out, at_most_pixels(tested, config.trust.rays), strict=True):
         radiance = contrast.shown(view.radiance_at(pixels))
         normals = surface.normals_camera.flatten(1)[:, pixels]
         shaded = geometry.shade(environment, view.camera, pixels, normals).minimum(saturation)
         shown = contrast.shown(shaded) - radiance
-        parts.add(view, surface, pixels, bounded_error(shown, options.scale)[:, None])
+        parts.add(view, surface, pixels, bounded_error(shown, SCALE)[:, None])
         guesses = {"one_color": radiance.mean(0), "matte": places.means(view, surface, pixels)}
         for name, guess in guesses.items():
-            plain[name].add(bounded_error(guess - radiance, options.scale), torch.ones_like(radiance[:, 0]))
+            plain[name].add(bounded_error(guess - radiance, SCALE), torch.ones_like(radiance[:, 0]))
     if explained.weight <= 0:
         return nothing
     every, sure = torch.cat(errors), torch.cat(confidence)
@@ -246,9 +267,9 @@ def _light(
         "unexplained": explained.value,
         "one_color": plain["one_color"].value,
         "matte": plain["matte"].value,
-        "unexplained_part": parts.share_above(options.part_unexplained * plain["matte"].value),
+        "unexplained_part": parts.share_above(PART_UNEXPLAINED * plain["matte"].value),
         "noise": noise if contrast.knee is not None else noise / encoding_of(config).exposure,
-        "error_in_noise": float(every.abs().median()) / max(noise, options.least_noise),
+        "error_in_noise": float(every.abs().median()) / max(noise, LEAST_NOISE),
         "rank_correlation": _rank_correlation(sure, every.square().sum(1)),
     }
 
@@ -267,10 +288,8 @@ def _predicting_map(areas: Sequence[PixelFootprints], config: FitConfig) -> Floa
     """
     rays = [each.rays() for each in areas]
     environment = solve_environment(rays, min(config.trust.resolution, densest_resolution(rays)))
-    options = replace(config.footprint_map, steps=config.footprint_map.trial_steps)
-    saturation, smoothness = encoding_of(config).saturation, options.smoothness[options.middle]
-    lamps = replace(options.hard, saturated_weight=1.0)
-    return deblur_map(Footprints(list(areas)), environment, saturation, smoothness, options, lamps)
+    saturation, lamps = encoding_of(config).saturation, replace(HARD, saturated_weight=1.0)
+    return deblur_map(Footprints(list(areas)), environment, saturation, SMOOTHNESS[MIDDLE], lamps, steps=TRIAL_STEPS)
 
 
 @dataclass
@@ -347,7 +366,7 @@ class _Silhouette(NamedTuple):
     """Covered pixels well outside, over those of the mask."""
 
 
-def _silhouette(view: TrainView, surface: SurfaceBuffers, options: TrustOptions) -> _Silhouette:
+def _silhouette(view: TrainView, surface: SurfaceBuffers) -> _Silhouette:
     """What the outlines of fit and mask have in common.
 
     A pixel near the fitted contour has the mask's signed distance less the fitted one; a shift t changes it by n·t.
@@ -362,7 +381,7 @@ def _silhouette(view: TrainView, surface: SurfaceBuffers, options: TrustOptions)
         missed = float((alpha[solid] < MASK_LEVEL).mean()) if solid.any() else 0.0
         return _Silhouette(farthest, farthest, shared, missed)
     of_mask, of_fit = silhouette_distance_px(view.mask).cpu().numpy(), mask_distance_px(alpha)
-    inside, outside = of_mask < -options.missed_inside_px, of_mask > options.missed_inside_px
+    inside, outside = of_mask < -WELL_INSIDE_PX, of_mask > WELL_INSIDE_PX
     missed = float((alpha[inside] < MASK_LEVEL).mean()) if inside.any() else 0.0
     surplus = float((alpha[outside] >= MASK_LEVEL).sum() / (mask >= MASK_LEVEL).sum())
     rows, columns = np.gradient(of_fit)
@@ -371,20 +390,18 @@ def _silhouette(view: TrainView, surface: SurfaceBuffers, options: TrustOptions)
     if not near.any():
         return _Silhouette(farthest, farthest, shared, missed, surplus)
     normals, away = np.stack([columns[near], rows[near]], 1), (of_mask - of_fit)[near]
-    distance, shift = float(np.median(np.abs(away))), float(np.linalg.norm(_shift(normals, away, options)))
+    distance, shift = float(np.median(np.abs(away))), float(np.linalg.norm(_shift(normals, away)))
     return _Silhouette(distance, shift, shared, missed, surplus)
 
 
-def _shift(
-    normals: Float[np.ndarray, "P 2"], away: Float[np.ndarray, "P"], options: TrustOptions
-) -> Float[np.ndarray, "2"]:
+def _shift(normals: Float[np.ndarray, "P 2"], away: Float[np.ndarray, "P"]) -> Float[np.ndarray, "2"]:
     """min Σ ρ(a − n·t) over shifts t (px): a dent that a wrong mask has in a part of its outline is no shift."""
     weight, shift = np.ones_like(away), np.zeros(2)
-    for _ in range(options.shift_rounds):
+    for _ in range(SHIFT_ROUNDS):
         root = np.sqrt(weight)
         shift = np.linalg.lstsq(root[:, None] * normals, root * away, rcond=None)[0]
         left = away - normals @ shift
-        weight = robust_weight(left, robust_scale(left, options.shift_scale_px, options.shift_medians))
+        weight = robust_weight(left, robust_scale(left, SHIFT_SCALE_PX, SHIFT_MEDIANS))
     return shift
 
 
@@ -399,12 +416,12 @@ def _noise(view: TrainView) -> float:
     return float(values.abs().median()) / (NORMAL_MEDIAN * 6**0.5) if values.numel() else 0.0
 
 
-def _saturated(views: Sequence[TrainView], saturation: Float[Tensor, "3"], options: TrustOptions) -> float:
+def _saturated(views: Sequence[TrainView], saturation: Float[Tensor, "3"]) -> float:
     """Share of the object's pixels that end at the largest value in some channel."""
     count, total = 0, 0
     for view in views:
         radiance = view.radiance_at(view.solid)
-        ends = (radiance >= options.saturated * saturation.to(radiance)).any(1)
+        ends = (radiance >= SATURATED * saturation.to(radiance)).any(1)
         count, total = count + int(ends.sum()), total + len(ends)
     return count / max(total, 1)
 

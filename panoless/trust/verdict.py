@@ -1,7 +1,7 @@
 """One verdict on a finished fit, with its reason and what helps.
 
 Every doubt is a figure of the evidence over its limit. The risk is the root of the sum of their squares, because
-doubts add up: below one the fit is trusted, from `TrustOptions.refused` on it is not, and between them it may be wrong
+doubts add up: below one the fit is trusted, from `REFUSED` on it is not, and between them it may be wrong
 in part. The largest doubt is the reason that is given.
 """
 
@@ -11,8 +11,32 @@ from dataclasses import dataclass
 
 from panoless.capture.views import HELD_OUT_EVERY
 from panoless.trust.evidence import Evidence
-from panoless.trust.options import TrustOptions
 from shinypartial.prediction.format import Trust, Verdict
+
+LARGEST_VIEW_SHIFT_PX = 0.8
+"""Root mean square shift of single silhouettes (px) from which a fit is doubted."""
+LARGEST_SILHOUETTE_PX = 1.0
+"""Median distance of the silhouettes (px) from which it is."""
+LARGEST_SHARE_OF_MATTE = 0.5
+"""Unexplained light over that of a matte object from which it is."""
+LARGEST_UNEXPLAINED = 0.15
+"""Unexplained share of held-out light from which it is; good fits leave 0.01 to 0.05."""
+LARGEST_UNEXPLAINED_PART = 0.2
+"""Share of the light from places that are not explained from which it is."""
+LARGEST_MISSED = 0.03
+"""Share of the pixels well inside the masks that the surface leaves bare from which it is."""
+LARGEST_SURPLUS = 0.01
+"""Pixels that it covers well outside the masks, over those of the masks, from which it is."""
+LEAST_VIEWED = 0.08
+"""Share of all directions near those of cameras up to which it is."""
+LARGEST_SATURATED = 0.3
+"""Share of saturated pixels from which it is."""
+LARGEST_ROUGHNESS = 0.1
+"""Roughness of the object from which it is."""
+LEAST_ONE_COLOR = 0.01
+"""Light that one color a view leaves unexplained up to which it is."""
+REFUSED = 2.0
+"""How many times its limit a figure has to be for `do not trust`."""
 
 POSES = "Refine the camera poses and the focal length, or take them from a board or a textured background."
 MASKS = "Look at the masks, and at the poses of the views whose silhouettes disagree."
@@ -44,7 +68,7 @@ class _Doubt:
     """A figure that may speak against a fit; `measure` is None where it can't be told."""
 
     measure: Callable[[Evidence], float | None]
-    limit: Callable[[TrustOptions], float]
+    limit: float
     reason: Callable[[Evidence], str]
     remedy: str
     of_balls: str | None = None
@@ -63,7 +87,7 @@ def _disagreement(found: Evidence) -> float | None:
 DOUBTS = (
     _Doubt(
         lambda found: found.view_shift_px,
-        lambda options: options.largest_view_shift_px,
+        LARGEST_VIEW_SHIFT_PX,
         lambda found: (
             f"single views are shifted by {found.view_shift_px:.2g} px ({found.view_shift_deg:.2g}°) "
             "against the common shape, as wrong poses do"
@@ -72,13 +96,13 @@ DOUBTS = (
     ),
     _Doubt(
         lambda found: found.silhouette_px,
-        lambda options: options.largest_silhouette_px,
+        LARGEST_SILHOUETTE_PX,
         lambda found: f"the shape misses the silhouettes by {found.silhouette_px:.2g} px",
         MASKS,
     ),
     _Doubt(
         lambda found: None if found.unexplained is None or not found.matte else found.unexplained / found.matte,
-        lambda options: options.largest_share_of_matte,
+        LARGEST_SHARE_OF_MATTE,
         lambda found: (
             f"a matte object explains held-out views about as well as a mirror "
             f"({found.matte:.2f} and {found.unexplained:.2f} of their light are unexplained)"
@@ -87,14 +111,14 @@ DOUBTS = (
     ),
     _Doubt(
         lambda found: found.unexplained,
-        lambda options: options.largest_unexplained,
+        LARGEST_UNEXPLAINED,
         lambda found: f"{found.unexplained:.0%} of the light in held-out views is unexplained",
         SHAPE,
         NEAR_BALL,
     ),
     _Doubt(
         lambda found: found.unexplained_part,
-        lambda options: options.largest_unexplained_part,
+        LARGEST_UNEXPLAINED_PART,
         lambda found: (
             f"{found.unexplained_part:.0%} of what held-out views show of the object lies where its shape "
             "explains little of it"
@@ -103,32 +127,32 @@ DOUBTS = (
     ),
     _Doubt(
         lambda found: found.missed,
-        lambda options: options.largest_missed,
+        LARGEST_MISSED,
         lambda found: f"the shape leaves {found.missed:.0%} of what lies well inside the masks bare",
         PART,
     ),
     _Doubt(
         lambda found: found.surplus,
-        lambda options: options.largest_surplus,
+        LARGEST_SURPLUS,
         lambda found: f"well outside the masks the shape covers {found.surplus:.1%} as much as they do",
         SURPLUS,
     ),
     _Doubt(
         lambda found: found.roughness,
-        lambda options: options.largest_roughness,
+        LARGEST_ROUGHNESS,
         lambda found: f"the object has a roughness of {found.roughness:.2g}, which blurs what it mirrors",
         SHINE,
     ),
     _Doubt(
         lambda found: found.rim_px,
-        lambda options: options.largest_silhouette_px,
+        LARGEST_SILHOUETTE_PX,
         lambda found: f"the rim of the ball is {found.rim_px:.2g} px off a circular cone",
         RIM,
         RIM,
     ),
     _Doubt(
         _disagreement,
-        lambda options: options.refused,
+        REFUSED,
         lambda found: (
             "nothing beside the ball says whether it mirrors"
             if found.agreement is None
@@ -139,20 +163,20 @@ DOUBTS = (
     ),
     _Doubt(
         lambda found: 1 / max(found.viewed, 1e-3),
-        lambda options: 1 / options.least_viewed,
+        1 / LEAST_VIEWED,
         lambda found: f"{found.views} views see the object from {found.viewed:.0%} of all directions only",
         AROUND,
     ),
     _Doubt(
         lambda found: found.saturated,
-        lambda options: options.largest_saturated,
+        LARGEST_SATURATED,
         lambda found: f"{found.saturated:.0%} of the object's pixels are saturated",
         EXPOSURE,
         EXPOSURE,
     ),
     _Doubt(
         lambda found: None if found.one_color is None else 1 / max(found.one_color, LEAST_TOLD),
-        lambda options: 1 / options.least_one_color,
+        1 / LEAST_ONE_COLOR,
         lambda found: "the photographs show one plain color, so that they don't tell one direction from another",
         TEXTURE,
         TEXTURE,
@@ -160,7 +184,7 @@ DOUBTS = (
 )
 
 
-def judge(found: Evidence, options: TrustOptions) -> Trust:
+def judge(found: Evidence) -> Trust:
     """The verdict on that evidence."""
     figures = {name: value for name, value in vars(found).items() if value is not None}
     if found.unexplained is None and found.rim_px is None:
@@ -169,8 +193,8 @@ def judge(found: Evidence, options: TrustOptions) -> Trust:
             reason, remedy = f"{found.views} usable {noun} none to hold out", VIEWS
         else:
             reason, remedy = "no held-out view shows the surface where its mask has the object", MASKS
-        return Trust("do not trust", reason, remedy, options.refused, figures)
-    risks = list(_risks(found, options))
+        return Trust("do not trust", reason, remedy, REFUSED, figures)
+    risks = list(_risks(found))
     doubt = max(risks, key=lambda each: each[0])[1]
     risk = math.hypot(*(each for each, _ in risks))
     if risk < 1:
@@ -184,13 +208,13 @@ def judge(found: Evidence, options: TrustOptions) -> Trust:
             f"and silhouettes agree to {found.silhouette_px:.2g} px"
         )
         return Trust("trust", reason, "", risk, figures)
-    word: Verdict = "partly" if risk < options.refused else "do not trust"
+    word: Verdict = "partly" if risk < REFUSED else "do not trust"
     remedy = doubt.remedy if found.rim_px is None else doubt.of_balls or doubt.remedy
     return Trust(word, doubt.reason(found), remedy, risk, figures)
 
 
-def _risks(found: Evidence, options: TrustOptions) -> Iterator[tuple[float, _Doubt]]:
+def _risks(found: Evidence) -> Iterator[tuple[float, _Doubt]]:
     for doubt in DOUBTS:
         measured = doubt.measure(found)
         if measured is not None and (found.rim_px is None or doubt.of_balls):
-            yield measured / doubt.limit(options), doubt
+            yield measured / doubt.limit, doubt

@@ -21,20 +21,17 @@ from shinypartial.prediction.format import read_info
 TUNED = (
     "mask_repair",
     "contrast",
-    "first_surface",
     "sphere",
     "plane",
     "height_field",
     "revolution",
     "free_form",
-    "footprint_map",
     "poses",
     "surroundings",
     "material",
     "corrections",
     "selection",
     "trust",
-    "confidence",
     "surfels.tuned",
 )
 TINY = ["--config.iterations", "4", "--config.surfels.count", "40", "--config.surfels.hull-resolution", "24"]
@@ -82,9 +79,9 @@ def test_every_tuned_number_can_be_set(section: str) -> None:
             with_overrides(config, [override])
 
 
-def test_a_tuned_number_deep_inside_can_be_set() -> None:
-    config = with_overrides(FitConfig(), ["revolution.lip.clearance-px=3", "selection.least_gain=0.1"])
-    assert config.revolution.lip.clearance_px == 3
+def test_a_tuned_number_may_be_written_with_dashes() -> None:
+    config = with_overrides(FitConfig(), ["revolution.max-bounces=3", "selection.least_gain=0.1"])
+    assert config.revolution.max_bounces == 3
     assert config.selection.least_gain == 0.1
 
 

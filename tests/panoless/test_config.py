@@ -52,6 +52,15 @@ def test_a_configuration_of_another_version_is_named(damage: str) -> None:
         config_from_dict(content)
 
 
+def test_a_number_that_is_a_constant_now_is_named() -> None:
+    """In the configuration of an earlier run, and after `--set`."""
+    earlier = write_record(PRESETS["default"]) | {"first_surface": {"contact_px": 3.9}}
+    with pytest.raises(InputError, match=r"first_surface.*version of panoless"):
+        config_from_dict(earlier)
+    with pytest.raises(InputError, match=r"plane\.min_views.*constant"):
+        with_overrides(PRESETS["default"], ["plane.min_views=4"])
+
+
 @cache
 def reads() -> set[tuple[str, str]]:
     """(owner, name) of every attribute that any module but config.py reads: `config.splats.loss.x` gives (loss, x)."""
@@ -146,7 +155,7 @@ def test_every_number_has_a_range_at_its_field(options: type) -> None:
 
 
 @pytest.mark.parametrize(
-    "override", ["surroundings.checked_views=0", "material.rays=0", "plane.start_grid=1", "height_field.cells=-1"]
+    "override", ["surroundings.rays=0", "material.resolution=0", "plane.max_vertices=2", "height_field.cells=-1"]
 )
 def test_a_tuned_number_out_of_range_is_refused(override: str) -> None:
     with pytest.raises(InputError, match=override.partition("=")[0]):
@@ -157,7 +166,7 @@ def test_a_tuned_number_out_of_range_is_refused(override: str) -> None:
     ("preset", "name"),
     [
         ("default", "environment.solve_resolution"),
-        ("default", "material.judged_resolution"),
+        ("default", "material.resolution"),
         ("gaussian-shader", "environment.resolution"),
         ("material-refgs", "environment.resolution"),
         ("ref-gaussian", "environment.resolution"),

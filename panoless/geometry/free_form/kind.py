@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
-from panoless.capture.contrast import Contrast
+from panoless.capture.contrast import EXPLAINED, Contrast
 from panoless.capture.lens import LensChange
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.poses import Poses, StatedCameras, with_pose_covariances
@@ -254,7 +254,7 @@ class FreeFormFamily(ExactFamily):
         contrast = Contrast.of(views, config.contrast)
         shown = contrast.applied(views)
         fitted = _fitted(views, proposal.shape, told, config)
-        if shown is views or (left := _unexplained(shown, fitted, config)) < config.contrast.explained:
+        if shown is views or (left := _unexplained(shown, fitted, config)) < EXPLAINED:
             return fitted
         first = replace(first_surfaces(shown, config), surroundings=proposal.shape.surroundings)
         again = replace(_fitted(shown, first, told, config), contrast=contrast)

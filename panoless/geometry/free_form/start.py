@@ -56,9 +56,9 @@ def first_surfaces(views: Views, config: FitConfig) -> FirstSurfaces:
         return level_set_of(mesh, options.start_cells, options.margin)
 
     disagreement = _disagreement(views, options, options.start_pixels, options.start_resolution)
-    plates = {tension: level_set(completed(known, first, tension, rounds=1)) for tension in options.start_tensions}
+    plates = {tension: level_set(completed(known, tension, rounds=1)) for tension in options.start_tensions}
     best = min(plates, key=lambda tension: disagreement(plates[tension]))
-    plain, hull = level_set(completed(known, first, best)), level_set(known.surface)
+    plain, hull = level_set(completed(known, best)), level_set(known.surface)
     return FirstSurfaces(plain, hull, tuple(plates.values()), known.hull.left_out == 0)
 
 

@@ -1,6 +1,6 @@
 """The height field as a kind of geometry."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -23,7 +23,6 @@ from panoless.geometry.height_field.model import (
 from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.kernels.camera import RasterCamera
 from shinypartial.core.errors import InputError
-from shinypartial.io.records import read_record, write_record
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,6 @@ class HeightFieldMirror(SeenByCenters):
 
     kind: ClassVar[str] = "height_field"
     height_field: HeightField
-    options: HeightFieldOptions = field(default_factory=HeightFieldOptions)
 
     @property
     def surroundings(self) -> Surroundings:
@@ -51,11 +49,11 @@ class HeightFieldMirror(SeenByCenters):
 
     def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
         """Solid pixels whose reflected rays pass the frame."""
-        return visible_reflections(self.height_field, view, view.solid, self.options).pixels
+        return visible_reflections(self.height_field, view, view.solid).pixels
 
     def seen(self, view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Int[Tensor, "Q"], Float[Tensor, "Q 3"]]:
         """Those of the pixels whose reflected rays pass the frame."""
-        visible = visible_reflections(self.height_field, view, pixels, self.options)
+        visible = visible_reflections(self.height_field, view, pixels)
         return visible.pixels, torch.from_numpy(visible.outgoing).to(view.radiance)
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
@@ -69,14 +67,12 @@ class HeightFieldMirror(SeenByCenters):
 
     def state_dict(self) -> dict[str, Any]:
         """All numbers as lists and plain values."""
-        height_field, options = to_plain(self.height_field), write_record(self.options)
-        return {"height_field": height_field, "options": options, "poses": to_plain(self.poses)}
+        return {"height_field": to_plain(self.height_field), "poses": to_plain(self.poses)}
 
     @classmethod
     def from_state_dict(cls, content: dict[str, Any]) -> "HeightFieldMirror":
-        """The geometry that `state_dict` was taken from; a version before kept no options."""
-        options = read_record(HeightFieldOptions, content.get("options", {}), "the options of a height field")
-        return cls(from_plain(HeightField, content["height_field"]), options, poses=poses_from_plain(content))
+        """The geometry that `state_dict` was taken from."""
+        return cls(from_plain(HeightField, content["height_field"]), poses=poses_from_plain(content))
 
 
 class HeightFieldFamily(ExactFamily):
@@ -99,14 +95,14 @@ class HeightFieldFamily(ExactFamily):
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The plane that it bends, flat as yet."""
-        return HeightFieldMirror(flat_height_field(proposal.shape, config.height_field.cells), config.height_field)
+        return HeightFieldMirror(flat_height_field(proposal.shape, config.height_field.cells))
 
     def before_steps(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """The dome or bowl over the plane that photographs agree on best, or the plane."""
         flat = flat_height_field(proposal.shape, config.height_field.cells)
-        return HeightFieldMirror(best_dome(views, flat, config.height_field), config.height_field)
+        return HeightFieldMirror(best_dome(views, flat))
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """Heights, plane and boundary by silhouettes and photographs together."""
         options, fitted = config.height_field, None if proposal.fitted is None else proposal.fitted.height_field
-        return HeightFieldMirror(fit_height_field(views, proposal.shape, options, fitted), options)
+        return HeightFieldMirror(fit_height_field(views, proposal.shape, options, fitted))

@@ -10,12 +10,14 @@ from torch import Tensor
 from panoless.capture.rays import pixel_rays, pose_of, reflect
 from panoless.capture.views import TrainView
 from panoless.geometry.base import SurfaceBuffers, buffers_from_arrays
-from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.model import Plane
 from panoless.kernels.camera import RasterCamera
 from panoless.kernels.height_field import first_hits
 from panoless.numeric.bspline import cubic_bsplines_at, with_halved_knots
 from panoless.numeric.polygon import depth_inside, projected_coverage, with_cut_sides
+
+CLEAR_PX = 1.0
+"""A mirrored ray has to pass the frame at least this far away (px): pixels are no points."""
 
 ORDERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 """Derivatives along u and v: height, slopes, bending."""
@@ -193,9 +195,9 @@ def visible_reflections(
     height_field: HeightField,
     view: TrainView,
     pixels: Int[Tensor, "P"],
-    options: HeightFieldOptions = HeightFieldOptions(),
+    clear_px: float = CLEAR_PX,
 ) -> VisibleReflections:
-    """Those of the given pixels whose mirrored rays pass the frame, if there is one, by a pixel or more."""
+    """Those of the given pixels whose mirrored rays pass the frame, if there is one, by `clear_px` or more."""
     origins, directions = pixel_rays(view.camera, pixels.cpu().numpy())
     plane, hits = height_field.plane, height_field.hits(origins, directions)
     passed_height = max(plane.frame_height, height_field.clearance)
@@ -208,7 +210,7 @@ def visible_reflections(
         rise = np.maximum(passed_height - height, 0.0) / np.where(kept, outgoing[:, 2], 1.0)
         passed = hits.places + rise[:, None] * outgoing[:, :2]
         pixel = (distance + rise) / view.camera.fx
-        kept &= depth_inside(passed, plane.boundary) > options.clear_px * pixel
+        kept &= depth_inside(passed, plane.boundary) > clear_px * pixel
     chosen = HeightFieldHits(*(values[kept] for values in vars(hits).values()))
     outgoing = outgoing[kept] / np.linalg.norm(outgoing[kept], axis=1, keepdims=True)
     points = origins[kept] + chosen.distance[:, None] * directions[kept]

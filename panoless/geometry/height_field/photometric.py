@@ -20,8 +20,10 @@ from panoless.environment.following import FollowingMap
 from panoless.environment.mirrored import MirroredRays
 from panoless.environment.rays import Rays
 from panoless.geometry.height_field.model import HeightField, HeightFieldHits, visible_reflections
-from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.numeric.robust import robust_weight
+
+RADIANCE_SIGMA = 0.05
+"""Standard deviation of a pixel (linear radiance)."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +49,9 @@ class Observations:
         return MirroredRays(directions, hits.normals @ height_field.frame, points, height_field.plane.surroundings)
 
 
-def observe(
-    views: Views, height_field: HeightField, max_pixels: int, options: HeightFieldOptions = HeightFieldOptions()
-) -> Observations:
+def observe(views: Views, height_field: HeightField, max_pixels: int) -> Observations:
     """About `max_pixels` pixels of all views, evenly."""
-    visible = [visible_reflections(height_field, *chosen, options) for chosen in every_kth_pixel(views, max_pixels)]
+    visible = [visible_reflections(height_field, *chosen) for chosen in every_kth_pixel(views, max_pixels)]
     radiance = [view.radiance_at(part.pixels) for view, part in zip(views.train, visible, strict=True)]
     outgoing = torch.from_numpy(np.concatenate([part.outgoing for part in visible])).float()
     return Observations(
@@ -85,13 +85,12 @@ class Photographs:
         observed: Observations,
         environment: Float[Tensor, "6 3 L L"],
         robust_scale: float,
-        options: HeightFieldOptions = HeightFieldOptions(),
         *,
         tell_tilt: bool = True,
     ) -> "Photographs":
         """Weights (1 + ‖r‖²/s²)⁻²/σ² and texels of observations at the height field that they were made with."""
         residual = observed.mirrored_by(height_field, observed.hits).light(environment) - observed.radiance
-        weights = robust_weight(residual, robust_scale) / options.radiance_sigma**2
+        weights = robust_weight(residual, robust_scale) / RADIANCE_SIGMA**2
         directions = observed.rays.directions.cpu().numpy().astype(np.float64)
         following = FollowingMap.of(directions, weights, environment.shape[-1])
         return cls(height_field, observed, environment, residual, following, tell_tilt)

@@ -11,7 +11,6 @@ from jaxtyping import Float
 
 from panoless.capture.silhouettes import MaskContours
 from panoless.geometry.height_field.model import HeightField
-from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.silhouette import BoundaryResiduals, boundary_jacobian, boundary_residuals, vertex_pull
 from panoless.numeric.gauss_newton import jacobian_of_rows, normal_equations
 
@@ -19,10 +18,10 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 
-def edge_residuals(contours: MaskContours, height_field: HeightField, options: HeightFieldOptions) -> BoundaryResiduals:
+def edge_residuals(contours: MaskContours, height_field: HeightField) -> BoundaryResiduals:
     """Distances of the contours from the mirror's edge or its frame, whichever hides the other."""
     plane = height_field.plane
-    return boundary_residuals(contours, plane, options.contours, height_field.heights(plane.boundary, 0)[0])
+    return boundary_residuals(contours, plane, height_field.heights(plane.boundary, 0)[0])
 
 
 def edge_jacobian(residuals: BoundaryResiduals, height_field: HeightField) -> "csr_matrix":
@@ -46,11 +45,11 @@ def edge_jacobian(residuals: BoundaryResiduals, height_field: HeightField) -> "c
 
 
 def edge_equations(
-    residuals: BoundaryResiduals, height_field: HeightField, scale: float, options: HeightFieldOptions
+    residuals: BoundaryResiduals, height_field: HeightField, scale: float
 ) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
     """Gradient Jᵀ W e and matrix Jᵀ W J of the distances in pixels, at that robust scale."""
     weights, size = residuals.weights(scale), height_field.plane.boundary.size
     gradient, matrix = normal_equations(edge_jacobian(residuals, height_field), residuals.pixels, weights)
     held = np.arange(4, 4 + size)
-    matrix[held, held] += vertex_pull(residuals, weights, size // 2, options.contours)
+    matrix[held, held] += vertex_pull(residuals, weights, size // 2)
     return gradient, matrix

@@ -19,8 +19,9 @@ from panoless.capture.silhouettes import MaskContours, mask_contours
 from panoless.capture.views import TrainView, Views
 from panoless.geometry.base import overlap
 from panoless.geometry.plane.model import Plane, plane_buffers
-from panoless.geometry.plane.options import BoundaryRound, PlaneOptions
+from panoless.geometry.plane.options import PlaneOptions
 from panoless.geometry.plane.silhouette import (
+    CORNER_DEG,
     BoundaryResiduals,
     apply_plane_step,
     back_project,
@@ -31,6 +32,68 @@ from panoless.geometry.plane.silhouette import (
 from panoless.numeric.gauss_newton import accept_step, damped_step, normal_equations
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import fibonacci_directions
+
+
+@dataclass(frozen=True)
+class BoundaryRound:
+    """A boundary by vote of the masks on a grid, then one Gauss–Newton step on plane and boundary for each scale."""
+
+    grid: int
+    """Points along a side of the grid."""
+    level: float
+    """The boundary runs where this share of the largest vote is; later rounds see sharper edges."""
+    tolerance_cells: float
+    """The voted boundary is simplified by at most this many cells."""
+    scales_px: tuple[float, ...]
+    """Robust scales of the steps (px)."""
+
+
+MIN_VIEWS = 3
+"""Fewest distinct views that determine a plane."""
+MIN_BASELINE = 0.02
+"""Distance between two cameras, as a share of their distance from the object, that makes them distinct."""
+START_DIRECTIONS = 200
+"""Normals that are tried, evenly over the sphere."""
+START_OFFSETS = (-0.2, 0.0, 0.2)
+"""Offsets that are tried with each, in radii of the object."""
+START_COSINE = 0.15
+"""A plane faces a camera if the cosine between its normal and the direction to it is above this."""
+START_GRID = 32
+"""Points along a side of the grid on which masks are compared at the start."""
+START_VIEWS = 16
+"""Views that are compared at the start."""
+START_HALF_SIDE = 1.2
+"""Half a side of that grid, in radii of the object."""
+STARTS = 3
+"""So many of the best starts go through the first round."""
+MAX_POINTS = 40_000
+"""Most contour points of all views."""
+VOTING_VIEWS = 32
+"""Views whose masks vote for the boundary."""
+FIRST_ROUND = BoundaryRound(96, 0.5, 1.0, (16.0, 8.0, 8.0))
+"""From each start."""
+LATER_ROUNDS = (
+    BoundaryRound(128, 0.5, 1.0, (4.0, 4.0, 2.0, 2.0)),
+    BoundaryRound(256, 0.4, 0.7, (1.0, 1.0, 0.5, 0.5, 0.5)),
+)
+"""From the best of them."""
+HOPELESS_PX = 2.0
+"""A start whose median contour point is further from the boundary than this (px), and than a cell of its grid, is no
+plane."""
+LARGEST_STEP = 0.2
+"""Most by which a step may move any parameter, in radii of the object or radians."""
+FINAL_SCALE_PX = 0.5
+"""Robust scale of the last steps (px)."""
+FINAL_STEPS = 3
+"""Steps after each simplification."""
+SIMPLIFICATIONS = 2
+"""How often the boundary is simplified."""
+SIMPLE_PX = 0.25
+"""A vertex goes if the boundary without it is nowhere further away than this (px)."""
+CHAMFER_PX = 6.0
+"""Shorter sides (px) that cut the corner of longer ones are removed: votes round corners."""
+FRAME_SIGMAS = 3.0
+"""A frame is kept if its height is this many standard deviations above zero."""
 
 
 @dataclass(frozen=True)
@@ -60,49 +123,49 @@ def fit_plane(views: Views, *, thorough: bool = True, options: PlaneOptions = Pl
     Raises InputError when masks have a boundary in fewer than three views taken from distinct places.
     """
     contours = mask_contours(views)
-    _require_distinct_views(contours, options)
-    sparse = contours.every(max(1, len(contours.view) // options.max_points))
-    starts = [_refine(views, sparse, start, options.first_round, options) for start in _starts(views, options)]
-    plane = min(starts, key=lambda start: _cost(sparse, start, options))
-    if not thorough and _hopeless(sparse, plane, options):
-        return _score(views, contours, plane, math.inf, options)
-    for settings in options.later_rounds:
+    _require_distinct_views(contours)
+    sparse = contours.every(max(1, len(contours.view) // MAX_POINTS))
+    starts = [_refine(views, sparse, start, FIRST_ROUND, options) for start in _starts(views)]
+    plane = min(starts, key=lambda start: _cost(sparse, start))
+    if not thorough and _hopeless(sparse, plane):
+        return _score(views, contours, plane, math.inf)
+    for settings in LATER_ROUNDS:
         plane = _refine(views, sparse, plane, settings, options)
-    final_scales = (options.final_scale_px,) * options.final_steps
-    for _ in range(options.simplifications):
-        plane = _descend(sparse, _simplify_boundary(plane, sparse, options), final_scales, options)
-    sigma = float(np.sqrt(max(_covariance(sparse, plane, options, frame=True)[2, 2], 0.0)))
-    frame = plane.frame_height > options.frame_sigmas * sigma
+    final_scales = (FINAL_SCALE_PX,) * FINAL_STEPS
+    for _ in range(SIMPLIFICATIONS):
+        plane = _descend(sparse, _simplify_boundary(plane, sparse, options), final_scales)
+    sigma = float(np.sqrt(max(_covariance(sparse, plane, frame=True)[2, 2], 0.0)))
+    frame = plane.frame_height > FRAME_SIGMAS * sigma
     if not frame:
-        plane = _descend(sparse, replace(plane, frame_height=0.0), final_scales, options, frame=False)
-    tilt = np.linalg.eigvalsh(_covariance(sparse, plane, options, frame)[:2, :2])[-1]
-    return _score(views, contours, plane, float(np.degrees(np.sqrt(max(tilt, 0.0)))), options)
+        plane = _descend(sparse, replace(plane, frame_height=0.0), final_scales, frame=False)
+    tilt = np.linalg.eigvalsh(_covariance(sparse, plane, frame)[:2, :2])[-1]
+    return _score(views, contours, plane, float(np.degrees(np.sqrt(max(tilt, 0.0)))))
 
 
-def _require_distinct_views(contours: MaskContours, options: PlaneOptions) -> None:
+def _require_distinct_views(contours: MaskContours) -> None:
     distinct: list[np.ndarray] = []
     for center in contours.centers[np.unique(contours.view, return_index=True)[1]]:
-        if all(np.linalg.norm(center - other) > options.min_baseline * np.linalg.norm(center) for other in distinct):
+        if all(np.linalg.norm(center - other) > MIN_BASELINE * np.linalg.norm(center) for other in distinct):
             distinct.append(center)
-    if len(distinct) < options.min_views:
+    if len(distinct) < MIN_VIEWS:
         raise InputError(
-            expected=f"masks with a boundary, seen from at least {options.min_views} distinct places",
+            expected=f"masks with a boundary, seen from at least {MIN_VIEWS} distinct places",
             found=f"{len(distinct)} such views",
             remedy="Add views from other directions, and check that masks end within the images.",
         )
 
 
-def _starts(views: Views, options: PlaneOptions) -> list[Plane]:
+def _starts(views: Views) -> list[Plane]:
     """The best few of many planes through the object that face as many cameras as a plane can."""
     centers = np.stack([view.position for view in views.train])
     centers /= np.linalg.norm(centers, axis=1, keepdims=True)
     # The mean view direction joins the lattice: with few cameras it can be the only one that all of them face.
-    directions = np.concatenate([centers.mean(0, keepdims=True), fibonacci_directions(options.start_directions)])
-    facing = (directions @ centers.T > options.start_cosine).sum(1)
-    voters = _spread(views.train, options.start_views)
-    planes = [_plane(n, offset) for n in directions[facing == facing.max()] for offset in options.start_offsets]
-    planes.sort(key=lambda plane: -_agreement(plane, voters, options))
-    return planes[: options.starts]
+    directions = np.concatenate([centers.mean(0, keepdims=True), fibonacci_directions(START_DIRECTIONS)])
+    facing = (directions @ centers.T > START_COSINE).sum(1)
+    voters = _spread(views.train, START_VIEWS)
+    planes = [_plane(n, offset) for n in directions[facing == facing.max()] for offset in START_OFFSETS]
+    planes.sort(key=lambda plane: -_agreement(plane, voters))
+    return planes[:STARTS]
 
 
 def _plane(direction: Float[np.ndarray, "3"], offset: float) -> Plane:
@@ -116,9 +179,9 @@ def _spread(views: Sequence[TrainView], count: int) -> Sequence[TrainView]:
     return views[:: max(1, len(views) // count)]
 
 
-def _agreement(plane: Plane, voters: Sequence[TrainView], options: PlaneOptions) -> float:
+def _agreement(plane: Plane, voters: Sequence[TrainView]) -> float:
     """Mean intersection over union, on the plane, of each mask with the majority of all."""
-    line = np.linspace(-options.start_half_side, options.start_half_side, options.start_grid)
+    line = np.linspace(-START_HALF_SIDE, START_HALF_SIDE, START_GRID)
     votes = _votes(plane, line, line, voters).reshape(len(voters), -1) > 0.5
     majority = votes.mean(0) > 0.5
     return float(((votes & majority).sum(1) / np.maximum((votes | majority).sum(1), 1)).mean())
@@ -146,7 +209,7 @@ def _refine(
     views: Views, contours: MaskContours, plane: Plane, settings: BoundaryRound, options: PlaneOptions
 ) -> Plane:
     plane = replace(plane, boundary=_vote_boundary(views, contours, plane, settings, options))
-    return _descend(contours, plane, settings.scales_px, options)
+    return _descend(contours, plane, settings.scales_px)
 
 
 def _vote_boundary(
@@ -159,7 +222,7 @@ def _vote_boundary(
     low, high = np.percentile(coordinates[valid], (2, 98), axis=0) if valid.any() else (-np.ones(2), np.ones(2))
     low, high = (low - 0.1 * (high - low), high + 0.1 * (high - low)) if (high > low).all() else (low - 1, high + 1)
     u, v = (np.linspace(low[axis], high[axis], settings.grid) for axis in (0, 1))
-    votes = _votes(plane, u, v, _spread(views.train, options.voting_views)).mean(0)
+    votes = _votes(plane, u, v, _spread(views.train, VOTING_VIEWS)).mean(0)
     votes[[0, -1]], votes[:, [0, -1]] = 0, 0
     curves = find_contours(votes, settings.level * votes.max()) if votes.max() > 0 else []
     if not curves:
@@ -188,40 +251,38 @@ def _counterclockwise(boundary: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "
     return boundary if (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() > 0 else boundary[::-1].copy()
 
 
-def _cost(contours: MaskContours, plane: Plane, options: PlaneOptions) -> float:
+def _cost(contours: MaskContours, plane: Plane) -> float:
     """The robust cost of all contour points at the scale of the last step of the first round."""
-    residuals = boundary_residuals(contours, plane, options)
-    return residuals.cost(options.first_round.scales_px[-1], np.ones(len(contours.view), dtype=bool))
+    residuals = boundary_residuals(contours, plane)
+    return residuals.cost(FIRST_ROUND.scales_px[-1], np.ones(len(contours.view), dtype=bool))
 
 
-def _hopeless(contours: MaskContours, plane: Plane, options: PlaneOptions) -> bool:
+def _hopeless(contours: MaskContours, plane: Plane) -> bool:
     """Whether half of the contour points are more than a cell of the first round's grid, and 2 px, from the boundary.
 
     That boundary follows the vote to a cell before it is moved.
     """
-    residuals = boundary_residuals(contours, plane, options)
+    residuals = boundary_residuals(contours, plane)
     size = np.where(residuals.valid, np.abs(residuals.pixels), np.inf)
     pixels_per_unit = float(np.median(residuals.pixels_per_unit))
-    cell = float(np.ptp(plane.boundary, axis=0).max()) * pixels_per_unit / options.first_round.grid
-    return float(np.median(size)) > max(cell, options.hopeless_px)
+    cell = float(np.ptp(plane.boundary, axis=0).max()) * pixels_per_unit / FIRST_ROUND.grid
+    return float(np.median(size)) > max(cell, HOPELESS_PX)
 
 
-def _descend(
-    contours: MaskContours, plane: Plane, scales_px: Sequence[float], options: PlaneOptions, frame: bool = True
-) -> Plane:
+def _descend(contours: MaskContours, plane: Plane, scales_px: Sequence[float], frame: bool = True) -> Plane:
     """A robust Gauss–Newton step of plane and boundary together for each scale; none raises the cost at its scale."""
 
     def residuals_of(plane: Plane) -> tuple[Plane, BoundaryResiduals]:
-        return plane, boundary_residuals(contours, plane, options)
+        return plane, boundary_residuals(contours, plane)
 
     state = residuals_of(plane)
     for scale_px in scales_px:
         plane, residuals = state
-        scale, counted = residuals.scale(scale_px, options), residuals.counted
-        gradients, matrix = _equations(contours, plane, residuals, scale, options, frame)
+        scale, counted = residuals.scale(scale_px), residuals.counted
+        gradients, matrix = _equations(contours, plane, residuals, scale, frame)
         state = accept_step(
             state,
-            damped_step(gradients.sum(0), matrix, largest=options.largest_step),
+            damped_step(gradients.sum(0), matrix, largest=LARGEST_STEP),
             lambda state, step: residuals_of(apply_plane_step(state[0], step)),
             partial(_cost_of_state, scale=scale, counted=counted),
         )
@@ -237,7 +298,6 @@ def _equations(
     plane: Plane,
     residuals: BoundaryResiduals,
     scale: float,
-    options: PlaneOptions,
     frame: bool,
 ) -> tuple[Float[np.ndarray, "V D"], Float[np.ndarray, "D D"]]:
     """The gradient Σ J w e of each view and the matrix Jᵀ W J, over four numbers of the plane and two of each vertex.
@@ -250,7 +310,7 @@ def _equations(
     residuals = replace(residuals, by_plane=residuals.by_plane * [1, 1, 1, frame])
     jacobian = boundary_jacobian(residuals, vertices)
     _, matrix = normal_equations(jacobian, residuals.pixels, weights)
-    matrix[4:, 4:] += vertex_pull(residuals, weights, vertices, options) * np.eye(2 * vertices)
+    matrix[4:, 4:] += vertex_pull(residuals, weights, vertices) * np.eye(2 * vertices)
     points = np.arange(len(weights))
     by_view = sparse.csr_matrix((weights * residuals.pixels, (contours.view, points)))
     return (by_view @ jacobian).toarray(), matrix
@@ -258,9 +318,9 @@ def _equations(
 
 def _simplify_boundary(plane: Plane, contours: MaskContours, options: PlaneOptions) -> Plane:
     """The plane with sharp corners and as few vertices as a quarter of a pixel allows."""
-    pixel = 1 / max(float(np.median(boundary_residuals(contours, plane, options).pixels_per_unit)), 1e-9)
-    simple = _simplify(plane.boundary, options.simple_px * pixel, options.max_vertices)
-    return replace(plane, boundary=_sharpen(simple, options.chamfer_px * pixel, options.corner_deg))
+    pixel = 1 / max(float(np.median(boundary_residuals(contours, plane).pixels_per_unit)), 1e-9)
+    simple = _simplify(plane.boundary, SIMPLE_PX * pixel, options.max_vertices)
+    return replace(plane, boundary=_sharpen(simple, CHAMFER_PX * pixel, CORNER_DEG))
 
 
 def _sharpen(boundary: Float[np.ndarray, "N 2"], reach: float, corner_deg: float) -> Float[np.ndarray, "M 2"]:
@@ -283,15 +343,15 @@ def _sharpen(boundary: Float[np.ndarray, "N 2"], reach: float, corner_deg: float
     return np.concatenate(parts)
 
 
-def _covariance(contours: MaskContours, plane: Plane, options: PlaneOptions, frame: bool) -> Float[np.ndarray, "3 3"]:
+def _covariance(contours: MaskContours, plane: Plane, frame: bool) -> Float[np.ndarray, "3 3"]:
     """Covariance of the tilts along t_u and t_v and of the frame's height: σ² H⁻¹, or H⁻¹ (Σ_views g gᵀ) H⁻¹ if larger.
 
     The second takes views, not contour points, for independent, as errors of poses are (Liang and Zeger 1986).
     """
-    residuals = boundary_residuals(contours, plane, options)
-    scale = residuals.scale(options.final_scale_px, options)
+    residuals = boundary_residuals(contours, plane)
+    scale = residuals.scale(FINAL_SCALE_PX)
     weights = residuals.weights(scale)
-    gradients, matrix = _equations(contours, plane, residuals, scale, options, frame)
+    gradients, matrix = _equations(contours, plane, residuals, scale, frame)
     inverse = np.linalg.pinv(matrix, hermitian=True)[[0, 1, 3]]
     variance = (weights * residuals.pixels**2).sum() / max(weights.sum(), 1.0)
     by_point = variance * inverse[:, [0, 1, 3]]
@@ -301,8 +361,8 @@ def _covariance(contours: MaskContours, plane: Plane, options: PlaneOptions, fra
     return by_view if np.trace(by_view[:2, :2]) > np.trace(by_point[:2, :2]) else by_point
 
 
-def _score(views: Views, contours: MaskContours, plane: Plane, sigma_deg: float, options: PlaneOptions) -> PlaneFit:
-    residuals = boundary_residuals(contours, plane, options)
+def _score(views: Views, contours: MaskContours, plane: Plane, sigma_deg: float) -> PlaneFit:
+    residuals = boundary_residuals(contours, plane)
     size = np.where(residuals.valid, np.abs(residuals.pixels), np.inf)
     count = len(views.train)
     median_px, iou = np.full(count, np.inf), np.zeros(count)

@@ -10,13 +10,21 @@ from jaxtyping import Bool, Float, Int
 
 from panoless.capture.silhouettes import MaskContours
 from panoless.geometry.plane.model import Plane
-from panoless.geometry.plane.options import PlaneOptions
 from panoless.numeric.gauss_newton import jacobian_of_rows
 from panoless.numeric.polygon import nearest_side
 from panoless.numeric.robust import bounded_error, robust_scale, robust_weight
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
+
+CORNER_DEG = 20.0
+"""Sides that turn by more than this meet in a corner."""
+CORNER_PX = 1.5
+"""Contour points nearer to a corner (px) do not count: the level set of pixel averages is round there."""
+NOISE_SCALE = 3.0
+"""The robust scale is at least this times the median distance, so that wrong poses leave all views a say."""
+VERTEX_PULL = 1e-3
+"""Weight of a vertex's place against the contour points of its side: along a straight side nothing else keeps it."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +53,9 @@ class BoundaryResiduals:
         """The first and the second vertex of each side, of so many."""
         return np.stack([self.side, (self.side + 1) % vertices], 1)
 
-    def scale(self, scale_px: float, options: PlaneOptions) -> float:
+    def scale(self, scale_px: float) -> float:
         """The robust scale: `scale_px`, or a multiple of the median distance if that is larger."""
-        return robust_scale(self.pixels[self.valid], scale_px, options.noise_scale)
+        return robust_scale(self.pixels[self.valid], scale_px, NOISE_SCALE)
 
     def weights(self, scale: float) -> Float[np.ndarray, "P"]:
         """Geman–McClure weights, zero for points that do not count."""
@@ -70,7 +78,6 @@ def back_project(contours: MaskContours, plane: Plane) -> tuple[Float[np.ndarray
 def boundary_residuals(
     contours: MaskContours,
     plane: Plane,
-    options: PlaneOptions = PlaneOptions(),
     heights: Float[np.ndarray, "N"] | None = None,
 ) -> BoundaryResiduals:
     """First-order pixel distances: the plane distance from a side times |det J|/‖J τ‖, J = ∂pixel/∂coordinates.
@@ -114,10 +121,10 @@ def boundary_residuals(
         turn_of_camera + (beyond / above)[:, None] * camera
     )
     by_level = beyond / above * (1 + parallax)
-    turns = np.einsum("ni,ni->n", tangents, np.roll(tangents, 1, 0)) < np.cos(np.radians(options.corner_deg))
+    turns = np.einsum("ni,ni->n", tangents, np.roll(tangents, 1, 0)) < np.cos(np.radians(CORNER_DEG))
     reach = stretch * lengths[side]
-    at_corner = (turns[side] & (along * reach < options.corner_px)) | (
-        np.roll(turns, -1)[side] & ((1 - along) * reach < options.corner_px)
+    at_corner = (turns[side] & (along * reach < CORNER_PX)) | (
+        np.roll(turns, -1)[side] & ((1 - along) * reach < CORNER_PX)
     )
     return BoundaryResiduals(
         pixels=(outward * (coordinates - foot)).sum(1) + beyond * parallax,
@@ -148,11 +155,9 @@ def boundary_jacobian(residuals: BoundaryResiduals, vertices: int) -> "csr_matri
     )
 
 
-def vertex_pull(
-    residuals: BoundaryResiduals, weights: Float[np.ndarray, "P"], vertices: int, options: PlaneOptions
-) -> float:
+def vertex_pull(residuals: BoundaryResiduals, weights: Float[np.ndarray, "P"], vertices: int) -> float:
     """What holds each number of a vertex where it is, against the sum of the contour points' weights."""
-    return float(options.vertex_pull * weights.sum() / vertices * np.median(residuals.pixels_per_unit**2))
+    return float(VERTEX_PULL * weights.sum() / vertices * np.median(residuals.pixels_per_unit**2))
 
 
 def apply_plane_step(plane: Plane, step: Float[np.ndarray, "D"]) -> Plane:

@@ -11,7 +11,12 @@ from panoless.environment.footprints import Footprints, PixelFootprints, batched
 from panoless.geometry.revolution.model import SurfaceOfRevolution
 from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
 from panoless.geometry.revolution.pixels import PixelBundles
-from panoless.geometry.revolution.render import smooth_pixels
+from panoless.geometry.revolution.render import LARGEST_BEND, smooth_pixels
+
+PIXELS = 3_500_000
+"""Most pixels with a footprint."""
+TRACED = 60_000
+"""Pixels without a smooth footprint that tell how bright saturated regions are."""
 
 OFFSETS = (-0.25, 0.25)
 """Of a footprint's directions from the pixel's center, in pixels."""
@@ -26,16 +31,15 @@ def pixel_footprints(
     occlusion_test: bool = True,
 ) -> Footprints:
     """Footprints of all pixels of evenly chosen views that are reflected up to `max_bounces` times."""
-    stride = -(-views.num_solid // options.map.pixels)
+    stride = -(-views.num_solid // PIXELS)
     chosen = views.train[:: max(stride, 1)]
     others = list[Int[np.ndarray, "_"]]()
 
     def seen() -> Iterator[PixelFootprints]:
         for view in chosen:
             places = view.solid.cpu().numpy()
-            bend = options.rendering.largest_bend
             at, smooth = smooth_pixels(
-                surface, view.camera, places, bend, max_bounces=max_bounces, occlusion_test=occlusion_test
+                surface, view.camera, places, LARGEST_BEND, max_bounces=max_bounces, occlusion_test=occlusion_test
             )
             others.append(places[~smooth])
             pixels = view.solid[torch.from_numpy(smooth).to(view.solid.device)]
@@ -51,8 +55,8 @@ def _trace(
     pixels: Sequence[Int[np.ndarray, "_"]],
     options: RevolutionOptions,
 ) -> PixelFootprints:
-    """About `options.map.traced` of the pixels, as far as all of their rays leave."""
-    stride = max(1, -(-sum(map(len, pixels)) // options.map.traced))
+    """About `TRACED` of the pixels, as far as all of their rays leave."""
+    stride = max(1, -(-sum(map(len, pixels)) // TRACED))
     chosen = [each[index % stride :: stride] for index, each in enumerate(pixels)]
     bundles = PixelBundles.of(zip(views, chosen, strict=True))
     paths, device = bundles.trace(surface, options.max_bounces), views[0].radiance.device

@@ -17,16 +17,18 @@ from torch.nn.functional import avg_pool2d
 from panoless.capture.views import TrainView, Views, split_held_out
 from panoless.geometry.base import overlap
 from panoless.geometry.revolution.floor import fit_floor, floor_pixels
-from panoless.geometry.revolution.footprints import has_edges, informative_pixels, refine_by_footprints
+from panoless.geometry.revolution.footprints import ROUNDS, has_edges, informative_pixels, refine_by_footprints
 from panoless.geometry.revolution.interior import end_pixels, search_interior
-from panoless.geometry.revolution.lip import clear_of_lip, lip_pixels, open_at_lip, place_lip, refine_lip
-from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_buffers
-from panoless.geometry.revolution.options import DEFAULTS, PhotometricOptions, RevolutionOptions, Round
-from panoless.geometry.revolution.photometric import refine_round, solve_map
-from panoless.geometry.revolution.pixels import CENTER, PixelBundles, evenly
+from panoless.geometry.revolution.lip import LENGTH_PX, clear_of_lip, lip_pixels, open_at_lip, place_lip, refine_lip
+from panoless.geometry.revolution.model import MAX_BOUNCES, SurfaceOfRevolution, revolution_buffers
+from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
+from panoless.geometry.revolution.photometric import Round, refine_round, solve_map
+from panoless.geometry.revolution.pixels import CENTER, JUDGED_SCALE, PixelBundles, evenly
 from panoless.geometry.revolution.profile import resample_profile
 from panoless.geometry.revolution.silhouette import (
     EXTENTS,
+    JUDGED_SCALE_PX,
+    START_POINTS,
     ContourRays,
     axis_starts,
     contour_cost,
@@ -38,6 +40,52 @@ from panoless.geometry.revolution.silhouette import (
 from panoless.journal import remembered
 from panoless.numeric.gauss_newton import keep_if_better
 from shinypartial.io.progress import Progress
+
+LARGEST_START_COST = 0.6
+"""Mean of e²/(e² + s²) over the contours of a coarse fit above which no axis is near."""
+LEAST_VIEWS = 6
+"""Fewer views with a contour propose nothing."""
+SUFFICIENT_OVERLAP = 0.98
+"""Intersection over union of the closed body with the masks from which no stem is looked for."""
+SCORED_VIEWS = 16
+"""Most views over which the overlap of a proposal is measured."""
+COARSE = (Round(64, 0.3, 3.0, 2), Round(128, 0.3, 2.0, 2))
+"""Rounds on single rays before the mouth is opened."""
+FINE = (Round(128, 0.2, 1.5, 2), Round(256, 0.2, 1.5, 2), Round(256, 0.1, 1.0, 2), Round(256, 0.1, 1.0, 2))
+"""Rounds after."""
+CONTOUR_POINTS = 20_000
+"""Contour points of a step."""
+END_PIXELS = 100_000
+"""Pixels among which those are counted that see an end of the closed surface."""
+UNCLEAR_SHARE = 0.1
+"""Both ends are tried if the one that fewer pixels see is seen by more than this share of the other's."""
+JUDGED_PIXELS = 120_000
+"""Pixels of the held-out views among which those that see an end judge what is inside."""
+SEARCHED_RESOLUTION = 128
+"""Texels along a face side of the map under which an interior is searched again."""
+SETTLED_SHARE = 0.05
+"""Share of all pixels that the ends may leave unexplained before candidates descend under coarse maps."""
+DESCENDING = 1.25
+"""Those descend whose error is within so many times the least."""
+DESCENT = (
+    Round(8, 0.5, 6.0, 4),
+    Round(16, 0.5, 4.0, 4),
+    Round(32, 0.4, 3.0, 4),
+    Round(64, 0.3, 2.0, 4),
+)
+"""Rounds of that descent."""
+LEAST_FLOOR_PIXELS = 200
+"""Fewer pixels whose paths meet the floor tell nothing."""
+LIP_PIXELS = 8_000
+"""Mixed pixels that refine the lip."""
+LEAST_LIP_PIXELS = 500
+"""Fewer tell nothing."""
+WHOLE_PIXELS = 30_000
+"""Pixels of the held-out views, all over the vessel, that a moved lip must not explain worse."""
+FINEST_MAP_RAYS = 2_000_000
+"""Rays of the map that has the resolution of the last round."""
+LEAST_GAIN = 0.02
+"""Share of the held-out error by which a refinement has to be better to be kept."""
 
 
 @dataclass(frozen=True)
@@ -54,36 +102,35 @@ class RevolutionProposal:
     """Σ min(alpha, mask) / Σ max(alpha, mask), for some of the views."""
 
 
-def propose_revolution(views: Views, options: RevolutionOptions = DEFAULTS) -> RevolutionProposal | None:
+def propose_revolution(views: Views) -> RevolutionProposal | None:
     """Axis and outer profile that explain the masks best; None when none comes near.
 
     What may be a stem below the body, or a cone that silhouettes leave beyond its lip, and then what lies beyond a
     narrow place, is believed only where the body without it misses the masks.
     """
-    rays = contour_rays(views, options.silhouette)
-    if len(np.unique(rays.view)) < options.silhouette.least_views:
+    rays = contour_rays(views)
+    if len(np.unique(rays.view)) < LEAST_VIEWS:
         return None
-    best, starts = None, axis_starts(views, options.silhouette)
+    best, starts = None, axis_starts(views)
     for extent in range(EXTENTS):
-        found = _propose(views, rays, starts, options, extent)
+        found = _propose(views, rays, starts, extent)
         if found is not None and (best is None or np.median(found.iou) > np.median(best.iou)):
             best = found
-        if best is not None and np.median(best.iou) >= options.silhouette.believed_overlap:
+        if best is not None and np.median(best.iou) >= SUFFICIENT_OVERLAP:
             break
     return best
 
 
 def _propose(
-    views: Views, rays: ContourRays, starts: list[SurfaceOfRevolution], options: RevolutionOptions, extent: int
+    views: Views, rays: ContourRays, starts: list[SurfaceOfRevolution], extent: int
 ) -> RevolutionProposal | None:
-    own = options.silhouette
     start = fit_outer(rays, starts, extent)
     if start is None:
         return None
-    residuals = silhouette_residuals(rays.at_most(own.start_points), start, rays.pixel)
-    if contour_cost(residuals, own.judged_scale_px) > own.largest_start_cost:
+    residuals = silhouette_residuals(rays.at_most(START_POINTS), start, rays.pixel)
+    if contour_cost(residuals, JUDGED_SCALE_PX) > LARGEST_START_COST:
         return None
-    base, lid = (_count(end) for end in end_pixels(views, start, options.mouth.pixels))
+    base, lid = (_count(end) for end in end_pixels(views, start, END_PIXELS))
     surface = refine_outer(rays, start if lid >= base else start.turned_over(), extent)
     if surface is None:
         return None
@@ -91,7 +138,7 @@ def _propose(
     distance = np.where(found.side >= 0, np.abs(found.pixels), np.inf)
     medians = np.array([np.median(distance[rays.view == view]) for view in np.unique(rays.view)])
     overlaps = []
-    for view in views.train[:: max(1, len(views.train) // own.scored_views)]:
+    for view in views.train[:: max(1, len(views.train) // SCORED_VIEWS)]:
         alpha = revolution_buffers(surface, view.camera).alpha
         overlaps.append(overlap(alpha, view.mask))
     return RevolutionProposal(surface, medians, np.array(overlaps))
@@ -118,7 +165,7 @@ def follow_views(
 ) -> SurfaceOfRevolution:
     """A fitted surface after one more round on single rays, to views that changed a little."""
     with torch.no_grad():
-        return Refinement(views, fitted, options).refine_by_centers(fitted, options.photometric.fine[-1], None)[0]
+        return Refinement(views, fitted, options).refine_by_centers(fitted, FINE[: options.rounds][-1], None)[0]
 
 
 @dataclass(frozen=True)
@@ -139,12 +186,12 @@ class Refinement:
         self.views, self.start, self.options = views, start, options
         kept, held_out = split_held_out(views.train)
         self.kept, self.held_out = (replace(views, train=tuple(part)) for part in (kept, held_out))
-        self.contours = contour_rays(views, options.silhouette).at_most(options.photometric.contour_points)
+        self.contours = contour_rays(views).at_most(CONTOUR_POINTS)
         self.pixel = self.contours.pixel
 
     def run(self) -> SurfaceOfRevolution:
         """All of them, in order."""
-        fine = self.options.photometric.fine
+        fine = FINE[: self.options.rounds]
         progress = Progress("fitting a surface of revolution", 5 + len(fine))
         surface, environment = self.open_mouth()
         progress.advance()
@@ -168,12 +215,10 @@ class Refinement:
         environment: Float[Tensor, "6 3 L L"],
     ) -> SurfaceOfRevolution:
         """The candidate, if it explains pixels of held-out views better than the surface does."""
-        return keep_if_better(
-            (surface, candidate), lambda each: self._error(held_out, each, environment), self.options.least_gain
-        )
+        return keep_if_better((surface, candidate), lambda each: self._error(held_out, each, environment), LEAST_GAIN)
 
     def _error(self, pixels: PixelBundles, surface: SurfaceOfRevolution, environment: Tensor) -> float:
-        return pixels.error(surface, environment, self.options.rendering.max_bounces, self.options.judged_scale)
+        return pixels.error(surface, environment, MAX_BOUNCES, JUDGED_SCALE)
 
     def open_mouth(self) -> tuple[SurfaceOfRevolution, Tensor | None]:
         """The outside after coarse rounds with what is inside its lid, or inside its base if that is unclear; and the
@@ -181,22 +226,21 @@ class Refinement:
 
         Every candidate is judged under a map of its own: that of a wide bowl's flat lid says nothing of its inside.
         """
-        own = self.options.mouth
-        base, lid = (_count(end) for end in end_pixels(self.views, self.start, own.pixels))
-        every = _count(evenly(self.views, own.pixels))
-        starts = [self.start, self.start.turned_over()] if base > own.unclear_share * lid else [self.start]
+        base, lid = (_count(end) for end in end_pixels(self.views, self.start, END_PIXELS))
+        every = _count(evenly(self.views, END_PIXELS))
+        starts = [self.start, self.start.turned_over()] if base > UNCLEAR_SHARE * lid else [self.start]
         seen = self._held_out_ends(self.start)
         opened = []
         for surface in starts:
             environment = None
-            for each in self.options.photometric.coarse:
+            for each in COARSE[: self.options.rounds]:
                 surface, environment = self.refine_by_centers(surface, each, environment)
             assert environment is not None, "there is a coarse round"
             flat = self._judged(surface, seen, environment)
             within = list(self._walls(surface, environment, flat, seen))
             best = self._best(flat, *within)
-            if best.error * (base + lid) > own.settled_share * every:
-                near = [each for each in within if each.error < own.descending * best.error]
+            if best.error * (base + lid) > SETTLED_SHARE * every:
+                near = [each for each in within if each.error < DESCENDING * best.error]
                 best = self._best(best, *(self._descended(each, seen) for each in near))
             opened.append(best)
         best = min(opened, key=lambda each: each.error)
@@ -208,22 +252,21 @@ class Refinement:
         """What may be inside: a wall without thickness, and interiors that are searched under the map of the outside,
         and under that of such a wall if it explains more than the flat lid.
         """
-        own, maps = self.options.mouth, [environment]
-        if own.thin_walls and (opened := open_at_lip(self.contours, closed, self.options.lip)) is not None:
+        maps = [environment]
+        if self.options.thin_walls and (opened := open_at_lip(self.contours, closed)) is not None:
             thin = self._judged(opened, seen)
             yield thin
             if self._best(flat, thin) is thin:
                 maps.append(thin.environment)
         for known in maps:
-            searched = search_interior(self.kept, closed, known, self.pixel, own)
+            searched = search_interior(self.kept, closed, known, self.pixel)
             yield self._judged(searched, seen, environment if known is environment else None)
 
     def _descended(self, start: _Judged, seen: PixelBundles) -> _Judged:
         """A surface after steps under maps so coarse that its inside may be wrong by many degrees."""
-        surface, own = start.surface, self.options.mouth
-        photometric = replace(self.options.photometric, pixels=own.descent_pixels, map_rays=own.descent_rays)
-        for each in own.descent:
-            surface, _ = self.refine_by_centers(surface, each, None, photometric)
+        surface = start.surface
+        for each in DESCENT[: self.options.rounds]:
+            surface, _ = self.refine_by_centers(surface, each, None, share=4)
         return self._judged(surface, seen)
 
     @remembered()
@@ -231,7 +274,7 @@ class Refinement:
         """A surface under its own map of the views that are not held out, from nothing, since others' leave traces;
         with rays that are mirrored often, since some directions are seen by way of the walls only.
         """
-        rays, resolution = self.options.photometric.map_rays, self.options.photometric.coarse[-1].resolution
+        rays, resolution = self.options.map_rays, COARSE[: self.options.rounds][-1].resolution
         environment = solve_map(self.kept, surface, rays, resolution, max_bounces=self.options.max_bounces)
         return _Judged(surface, environment, self._error(seen, surface, environment), going_on)
 
@@ -239,12 +282,12 @@ class Refinement:
         """The last that is clearly better than the best before it."""
 
         def better(best: _Judged, candidate: _Judged) -> _Judged:
-            return keep_if_better((best, candidate), lambda each: each.error, self.options.least_gain)
+            return keep_if_better((best, candidate), lambda each: each.error, LEAST_GAIN)
 
         return reduce(better, candidates)
 
     def _held_out_ends(self, closed: SurfaceOfRevolution) -> PixelBundles:
-        base, lid = end_pixels(self.held_out, closed, self.options.mouth.judged_pixels)
+        base, lid = end_pixels(self.held_out, closed, JUDGED_PIXELS)
         return PixelBundles.of([*base, *lid], CENTER)
 
     @remembered()
@@ -253,29 +296,26 @@ class Refinement:
         surface: SurfaceOfRevolution,
         each: Round,
         environment: Tensor | None,
-        options: PhotometricOptions | None = None,
+        share: int = 1,
     ) -> tuple[SurfaceOfRevolution, Tensor]:
-        """The surface after one round on single rays, and the map before it."""
-        own, lip = options or self.options.photometric, self.options.lip
-        views = clear_of_lip(self.views, surface, lip)
-        environment = solve_map(views, surface, own.map_rays, each.resolution, environment)
+        """The surface after one round on single rays, and the map before it; of one in `share` pixels and rays."""
+        views = clear_of_lip(self.views, surface)
+        environment = solve_map(views, surface, self.options.map_rays // share, each.resolution, environment)
         surface = refine_round(
-            PixelBundles.of(evenly(views, own.pixels), CENTER),
+            PixelBundles.of(evenly(views, self.options.pixels // share), CENTER),
             self.contours,
             surface,
             environment,
             each,
-            lambda moved: resample_profile(place_lip(self.contours, moved, self.pixel, lip), self.pixel),
-            own,
+            lambda moved: resample_profile(place_lip(self.contours, moved, self.pixel), self.pixel),
         )
         return surface, environment
 
     @remembered()
     def solve_finest_map(self, surface: SurfaceOfRevolution, environment: Tensor) -> Float[Tensor, "6 3 L L"]:
         """The map of many rays in the resolution of the last round on areas."""
-        own = self.options.footprints
-        views = clear_of_lip(self.views, surface, self.options.lip)
-        return solve_map(views, surface, own.map_rays, own.rounds[-1].resolution, environment)
+        views = clear_of_lip(self.views, surface)
+        return solve_map(views, surface, FINEST_MAP_RAYS, ROUNDS[: self.options.rounds][-1].resolution, environment)
 
     def refine_areas(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
         """Grooves and edges, by pixels as areas, where there are any."""
@@ -285,20 +325,19 @@ class Refinement:
     def _keep_areas(
         self, surface: SurfaceOfRevolution, start: SurfaceOfRevolution, environment: Tensor
     ) -> SurfaceOfRevolution:
-        views, own = clear_of_lip(self.kept, start, self.options.lip), self.options.footprints
-        if not has_edges(views, start, self.pixel, own):
+        views = clear_of_lip(self.kept, start)
+        if not has_edges(views, start, self.pixel):
             return start
         candidate = refine_by_footprints(views.train, self.contours, start, environment, self.options)
-        held_out = informative_pixels(self.held_out.train, start, own.pixels // 4, self.pixel, own)
+        held_out = informative_pixels(self.held_out.train, start, self.options.pixels // 8, self.pixel)
         return self.keep_if_better(surface, candidate, PixelBundles.of(held_out), environment)
 
     def refine_interior(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
         """An interior searched anew under a better map, and then its grooves and edges."""
-        own = self.options.mouth
-        blurred = avg_pool2d(environment, max(environment.shape[-1] // own.searched_resolution, 1))
+        blurred = avg_pool2d(environment, max(environment.shape[-1] // SEARCHED_RESOLUTION, 1))
         outer = surface.profile[: surface.lip + 1]
         closed = replace(surface, profile=np.concatenate([outer, [[0.0, outer[-1, 1]]]]))
-        found = search_interior(self.kept, closed, blurred, self.pixel, own)
+        found = search_interior(self.kept, closed, blurred, self.pixel)
         # The search samples the outside anew, too, which would blunt its edges.
         candidate = replace(surface, profile=np.concatenate([outer, found.profile[found.lip + 1 :]]))
         seen = self._held_out_ends(closed)
@@ -309,10 +348,10 @@ class Refinement:
     @remembered()
     def refine_floor(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
         """The floor, where enough pixels see it by way of the walls or from below."""
-        seen, judging = (floor_pixels(part, surface, self.options) for part in (self.kept, self.held_out))
-        if len(seen.radiance) < self.options.floor.least_pixels or not len(judging.radiance):
+        seen, judging = (floor_pixels(part, surface) for part in (self.kept, self.held_out))
+        if len(seen.radiance) < LEAST_FLOOR_PIXELS or not len(judging.radiance):
             return surface
-        candidate = fit_floor(seen, surface, environment, self.pixel, self.options)
+        candidate = fit_floor(seen, surface, environment, self.pixel)
         return self.keep_if_better(surface, candidate, judging, environment)
 
     @remembered()
@@ -321,15 +360,14 @@ class Refinement:
 
         It moves more of the wall than these pixels see, so the vessel as a whole must not be explained worse.
         """
-        own = self.options.lip
-        if surface.arc_lengths[surface.lip] < 2 * own.length_px * self.pixel:
+        if surface.arc_lengths[surface.lip] < 2 * LENGTH_PX * self.pixel:
             return surface
-        parts = ((self.kept, own.pixels), (self.held_out, own.pixels // 2))
-        seen, judging = (lip_pixels(part.train, surface, count, self.options) for part, count in parts)
-        if min(len(seen.radiance), len(judging.radiance)) < own.least_pixels:
+        parts = ((self.kept, LIP_PIXELS), (self.held_out, LIP_PIXELS // 2))
+        seen, judging = (lip_pixels(part.train, surface, count) for part, count in parts)
+        if min(len(seen.radiance), len(judging.radiance)) < LEAST_LIP_PIXELS:
             return surface
-        candidate = refine_lip(seen, surface, environment, self.pixel, self.options)
-        whole = PixelBundles.of(evenly(self.held_out, own.judged_pixels), CENTER)
+        candidate = refine_lip(seen, surface, environment, self.pixel)
+        whole = PixelBundles.of(evenly(self.held_out, WHOLE_PIXELS), CENTER)
         if self._error(whole, candidate, environment) > self._error(whole, surface, environment):
             return surface
         return self.keep_if_better(surface, candidate, judging, environment)

@@ -13,9 +13,21 @@ from torch import Tensor
 
 from panoless.capture.rays import pixel_rays, reflect
 from panoless.capture.views import Views
-from panoless.geometry.revolution.model import RAY_EPSILON, SurfaceOfRevolution
-from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
-from panoless.geometry.revolution.pixels import PixelBundles, evenly
+from panoless.geometry.revolution.model import MAX_BOUNCES, RAY_EPSILON, SurfaceOfRevolution
+from panoless.geometry.revolution.pixels import JUDGED_SCALE, PixelBundles, evenly
+
+PIXELS = 2500
+"""Pixels whose paths meet the floor that judge heights."""
+SEARCHED_PIXELS = 400_000
+"""Pixels of all views among which those are searched."""
+HEIGHTS = 16
+"""Tried to either side of a flat floor, in steps of a 64th of its radius."""
+HALVINGS = 6
+"""Of the step around the best height."""
+SIDES = 24
+"""Of the profile's polyline along the floor."""
+WALL_PX = 9.0
+"""Length of the wall (px) from which its slope is found where the floor begins."""
 
 
 def fit_floor(
@@ -23,60 +35,54 @@ def fit_floor(
     surface: SurfaceOfRevolution,
     environment: Float[Tensor, "6 3 L L"],
     pixel: float,
-    options: RevolutionOptions = DEFAULTS,
 ) -> SurfaceOfRevolution:
     """The surface with the floor that explains best what `floor_pixels` see under a map."""
-    own = options.floor
 
     def error(rise: float) -> float:
-        tried = with_floor(surface, rise * step, pixel, options)
-        return pixels.error(tried, environment, options.rendering.max_bounces, options.judged_scale)
+        tried = with_floor(surface, rise * step, pixel)
+        return pixels.error(tried, environment, MAX_BOUNCES, JUDGED_SCALE)
 
-    step = float(surface.profile[1, 0]) / (4 * own.heights)
-    errors = {float(rise): error(rise) for rise in range(-own.heights, own.heights + 1)}
+    step = float(surface.profile[1, 0]) / (4 * HEIGHTS)
+    errors = {float(rise): error(rise) for rise in range(-HEIGHTS, HEIGHTS + 1)}
     best = min(errors, key=lambda rise: errors[rise])
     least, width = errors[best], 0.5
-    for _ in range(own.halvings):
+    for _ in range(HALVINGS):
         for rise in (best - width, best + width):
             found = error(rise)
             if found < least:
                 best, least = rise, found
         width /= 2
-    return with_floor(surface, best * step, pixel, options)
+    return with_floor(surface, best * step, pixel)
 
 
-def with_floor(
-    surface: SurfaceOfRevolution, rise: float, pixel: float, options: RevolutionOptions = DEFAULTS
-) -> SurfaceOfRevolution:
+def with_floor(surface: SurfaceOfRevolution, rise: float, pixel: float) -> SurfaceOfRevolution:
     """The surface with a floor that is a cubic in ρ: `rise` higher on the axis than at its edge, level there, and with
     the wall's slope at the edge.
     """
     radius, height = surface.profile[1]
     lengths = surface.arc_lengths[1 : surface.lip + 1] - surface.arc_lengths[1]
-    near = max(int((lengths < options.floor.wall_px * pixel).sum()), 3)
+    near = max(int((lengths < WALL_PX * pixel).sum()), 3)
     offset, length = surface.profile[2 : 1 + near] - surface.profile[1], lengths[1:near]
     powers = np.stack([length, length**2], 1)
     across, up = (np.linalg.lstsq(powers, offset[:, k], rcond=None)[0][0] for k in (0, 1))
     slope = float(np.clip(up / max(across, 1e-3), -1.0, 1.0)) * radius
-    sides = options.floor.sides
-    x = np.arange(sides) / sides
+    x = np.arange(SIDES) / SIDES
     # Hermite: (0, rise) with slope 0 to (1, 0) with that slope.
     heights = height + rise * (2 * x**3 - 3 * x**2 + 1) + slope * (x**3 - x**2)
     return replace(
         surface,
         profile=np.concatenate([np.stack([radius * x, heights], 1), surface.profile[1:]]),
-        lip=surface.lip + sides - 1,
+        lip=surface.lip + SIDES - 1,
     )
 
 
-def floor_pixels(views: Views, surface: SurfaceOfRevolution, options: RevolutionOptions = DEFAULTS) -> PixelBundles:
+def floor_pixels(views: Views, surface: SurfaceOfRevolution) -> PixelBundles:
     """Pixels whose path meets the floor."""
-    own = options.floor
     chosen = [
-        (view, pixels[_meets_floor(surface, *pixel_rays(view.camera, pixels), options.rendering.max_bounces)])
-        for view, pixels in evenly(views, own.searched_pixels)
+        (view, pixels[_meets_floor(surface, *pixel_rays(view.camera, pixels), MAX_BOUNCES)])
+        for view, pixels in evenly(views, SEARCHED_PIXELS)
     ]
-    return PixelBundles.of(chosen).at_most(own.pixels)
+    return PixelBundles.of(chosen).at_most(PIXELS)
 
 
 def _meets_floor(

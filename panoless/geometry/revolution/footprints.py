@@ -5,6 +5,7 @@ tells it. Blurred maps come first, because blurring widens the basin of converge
 errors.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,11 +17,35 @@ from panoless.capture.rays import pixel_rays
 from panoless.capture.views import TrainView, Views, every_kth_pixel
 from panoless.geometry.revolution.lip import place_lip
 from panoless.geometry.revolution.model import SurfaceOfRevolution
-from panoless.geometry.revolution.options import DEFAULTS, FootprintOptions, RevolutionOptions
-from panoless.geometry.revolution.photometric import refine_round
+from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
+from panoless.geometry.revolution.photometric import Round, refine_round
 from panoless.geometry.revolution.pixels import PixelBundles
 from panoless.geometry.revolution.profile import resample_profile
 from panoless.geometry.revolution.silhouette import ContourRays
+
+SPACING_PX = 1 / 3
+"""Of the vertices (px): an edge is as sharp as they are dense."""
+ROUNDS = (
+    Round(32, 0.5, 1.5, 4),
+    Round(64, 0.4, 1.5, 4),
+    Round(128, 0.3, 1.0, 4),
+    Round(256, 0.2, 0.7, 4, 1e-5),
+)
+"""Blurred maps first: their basins are as wide as the normals are wrong."""
+LARGEST_SHARE = 1 / 3
+"""Of all pixels that are taken."""
+SEARCHED_PIXELS = 2_000_000
+"""Pixels among which those are searched that see the profile turn."""
+CURVED_RAD = math.radians(2.0)
+"""Where the profile turns by more within two pixels, single rays tell less than areas."""
+CURVED_SHARE = 0.75
+"""Of the pixels taken that see such a place."""
+EDGE_RAD = math.radians(8.0)
+"""Where the profile turns by more within two pixels, there is an edge or a groove."""
+LEAST_EDGE_SHARE = 0.01
+"""Of the pixels that see one: with fewer, areas are not worth their time."""
+COUNTED_PIXELS = 100_000
+"""Pixels among which those are counted."""
 
 
 def informative_pixels(
@@ -28,12 +53,11 @@ def informative_pixels(
     surface: SurfaceOfRevolution,
     count: int,
     pixel: float,
-    options: FootprintOptions = DEFAULTS.footprints,
 ) -> list[tuple[TrainView, Int[np.ndarray, "_"]]]:
     """About `count` pixels of all views, three quarters of them where the profile turns within two pixels."""
-    curved = _curved_sides(surface, pixel, options.curved_rad)
+    curved = _curved_sides(surface, pixel, CURVED_RAD)
     generator = np.random.default_rng(0)
-    share = min(1.0, options.searched_pixels / max(sum(len(view.solid) for view in views), 1))
+    share = min(1.0, SEARCHED_PIXELS / max(sum(len(view.solid) for view in views), 1))
     found = []
     for view in views:
         pixels = view.solid.cpu().numpy()
@@ -41,20 +65,18 @@ def informative_pixels(
         hits = surface.hits(*pixel_rays(view.camera, pixels))
         found.append((view, pixels, hits.met & curved[hits.side]))
     counts = sum(int(turns.sum()) for *_, turns in found), sum(int((~turns).sum()) for *_, turns in found)
-    shares = (options.curved_share, 1 - options.curved_share)
+    shares = (CURVED_SHARE, 1 - CURVED_SHARE)
     kept = [each * count / max(total, 1) for each, total in zip(shares, counts, strict=True)]
     return [(view, pixels[generator.random(len(pixels)) < np.where(turns, *kept)]) for view, pixels, turns in found]
 
 
-def has_edges(
-    views: Views, surface: SurfaceOfRevolution, pixel: float, options: FootprintOptions = DEFAULTS.footprints
-) -> bool:
+def has_edges(views: Views, surface: SurfaceOfRevolution, pixel: float) -> bool:
     """Whether enough pixels see an edge or a groove."""
-    edges, count, total = _curved_sides(surface, pixel, options.edge_rad), 0, 0
-    for view, pixels in every_kth_pixel(views, options.counted_pixels):
+    edges, count, total = _curved_sides(surface, pixel, EDGE_RAD), 0, 0
+    for view, pixels in every_kth_pixel(views, COUNTED_PIXELS):
         hits = surface.hits(*pixel_rays(view.camera, pixels.cpu().numpy()))
         count, total = count + int((hits.met & edges[hits.side]).sum()), total + int(hits.met.sum())
-    return count > options.least_edge_share * total
+    return count > LEAST_EDGE_SHARE * total
 
 
 def _curved_sides(surface: SurfaceOfRevolution, pixel: float, curved_rad: float) -> Bool[np.ndarray, "S"]:
@@ -73,12 +95,12 @@ def refine_by_footprints(
     options: RevolutionOptions = DEFAULTS,
 ) -> SurfaceOfRevolution:
     """The surface with vertices a third of a pixel apart, after rounds of Gauss–Newton on pixels as areas."""
-    own, pixel = options.footprints, contours.pixel
-    count = min(own.pixels, int(own.largest_share * sum(len(view.solid) for view in views)))
-    pixels = PixelBundles.of(informative_pixels(views, surface, count, pixel, own))
-    spacing = own.spacing_px * pixel
+    pixel = contours.pixel
+    count = min(options.pixels // 2, int(LARGEST_SHARE * sum(len(view.solid) for view in views)))
+    pixels = PixelBundles.of(informative_pixels(views, surface, count, pixel))
+    spacing = SPACING_PX * pixel
     surface = resample_profile(surface, spacing)
-    for each in own.rounds:
+    for each in ROUNDS[: options.rounds]:
         blurred = avg_pool2d(environment, max(environment.shape[-1] // each.resolution, 1))
         surface = refine_round(
             pixels,
@@ -86,8 +108,7 @@ def refine_by_footprints(
             surface,
             blurred,
             each,
-            lambda moved: resample_profile(place_lip(contours, moved, spacing, options.lip), spacing),
-            options.photometric,
+            lambda moved: resample_profile(place_lip(contours, moved, spacing), spacing),
             options.max_bounces,
         )
     return surface

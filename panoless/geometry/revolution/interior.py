@@ -15,11 +15,31 @@ from torch import Tensor
 from panoless.capture.rays import pixel_rays
 from panoless.capture.views import TrainView, Views
 from panoless.geometry.revolution.model import SurfaceOfRevolution
-from panoless.geometry.revolution.options import DEFAULTS, MouthOptions
 from panoless.geometry.revolution.pixels import evenly
 from panoless.geometry.revolution.profile import resample_profile
 from panoless.journal import remembered
 from panoless.kernels.revolution import slope_votes
+
+SEARCHED_PIXELS = 60_000
+"""Most pixels that vote."""
+SLOPES = 48
+"""Directions of the profile that the search tells apart."""
+CELL_PX = 0.75
+"""Size of the search's cells (px)."""
+CELLS = 128
+"""Most cells along the radius; wider mouths have larger cells."""
+DEPTH = 0.8
+"""Of the search, in radii of the mouth."""
+ROWS_ABOVE = 3
+"""Cells above the lip: a rolled lip rises on where silhouettes end."""
+ERROR_SCALE = 0.15
+"""Scale s of a vote ‖e‖²/(‖e‖² + s²)."""
+FEW_PIXELS = 4.0
+"""Votes' worth of the cost of an unseen cell that every cell starts with."""
+UNSEEN_COST = 0.7
+"""Cost of a cell and slope that no pixel sees: worse than a fair one, better than a wrong one."""
+REACH = 3
+"""Cells that an edge of the path spans at most."""
 
 
 def end_pixels(
@@ -52,16 +72,14 @@ def search_interior(
     closed: SurfaceOfRevolution,
     environment: Float[Tensor, "6 3 L L"],
     pixel: float,
-    options: MouthOptions = DEFAULTS.mouth,
 ) -> SurfaceOfRevolution:
     """The closed surface with the cheapest interior in place of its lid."""
     radius = float(closed.profile[closed.lip, 0])
-    cell = max(options.cell_px * pixel, radius / options.cells)
+    cell = max(CELL_PX * pixel, radius / CELLS)
     columns = max(int(np.ceil(radius / cell)), 2)
-    above = options.rows_above
-    top = float(closed.profile[closed.lip, 1]) + above * cell
-    grid = Grid(cell, top, columns, max(int(options.depth * columns), 2) + above, above)
-    path = _cheapest(slope_costs(views, closed, environment, grid, options), grid, options.reach)
+    top = float(closed.profile[closed.lip, 1]) + ROWS_ABOVE * cell
+    grid = Grid(cell, top, columns, max(int(DEPTH * columns), 2) + ROWS_ABOVE, ROWS_ABOVE)
+    path = _cheapest(slope_costs(views, closed, environment, grid), grid, REACH)
     inner = np.stack([(path[:, 1] + 0.5) * cell, grid.top - (path[:, 0] + 0.5) * cell], 1)
     inner = _smoothed(np.concatenate([closed.profile[closed.lip, None], inner, [[0.0, inner[-1, 1]]]]))
     return resample_profile(replace(closed, profile=np.concatenate([closed.profile[: closed.lip], inner])), pixel)
@@ -77,13 +95,12 @@ def slope_costs(
     closed: SurfaceOfRevolution,
     environment: Float[Tensor, "6 3 L L"],
     grid: Grid,
-    options: MouthOptions,
 ) -> Float[np.ndarray, "rows columns slopes"]:
     """Mean of ‖e‖²/(‖e‖² + s²) for each cell and direction of the profile, 2π k/slopes from outward level.
 
     Only rays count that leave through the mouth again, which alone is known to be open, or above it.
     """
-    origins, rays, radiance = _lid_pixels(views, closed, options.searched_pixels)
+    origins, rays, radiance = _lid_pixels(views, closed, SEARCHED_PIXELS)
     summed, count = slope_votes(
         (origins - closed.origin) @ closed.frame.T,
         rays @ closed.frame.T,
@@ -91,11 +108,11 @@ def slope_costs(
         environment.permute(0, 2, 3, 1).cpu().numpy().astype(np.float64),
         closed.frame,
         np.array([grid.cell, grid.top, grid.columns, grid.rows, closed.profile[closed.lip, 1]]),
-        2 * np.pi * np.arange(options.slopes) / options.slopes,
-        options.error_scale,
+        2 * np.pi * np.arange(SLOPES) / SLOPES,
+        ERROR_SCALE,
     )
-    mean = (summed + options.unseen_cost * options.few_pixels) / (count + options.few_pixels)
-    return mean.reshape(grid.rows, grid.columns, options.slopes)
+    mean = (summed + UNSEEN_COST * FEW_PIXELS) / (count + FEW_PIXELS)
+    return mean.reshape(grid.rows, grid.columns, SLOPES)
 
 
 def _lid_pixels(

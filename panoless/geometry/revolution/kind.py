@@ -18,7 +18,7 @@ from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, fro
 from panoless.geometry.exact import ExactFamily, ExactGeometry
 from panoless.geometry.revolution.deblurred_map import pixel_footprints
 from panoless.geometry.revolution.fit import follow_views, propose_revolution, refine_revolution
-from panoless.geometry.revolution.lip import beside_lip
+from panoless.geometry.revolution.lip import CLEARANCE_PX, beside_lip
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_buffers, revolution_rays
 from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
 from panoless.geometry.revolution.render import mean_light
@@ -57,7 +57,7 @@ class RevolutionMirror(ExactGeometry):
         """Solid pixels, but for those beside the lip of an open wall, which mix two surfaces."""
         if not self.surface.is_open:
             return view.solid
-        mixed = torch.from_numpy(beside_lip(view.camera, self.surface, self.options.lip.clearance_px).ravel())
+        mixed = torch.from_numpy(beside_lip(view.camera, self.surface, CLEARANCE_PX).ravel())
         return view.solid[~mixed.to(view.solid.device)[view.solid]]
 
     def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
@@ -68,7 +68,6 @@ class RevolutionMirror(ExactGeometry):
             pixels,
             occlusion_test=self.occlusion_test,
             weighted=len(pixels) == len(view.solid),
-            options=self.options.map,
         )[0]
 
     def footprints(self, views: Views, max_pixels: int) -> Footprints:
@@ -77,7 +76,7 @@ class RevolutionMirror(ExactGeometry):
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
         """By intersection; alpha by 4×4 rays where neighbors disagree."""
-        return revolution_buffers(self.surface, camera, self.options.rendering.samples)
+        return revolution_buffers(self.surface, camera, SAMPLES)
 
     def shade(
         self,
@@ -87,7 +86,7 @@ class RevolutionMirror(ExactGeometry):
         normals_camera: Float[Tensor, "3 P"],
     ) -> Float[Tensor, "P 3"]:
         """Mean over the pixels' areas, followed through all their reflections."""
-        return mean_light(self.surface, environment, camera, pixels, self.options.rendering)
+        return mean_light(self.surface, environment, camera, pixels)
 
     def state_dict(self) -> dict[str, Any]:
         """All numbers as lists and plain values."""
@@ -119,7 +118,7 @@ class RevolutionFamily(ExactFamily):
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """Axis and outer profile by silhouettes."""
-        found = propose_revolution(views, config.revolution)
+        found = propose_revolution(views)
         if found is not None:
             return Proposal(found.surface, float(np.median(found.median_px)), float(np.median(found.iou)))
         if asked:

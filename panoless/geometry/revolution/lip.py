@@ -23,9 +23,9 @@ from torch import Tensor
 
 from panoless.capture.rays import pixel_rays, pose_of, project
 from panoless.capture.views import TrainView, Views
-from panoless.geometry.revolution.model import SurfaceOfRevolution, trace_reflections
-from panoless.geometry.revolution.options import DEFAULTS, LipOptions, RevolutionOptions
-from panoless.geometry.revolution.pixels import PixelBundles
+from panoless.geometry.revolution.model import MAX_BOUNCES, SurfaceOfRevolution, trace_reflections
+from panoless.geometry.revolution.photometric import RADIANCE_SIGMA
+from panoless.geometry.revolution.pixels import JUDGED_SCALE, PixelBundles
 from panoless.geometry.revolution.profile import resample_profile
 from panoless.geometry.revolution.silhouette import ContourRays, adapted_scale, in_axis_frame, silhouette_residuals
 from panoless.kernels.camera import RasterCamera
@@ -34,21 +34,56 @@ from panoless.numeric.gauss_newton import accept_step, damped_step
 from panoless.numeric.robust import robust_weight
 from shinypartial.core.conventions import PIXEL_CENTER
 
+LEAST_RAYS = 20
+"""Fewer contour rays over the lip leave it where it is."""
+FARTHEST_PX = 6.0
+"""Contour rays that pass the lip farther away (px) touch something else."""
+STEPS = 6
+"""Of placing the lip by silhouettes."""
+TIP_DAMPING = 2e-3
+"""Of each of these steps, in mean diagonals."""
+SPOILED_PX = 7.0
+"""Length of the wall below a flat lid (px) that the lid's corner bends."""
+FITTED_PX = 16.0
+"""Length of the wall (px) from which a cubic is led on to the lip."""
+TIP_WEIGHT = 4.0
+"""Of the lip in that cubic, in vertices of the wall."""
+END_PX = 4.0
+"""Length of a thin wall below its lip (px) that no pixel sees alone."""
+CLEARANCE_PX = 2
+"""Pixels nearer to the image of a thin wall's lip may show what lies before and behind it."""
+LENGTH_PX = 20.0
+"""Length of the wall (px) that is refined by mixed pixels."""
+KNOT_PX = 3.0
+"""Spacing of its B-splines (px)."""
+REACH_PX = 5
+"""Mixed pixels are nearer to the image of the lip than this, or mirrored more than once."""
+REFINED_STEPS = 3
+"""Most Gauss–Newton steps of the refinement."""
+LENGTHS = (4.0, 2.0, 1.0, 0.5)
+"""Of a step, tried in turn: radiance that changes by leaps makes steps too short."""
+DIFFERENCE_PX = 0.05
+"""Of the derivatives (px)."""
+LARGEST_STEP_PX = 0.5
+"""Most that a parameter changes in a step of length one (px)."""
+PARAMETER_SIGMA_PX = 0.05
+"""Standard deviation of what is not fitted (px): pixels that change much with the parameters count less."""
+DAMPING = 1e-3
+"""Of the refinement, in mean diagonals."""
+
 RING_POINTS = 2000
 """Around the lip's image: more than its pixels."""
 
 
-def tip_shift(
-    contours: ContourRays, surface: SurfaceOfRevolution, scale_px: float, options: LipOptions = DEFAULTS.lip
-) -> Float[np.ndarray, "2"]:
+def tip_shift(contours: ContourRays, surface: SurfaceOfRevolution, scale_px: float) -> Float[np.ndarray, "2"]:
     """How (ρ, h) of the lip has to move for the outlines: one robust Gauss–Newton step; zero when hardly any see it."""
     found = silhouette_residuals(contours, surface, contours.pixel)
     tip = surface.profile[surface.lip]
     radius = np.maximum(np.hypot(found.points[:, 0], found.points[:, 1]), 1e-9)
     away = np.stack([radius, found.points[:, 2]], 1) - tip
-    near = np.linalg.norm(away, axis=1) < options.farthest_px * contours.pixel
+    near = np.linalg.norm(away, axis=1) < FARTHEST_PX * contours.pixel
     over = (found.side >= 0) & ~found.valid & near
-    if int(over.sum()) < options.least_rays:
+    if int(over.sum()) < LEAST_RAYS:
         return np.zeros(2)
     directions = in_axis_frame(contours, surface)[1][over]
     outward = (found.points[over, :2] * directions[:, :2]).sum(1) / radius[over]
@@ -58,20 +93,18 @@ def tip_shift(
     in_pixels = distance / contours.pixel_lengths[over]
     weights = robust_weight(in_pixels, adapted_scale(contours, in_pixels, scale_px))
     weighted = normals * weights[:, None]
-    return damped_step(-weighted.T @ distance, weighted.T @ normals, options.tip_damping)
+    return damped_step(-weighted.T @ distance, weighted.T @ normals, TIP_DAMPING)
 
 
-def open_at_lip(
-    contours: ContourRays, closed: SurfaceOfRevolution, options: LipOptions = DEFAULTS.lip
-) -> SurfaceOfRevolution | None:
+def open_at_lip(contours: ContourRays, closed: SurfaceOfRevolution) -> SurfaceOfRevolution | None:
     """The outside of a closed surface as a wall without thickness that ends where outlines put its lip.
 
     Up to there the profile goes on as a cubic through its last good vertex, fitted to those before it and to the lip.
     None where the outside is no longer than what is fitted, or doesn't rise to its lip.
     """
     pixel = contours.pixel
-    kept = _vertex_below_lip(closed, options.spoiled_px * pixel)
-    first = _vertex_below_lip(closed, (options.spoiled_px + options.fitted_px) * pixel)
+    kept = _vertex_below_lip(closed, SPOILED_PX * pixel)
+    first = _vertex_below_lip(closed, (SPOILED_PX + FITTED_PX) * pixel)
     if first < 1:
         return None
     last = closed.profile[kept]
@@ -79,10 +112,10 @@ def open_at_lip(
     if rise[1] < 0.1 * np.linalg.norm(rise):
         return None
     tip = last + rise * max((closed.profile[closed.lip, 1] - last[1]) / rise[1], 0.0)
-    ended = _end_at(closed, kept, tip, pixel, pixel, options)
-    for step in range(options.steps):
-        shift = tip_shift(contours, ended, max(4.0 / 2**step, 0.5), options)
-        ended = _end_at(closed, kept, ended.profile[-1] + shift, pixel, pixel, options)
+    ended = _end_at(closed, kept, tip, pixel, pixel)
+    for step in range(STEPS):
+        shift = tip_shift(contours, ended, max(4.0 / 2**step, 0.5))
+        ended = _end_at(closed, kept, ended.profile[-1] + shift, pixel, pixel)
     return ended
 
 
@@ -98,11 +131,10 @@ def _end_at(
     tip: Float[np.ndarray, "2"],
     pixel: float,
     spacing: float,
-    options: LipOptions,
 ) -> SurfaceOfRevolution:
     """The outside up to the vertex `kept`, and a cubic from there to the tip."""
     below = surface.arc_lengths[kept] - surface.arc_lengths[1:kept]
-    start, points = surface.profile[kept], surface.profile[1:kept][below < (options.fitted_px + 0.5) * pixel]
+    start, points = surface.profile[kept], surface.profile[1:kept][below < (FITTED_PX + 0.5) * pixel]
     way = tip - start
     length = float(np.linalg.norm(way))
     if length < pixel:
@@ -111,7 +143,7 @@ def _end_at(
     along, across = way / length, np.array([-way[1], way[0]]) / length
     x = np.append((points - start) @ along, length)
     y = np.append((points - start) @ across, 0.0)
-    weights = np.append(np.full(len(points), (spacing / pixel) ** 0.5), options.tip_weight)
+    weights = np.append(np.full(len(points), (spacing / pixel) ** 0.5), TIP_WEIGHT)
     powers = np.stack([x, x**2, x**3], 1) / length ** np.arange(1, 4)
     coefficients = np.linalg.lstsq(powers * weights[:, None], y * weights, rcond=None)[0]
     t = np.arange(1, max(int(np.ceil(length / spacing)), 1) + 1) / max(int(np.ceil(length / spacing)), 1)
@@ -122,29 +154,27 @@ def _end_at(
     return resample_profile(replace(surface, profile=profile, lip=len(profile) - 1), spacing)
 
 
-def place_lip(
-    contours: ContourRays, surface: SurfaceOfRevolution, spacing: float, options: LipOptions = DEFAULTS.lip
-) -> SurfaceOfRevolution:
+def place_lip(contours: ContourRays, surface: SurfaceOfRevolution, spacing: float) -> SurfaceOfRevolution:
     """A thin wall with its lip where outlines put it, and its last pixels led there as the wall before them goes.
 
     Others are returned as they are, and so is a wall that is no longer than what the end is fitted to.
     """
     pixel = contours.pixel
-    if not surface.is_open or _vertex_below_lip(surface, (options.end_px + options.fitted_px) * pixel) < 1:
+    if not surface.is_open or _vertex_below_lip(surface, (END_PX + FITTED_PX) * pixel) < 1:
         return surface
-    kept = _vertex_below_lip(surface, options.end_px * pixel)
-    shift = tip_shift(contours, surface, 1.0, options)
+    kept = _vertex_below_lip(surface, END_PX * pixel)
+    shift = tip_shift(contours, surface, 1.0)
     shift *= min(1.0, pixel / max(float(np.linalg.norm(shift)), 1e-12))
-    return _end_at(surface, kept, surface.profile[-1] + shift, pixel, spacing, options)
+    return _end_at(surface, kept, surface.profile[-1] + shift, pixel, spacing)
 
 
-def clear_of_lip(views: Views, surface: SurfaceOfRevolution, options: LipOptions = DEFAULTS.lip) -> Views:
+def clear_of_lip(views: Views, surface: SurfaceOfRevolution) -> Views:
     """The views without the pixels beside the lip of an open surface, which mix two surfaces: a lid's doesn't
     matter.
     """
     if not surface.is_open:
         return views
-    return replace(views, train=tuple(_clear(view, surface, options.clearance_px) for view in views.train))
+    return replace(views, train=tuple(_clear(view, surface, CLEARANCE_PX) for view in views.train))
 
 
 def _clear(view: TrainView, surface: SurfaceOfRevolution, clearance_px: int) -> TrainView:
@@ -174,11 +204,10 @@ def refine_lip(
     surface: SurfaceOfRevolution,
     environment: Float[Tensor, "6 3 L L"],
     pixel: float,
-    options: RevolutionOptions = DEFAULTS,
 ) -> SurfaceOfRevolution:
     """The surface with its profile near the lip where `lip_pixels` put it under a map, by Gauss–Newton."""
-    for _ in range(options.lip.refined_steps):
-        moved = _lip_step(pixels, surface, environment, pixel, options)
+    for _ in range(REFINED_STEPS):
+        moved = _lip_step(pixels, surface, environment, pixel)
         if moved is surface:
             break
         surface = moved
@@ -190,43 +219,41 @@ def _lip_step(
     surface: SurfaceOfRevolution,
     environment: Float[Tensor, "6 3 L L"],
     pixel: float,
-    options: RevolutionOptions,
 ) -> SurfaceOfRevolution:
-    own, max_bounces = options.lip, options.rendering.max_bounces
-    shifts = _shifts(surface, pixel, own)
+    shifts = _shifts(surface, pixel)
 
     def shown(shift: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "P 3"]:
-        return pixels.shown(_shifted(surface, shift), environment, max_bounces)
+        return pixels.shown(_shifted(surface, shift), environment, MAX_BOUNCES)
 
     residual = shown(np.zeros_like(surface.profile)) - pixels.radiance
-    small = own.difference_px * pixel * shifts
-    jacobian = np.stack([shown(shift) - shown(-shift) for shift in small], -1) / (2 * own.difference_px)
-    variance = options.photometric.radiance_sigma**2 + own.parameter_sigma_px**2 * (jacobian**2).sum(-1).mean(1)
+    small = DIFFERENCE_PX * pixel * shifts
+    jacobian = np.stack([shown(shift) - shown(-shift) for shift in small], -1) / (2 * DIFFERENCE_PX)
+    variance = RADIANCE_SIGMA**2 + PARAMETER_SIGMA_PX**2 * (jacobian**2).sum(-1).mean(1)
     weighted = jacobian * (robust_weight(residual, 3 * variance**0.5) / variance)[:, None, None]
     matrix = np.tensordot(weighted, jacobian, ((0, 1), (0, 1)))
     gradient = np.tensordot(weighted, residual, ((0, 1), (0, 1)))
     return accept_step(
         surface,
-        damped_step(gradient, matrix, own.damping, own.largest_step_px),
+        damped_step(gradient, matrix, DAMPING, LARGEST_STEP_PX),
         lambda each, step: _shifted(each, pixel * np.tensordot(step, shifts, 1)),
-        lambda each: pixels.error(each, environment, max_bounces, options.judged_scale),
-        own.lengths,
+        lambda each: pixels.error(each, environment, MAX_BOUNCES, JUDGED_SCALE),
+        LENGTHS,
     )
 
 
-def _shifts(surface: SurfaceOfRevolution, pixel: float, options: LipOptions) -> Float[np.ndarray, "D N 2"]:
+def _shifts(surface: SurfaceOfRevolution, pixel: float) -> Float[np.ndarray, "D N 2"]:
     """Unit shifts of the profile's vertices: cubic B-splines along the normals on both sides of the lip, and an
     extension along a thin wall.
     """
     place = (surface.arc_lengths - surface.arc_lengths[surface.lip]) / pixel
-    last = min(float(place[-1]), options.length_px)
-    places = place - np.arange(-options.length_px, last + options.knot_px + 1, options.knot_px)[:, None]
-    splines = cubic_bspline(places / options.knot_px)
+    last = min(float(place[-1]), LENGTH_PX)
+    places = place - np.arange(-LENGTH_PX, last + KNOT_PX + 1, KNOT_PX)[:, None]
+    splines = cubic_bspline(places / KNOT_PX)
     along = np.gradient(surface.profile, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
     shifts = splines[..., None] * np.stack([along[:, 1], -along[:, 0]], 1)
     if surface.is_open:
-        extension = np.clip(1 + place / options.length_px, 0, 1)[:, None] ** 2 * along
+        extension = np.clip(1 + place / LENGTH_PX, 0, 1)[:, None] ** 2 * along
         shifts = np.concatenate([shifts, extension[None]])
     # The ends stay on the axis.
     shifts[:, surface.profile[:, 0] < 1e-9] = 0
@@ -241,15 +268,14 @@ def lip_pixels(
     views: Sequence[TrainView],
     surface: SurfaceOfRevolution,
     count: int,
-    options: RevolutionOptions = DEFAULTS,
 ) -> PixelBundles:
     """About `count` pixels: half of them near the lip, half mirrored more than once."""
     generator = np.random.default_rng(0)
-    near = [np.flatnonzero(beside_lip(view.camera, surface, options.lip.reach_px)) for view in views]
+    near = [np.flatnonzero(beside_lip(view.camera, surface, REACH_PX)) for view in views]
     deep = []
     for view in views:
-        pixels, limit = view.solid.cpu().numpy(), options.rendering.max_bounces
-        paths = trace_reflections(surface, *pixel_rays(view.camera, pixels), max_bounces=limit)
+        pixels = view.solid.cpu().numpy()
+        paths = trace_reflections(surface, *pixel_rays(view.camera, pixels), max_bounces=MAX_BOUNCES)
         deep.append(pixels[paths.bounces != 1])
     shares = [count / 2 / max(sum(map(len, group)), 1) for group in (near, deep)]
     chosen = []

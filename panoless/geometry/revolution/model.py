@@ -22,6 +22,11 @@ from panoless.kernels.camera import RasterCamera
 from panoless.kernels.revolution import first_hits, follow
 from shinypartial.core.sphere import pixel_footprint_sr
 
+CONFIDENCE_TEXEL_RAD = math.pi / 2 / 128
+"""A pixel that spans a wider angle says little about any texel: confidence 1/(1 + a/t) with t its square."""
+MAX_BOUNCES = 16
+"""Reflections after which a ray is black: as many as the renderer of the data sets follows."""
+
 CREASE_RAD = math.radians(35.0)
 """A turn of the profile above this is an edge: normals are not interpolated across it."""
 BOX_AROUND = 64
@@ -281,7 +286,6 @@ def revolution_rays(
     max_bounces: int = 1,
     occlusion_test: bool = True,
     weighted: bool = False,
-    options: MapOptions = DEFAULTS.map,
 ) -> tuple[Rays, Hits]:
     """What pixels (flat indices) of a view observed of the environment (see `trace_reflections`), and where they met
     the surface.
@@ -301,6 +305,6 @@ def revolution_rays(
         places = kept.cpu().numpy()
         image.reshape(-1, 3)[places], mask.ravel()[places] = paths.directions[left], True
         footprint_sr = pixel_footprint_sr(image, mask)[mask]
-        trust = torch.from_numpy(1 / (1 + footprint_sr / options.confidence_texel_rad**2)).to(outgoing)
+        trust = torch.from_numpy(1 / (1 + footprint_sr / CONFIDENCE_TEXEL_RAD**2)).to(outgoing)
     radiance, incoming = view.radiance_at(kept), view.directions_world(kept)
     return Rays(outgoing, radiance, trust, incoming), paths.first.of(left)

@@ -22,10 +22,11 @@ from panoless.capture.views import Views, every_kth_pixel
 from panoless.environment.mirrored import MirroredRays
 from panoless.environment.solve import solve_environment
 from panoless.geometry.revolution.model import Hits, ReflectionPaths, SurfaceOfRevolution, revolution_rays
-from panoless.geometry.revolution.options import DEFAULTS, PhotometricOptions, Round
 from panoless.geometry.revolution.pixels import PixelBundles
 from panoless.geometry.revolution.profile import ProfileSplines, apply_step
 from panoless.geometry.revolution.silhouette import (
+    DAMPING,
+    LARGEST_TURN_RAD,
     ContourRays,
     SilhouetteResiduals,
     adapted_scale,
@@ -37,6 +38,34 @@ from panoless.geometry.revolution.silhouette import (
 )
 from panoless.numeric.gauss_newton import accept_step, damped_step, jacobian_of_rows, normal_equations
 from panoless.numeric.robust import bounded_error, robust_weight
+
+CONTOUR_SCALE_PX = 1.0
+"""Robust scale of the contours (px)."""
+CONTOUR_SIGMA_PX = 0.15
+"""Standard deviation of contours (px), which weighs them against radiance."""
+RADIANCE_SIGMA = 0.05
+"""Standard deviation of radiance under a right map."""
+LEAST_COSINE = 0.05
+"""Rays that graze the surface more than this have no vote: they amplify every error."""
+LEAST_RADIUS_PX = 1.0
+"""Nearer to the axis (px), azimuth is not determined."""
+LEAST_FALL = 1e-3
+"""A round ends with a step that lowers its cost by a smaller share."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """Steps under one map."""
+
+    resolution: int
+    """Texels along a face side of the map."""
+    robust: float
+    """Robust scale of radiance."""
+    knot_px: float
+    """Spacing of the splines (px)."""
+    steps: int
+    bending: float = 1e-4
+    """Penalty on second differences, in mean diagonals of the normal matrix."""
 
 
 def solve_map(
@@ -90,7 +119,6 @@ def photometric_equations(
     environment: Float[Tensor, "6 3 L L"],
     robust: float,
     pixel: float,
-    options: PhotometricOptions = DEFAULTS.photometric,
 ) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
     """Gradient and matrix over the axis' four numbers and the splines, in units of the radiance's deviation.
 
@@ -100,14 +128,14 @@ def photometric_equations(
 
     count, each = len(pixels.radiance), pixels.rays_per_pixel
     once = np.flatnonzero((found.paths.bounces == 1) & np.repeat(found.whole, each))
-    motion = normal_motion(pixels.directions[once], found.paths.first.of(once), surface, splines, pixel, options)
+    motion = normal_motion(pixels.directions[once], found.paths.first.of(once), surface, splines, pixel)
     rows, ray, columns = (
         motion.radiance_by_parameters(environment),
         once[motion.kept],
         parameter_columns(motion.index),
     )
     mean = csr_matrix((np.full(len(ray), 1 / each), (ray // each, np.arange(len(ray)))), (count, len(ray)))
-    weights = robust_weight(found.residual, robust) / options.radiance_sigma**2
+    weights = robust_weight(found.residual, robust) / RADIANCE_SIGMA**2
     gradient, matrix = np.zeros(4 + splines.count), np.zeros((4 + splines.count, 4 + splines.count))
     for channel in range(3):
         jacobian = mean @ jacobian_of_rows(rows[:, channel], columns, 4 + splines.count)
@@ -141,7 +169,6 @@ def normal_motion(
     surface: SurfaceOfRevolution,
     splines: ProfileSplines,
     pixel: float,
-    options: PhotometricOptions,
 ) -> NormalMotion:
     """The turns of the module's equation for rays in the normalized frame and where they meet a surface of
     revolution.
@@ -151,7 +178,7 @@ def normal_motion(
     points, normals = (hits.points - surface.origin) @ surface.frame.T, hits.normals @ surface.frame.T
     rho = np.hypot(points[:, 0], points[:, 1])
     facing = (rays * normals).sum(1)
-    kept = (np.abs(facing) > options.least_cosine) & (rho > options.least_radius_px * pixel)
+    kept = (np.abs(facing) > LEAST_COSINE) & (rho > LEAST_RADIUS_PX * pixel)
     rays, points, normals, rho, facing = (each[kept] for each in (rays, points, normals, rho, facing))
     side, along = hits.side[kept], hits.along[kept]
     azimuth = np.stack([-points[:, 1], points[:, 0], np.zeros_like(rho)], 1) / rho[:, None]
@@ -211,7 +238,6 @@ def refine_round(
     environment: Float[Tensor, "6 3 L L"],
     each: Round,
     settle: Callable[[SurfaceOfRevolution], SurfaceOfRevolution],
-    options: PhotometricOptions,
     max_bounces: int = 1,
 ) -> SurfaceOfRevolution:
     """Gauss–Newton steps on photographs and contours together; each is taken if it lowers the cost of both.
@@ -221,10 +247,10 @@ def refine_round(
     """
     cell = contours.pixel
     touched = silhouette_residuals(contours, surface, cell)
-    scale = adapted_scale(contours, touched.pixels[touched.valid], options.contour_scale_px)
+    scale = adapted_scale(contours, touched.pixels[touched.valid], CONTOUR_SCALE_PX)
     of_contours, of_pixels = (
-        (scale / options.contour_sigma_px) ** 2 / 2,
-        (each.robust / options.radiance_sigma) ** 2 / 2,
+        (scale / CONTOUR_SIGMA_PX) ** 2 / 2,
+        (each.robust / RADIANCE_SIGMA) ** 2 / 2,
     )
 
     def evaluate(tried: SurfaceOfRevolution) -> _Evaluation:
@@ -236,13 +262,13 @@ def refine_round(
         )
 
     def advance(here: _Evaluation) -> _Evaluation:
-        splines, limits, evaluations = ProfileSplines.of(here.surface, each.knot_px * cell), contours.options, [here]
+        splines, evaluations = ProfileSplines.of(here.surface, each.knot_px * cell), [here]
         gradient, matrix = photometric_equations(
-            pixels, here.photometry, here.surface, splines, environment, each.robust, cell, options
+            pixels, here.photometry, here.surface, splines, environment, each.robust, cell
         )
         by_contour, contour_matrix = contour_equations(contours, here.contours, splines, scale)
-        gradient = gradient + by_contour / options.contour_sigma_px**2
-        matrix = matrix + contour_matrix / options.contour_sigma_px**2
+        gradient = gradient + by_contour / CONTOUR_SIGMA_PX**2
+        matrix = matrix + contour_matrix / CONTOUR_SIGMA_PX**2
         matrix[4:, 4:] += splines.bending(each.bending * np.trace(matrix[4:, 4:]) / splines.count)
 
         def cost(tried: SurfaceOfRevolution) -> float:
@@ -252,7 +278,7 @@ def refine_round(
 
         moved = accept_step(
             here.surface,
-            damped_step(gradient, matrix, limits.damping, limits.largest_turn_rad, slice(4)),
+            damped_step(gradient, matrix, DAMPING, LARGEST_TURN_RAD, slice(4)),
             lambda surface, step: settle(apply_step(surface, splines, step)),
             cost,
         )
@@ -264,6 +290,6 @@ def refine_round(
         before = here if here is not None and settled is here.surface else evaluate(settled)
         here = advance(before)
         surface = here.surface
-        if here.cost > (1 - options.least_fall) * before.cost:
+        if here.cost > (1 - LEAST_FALL) * before.cost:
             break
     return surface

@@ -18,6 +18,9 @@ from panoless.geometry.revolution.model import ReflectionPaths, SurfaceOfRevolut
 from panoless.numeric.robust import bounded_error
 from shinypartial.core.conventions import PIXEL_CENTER
 
+JUDGED_SCALE = 0.1
+"""Scale s of the errors ‖e‖²/(‖e‖² + s²) by which held-out views judge."""
+
 CENTER = ((PIXEL_CENTER, PIXEL_CENTER),)
 FOUR = ((0.125, 0.625), (0.375, 0.125), (0.625, 0.875), (0.875, 0.375))
 """Places (column, row) within a pixel: every column and every row of a 4×4 grid once."""

@@ -22,6 +22,11 @@ from panoless.geometry.revolution.options import DEFAULTS, RenderingOptions
 from panoless.kernels.camera import RasterCamera
 from panoless.kernels.cubemap import sample_cubemap
 
+SAMPLES = 4
+"""Rays along either side of a pixel: a box filter, as in the data sets."""
+LARGEST_BEND = 0.05
+"""Second differences of directions (rad per pixel²) up to which they are interpolated between pixels."""
+
 
 @dataclass(frozen=True)
 class RayDifferentials:
@@ -48,17 +53,18 @@ def mean_light(
     environment: Float[Tensor, "6 3 L L"],
     camera: RasterCamera,
     pixels: Int[Tensor, "P"],
-    options: RenderingOptions = DEFAULTS.rendering,
+    *,
+    largest_bend: float = LARGEST_BEND,
 ) -> Float[Tensor, "P 3"]:
     """Radiance of pixels (flat indices): the mean over those of their rays that meet the surface; zero if none does.
 
     A ray that has not left after the last reflection is black.
     """
     places = pixels.cpu().numpy()
-    at, smooth = smooth_pixels(surface, camera, places, options.largest_bend, max_bounces=options.max_bounces)
+    at, smooth = smooth_pixels(surface, camera, places, largest_bend, max_bounces=MAX_BOUNCES)
     light = torch.zeros(len(places), 3, device=environment.device)
-    light[torch.from_numpy(smooth)] = _interpolated(environment, at, options)
-    light[torch.from_numpy(~smooth)] = _traced(surface, environment, camera, places[~smooth], options)
+    light[torch.from_numpy(smooth)] = _interpolated(environment, at)
+    light[torch.from_numpy(~smooth)] = _traced(surface, environment, camera, places[~smooth])
     return light
 
 
@@ -84,12 +90,10 @@ def _offsets(samples: int) -> list[float]:
     return [(i + 0.5) / samples for i in range(samples)]
 
 
-def _interpolated(
-    environment: Float[Tensor, "6 3 L L"], at: RayDifferentials, options: RenderingOptions
-) -> Float[Tensor, "P 3"]:
-    directions = torch.cat(list(at.within([offset - 0.5 for offset in _offsets(options.samples)])))
+def _interpolated(environment: Float[Tensor, "6 3 L L"], at: RayDifferentials) -> Float[Tensor, "P 3"]:
+    directions = torch.cat(list(at.within([offset - 0.5 for offset in _offsets(SAMPLES)])))
     light = sample_cubemap(environment, directions.to(environment.device))
-    return light.view(options.samples**2, -1, 3).mean(0)
+    return light.view(SAMPLES**2, -1, 3).mean(0)
 
 
 def _traced(
@@ -97,14 +101,13 @@ def _traced(
     environment: Float[Tensor, "6 3 L L"],
     camera: RasterCamera,
     pixels: Int[np.ndarray, "P"],
-    options: RenderingOptions,
 ) -> Float[Tensor, "P 3"]:
     total, count = torch.zeros(len(pixels), 3, device=environment.device), np.zeros(len(pixels))
-    offsets = _offsets(options.samples)
+    offsets = _offsets(SAMPLES)
     for row in offsets:
         rays = [pixel_rays(camera, pixels, (column, row)) for column in offsets]
         origins, directions = (np.concatenate([each[part] for each in rays]) for part in (0, 1))
-        paths = trace_reflections(surface, origins, directions, max_bounces=options.max_bounces)
+        paths = trace_reflections(surface, origins, directions, max_bounces=MAX_BOUNCES)
         left = torch.from_numpy(paths.bounces > 0)
         light = torch.zeros(len(left), 3, device=environment.device)
         light[left] = sample_cubemap(environment, torch.from_numpy(paths.directions).to(light)[left])

@@ -4,6 +4,7 @@ In the half-plane of radius ρ and height h the ray of every contour point is a 
 of all views and both sides have one envelope, which is the profile, if the axis is right.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,12 +17,46 @@ from panoless.capture.rays import camera_rays, pose_of
 from panoless.capture.silhouettes import MaskContours, mask_contours
 from panoless.capture.views import Views
 from panoless.geometry.revolution.model import SurfaceOfRevolution, closed_profile
-from panoless.geometry.revolution.options import DEFAULTS, SilhouetteOptions
 from panoless.geometry.revolution.profile import ProfileSplines, apply_step, resample_profile
 from panoless.kernels.revolution import closest_approach, distance_grid, envelope
 from panoless.numeric.gauss_newton import accept_step, damped_step, jacobian_of_rows, normal_equations
 from panoless.numeric.robust import bounded_error, robust_scale, robust_weight
 from shinypartial.core.conventions import PIXEL_CENTER
+
+START_VIEWS = 24
+"""Most views whose principal axes propose an axis."""
+START_POINTS = 1500
+"""Contour points of a coarse fit."""
+START_CELL_PX = 3.0
+"""Spacing of the profile in a coarse fit (px)."""
+START_SCALES_PX = (16.0, 16.0, 16.0, 16.0)
+"""Robust scales of the steps of a coarse fit (px)."""
+POINTS = 30_000
+"""Contour points of the final fit."""
+SCALES_PX = (4.0, 2.0, 1.0, 1.0, 0.5, 0.5)
+"""Robust scales of its steps (px)."""
+NOISE_MULTIPLE = 3.0
+"""Robust scales are at least this many medians of the distances."""
+RANK_SHARE = 0.02
+"""Share of the rays at a height that may cut into the body by noise."""
+TIP_CELLS = 1.5
+"""A profile narrower than this (cells) ends in a tip."""
+BLUNT_CELLS = 4.0
+"""A profile wider than this (cells) may end flat, where silhouettes stop telling its slope."""
+WIDEST_WITHIN = 0.6
+"""The widest place of the body has a height below this (radii of the object frame)."""
+LEAST_CELLS = 5
+"""Fewer cells make no profile."""
+GRAZING_RAD = math.radians(10.0)
+"""Silhouettes don't tell slopes within this angle of the lowest camera's line of sight over an end."""
+BENDING = 1e-3
+"""Penalty on second differences of a step, in mean diagonals of the normal matrix."""
+LARGEST_TURN_RAD = 0.1
+"""Most that a step turns the axis, and shifts it in radii of the object frame."""
+DAMPING = 1e-6
+"""Of every step, in mean diagonals."""
+JUDGED_SCALE_PX = 2.0
+"""Scale s of the errors e²/(e² + s²) by which coarse fits are compared (px)."""
 
 REACH = 1.5
 TALLEST = 1.05
@@ -38,7 +73,6 @@ class ContourRays:
     origins: Float[np.ndarray, "P 3"]
     directions: Float[np.ndarray, "P 3"]
     pixel_lengths: Float[np.ndarray, "P"]
-    options: SilhouetteOptions = DEFAULTS.silhouette
 
     @cached_property
     def pixel(self) -> float:
@@ -49,7 +83,7 @@ class ContourRays:
         """Every k-th, so that about `count` remain."""
         k = max(1, len(self.view) // count)
         rays = (self.view[::k], self.origins[::k], self.directions[::k], self.pixel_lengths[::k])
-        return ContourRays(*rays, self.options)
+        return ContourRays(*rays)
 
 
 @dataclass(frozen=True)
@@ -66,21 +100,21 @@ class SilhouetteResiduals:
     normals: Float[np.ndarray, "P 3"]
 
 
-def contour_rays(views: Views, options: SilhouetteOptions = DEFAULTS.silhouette) -> ContourRays:
+def contour_rays(views: Views) -> ContourRays:
     """The contours of all masks as unit rays."""
     contours: MaskContours = mask_contours(views)
     length = np.linalg.norm(contours.rays, axis=1)
     focal = np.array([view.camera.fx for view in views.train])
     distance = np.linalg.norm(contours.centers, axis=1)
     pixel = distance / (focal[contours.view] * length) if len(length) else length
-    return ContourRays(contours.view, contours.centers, contours.rays / length[:, None], pixel, options)
+    return ContourRays(contours.view, contours.centers, contours.rays / length[:, None], pixel)
 
 
-def axis_starts(views: Views, options: SilhouetteOptions = DEFAULTS.silhouette) -> list[SurfaceOfRevolution]:
+def axis_starts(views: Views) -> list[SurfaceOfRevolution]:
     """Axes worth trying, without profiles: the planes through either principal axis of the masks meet in a line near
     the axis; and the principal axes of the cameras' positions through the middle.
     """
-    chosen = views.train[:: max(1, len(views.train) // options.start_views)]
+    chosen = views.train[:: max(1, len(views.train) // START_VIEWS)]
     normals: list[list[np.ndarray]] = [[], []]
     centers = []
     for view in chosen:
@@ -117,13 +151,13 @@ def outer_surface(
     """
     origins, directions = in_axis_frame(rays, start)
     cells = int(2 * TALLEST / cell)
-    rank = int(rays.options.rank_share * len(rays.view) / (2 * TALLEST / cell)) + 1
+    rank = int(RANK_SHARE * len(rays.view) / (2 * TALLEST / cell)) + 1
     smallest = envelope(origins, directions, -TALLEST, cell, cells, rank + 1, REACH)[:, rank]
     radius = np.where(np.isfinite(smallest), smallest, 0.0)
     heights = -TALLEST + (np.arange(cells) + 0.5) * cell
-    ends = _ends(origins, heights, radius, cell, rays.options)
+    ends = _ends(origins, heights, radius, cell)
     for lowest, highest in [*ends[extent:], *reversed(ends[:extent])]:
-        if highest - lowest >= rays.options.least_cells:
+        if highest - lowest >= LEAST_CELLS:
             outer = np.stack([radius, heights], 1)[lowest : highest + 1]
             profile = closed_profile(outer)
             return resample_profile(replace(start, profile=profile, lip=len(outer)), cell)
@@ -135,7 +169,6 @@ def _ends(
     heights: Float[np.ndarray, "C"],
     radius: Float[np.ndarray, "C"],
     cell: float,
-    options: SilhouetteOptions,
 ) -> list[tuple[int, int]]:
     """Cells between which silhouettes tell the profile: beyond, it closes as fast as the most level view allows. One to
     three pairs, the nearest first.
@@ -145,33 +178,31 @@ def _ends(
     profile does, in a tip or bluntly. The third goes on beyond tips: around an axis that is a little off, the stem
     between a goblet's cup and its foot is one.
     """
-    middle = np.abs(heights) < options.widest_within
+    middle = np.abs(heights) < WIDEST_WITHIN
     widest = int(np.argmax(np.where(middle, radius, 0.0)))
     across = np.hypot(origins[:, 0], origins[:, 1]) + float(radius[widest])
     pairs = []
     for outward in (-1, 1):
         elevation = np.arctan2(outward * (origins[:, 2] - heights[widest]), across).min()
-        steepest = 1 / np.tan(max(elevation, 0.0) + options.grazing_rad)
+        steepest = 1 / np.tan(max(elevation, 0.0) + GRAZING_RAD)
         outer = np.arange(widest, len(radius) if outward > 0 else -1, outward)
         outer = outer[np.abs(heights[outer]) < 1]
-        wide = radius[outer] > options.tip_cells * cell
+        wide = radius[outer] > TIP_CELLS * cell
         tips = [outer[len(wide) - 1 if wide.all() else wide.argmin()], outer[np.flatnonzero(wide).max(initial=0)]]
-        end, beyond = (_blunt_end(radius, widest, int(tip), steepest, cell, options) for tip in tips)
+        end, beyond = (_blunt_end(radius, widest, int(tip), steepest, cell) for tip in tips)
         inward = np.arange(widest, end, outward)
         steep = radius[inward] - radius[end] > steepest * cell * np.abs(inward - end)
         pairs.append((int(inward[np.argmax(steep)]) if steep.any() else end, end, beyond))
     return list(dict.fromkeys(zip(*pairs, strict=True)))
 
 
-def _blunt_end(
-    radius: Float[np.ndarray, "C"], widest: int, tip: int, steepest: float, cell: float, options: SilhouetteOptions
-) -> int:
+def _blunt_end(radius: Float[np.ndarray, "C"], widest: int, tip: int, steepest: float, cell: float) -> int:
     """The last cell on the way from the widest to a tip that is wide, and where the profile is less steep than that."""
     outward = 1 if tip > widest else -1
     index = tip
     while abs(index - widest) > 2:
         rise = (radius[index - 2 * outward] - radius[index]) / (2 * cell)
-        if radius[index] > options.blunt_cells * cell and rise < steepest:
+        if radius[index] > BLUNT_CELLS * cell and rise < steepest:
             break
         index -= outward
     return index
@@ -230,7 +261,7 @@ def contour_equations(
 
 def adapted_scale(rays: ContourRays, pixels: Float[np.ndarray, "P"], scale_px: float) -> float:
     """The scale, or a multiple of the median distance if that is larger, so that all views keep a say."""
-    return robust_scale(pixels, scale_px, rays.options.noise_multiple)
+    return robust_scale(pixels, scale_px, NOISE_MULTIPLE)
 
 
 def parameter_columns(index: Int[np.ndarray, "P 4"]) -> Int[np.ndarray, "P 8"]:
@@ -254,18 +285,18 @@ def contour_step(
     rays: ContourRays, surface: SurfaceOfRevolution, cell: float, scale_px: float, knot: float
 ) -> SurfaceOfRevolution:
     """One robust Gauss–Newton step of axis and profile together; the surface as it is where its cost does not fall."""
-    splines, options = ProfileSplines.of(surface, knot), rays.options
+    splines = ProfileSplines.of(surface, knot)
     found = silhouette_residuals(rays, surface, cell)
     scale = adapted_scale(rays, found.pixels[found.valid], scale_px)
     gradient, matrix = contour_equations(rays, found, splines, scale)
-    matrix[4:, 4:] += splines.bending(options.bending * np.trace(matrix[4:, 4:]) / splines.count)
+    matrix[4:, 4:] += splines.bending(BENDING * np.trace(matrix[4:, 4:]) / splines.count)
 
     def cost(each: SurfaceOfRevolution) -> float:
         return contour_cost(found if each is surface else silhouette_residuals(rays, each, cell), scale)
 
     return accept_step(
         surface,
-        damped_step(gradient, matrix, options.damping, options.largest_turn_rad, slice(4)),
+        damped_step(gradient, matrix, DAMPING, LARGEST_TURN_RAD, slice(4)),
         lambda each, step: resample_profile(apply_step(each, splines, step), cell),
         cost,
     )
@@ -273,14 +304,13 @@ def contour_step(
 
 def fit_outer(rays: ContourRays, starts: Sequence[SurfaceOfRevolution], extent: int = 0) -> SurfaceOfRevolution | None:
     """Axis and outer profile of the best of several starts, coarse to fine; None when no start has an envelope."""
-    options = rays.options
-    sparse = rays.at_most(options.start_points)
-    cell = options.start_cell_px * rays.pixel
+    sparse = rays.at_most(START_POINTS)
+    cell = START_CELL_PX * rays.pixel
     best, least = None, np.inf
     for start in starts:
-        surface = _refine(sparse, start, cell, options.start_scales_px, extent)
+        surface = _refine(sparse, start, cell, START_SCALES_PX, extent)
         if surface is not None:
-            cost = contour_cost(silhouette_residuals(sparse, surface, cell), options.judged_scale_px)
+            cost = contour_cost(silhouette_residuals(sparse, surface, cell), JUDGED_SCALE_PX)
             if cost < least:
                 best, least = surface, cost
     return best
@@ -288,7 +318,7 @@ def fit_outer(rays: ContourRays, starts: Sequence[SurfaceOfRevolution], extent: 
 
 def refine_outer(rays: ContourRays, start: SurfaceOfRevolution, extent: int = 0) -> SurfaceOfRevolution | None:
     """Axis and profile at a pixel's spacing."""
-    return _refine(rays.at_most(rays.options.points), start, rays.pixel, rays.options.scales_px, extent)
+    return _refine(rays.at_most(POINTS), start, rays.pixel, SCALES_PX, extent)
 
 
 def _refine(

@@ -15,11 +15,24 @@ from panoless.capture.silhouettes import mask_contours
 from panoless.capture.views import Views
 from panoless.geometry.base import overlap
 from panoless.geometry.sphere.model import Sphere, sphere_buffers
-from panoless.geometry.sphere.options import SphereOptions
 from panoless.numeric.cones import nearest_cone
 from panoless.numeric.factorize import regularize
 from panoless.numeric.gauss_newton import accept_step, damped_step
 from panoless.numeric.robust import bounded_error, robust_scale, robust_weight
+
+LARGEST_CONE_PX = 0.5
+"""Where the median contour point of the median view is farther from the best cone (px), the object is no sphere."""
+LARGEST_ELLIPTICITY = 0.005
+"""Nor where the contour is an oval about its cone by this share of its radius: an ellipsoid of the axes 1, 1 and 0.98
+is by 0.005."""
+CONE_ROUNDS = 6
+"""Rounds of robust weights that a cone is found in."""
+SCALES_PX = (4.0, 2.0, 1.0, 0.5, 0.5)
+"""Robust scales of the steps by all outlines (px)."""
+NOISE_SCALE = 3.0
+"""A robust scale is no less than so many medians of the distances."""
+SAMPLES = 4
+"""Rays along each side of a pixel at the outline that tell how far it is covered, and of every pixel what it shows."""
 
 ORIGIN_PULL = 1e-6
 """Weight of a center at the origin of the normalized frame, for views that leave its distance open; not tuned."""
@@ -60,7 +73,7 @@ class Cones:
     """
 
     @classmethod
-    def of(cls, rays: OutlineRays, options: SphereOptions) -> "Cones":
+    def of(cls, rays: OutlineRays) -> "Cones":
         """Those nearest to the contour rays of each view."""
         found = []
         for view in np.unique(rays.view):
@@ -69,9 +82,9 @@ class Cones:
             cone = nearest_cone(
                 directions,
                 scale,
-                rounds=options.cone_rounds,
-                scale_px=options.scales_px[-1],
-                medians=options.noise_scale,
+                rounds=CONE_ROUNDS,
+                scale_px=SCALES_PX[-1],
+                medians=NOISE_SCALE,
                 widest_cosine=WIDEST_COSINE,
             )
             median_px = float(np.median(np.abs(cone.off_px)))
@@ -80,12 +93,12 @@ class Cones:
         origins, axes, *figures = zip(*found, strict=True) if found else [()] * 5
         return cls(np.array(origins).reshape(-1, 3), np.array(axes).reshape(-1, 3), *map(np.array, figures))
 
-    def are_of_a_sphere(self, options: SphereOptions) -> bool:
+    def are_of_a_sphere(self) -> bool:
         """Whether the median view has a contour near its cone, and not an oval one."""
         return bool(
             len(self.sines)
-            and np.median(self.median_px) <= options.largest_cone_px
-            and np.median(self.ellipticity) <= options.largest_ellipticity
+            and np.median(self.median_px) <= LARGEST_CONE_PX
+            and np.median(self.ellipticity) <= LARGEST_ELLIPTICITY
         )
 
     def sphere(self, radius: float) -> Sphere:
@@ -174,28 +187,31 @@ class SphereFit:
     """Σ min(alpha, mask) / Σ max(alpha, mask)."""
 
 
-def fit_sphere(views: Views, options: SphereOptions, *, asked: bool) -> SphereFit | None:
-    """The sphere that explains the masks best; None where their outlines are no cones, unless it was `asked` for."""
+def fit_sphere(views: Views, radius: float = 0.0, *, asked: bool) -> SphereFit | None:
+    """The sphere that explains the masks best; None where their outlines are no cones, unless it was `asked` for.
+
+    A `radius` that is known, in units of the world, stays as it is; 0: unknown.
+    """
     rays = OutlineRays.of(views)
-    cones = Cones.of(rays, options)
-    if not len(cones.sines) or not (asked or cones.are_of_a_sphere(options)):
+    cones = Cones.of(rays)
+    if not len(cones.sines) or not (asked or cones.are_of_a_sphere()):
         return None
-    known = options.radius / views.object_frame.radius
-    sphere = _refined(cones.sphere(known), rays, known > 0, options)
+    known = radius / views.object_frame.radius
+    sphere = _refined(cones.sphere(known), rays, known > 0)
     size = np.abs(OutlineResiduals(sphere, rays).pixels)
     medians = [np.median(size[rays.view == view]) for view in np.unique(rays.view)]
     overlaps = []
     for view in views.train:
-        alpha = sphere_buffers(sphere, view.camera, options.samples).alpha.to(view.mask)
+        alpha = sphere_buffers(sphere, view.camera, SAMPLES).alpha.to(view.mask)
         overlaps.append(overlap(alpha, view.mask))
     return SphereFit(sphere, np.array(medians), np.array(overlaps))
 
 
-def _refined(sphere: Sphere, rays: OutlineRays, radius_known: bool, options: SphereOptions) -> Sphere:
+def _refined(sphere: Sphere, rays: OutlineRays, radius_known: bool) -> Sphere:
     """After a robust Gauss–Newton step of all contour points for each scale."""
     state = OutlineResiduals(sphere, rays)
-    for least_px in options.scales_px:
-        scale = robust_scale(state.pixels, least_px, options.noise_scale)
+    for least_px in SCALES_PX:
+        scale = robust_scale(state.pixels, least_px, NOISE_SCALE)
         gradient, matrix = state.equations(scale)
         if radius_known:
             gradient[3], matrix[3], matrix[:, 3] = 0, 0, 0

@@ -1,6 +1,6 @@
 """The sphere as a kind of geometry."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,7 +17,7 @@ from panoless.environment.rays import Rays
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, poses_from_plain, to_plain
 from panoless.geometry.exact import ExactFamily, ExactGeometry
-from panoless.geometry.sphere.fit import fit_sphere
+from panoless.geometry.sphere.fit import SAMPLES, fit_sphere
 from panoless.geometry.sphere.model import CENTER, Sphere, mirrored, parts_of_pixel, sphere_buffers
 from panoless.geometry.sphere.options import SphereOptions
 from panoless.kernels.camera import RasterCamera
@@ -37,7 +37,6 @@ class SphereMirror(ExactGeometry):
     sphere: Sphere
     operator_deg: float = 0.0
     """Rays that return to their camera within this angle are hardly trusted."""
-    options: SphereOptions = field(default_factory=SphereOptions)
 
     @property
     def num_parameters(self) -> int:
@@ -78,7 +77,7 @@ class SphereMirror(ExactGeometry):
         found = []
         for view in views.train:
             corners, met = mirrored(self.sphere, view.camera, view.solid.cpu().numpy(), parts_of_pixel(2))
-            kept = met.all(1) & (_spans(corners) < self.options.widest_footprint_rad**2)
+            kept = met.all(1) & (_spans(corners) < WIDEST_FOOTPRINT_RAD**2)
             pixels = view.solid[torch.from_numpy(kept).to(view.solid.device)]
             trust = self._trust_by_return(view, corners[kept].mean(1))
             directions, trusted = (
@@ -95,14 +94,14 @@ class SphereMirror(ExactGeometry):
         normals_camera: Float[Tensor, "3 P"],
     ) -> Float[Tensor, "P 3"]:
         """Mean over the pixels' areas, as far as the sphere covers them; zero where it covers nothing."""
-        outgoing, met = mirrored(self.sphere, camera, pixels.cpu().numpy(), parts_of_pixel(self.options.samples))
+        outgoing, met = mirrored(self.sphere, camera, pixels.cpu().numpy(), parts_of_pixel(SAMPLES))
         directions, weight = (torch.from_numpy(each).to(environment) for each in (outgoing, met))
         light = sample_cubemap(environment, directions.flatten(0, 1)).unflatten(0, met.shape)
         return (light * weight[..., None]).sum(1) / weight.sum(1).clamp(min=1)[:, None]
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
         """By intersection; alpha by a grid of rays at the outline."""
-        return sphere_buffers(self.sphere, camera, self.options.samples)
+        return sphere_buffers(self.sphere, camera, SAMPLES)
 
     def mesh(self, frame: ObjectFrame) -> Mesh:
         """Quadrilaterals between 128 meridians and 64 rings, with exact normals; triangles' worth at the poles."""
@@ -117,21 +116,20 @@ class SphereMirror(ExactGeometry):
 
     def state_dict(self) -> dict[str, Any]:
         """All numbers as lists and plain values."""
-        known = {"operator_deg": self.operator_deg, "options": write_record(self.options)}
-        return {"sphere": to_plain(self.sphere), "poses": to_plain(self.poses), **known}
+        known = {"operator_deg": self.operator_deg, "poses": to_plain(self.poses)}
+        return {"sphere": to_plain(self.sphere), **known}
 
     @classmethod
     def from_state_dict(cls, content: dict[str, Any]) -> "SphereMirror":
         """The geometry that `state_dict` was taken from."""
-        options = read_record(SphereOptions, content["options"], "the options of a sphere", allow_unknown=True)
         sphere = from_plain(Sphere, content["sphere"])
-        return cls(sphere, content["operator_deg"], options, poses=poses_from_plain(content))
+        return cls(sphere, content["operator_deg"], poses=poses_from_plain(content))
 
     def _trust_by_return(self, view: TrainView, outgoing: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
         """Little where rays come back to their camera, which sees itself and who holds it there."""
         back = view.position - self.sphere.center
         returns = outgoing @ (back / np.linalg.norm(back)) > np.cos(np.radians(self.operator_deg))
-        return np.where(returns & (self.operator_deg > 0), self.options.operator_trust, 1.0)
+        return np.where(returns & (self.operator_deg > 0), OPERATOR_TRUST, 1.0)
 
 
 def _spans(corners: Float[np.ndarray, "P 4 3"]) -> Float[np.ndarray, "P"]:
@@ -157,7 +155,7 @@ class SphereFamily(ExactFamily):
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """Center and radius by outlines."""
-        found = fit_sphere(views, config.sphere, asked=asked)
+        found = fit_sphere(views, config.sphere.radius, asked=asked)
         if found is not None:
             return Proposal(found.sphere, float(np.median(found.median_px)), float(np.median(found.overlap)))
         if asked:
@@ -170,12 +168,12 @@ class SphereFamily(ExactFamily):
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The sphere."""
-        return SphereMirror(proposal.shape, options=config.sphere)
+        return SphereMirror(proposal.shape)
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """The proposal itself: outlines tell a sphere to the end. After an earlier fit, they are asked again."""
-        shape, options = proposal.shape, config.sphere
+        shape = proposal.shape
         again = None if proposal.fitted is None else self.propose(views, config, asked=False)
         if again is not None:
             shape = replace(again.shape, surroundings=proposal.fitted.surroundings)
-        return SphereMirror(shape, options.operator_deg if len(views.train) > 1 else 0.0, options)
+        return SphereMirror(shape, config.sphere.operator_deg if len(views.train) > 1 else 0.0)

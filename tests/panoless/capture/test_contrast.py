@@ -5,12 +5,17 @@ from dataclasses import replace
 import pytest
 import torch
 
-from panoless.capture.contrast import Contrast
+from panoless.capture.contrast import LEAST_KNEE, Contrast
 from panoless.capture.options import ContrastOptions
 from panoless.capture.views import Views
 from tests.support.mirror_body import body_views, sphere
 
-OPTIONS = ContrastOptions(least_knee=1e-9)
+OPTIONS = ContrastOptions()
+
+
+def knee_of(views: Views) -> float | None:
+    """Down to any darkness."""
+    return Contrast.of(views, OPTIONS, least_knee=1e-9).knee
 
 
 @pytest.fixture(scope="module")
@@ -43,15 +48,15 @@ def test_far_above_the_knee_equal_ratios_are_equal_differences() -> None:
 @pytest.mark.parametrize("gain", [0.3, 0.01])
 def test_whether_a_world_is_dark_does_not_depend_on_its_exposure(bright: Views, gain: float) -> None:
     """The knee is exposed as the views are, so that it stays at the same place of the world."""
-    once = Contrast.of(exposed(bright, 16.0), OPTIONS).knee
+    once = knee_of(exposed(bright, 16.0))
     assert once is not None
-    assert Contrast.of(exposed(bright, 16.0, gain), OPTIONS).knee == pytest.approx(gain * once, rel=1e-4)
-    assert Contrast.of(exposed(bright, 1.0, gain), OPTIONS).knee is None
+    assert knee_of(exposed(bright, 16.0, gain)) == pytest.approx(gain * once, rel=1e-4)
+    assert knee_of(exposed(bright, 1.0, gain)) is None
 
 
 def test_no_view_is_dark_where_none_is_to_be(bright: Views) -> None:
-    assert Contrast.of(exposed(bright, 16.0), replace(OPTIONS, dark_share=0.0)).knee is None
+    assert Contrast.of(exposed(bright, 16.0), ContrastOptions(dark_share=0.0)).knee is None
 
 
 def test_the_knee_stays_above_noise(bright: Views) -> None:
-    assert Contrast.of(exposed(bright, 16.0, 1e-3), replace(OPTIONS, least_knee=0.002)).knee == 0.002
+    assert Contrast.of(exposed(bright, 16.0, 1e-3), OPTIONS).knee == LEAST_KNEE

@@ -109,5 +109,5 @@ def test_a_finer_grid_fills_a_dent_up_to_the_outline(ring: Views) -> None:
     def lacking(views: Views) -> int:
         return int((before & (views.train[5].mask < MASK_LEVEL)).sum())
 
-    coarse, fine = (with_repaired_masks(dented, replace(OPTIONS, cells=20, fine_cells=cells)) for cells in (20, 40))
+    coarse, fine = (with_repaired_masks(dented, OPTIONS, grids=(20, cells)) for cells in (20, 40))
     assert lacking(fine) < 0.05 * lacking(dented) < 0.2 * lacking(dented) < lacking(coarse)

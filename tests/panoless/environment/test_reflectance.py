@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from panoless.environment.cubemap import flat_texels
-from panoless.environment.options import MaterialOptions
 from panoless.environment.rays import Rays
 from panoless.environment.reflectance import (
     Reflectance,
@@ -22,7 +21,7 @@ from shinypartial.core.sphere import cube_solid_angles
 
 GOLD = np.array([1.0, 0.77, 0.34])
 PALE = 0.75 * GOLD
-OPTIONS = MaterialOptions(resolution=8)
+RESOLUTION = 8
 OUTGOING = cubemap_directions(8).reshape(-1, 3).double()
 LIGHT = torch.rand(len(OUTGOING), 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64) / 2 + 0.1
 
@@ -54,24 +53,24 @@ def test_two_rays_tell_the_angle_at_which_they_were_mirrored() -> None:
 def test_two_angles_tell_all_of_a_metal() -> None:
     """Without noise exactly, brightness included: light that grazes is mirrored whole."""
     rays = joined(rays_at(20), rays_at(75))
-    found = find_reflectance(rays, OPTIONS)
+    found = find_reflectance(rays, RESOLUTION)
     assert found.at_normal == pytest.approx(GOLD, abs=2e-3)
-    assert np.abs(left_unexplained(rays, Reflectance(GOLD), OPTIONS)).max() < 1e-6
+    assert np.abs(left_unexplained(rays, Reflectance(GOLD), RESOLUTION)).max() < 1e-6
 
 
 def test_one_angle_tells_nothing() -> None:
     """Color of the light and of the mirror are one product."""
     rays = rays_at(50)
-    assert find_reflectance(rays, OPTIONS).tint == (1, 1, 1)
+    assert find_reflectance(rays, RESOLUTION).tint == (1, 1, 1)
     for each in (Reflectance(np.ones(3)), Reflectance(GOLD)):
-        assert np.abs(left_unexplained(rays, each, OPTIONS)).max() < 1e-6
+        assert np.abs(left_unexplained(rays, each, RESOLUTION)).max() < 1e-6
 
 
 def test_some_wrong_rays_change_little() -> None:
     """Every tenth is of another color."""
     rays = joined(rays_at(20), rays_at(50), rays_at(75), rays_at(80))
     rays.radiance[::10] = 0.9
-    assert find_reflectance(rays, OPTIONS).at_normal == pytest.approx(GOLD, abs=0.03)
+    assert find_reflectance(rays, RESOLUTION).at_normal == pytest.approx(GOLD, abs=0.03)
 
 
 def test_rays_without_trust_are_predicted_only() -> None:
@@ -80,7 +79,7 @@ def test_rays_without_trust_are_predicted_only() -> None:
     wrong = replace(unknown, radiance=unknown.radiance + 0.2)
     rays = joined(known, wrong)
     rays = replace(rays, trust=torch.cat([torch.ones(len(known.radiance)), torch.zeros(len(wrong.radiance))]))
-    residual = left_unexplained(rays, Reflectance(GOLD), OPTIONS)
+    residual = left_unexplained(rays, Reflectance(GOLD), RESOLUTION)
     assert residual[: len(known.radiance)] == pytest.approx(0, abs=1e-6)
     assert residual[len(known.radiance) :] == pytest.approx(0.2, abs=1e-6)
 
@@ -113,17 +112,17 @@ def test_what_is_scattered_is_told_beside_what_is_mirrored(lamp: float) -> None:
     albedo, saturation = np.array([0.2, 0.1, 0.05]), torch.ones(3)
     rays = scattering_rays(albedo, lamp)
     lamps, known = lamp_light(rays, saturation, 8), unsaturated(rays, saturation)
-    found = find_reflectance(known, OPTIONS, lamps)
+    found = find_reflectance(known, RESOLUTION, lamps)
     assert found.at_normal == pytest.approx(PALE, abs=0.03)
     assert found.albedo == pytest.approx(albedo, abs=0.03)
-    mirror = find_reflectance(known, OPTIONS)
-    errors = (np.abs(left_unexplained(known, each, OPTIONS)).mean() for each in (found, mirror))
+    mirror = find_reflectance(known, RESOLUTION)
+    errors = (np.abs(left_unexplained(known, each, RESOLUTION)).mean() for each in (found, mirror))
     assert next(errors) < 0.5 * next(errors)
 
 
 def test_a_perfect_metal_scatters_nothing() -> None:
     """Where light may be scattered, too, the metal comes out as without."""
     rays = joined(rays_at(20), rays_at(50), rays_at(75))
-    found = find_reflectance(rays, OPTIONS, np.zeros(9))
+    found = find_reflectance(rays, RESOLUTION, np.zeros(9))
     assert found.at_normal == pytest.approx(GOLD, abs=0.01)
     assert found.scattered_share is None or max(found.scattered_share) < 0.01

@@ -8,14 +8,12 @@ from torch import Tensor
 
 from panoless.environment.footprints import PixelFootprints
 from panoless.environment.lobe import Lobe
-from panoless.environment.options import MaterialOptions
 from panoless.environment.rays import Rays
-from panoless.environment.roughness import sharpened_map, with_smaller_lamps
+from panoless.environment.roughness import LAMP_LIGHT, sharpened_map, with_smaller_lamps
 from panoless.kernels.cubemap import cubemap_directions, cubemap_solid_angles
 
 SIDE, ROUGHNESS, SATURATION = 16, 0.35, torch.ones(3)
 DIRECTIONS = cubemap_directions(SIDE, dtype=torch.float64).reshape(-1, 3)
-OPTIONS = MaterialOptions()
 
 
 def world() -> Float[Tensor, "6 3 L L"]:
@@ -40,7 +38,7 @@ def shown(environment: Tensor) -> Float[Tensor, "P 3"]:
 def sharpened(seen: Float[Tensor, "P 3"], roughness: float | None = ROUGHNESS) -> Tensor:
     areas = [PixelFootprints.centers(Rays(DIRECTIONS.float(), seen))]
     start = as_map(seen)
-    return sharpened_map(start, areas, Lobe.of(roughness, SIDE), SATURATION, OPTIONS, OPTIONS.sharpening_rounds)
+    return sharpened_map(start, areas, Lobe.of(roughness, SIDE), SATURATION)
 
 
 def test_what_is_blurred_comes_back() -> None:
@@ -67,8 +65,8 @@ def test_lamps_start_smaller_and_brighter_than_what_they_saturate() -> None:
     image = torch.full((6, 3, SIDE, SIDE), 0.3)
     image[0, :, 4:9, 4:9] = 1.0
     image[2, 1, 7, 7] = 1.0
-    start = with_smaller_lamps(image, SATURATION, OPTIONS)
+    start = with_smaller_lamps(image, SATURATION)
     expected = torch.full_like(image, 0.3)
-    expected[0, :, 5:8, 5:8] = OPTIONS.lamp_light
-    expected[2, 1, 7, 7] = OPTIONS.lamp_light
+    expected[0, :, 5:8, 5:8] = LAMP_LIGHT
+    expected[2, 1, 7, 7] = LAMP_LIGHT
     assert start.numpy() == pytest.approx(expected.numpy(), abs=1e-3)

@@ -7,9 +7,14 @@ import torch
 from torch.nn.functional import normalize
 
 from panoless.environment.footprints import Footprints, PixelFootprints, in_patches, splat
-from panoless.environment.options import FootprintMapOptions, LampOptions
 from panoless.environment.rays import Rays
 from panoless.environment.sharpening import (
+    HARD,
+    HELD_OUT,
+    ROBUST_SCALE,
+    SMOOTHNESS,
+    SOFT,
+    Lamps,
     Sharpness,
     _Smoothness,
     _Trial,
@@ -23,7 +28,6 @@ from panoless.kernels.cubemap import cubemap_directions
 from panoless.numeric.robust import bounded_error
 
 ONE = torch.ones(3)
-OPTIONS = FootprintMapOptions()
 WIDTH = 0.06
 """Of a pixel, in radians."""
 SIZES = (16, 32)
@@ -61,12 +65,12 @@ def error(environment: torch.Tensor, waves: float = 6.0) -> float:
 
 def test_noise_makes_held_out_pixels_ask_for_smoothness() -> None:
     """They take the most that is offered, and not without noise. That map is the nearest to the truth by far."""
-    least, most = OPTIONS.smoothness[0], OPTIONS.smoothness[-1]
+    least, most = SMOOTHNESS[0], SMOOTHNESS[-1]
     assert chosen_sharpness([photographed(10_000, 0.0)], SIZES[-1:], ONE).smoothness < most
     noisy = photographed(10_000, 0.05)
     assert chosen_sharpness([noisy], SIZES[-1:], ONE).smoothness == most
     start = solve_environment([noisy.rays()], SIZES[-1])
-    errors = [error(deblur_map(Footprints.of([noisy]), start, ONE, each, OPTIONS)) for each in (least, most)]
+    errors = [error(deblur_map(Footprints.of([noisy]), start, ONE, each)) for each in (least, most)]
     assert errors[1] < errors[0] / 2
 
 
@@ -91,7 +95,7 @@ def test_rays_tell_the_map_where_no_footprint_falls() -> None:
 
 def test_a_refused_resolution_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Not even where a sharper map of the coarser one was better."""
-    tried, (_, usual, _) = [], OPTIONS.smoothness
+    tried, (_, usual, _) = [], SMOOTHNESS
 
     def made(trial: _Trial, sharpness: Sharpness) -> _Tried:
         resolution, smoothness = sharpness.resolution, sharpness.smoothness
@@ -100,17 +104,17 @@ def test_a_refused_resolution_is_not_tried_again(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(_Trial, "made", made)
     chosen = chosen_sharpness([photographed(10, 0.0)], SIZES, ONE)
-    assert (chosen.resolution, chosen.smoothness) == (SIZES[0], OPTIONS.smoothness[0])
+    assert (chosen.resolution, chosen.smoothness) == (SIZES[0], SMOOTHNESS[0])
     assert [each for each in tried if each[0] == SIZES[1]] == [(SIZES[1], usual)]
 
 
 def test_a_finer_map_explains_more_of_all_pixels_or_of_unsaturated_ones() -> None:
     """By a share of 0.002 of all, or of 0.005 of the unsaturated ones where all are explained no worse."""
     coarse = _Tried(1.0, 0.8)
-    assert _Tried(0.997, 0.9).is_better(coarse, OPTIONS)
-    assert _Tried(1.0, 0.79).is_better(coarse, OPTIONS)
-    assert not _Tried(0.999, 0.799).is_better(coarse, OPTIONS)
-    assert not _Tried(1.001, 0.5).is_better(coarse, OPTIONS)
+    assert _Tried(0.997, 0.9).is_better(coarse)
+    assert _Tried(1.0, 0.79).is_better(coarse)
+    assert not _Tried(0.999, 0.799).is_better(coarse)
+    assert not _Tried(1.001, 0.5).is_better(coarse)
 
 
 def test_bright_lamps_are_not_shown_too_large() -> None:
@@ -121,15 +125,15 @@ def test_bright_lamps_are_not_shown_too_large() -> None:
     areas = photographed(20_000, 0.0, window=30.0)
     start = solve_environment([areas.rays()], SIZES[-1])
     truth = light(cubemap_directions(SIZES[-1]), 6.0, 30.0).permute(0, 3, 1, 2).clamp(0, 1)
-    alike = LampOptions(1.0, OPTIONS.hard.robust_scales)
-    others = deblur_map(Footprints.of([areas]), start, ONE, OPTIONS.smoothness[0], OPTIONS, alike)
+    alike = Lamps(1.0, HARD.robust_scales)
+    others = deblur_map(Footprints.of([areas]), start, ONE, SMOOTHNESS[0], alike)
     found = sharpest_map(Footprints.of([areas]), [areas.rays()], SIZES[-1:], ONE)
     wrong, right = (each.clamp(0, 1) - truth for each in (others, found))
     assert right.square().mean() < wrong.square().mean() / 2
     assert wrong.clamp(min=0).square().sum() > 2 * wrong.clamp(max=0).square().sum()
     dimmer = photographed(20_000, 0.0, window=1.0)
     lamps = [chosen_sharpness([each], SIZES[-1:], ONE).lamps for each in (areas, dimmer)]
-    assert lamps == [OPTIONS.hard, OPTIONS.soft]
+    assert lamps == [HARD, SOFT]
 
 
 def test_saturated_pixels_without_footprints_keep_their_say() -> None:
@@ -165,13 +169,13 @@ def test_footprints_tell_a_fine_map_although_few_fall_on_a_texel() -> None:
 def test_held_out_saturated_pixels_count_as_they_do_in_the_map() -> None:
     """Of a map that is right but for a dark window, they are all of the error."""
     areas = photographed(10_000, 0.0, window=30.0)
-    trial = _Trial([areas], ONE, OPTIONS)
-    asked = areas.every(OPTIONS.held_out, 0)
+    trial = _Trial([areas], ONE)
+    asked = areas.every(HELD_OUT, 0)
     saturated = asked.reaches(trial.level)
     dark = light(cubemap_directions(128), 6.0, 0.0).permute(0, 3, 1, 2).contiguous()
-    for lamps in (OPTIONS.soft, OPTIONS.hard):
+    for lamps in (SOFT, HARD):
         weight = torch.where(saturated, lamps.saturated_weight, 1.0)
-        badly = bounded_error(asked.seen(dark) - asked.radiance, OPTIONS.robust_scale)
+        badly = bounded_error(asked.seen(dark) - asked.radiance, ROBUST_SCALE)
         every, _ = trial._errors(dark, lamps)
         assert every == pytest.approx(float((weight * badly).sum() / weight.sum()), rel=1e-5)
 
@@ -209,7 +213,7 @@ def test_texels_that_no_pixel_touches_stay() -> None:
     upper = areas.directions[..., 2].amin(1) > 0.1
     areas = PixelFootprints(areas.directions[upper].contiguous(), areas.radiance[upper])
     start = torch.rand(6, 3, 32, 32, generator=torch.Generator().manual_seed(0))
-    found = deblur_map(Footprints.of([areas]), start, ONE, 0.25, OPTIONS)
+    found = deblur_map(Footprints.of([areas]), start, ONE, 0.25)
     below = (cubemap_directions(32)[..., 2] < 0)[:, None].expand_as(start)
     assert torch.equal(found[below], start[below])
 
@@ -221,7 +225,7 @@ def test_a_held_out_pixel_has_no_say() -> None:
     other[2::5] = 0.9
     start = solve_environment([areas.rays()], 32)
     maps = [
-        deblur_map(Footprints.of([replace(areas, radiance=each).without(5, 2)]), start, ONE, 0.05, OPTIONS)
+        deblur_map(Footprints.of([replace(areas, radiance=each).without(5, 2)]), start, ONE, 0.05)
         for each in (areas.radiance, other)
     ]
     assert torch.equal(*maps)
@@ -242,8 +246,7 @@ def test_patches_of_the_sky_are_as_dense_as_the_whole() -> None:
 
 def test_patches_choose_the_sharpness_of_the_whole() -> None:
     """Noise asks for smoothness, slow waves for few texels and fast ones for many, by a quarter of the pixels, too."""
-    options = replace(OPTIONS, trial_pixels=10_000)
     cases = [(0.05, 2.0, 0.0), (0.0, 20.0, 0.3), (0.05, 6.0, 0.3), (0.0, 6.0, 30.0)]
     for noise, waves, window in cases:
         areas = photographed(40_000, noise, waves, window)
-        assert chosen_sharpness([areas], SIZES, ONE, options) == chosen_sharpness([areas], SIZES, ONE)
+        assert chosen_sharpness([areas], SIZES, ONE, trial_pixels=10_000) == chosen_sharpness([areas], SIZES, ONE)

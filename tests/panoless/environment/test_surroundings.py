@@ -7,10 +7,10 @@ import pytest
 from jaxtyping import Float
 
 from panoless.environment.nearness import LeavingRays, Linearized, found_surroundings, upward, with_floor
-from panoless.environment.options import SurroundingsOptions
 from panoless.environment.surroundings import FAR, Floor, Surroundings, harmonics
 from panoless.geometry.base import from_plain, to_plain
 from panoless.geometry.revolution.model import SurfaceOfRevolution
+from panoless.selection.surroundings import LARGEST_FLOOR_COST, LEAST_PULL
 from tests.support.mirror_revolution import goblet
 from tests.support.synthetic_dataset import environment_radiance
 
@@ -19,7 +19,6 @@ WALLS = Surroundings(np.array([0.2, 0.01, -0.02, 0.015, 0.01, -0.005, 0.01, 0.00
 LEANING = np.array([0.1, -0.05, 1.0]) / np.linalg.norm([0.1, -0.05, 1.0])
 FLOOR = Floor(LEANING, 0.8, 2.5)
 BELOW = Surroundings(np.array([0.2]), FLOOR)
-OPTIONS = SurroundingsOptions()
 
 
 def unit(count: int, seed: int = 0) -> Float[np.ndarray, "P 3"]:
@@ -117,16 +116,13 @@ def seen_in(radius: float | None, count: int = 10_000) -> LeavingRays:
 @pytest.mark.parametrize("radius", [4.0, 12.0])
 def test_the_distance_of_a_sphere_is_found(radius: float) -> None:
     """Within 5 %: maps of 32 texels a side are still sharpened by further steps."""
-    options = replace(OPTIONS, resolutions=(8, 8, 16, 16, 16, 32, 32, 32))
-    found = found_surroundings(seen_in(radius), FAR.with_degree(0), options)
+    found = found_surroundings(seen_in(radius), FAR.with_degree(0), (8, 8, 16, 16, 16, 32, 32, 32))
     assert found.coefficients[0] == pytest.approx(1 / radius, rel=0.05)
 
 
 def test_only_a_near_world_pulls() -> None:
-    near, far = (
-        Linearized.at(seen_in(radius, 40_000), FAR.with_degree(0), 8, OPTIONS).pull(1e-3) for radius in (8.0, None)
-    )
-    assert far < OPTIONS.least_pull < near
+    near, far = (Linearized.at(seen_in(radius, 40_000), FAR.with_degree(0), 8).pull() for radius in (8.0, None))
+    assert far < LEAST_PULL < near
 
 
 def test_a_surface_keeps_its_surroundings_on_disk_and_older_ones_are_far() -> None:
@@ -207,13 +203,13 @@ def test_a_floor_is_found_by_what_is_mirrored() -> None:
     """Depth within 1 %, the tilt that cameras did not tell within 0.3°, and the walls behind within 5 %."""
     points, directions = above_floor(20_000), unit(20_000)
     light = environment_radiance(BELOW.looked_up(points, directions)).clip(0, 1)
-    seen, options = LeavingRays(points, directions, light), replace(OPTIONS, resolutions=(16, 16, 16, 32, 32, 32, 32))
-    level, left = with_floor(seen, np.array([0.0, 0.0, 1.0]), options)
-    assert left < options.largest_floor_cost
-    flat = found_surroundings(seen, level, options)
+    seen, resolutions = LeavingRays(points, directions, light), (16, 16, 16, 32, 32, 32, 32)
+    level, left = with_floor(seen, np.array([0.0, 0.0, 1.0]))
+    assert left < LARGEST_FLOOR_COST
+    flat = found_surroundings(seen, level, resolutions)
     assert flat.floor is not None
     np.testing.assert_allclose(flat.floor.up, [0, 0, 1], atol=1e-12)
-    found = found_surroundings(seen, flat, options, tilts=True)
+    found = found_surroundings(seen, flat, resolutions, tilts=True)
     assert found.floor is not None
     assert found.floor.depth == pytest.approx(FLOOR.depth, rel=0.01)
     assert np.degrees(np.arccos(found.floor.up @ LEANING)) < 0.3
@@ -222,8 +218,8 @@ def test_a_floor_is_found_by_what_is_mirrored() -> None:
 
 @pytest.mark.parametrize("radius", [None, 5.0])
 def test_a_world_without_a_floor_asks_for_none(radius: float | None) -> None:
-    _, left = with_floor(seen_in(radius), np.array([0.0, 0.0, 1.0]), OPTIONS)
-    assert left > OPTIONS.largest_floor_cost
+    _, left = with_floor(seen_in(radius), np.array([0.0, 0.0, 1.0]))
+    assert left > LARGEST_FLOOR_COST
 
 
 def test_up_is_across_the_right_axes_of_level_cameras() -> None:

@@ -111,7 +111,7 @@ def photographed(tmp_path_factory: pytest.TempPathFactory):
 def test_a_board_is_known_by_its_markers(paper: str, found: str, tmp_path: Path) -> None:
     """Letter is A4 without its last row, so both define one world. Where most frames show none, there is none."""
     frames, _ = photographs_of(BOARDS[paper], tmp_path, 0.9)
-    options = CaptureOptions(board_frames=3)
+    options = CaptureOptions()
     assert recognized_board(frames, tmp_path, options) == BOARDS[found]
     gray = np.full((*SIZE[::-1], 3), 90, np.uint8)
     for one in frames.photographs[:6]:
@@ -156,8 +156,8 @@ def test_corners_are_found_by_all_print_around_them_and_not_where_something_hide
 
 def test_the_measured_square_scales_the_world(photographed) -> None:
     folder, frames, cameras = photographed
-    once = CaptureOptions(corner_blurs_px=())
-    found = poses_from_board(replace(BOARD, square_mm=2 * BOARD.square_mm), frames, folder, once)
+    board = replace(BOARD, square_mm=2 * BOARD.square_mm)
+    found = poses_from_board(board, frames, folder, CaptureOptions(), corner_blurs_px=())
     position = np.array(found.views[0].camera_to_world)[:3, 3]
     np.testing.assert_allclose(position, 2 * cameras[0].position_world, atol=0.004 * DISTANCE_M)
 
@@ -165,7 +165,7 @@ def test_the_measured_square_scales_the_world(photographed) -> None:
 def test_corners_that_no_print_explains_stay_as_they_were_detected(photographed) -> None:
     """No window has all of its variance explained: a refinement that keeps too few frames changes nothing."""
     folder, frames, _ = photographed
-    detected = poses_from_board(BOARD, frames, folder, CaptureOptions(corner_blurs_px=()))
+    detected = poses_from_board(BOARD, frames, folder, CaptureOptions(), corner_blurs_px=())
     assert poses_from_board(BOARD, frames, folder, CaptureOptions(least_match=1.0)) == detected
 
 

@@ -74,7 +74,7 @@ def test_the_sheet_is_known_below_the_ball_from_views_that_look_past_it() -> Non
     sheet = sheet_about(CAMERAS, GROUND, OPTIONS)
     foot = np.linalg.norm([camera.position_world for camera in CAMERAS], axis=1)
     assert sheet.half_side == pytest.approx(0.5 * np.median(foot), rel=0.01)
-    pattern, known = pattern_of(*laid_out(pictures, CAMERAS, sheet), OPTIONS)
+    pattern, known = pattern_of(*laid_out(pictures, CAMERAS, sheet))
     rows, columns = np.indices(known.shape)
     places = sheet.first + rows[..., None] * sheet.down + columns[..., None] * sheet.right
     inner = np.abs((places[..., :2] / TILE) % 1 - 0.5).max(-1) < 0.2
@@ -95,7 +95,7 @@ def test_gains_even_out_exposure_and_white_balance() -> None:
     factors = np.random.default_rng(2).uniform(0.85, 1.1, (len(CAMERAS), 3))
     pictures = [(seen_by(c)[0] * f).clip(0, 255).astype(np.uint8) for c, f in zip(CAMERAS, factors, strict=True)]
     sheet = sheet_about(CAMERAS, GROUND, OPTIONS)
-    even = factors * gains_of(*laid_out(pictures, CAMERAS, sheet), OPTIONS)
+    even = factors * gains_of(*laid_out(pictures, CAMERAS, sheet))
     assert (even.std(0) / even.mean(0)).max() < 0.03
     assert (factors.std(0) / factors.mean(0)).min() > 0.05
 
@@ -103,12 +103,12 @@ def test_gains_even_out_exposure_and_white_balance() -> None:
 def test_a_view_tells_ground_from_mirror() -> None:
     pictures = [seen_by(camera)[0] for camera in CAMERAS]
     sheet = sheet_about(CAMERAS, GROUND, OPTIONS)
-    pattern, known = pattern_of(*laid_out(pictures, CAMERAS, sheet), OPTIONS)
+    pattern, known = pattern_of(*laid_out(pictures, CAMERAS, sheet))
     mask = seen_by(CAMERAS[4])[1]
-    view = evidence_of(pictures[4], CAMERAS[4], np.ones(3, np.float32), sheet, pattern, known, OPTIONS)
+    view = evidence_of(pictures[4], CAMERAS[4], np.ones(3, np.float32), sheet, pattern, known)
     assert view.shown[mask].mean() < 0.1
     bare = seen_by(CAMERAS[4], ball=False)[0]
-    empty = evidence_of(bare, CAMERAS[4], np.ones(3, np.float32), sheet, pattern, known, OPTIONS)
+    empty = evidence_of(bare, CAMERAS[4], np.ones(3, np.float32), sheet, pattern, known)
     assert empty.shown[empty.told].mean() > 0.9
     outlines = [seen_by(CAMERAS[4])[1]] * 3
     odds = odds_of([view], [outlines])
@@ -137,15 +137,15 @@ def test_the_ground_is_the_plane_of_most_points_below_all_cameras() -> None:
     tilt = np.array([0.2, -0.3, 1.0])
     tilt /= np.linalg.norm(tilt)
     poses = np.stack([camera.camera_to_world for camera in CAMERAS])
-    found = find_ground(scattered(0.5, tilt), poses, OPTIONS)
+    found = find_ground(scattered(0.5, tilt), poses)
     assert found is not None
     np.testing.assert_allclose(found.normal, tilt, atol=1e-3)
     assert found.offset == pytest.approx(0.2 * tilt[2], abs=1e-3)
-    assert find_ground(scattered(0.1, tilt), poses, OPTIONS) is None
-    assert find_ground(np.zeros((0, 3)), poses, OPTIONS) is None
+    assert find_ground(scattered(0.1, tilt), poses) is None
+    assert find_ground(np.zeros((0, 3)), poses) is None
     # A wall between the cameras has some on either side, and they do not look down on one before them.
-    assert find_ground(scattered(0.5, np.array([1.0, 0.0, 0.0])), poses, OPTIONS) is None
-    assert find_ground(scattered(0.5, np.array([0.0, 1.0, 0.0])), poses, OPTIONS) is None
+    assert find_ground(scattered(0.5, np.array([1.0, 0.0, 0.0])), poses) is None
+    assert find_ground(scattered(0.5, np.array([0.0, 1.0, 0.0])), poses) is None
 
 
 def test_the_world_of_structure_from_motion_stands_on_its_ground() -> None:

@@ -165,7 +165,7 @@ def write_frames(folder: Path, images: list[np.ndarray]) -> Frames:
 def test_surroundings_without_any_feature_are_refused(tmp_path: Path) -> None:
     frames = write_frames(tmp_path / "frames", [np.full((60, 80), 128, np.uint8)] * 8)
     with pytest.raises(InputError, match="surroundings match"):
-        poses_from_structure(frames, tmp_path / "frames", {}, tmp_path / "work", CaptureOptions())
+        poses_from_structure(frames, tmp_path / "frames", {}, tmp_path / "work")
 
 
 @pytest.mark.slow
@@ -184,7 +184,7 @@ def test_cameras_are_found_in_a_corner_of_a_room(tmp_path: Path) -> None:
     planes = [(paper(seed), corners) for seed, corners in enumerate((floor, back, left))]
     cameras = arc(12, 2.2, (400, 300), 380.0)
     frames = write_frames(tmp_path / "frames", [photograph(camera, planes) for camera in cameras])
-    found = poses_from_structure(frames, tmp_path / "frames", {}, tmp_path / "work", CaptureOptions())
+    found = poses_from_structure(frames, tmp_path / "frames", {}, tmp_path / "work")
     assert len(found.views) == len(cameras)
     assert found.views[0].lens.fx == pytest.approx(380, rel=0.01)
     # Angles between cameras do not depend on the world.

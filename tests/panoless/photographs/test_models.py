@@ -58,7 +58,7 @@ def write_model(folder: Path, binary: bool) -> Path:
 
 @pytest.mark.parametrize("binary", [False, True], ids=["text", "binary"])
 def test_cameras_of_a_colmap_model_are_read(tmp_path: Path, binary: bool) -> None:
-    found = read_colmap(write_model(tmp_path, binary), frames_of_size(), CaptureOptions())
+    found = read_colmap(write_model(tmp_path, binary), frames_of_size())
     assert [view.name for view in found.views] == NAMES
     for view, pose in zip(found.views, POSES, strict=True):
         np.testing.assert_allclose(view.camera_to_world, pose, atol=1e-12)
@@ -77,7 +77,7 @@ def test_rotations_of_a_colmap_model_are_read(tmp_path: Path) -> None:
 
 
 def test_cameras_hold_for_averaged_pictures(tmp_path: Path) -> None:
-    lens = read_colmap(write_model(tmp_path, False), frames_of_size(side=2), CaptureOptions()).views[1].lens
+    lens = read_colmap(write_model(tmp_path, False), frames_of_size(side=2)).views[1].lens
     assert (lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height) == (40, 40.5, 15.5, 12.5, 32, 24)
 
 
@@ -93,22 +93,22 @@ def test_a_model_beside_the_pictures_is_found(tmp_path: Path) -> None:
 def test_pictures_that_were_turned_are_told_from_others(tmp_path: Path) -> None:
     model = write_model(tmp_path, False)
     with pytest.raises(InputError, match="--no-upright"):
-        read_colmap(model, frames_of_size(*SIZE[::-1]), CaptureOptions())
+        read_colmap(model, frames_of_size(*SIZE[::-1]))
     with pytest.raises(InputError, match="64×48"):
-        read_colmap(model, frames_of_size(100, 90), CaptureOptions())
+        read_colmap(model, frames_of_size(100, 90))
 
 
 def test_a_damaged_or_missing_model_is_refused(tmp_path: Path) -> None:
     model = write_model(tmp_path, False)
     with pytest.raises(InputError, match="sparse/0"):
-        read_colmap(tmp_path / "none", frames_of_size(), CaptureOptions())
+        read_colmap(tmp_path / "none", frames_of_size())
     (model / "cameras.txt").write_text("1 PINHOLE 64\n")
     with pytest.raises(InputError, match="complete COLMAP model"):
-        read_colmap(model, frames_of_size(), CaptureOptions())
+        read_colmap(model, frames_of_size())
 
 
 def test_too_few_poses_are_refused_and_frames_without_one_named(tmp_path: Path) -> None:
-    poses = read_colmap(write_model(tmp_path, False), frames_of_size(), CaptureOptions())
+    poses = read_colmap(write_model(tmp_path, False), frames_of_size())
     with pytest.raises(InputError, match="3 of 3"):
         without_the_rest(poses, frames_of_size(), CaptureOptions(), "Add more.")
     more = frames_of_size().photographs

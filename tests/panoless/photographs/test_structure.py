@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from panoless.photographs.frames import Frames, Photograph
-from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import Poses
 from panoless.photographs.structure import poses_from_structure
 from shinypartial.core.errors import InputError
@@ -23,7 +22,7 @@ FRAMES = Frames(
 
 def run(tmp_path: Path, program: str) -> Poses:
     command = (sys.executable, "-c", program)
-    return poses_from_structure(FRAMES, tmp_path, {}, tmp_path / "work", CaptureOptions(), command)
+    return poses_from_structure(FRAMES, tmp_path, {}, tmp_path / "work", command)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,6 @@ from panoless.capture.poses import Poses
 from panoless.environment.reflectance import Reflectance
 from panoless.geometry.base import Geometry, from_plain
 from panoless.geometry.height_field.kind import HeightFieldMirror
-from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.revolution.kind import RevolutionMirror
 from panoless.presets import PRESETS
@@ -111,7 +110,7 @@ def exact_kinds() -> list[Geometry]:
     plane = plane_of(L_SHAPE, frame_height=0.1 / 3, offset=1 / 7)
     return [
         PlaneMirror(plane, occlusion_test=False),
-        HeightFieldMirror(bumpy(plane, 0.02), HeightFieldOptions(clear_px=2.0)),
+        HeightFieldMirror(bumpy(plane, 0.02)),
         RevolutionMirror(funnel(1 / 3)),
     ]
 
@@ -139,9 +138,6 @@ def test_what_an_earlier_version_did_not_know_has_its_default() -> None:
         content = kind.state_dict()
         assert content.pop("poses") is None
         assert type(kind).from_state_dict(content).poses is None
-    before = HeightFieldMirror(bumpy(plane_of(L_SHAPE), 0.02)).state_dict()
-    del before["options"]
-    assert HeightFieldMirror.from_state_dict(before).options == HeightFieldOptions()
 
 
 def test_what_is_missing_has_its_default_also_where_each_has_its_own() -> None:

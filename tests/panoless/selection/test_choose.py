@@ -38,7 +38,6 @@ SIZE_PX = 56
 def coarse_config() -> FitConfig:
     """As few surfels and steps as tell kinds apart, and maps as coarse as views of these few pixels resolve."""
     config = tiny_config(iterations=200, count=200)
-    photometric, footprints = config.revolution.photometric, config.revolution.footprints
     coarsest = replace(config.free_form.rounds[0], rays=5000)
     return replace(
         config,
@@ -47,12 +46,8 @@ def coarse_config() -> FitConfig:
         # The traced dome has flat edges, so it looks like a flat mirror in a near room.
         surroundings=replace(config.surroundings, mode="off"),
         corrections=CorrectionOptions(masks="off", exposure="off", lens="off"),
-        height_field=replace(config.height_field, rounds=config.height_field.rounds[:3]),
-        revolution=replace(
-            config.revolution,
-            photometric=replace(photometric, coarse=photometric.coarse[:1], fine=photometric.fine[:1]),
-            footprints=replace(footprints, rounds=footprints.rounds[:2]),
-        ),
+        height_field=replace(config.height_field, rounds=3),
+        revolution=replace(config.revolution, rounds=1),
         free_form=replace(
             config.free_form,
             rounds=(coarsest, replace(coarsest, resolution=32, robust_scale=0.2, steps=4)),

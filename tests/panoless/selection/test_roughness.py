@@ -17,8 +17,11 @@ from tests.support.mirror_revolution import around, goblet, rays_of, revolution_
 
 ROUGHNESS = 0.3
 MIRROR = RevolutionMirror(goblet(), occlusion_test=False)
-OPTIONS = MaterialOptions(judged_resolution=64, first_roughness=0.15, roughnesses=(0.05, 0.5), roughness_trials=4)
-"""With texels as wide as the views are coarse, and rougher than slightly, so that they show it."""
+
+
+def found_softness(views: Views) -> Softness:
+    """With texels as wide as the views are coarse, and rougher than slightly, so that they show it."""
+    return earned_softness(views, MIRROR, FitConfig(), first_roughness=0.15, roughnesses=(0.05, 0.5), trials=4)
 
 
 def checkered(directions: Float[np.ndarray, "*P 3"]) -> Float[np.ndarray, "*P 3"]:
@@ -55,12 +58,11 @@ def views_of(roughness: float) -> Views:
 @pytest.mark.slow
 def test_a_rough_mirror_is_found_and_a_smooth_one_stays_smooth() -> None:
     """It comes out too low, as steps end before edges are sharp."""
-    config = FitConfig(material=OPTIONS)
-    found = earned_softness(views_of(ROUGHNESS), MIRROR, config)
+    found = found_softness(views_of(ROUGHNESS))
     assert found.blur_px is None
     assert found.roughness is not None
     assert 0.4 * ROUGHNESS < found.roughness < 1.2 * ROUGHNESS
-    assert earned_softness(views_of(1e-3), MIRROR, config) == Softness()
+    assert found_softness(views_of(1e-3)) == Softness()
 
 
 @pytest.mark.slow
@@ -68,7 +70,7 @@ def test_blurred_pictures_are_told_from_a_rough_mirror() -> None:
     """It comes out too low: fields of the checkered world are narrower than such a pixel in these views."""
     plain = views_of(1e-3)
     soft = tuple(replace(view, radiance=_blurred(view, 1.0)) for view in plain.train)
-    found = earned_softness(replace(plain, train=soft), MIRROR, FitConfig(material=OPTIONS))
+    found = found_softness(replace(plain, train=soft))
     assert found.roughness is None
     assert found.blur_px is not None
     assert 0.3 < found.blur_px < 1.2
@@ -106,7 +108,7 @@ def test_nothing_softer_is_asked_for_where_a_sharp_map_explains_all(
             found.append(softness)
             return np.full(5, sharp if softness.roughness is None else sharp / 2) + np.linspace(0, 1e-6, 5)
 
-        def searched(self, softness: Callable[[float], Softness], bounds: tuple[float, float]) -> float:
+        def searched(self, softness: Callable[[float], Softness], bounds: tuple[float, float], trials: int) -> float:
             return 0.1
 
     monkeypatch.setattr(_SoftnessTrial, "of", lambda *_: Trial())

@@ -25,14 +25,7 @@ from tests.support.mirror_height_field import height_field_views
 from tests.support.mirror_plane import RECTANGLE, arc, camera_at, disc, plane_of, reflecting_views
 from tests.support.synthetic_dataset import environment_radiance
 
-OPTIONS = SurroundingsOptions(
-    rays=10_000,
-    judged_rays=10_000,
-    resolutions=(8, 8, 16, 16, 32, 32, 32),
-    refined_floor_rays=10_000,
-    refined_floor_resolutions=(16, 32, 32, 32),
-)
-CONFIG = FitConfig(surroundings=OPTIONS)
+CONFIG = FitConfig(surroundings=SurroundingsOptions(rays=10_000))
 FAR_VIEWS = reflecting_views(plane_of(RECTANGLE), arc(10, size=48))
 
 
@@ -108,11 +101,12 @@ def test_a_flat_mirror_on_a_table_tells_how_high_it_stands() -> None:
     assert fitted is not None
     leaning = np.array([0.15, 0.1, 1.0]) / np.linalg.norm([0.15, 0.1, 1.0])
     wrong = fitted.in_surroundings(replace(found, floor=replace(found.floor, up=leaning)))
-    again = on_floor(views, wrong, lambda before, around: before.in_surroundings(around), CONFIG)
+    coarse = (16, 32, 32, 32)
+    again = on_floor(views, wrong, lambda before, around: before.in_surroundings(around), CONFIG, resolutions=coarse)
     assert again.surroundings.floor is not None
     assert again.surroundings.floor.up[2] > np.cos(np.radians(3)) > np.cos(np.radians(10)) > leaning[2]
     right = fitted.in_surroundings(Surroundings(np.array([1 / 6]), Floor(np.array([0.0, 0.0, 1.0]), 0.7, 3.0)))
-    assert on_floor(views, right, lambda *_: pytest.fail("nothing is gained"), CONFIG) is right
+    assert on_floor(views, right, lambda *_: pytest.fail("nothing is gained"), CONFIG, resolutions=coarse) is right
     assert on_floor(views, fitted, lambda *_: pytest.fail("there is no floor"), CONFIG) is fitted
 
 

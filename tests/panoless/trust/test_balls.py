@@ -5,10 +5,8 @@ from dataclasses import replace
 import pytest
 
 from panoless.trust.evidence import Evidence
-from panoless.trust.options import TrustOptions
 from panoless.trust.verdict import judge
 
-OPTIONS = TrustOptions()
 GOOD = Evidence(
     unexplained=0.05,
     one_color=0.5,
@@ -36,17 +34,17 @@ SINGLE = replace(GOOD, unexplained=None, one_color=None, matte=None, unexplained
 
 def test_a_single_photograph_of_a_ball_is_trusted_by_its_rim() -> None:
     """No view is left to hold out, and it sees one side: the rim and what lies beside it tell."""
-    found = judge(SINGLE, OPTIONS)
+    found = judge(SINGLE)
     assert found.verdict == "trust"
     assert found.reason == (
         "the rim of the ball is a circular cone to 0.1 px, and what lies beside it is what it mirrors (0.60)"
     )
-    assert judge(replace(SINGLE, rim_px=None), OPTIONS).verdict == "do not trust"
+    assert judge(replace(SINGLE, rim_px=None)).verdict == "do not trust"
 
 
 def test_a_ball_is_not_doubted_for_what_only_unknown_shapes_are() -> None:
-    assert judge(replace(GOOD, matte=0.06, viewed=0.05, view_shift_px=5.0, missed=0.5), OPTIONS).verdict == "trust"
-    assert judge(replace(GOOD, rim_px=None, viewed=0.05), OPTIONS).verdict != "trust"
+    assert judge(replace(GOOD, matte=0.06, viewed=0.05, view_shift_px=5.0, missed=0.5)).verdict == "trust"
+    assert judge(replace(GOOD, rim_px=None, viewed=0.05)).verdict != "trust"
 
 
 @pytest.mark.parametrize(
@@ -59,7 +57,7 @@ def test_a_ball_is_not_doubted_for_what_only_unknown_shapes_are() -> None:
 )
 @pytest.mark.parametrize("evidence", [SINGLE, GOOD])
 def test_a_wrong_ball_is_not_trusted(evidence: Evidence, figures: dict[str, float], reason: str) -> None:
-    found = judge(replace(evidence, **figures), OPTIONS)
+    found = judge(replace(evidence, **figures))
     assert found.verdict == "do not trust"
     assert reason in found.reason
     assert "capture/ball.jpg" in found.remedy
@@ -67,12 +65,12 @@ def test_a_wrong_ball_is_not_trusted(evidence: Evidence, figures: dict[str, floa
 
 def test_a_single_ball_whose_surroundings_tell_nothing_is_trusted_in_part() -> None:
     """A plain background says neither yes nor no; several photographs explain one another."""
-    found = judge(replace(SINGLE, agreement=None), OPTIONS)
+    found = judge(replace(SINGLE, agreement=None))
     assert (found.verdict, found.reason) == ("partly", "nothing beside the ball says whether it mirrors")
-    assert judge(replace(GOOD, agreement=None), OPTIONS).verdict == "trust"
+    assert judge(replace(GOOD, agreement=None)).verdict == "trust"
 
 
 def test_what_is_unexplained_of_a_ball_stands_near_it() -> None:
-    found = judge(replace(GOOD, unexplained=0.9), OPTIONS)
+    found = judge(replace(GOOD, unexplained=0.9))
     assert found.verdict != "trust"
     assert "low visibility" in found.remedy

@@ -13,13 +13,12 @@ from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.geometry.plane.kind import PlaneMirror
 from panoless.kernels.cubemap import cubemap_directions
-from panoless.trust.evidence import Evidence, gather_evidence
+from panoless.trust.evidence import VIEWED_WITHIN_RAD, Evidence, gather_evidence
 from panoless.trust.options import TrustOptions
-from panoless.trust.verdict import AROUND, MASKS, MATTER, POSES, SHINE, TEXTURE, judge
+from panoless.trust.verdict import AROUND, LARGEST_MISSED, LARGEST_SURPLUS, MASKS, MATTER, POSES, SHINE, TEXTURE, judge
 from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
 
-OPTIONS = TrustOptions(resolution=32)
-CONFIG = FitConfig(trust=OPTIONS)
+CONFIG = FitConfig(trust=TrustOptions(resolution=32))
 MIRROR = PlaneMirror(plane_of(RECTANGLE))
 VISIBILITY = torch.linspace(0.1, 1.0, 6 * 32 * 32).reshape(6, 32, 32)
 
@@ -55,7 +54,7 @@ def test_the_true_mirror_is_trusted(views: Views) -> None:
     assert found.view_shift_px < 0.05
     assert found.overlap > 0.99
     assert (found.views, found.coverage) == (15, 1.0)
-    assert judge(found, OPTIONS).verdict == "trust"
+    assert judge(found).verdict == "trust"
 
 
 def test_the_share_of_places_that_are_not_explained_is_measured_and_named(views: Views) -> None:
@@ -74,7 +73,7 @@ def test_the_share_of_places_that_are_not_explained_is_measured_and_named(views:
     assert mixed.unexplained_part is not None
     assert clean.unexplained_part < 0.02
     assert 0.3 < mixed.unexplained_part < 0.7
-    verdict = judge(mixed, replace(OPTIONS, largest_unexplained=1.0))
+    verdict = judge(replace(mixed, unexplained=0.0))
     assert verdict.verdict == "do not trust"
     assert "lies where its shape explains little of it" in verdict.reason
 
@@ -92,8 +91,8 @@ def test_what_the_shape_leaves_bare_is_measured_and_named(views: Views) -> None:
 
     bare = evidence(each(views, with_a_corner))
     assert evidence(views).missed == evidence(each(views, wider)).missed == 0
-    assert bare.missed > OPTIONS.largest_missed
-    verdict = judge(bare, replace(OPTIONS, largest_silhouette_px=100.0, largest_view_shift_px=100.0))
+    assert bare.missed > LARGEST_MISSED
+    verdict = judge(replace(bare, silhouette_px=0.0, view_shift_px=0.0))
     assert verdict.verdict != "trust"
     assert "bare" in verdict.reason
 
@@ -116,8 +115,8 @@ def test_what_the_shape_has_too_much_is_measured_and_named(views: Views) -> None
         float((turn.mask > 0.5).sum() / (view.mask > 0.5).sum())
         for turn, view in zip(views.train, each(views, cut).train, strict=True)
     ]
-    assert OPTIONS.largest_surplus < grown.surplus < np.mean(covered) - 1
-    verdict = judge(grown, replace(OPTIONS, largest_silhouette_px=100.0, largest_view_shift_px=100.0))
+    assert LARGEST_SURPLUS < grown.surplus < np.mean(covered) - 1
+    verdict = judge(replace(grown, silhouette_px=0.0, view_shift_px=0.0))
     assert verdict.verdict != "trust"
     assert "outside the masks" in verdict.reason
 
@@ -140,7 +139,7 @@ def test_turned_cameras_are_measured_and_named(views: Views) -> None:
     assert found.view_shift_deg == pytest.approx(1.5, rel=0.1)
     focal = np.array([view.camera.fx for view in views.train])
     assert found.view_shift_px == pytest.approx(np.tan(np.radians(1.5)) * np.sqrt((focal**2).mean()), rel=0.1)
-    verdict = judge(found, OPTIONS)
+    verdict = judge(found)
     assert verdict.verdict == "do not trust"
     assert (verdict.remedy, "wrong poses" in verdict.reason) == (POSES, True)
 
@@ -160,7 +159,7 @@ def test_a_matte_object_is_told_from_a_mirror(views: Views) -> None:
     assert found.matte is not None
     assert found.unexplained is not None
     assert found.matte < 0.2 * found.unexplained
-    verdict = judge(found, OPTIONS)
+    verdict = judge(found)
     assert (verdict.verdict, verdict.remedy) == ("do not trust", MATTER)
 
 
@@ -205,7 +204,7 @@ def test_gold_is_judged_by_where_its_channels_end(views: Views) -> None:
 def test_too_few_views_to_hold_one_out_are_said_to_be_so(views: Views, count: int) -> None:
     found = evidence(replace(views, train=views.train[:count]))
     assert found.unexplained is None
-    verdict = judge(found, OPTIONS)
+    verdict = judge(found)
     assert verdict.verdict == "do not trust"
     assert f"{count} usable view" in verdict.reason
     assert all(np.isfinite(value) for value in verdict.evidence.values())
@@ -215,7 +214,7 @@ def test_a_surface_that_no_view_shows_is_not_put_down_to_the_number_of_views(vie
     """Photographs that can be judged, and a mirror so small that it covers no whole pixel."""
     tiny = PlaneMirror(plane_of(1e-4 * RECTANGLE))
     found = gather_evidence(views, tiny, VISIBILITY, CONFIG)
-    verdict = judge(found, OPTIONS)
+    verdict = judge(found)
     assert found.unexplained is None
     assert (verdict.verdict, verdict.remedy) == ("do not trust", MASKS)
 
@@ -237,7 +236,7 @@ def test_views_without_the_object_count_for_nothing(views: Views) -> None:
 def test_no_worse_figure_lowers_the_risk(views: Views, figure: str) -> None:
     found, risks = evidence(views), []
     for value in np.linspace(0, 2, 11):
-        risks.append(judge(replace(found, **{figure: float(value)}), OPTIONS).risk)
+        risks.append(judge(replace(found, **{figure: float(value)})).risk)
     assert risks == sorted(risks)
     assert risks[-1] > 1
 
@@ -245,7 +244,7 @@ def test_no_worse_figure_lowers_the_risk(views: Views, figure: str) -> None:
 @pytest.mark.parametrize("radiance", [0.0, 0.4])
 def test_photographs_of_one_color_tell_nothing(views: Views, radiance: float) -> None:
     found = evidence(each(views, lambda _, view: replace(view, radiance=torch.full_like(view.radiance, radiance))))
-    verdict = judge(found, OPTIONS)
+    verdict = judge(found)
     assert verdict.verdict == "do not trust"
     assert verdict.remedy == TEXTURE
 
@@ -253,13 +252,13 @@ def test_photographs_of_one_color_tell_nothing(views: Views, radiance: float) ->
 def test_a_verdict_holds_every_figure_by_name(views: Views) -> None:
     found = evidence(views)
     of_balls = {"rim_px", "agreement"}
-    assert set(judge(found, OPTIONS).evidence) == {field.name for field in fields(Evidence)} - of_balls
+    assert set(judge(found).evidence) == {field.name for field in fields(Evidence)} - of_balls
 
 
 def test_a_rough_mirror_is_not_trusted(views: Views) -> None:
     """With the roughness that the fit found, however well its views are explained."""
     found = gather_evidence(views, MIRROR, VISIBILITY, CONFIG, roughness=0.16)
-    verdict = judge(found, OPTIONS)
+    verdict = judge(found)
     assert (verdict.verdict, verdict.remedy) == ("partly", SHINE)
     assert "roughness of 0.16" in verdict.reason
 
@@ -300,10 +299,10 @@ def test_views_from_one_place_are_doubted_however_well_they_agree(views: Views) 
     """Each camera sees the cap of 15° around it, (1 − cos 15°)/2 of the sphere, and the same one no more than once."""
     one = views.train[7]
     at_once = evidence(replace(views, train=(one,) * 15))
-    cap = (1 - np.cos(OPTIONS.viewed_within_rad)) / 2
+    cap = (1 - np.cos(VIEWED_WITHIN_RAD)) / 2
     assert at_once.viewed == pytest.approx(cap, rel=0.05)
     around = evidence(views)
     assert 5 * cap < around.viewed < 15 * cap
-    verdict = judge(replace(around, viewed=at_once.viewed), OPTIONS)
+    verdict = judge(replace(around, viewed=at_once.viewed))
     assert (verdict.verdict, verdict.remedy) == ("do not trust", AROUND)
     assert "15 views see the object from 2% of all directions" in verdict.reason

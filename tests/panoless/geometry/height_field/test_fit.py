@@ -8,9 +8,15 @@ import torch
 
 from panoless.capture.silhouettes import mask_contours
 from panoless.capture.views import Views
-from panoless.geometry.height_field.fit import apply_height_field_step, fit_height_field, step_height_field
+from panoless.geometry.height_field.fit import (
+    EDGE_BENDING,
+    EDGE_SCALES_PX,
+    apply_height_field_step,
+    fit_height_field,
+    step_height_field,
+)
 from panoless.geometry.height_field.model import HeightField, flat_height_field, visible_reflections
-from panoless.geometry.height_field.options import HeightFieldOptions, HeightFieldRound
+from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.height_field.photometric import Observations, Photographs, observe
 from panoless.geometry.height_field.silhouette import edge_jacobian, edge_residuals
 from panoless.geometry.plane.silhouette import apply_plane_step
@@ -24,7 +30,6 @@ TILTED = apply_plane_step(
     PLANE, np.append([np.radians(0.8), np.radians(-0.6), 0.0, 0.0], np.zeros(PLANE.boundary.size))
 )
 """By a degree, which photographs of a nearly flat mirror hardly tell."""
-OPTIONS = HeightFieldOptions()
 ALL_VOTE = 1e6
 """A robust scale at which weights do not change."""
 
@@ -49,10 +54,9 @@ def test_derivatives_of_contour_distances_are_finite_differences(truth: HeightFi
     chosen = direction[parts[kind]]
     chosen[:] = np.random.default_rng(3).normal(size=len(chosen))
     height_field = apply_height_field_step(truth, 5e-3 * direction)
-    residuals = edge_residuals(contours, height_field, OPTIONS)
+    residuals = edge_residuals(contours, height_field)
     ahead, behind = (
-        edge_residuals(contours, apply_height_field_step(height_field, step * direction), OPTIONS)
-        for step in (1e-5, -1e-5)
+        edge_residuals(contours, apply_height_field_step(height_field, step * direction)) for step in (1e-5, -1e-5)
     )
     kept = residuals.counted & (ahead.side == behind.side)
     difference = ((ahead.pixels - behind.pixels) / 2e-5)[kept]
@@ -66,8 +70,8 @@ def test_contours_alone_recover_the_plane_of_the_frame_and_the_height_of_the_edg
 ) -> None:
     """At 96 px a contour tells a tenth of the degree that was put in, and a tenth of the bumps."""
     contours, height_field = mask_contours(views), flat_height_field(TILTED, 4)
-    for scale in OPTIONS.edge_scales_px:
-        height_field, _ = step_height_field(contours, height_field, scale, OPTIONS.edge_bending, OPTIONS)
+    for scale in EDGE_SCALES_PX:
+        height_field, _ = step_height_field(contours, height_field, scale, EDGE_BENDING)
     assert np.degrees(np.arccos(height_field.plane.normal @ PLANE.normal)) < 0.15
     middles = (PLANE.boundary + np.roll(PLANE.boundary, -1, 0)) / 2
     found = height_field.heights(middles)[0] + height_field.plane.offset
@@ -142,7 +146,7 @@ def test_no_photograph_tells_the_tilt_of_a_flat_mirror() -> None:
 def test_a_bent_and_tilted_mirror_is_recovered(truth: HeightField) -> None:
     """From the flat, tilted plane, by 16 views of 64 px."""
     views, camera = height_field_views(truth, arc(16, size=64)), arc(16)[8]
-    found = fit_height_field(views, TILTED, replace(OPTIONS, halvings=0))
+    found = fit_height_field(views, TILTED, HeightFieldOptions(halvings=0))
     assert (
         np.mean(normal_errors_deg(found, truth, camera))
         < np.mean(normal_errors_deg(flat_height_field(TILTED, 4), truth, camera)) / 10
@@ -156,7 +160,7 @@ def test_a_dome_and_a_bowl_are_found_from_a_flat_start(slope: float) -> None:
     plane = plane_of(disc(24))
     truth = flat_height_field(plane, 6).domed(slope)
     views, camera = height_field_views(truth, arc(16, size=64)), arc(16)[8]
-    found = fit_height_field(views, plane, replace(OPTIONS, cells=6, halvings=0))
+    found = fit_height_field(views, plane, HeightFieldOptions(cells=6, halvings=0))
     assert np.mean(normal_errors_deg(flat_height_field(plane, 6), truth, camera)) > 9
     assert np.mean(normal_errors_deg(found, truth, camera)) < 0.5
 
@@ -165,8 +169,8 @@ def test_a_round_outline_bends_no_mirror() -> None:
     """What a polygon of few sides misses of a circle, more than a pixel here, is not put down to heights."""
     views = height_field_views(flat_height_field(plane_of(disc(256)), 16), arc(12, size=96))
     contours, height_field = mask_contours(views), flat_height_field(plane_of(disc(16)), 16)
-    for scale in OPTIONS.edge_scales_px:
-        height_field, _ = step_height_field(contours, height_field, scale, OPTIONS.edge_bending, OPTIONS)
+    for scale in EDGE_SCALES_PX:
+        height_field, _ = step_height_field(contours, height_field, scale, EDGE_BENDING)
     middle = height_field.plane.boundary.mean(0, keepdims=True)
     assert abs(height_field.heights(middle, 0)[0, 0]) < 0.01
 
@@ -179,7 +183,7 @@ def test_what_a_rim_hides_of_the_surroundings_is_left_out(rim: float) -> None:
     """
     truth = replace(flat_height_field(plane_of(RECTANGLE), 6).domed(0.3), clearance=rim)
     views, camera = height_field_views(truth, arc(16, size=64)), arc(16)[8]
-    found = fit_height_field(views, plane_of(RECTANGLE), replace(OPTIONS, cells=6, halvings=0))
+    found = fit_height_field(views, plane_of(RECTANGLE), HeightFieldOptions(cells=6, halvings=0))
     assert found.clearance in ((0.06, 0.12) if rim else (0.0,))
     assert np.mean(normal_errors_deg(found, truth, camera)) < 0.5
 
@@ -201,7 +205,7 @@ def test_a_tilt_that_photographs_do_not_tell_changes_nothing_for_them(truth: Hei
 @pytest.mark.slow
 def test_bumps_too_short_for_the_grid_are_recovered_on_a_finer_one() -> None:
     """Held-out views ask for halved cells, and for none where the mirror is flat."""
-    options = replace(OPTIONS, cells=5, rounds=(HeightFieldRound(64, 0.3, 20_000, 4),))
+    options = HeightFieldOptions(cells=5, rounds=3)
     for height, cells in ((0.0, 5), (0.004, 10)):
         truth = bumpy(PLANE, height, cells=10)
         found = fit_height_field(height_field_views(truth, arc(12, size=48)), PLANE, options)
@@ -223,10 +227,10 @@ def test_no_step_raises_the_cost_of_the_photographs(truth: HeightField, views: V
     """With contours too uncertain to speak and no bending energy, that cost is all of it. The map is the true one, its
     texels coarse: from bumps half again as high the cost falls; at the true ones a step of noise is refused or helps.
     """
-    contours, options = mask_contours(views), replace(OPTIONS, contour_sigma_px=1e6)
+    contours = mask_contours(views)
     for start in (replace(truth, coefficients=1.5 * truth.coefficients), truth):
         photographs = photographs_at(start, observe(views, start, 20_000), texel_map(32))
-        moved, fall = step_height_field(contours, start, 1.0, 0.0, options, photographs)
+        moved, fall = step_height_field(contours, start, 1.0, 0.0, photographs, contour_sigma_px=1e6)
         assert fall == pytest.approx(1 - photographs.cost(moved) / photographs.cost(start), abs=1e-4)
         assert photographs.cost(moved) <= photographs.cost(start) * (1 + 1e-6)
         if start is not truth:

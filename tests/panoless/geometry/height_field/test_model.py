@@ -17,7 +17,6 @@ from panoless.geometry.height_field.model import (
     height_field_buffers,
     visible_reflections,
 )
-from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.plane.model import plane_buffers, unoccluded_share
 from panoless.splats.kernels.reference.rasterize import rotation_matrices
@@ -129,15 +128,14 @@ def test_mirrored_rays_that_meet_the_rim_are_left_out() -> None:
 
 
 def test_the_map_leaves_out_as_wide_a_margin_at_the_rim_as_the_fit() -> None:
-    """Of 1 px by default, and of 4 px where options say so."""
+    """Of 1 px; one of 4 px leaves less."""
     plane = plane_of(RECTANGLE, frame_height=0.1)
     height_field, view = flat_height_field(plane, 6), mirror_views(plane, arc(1)).train[0]
-    wide = HeightFieldOptions(clear_px=4.0)
-    fitted = visible_reflections(height_field, view, view.solid, wide).pixels
-    mirror = HeightFieldMirror(height_field, wide)
+    fitted = visible_reflections(height_field, view, view.solid).pixels
+    mirror = HeightFieldMirror(height_field)
     assert torch.equal(mirror.usable_pixels(view), fitted)
     assert torch.equal(mirror.seen(view, view.solid)[0], fitted)
-    assert len(fitted) < len(HeightFieldMirror(height_field).usable_pixels(view))
+    assert len(visible_reflections(height_field, view, view.solid, clear_px=4.0).pixels) < len(fitted)
 
 
 def test_where_no_frame_stands_out_every_solid_pixel_is_seen_along_the_mirrored_ray() -> None:

@@ -205,14 +205,14 @@ def test_giving_up_early_changes_no_plane(flat_fit: PlaneFit) -> None:
 @pytest.mark.parametrize("tilt_deg", [2.0, 40.0])
 def test_no_step_raises_the_cost_that_it_minimizes(tilt_deg: float) -> None:
     """At the robust scale, and over the points, of where the step starts."""
-    contours, options, true = mask_contours(mirror_views(plane_of(L_SHAPE), arc(8))), PlaneOptions(), plane_of(L_SHAPE)
+    contours, true = mask_contours(mirror_views(plane_of(L_SHAPE), arc(8))), plane_of(L_SHAPE)
     plane = apply_plane_step(true, np.append([np.tan(np.radians(tilt_deg)), 0, 0.1, 0], np.zeros(true.boundary.size)))
     medians = []
     for _ in range(8):
-        before = boundary_residuals(contours, plane, options)
-        scale = before.scale(2.0, options)
-        plane = _descend(contours, plane, (2.0,), options)
-        after = boundary_residuals(contours, plane, options)
+        before = boundary_residuals(contours, plane)
+        scale = before.scale(2.0)
+        plane = _descend(contours, plane, (2.0,))
+        after = boundary_residuals(contours, plane)
         assert after.cost(scale, before.counted) <= before.cost(scale, before.counted)
         medians.append(np.median(np.abs(after.pixels)))
     assert medians[-1] < medians[0] / 2

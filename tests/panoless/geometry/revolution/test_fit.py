@@ -1,7 +1,6 @@
 """Whole fits of vessels that Embree traced: normals, map and axis, whichever way the world is turned."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,7 +12,7 @@ from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
 from panoless.geometry.revolution.fit import Refinement, propose_revolution, refine_revolution
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_rays
-from panoless.geometry.revolution.options import DEFAULTS
+from panoless.geometry.revolution.options import RevolutionOptions
 from panoless.kernels.cubemap import sample_cubemap
 from tests.support.traced_vessel import Photographs, Vessel, cut_bowl, deep_cup, dished_jar, photograph, plate, stripes
 
@@ -97,9 +96,8 @@ def test_a_deep_cup_is_open_though_no_ray_leaves_it_at_once() -> None:
     views = photograph(deep_cup(), VIEWS, SIZE).views
     proposal = propose_revolution(views)
     assert proposal is not None
-    photometric = replace(DEFAULTS.photometric, map_rays=100_000)
     with torch.no_grad():
-        opened, _ = Refinement(views, proposal.surface, replace(DEFAULTS, photometric=photometric)).open_mouth()
+        opened, _ = Refinement(views, proposal.surface, RevolutionOptions(map_rays=100_000)).open_mouth()
     assert opened.is_open
 
 
@@ -109,9 +107,7 @@ def test_the_inside_of_a_plate_is_found_by_steps_under_coarse_maps() -> None:
     photographs = photograph(plate(), VIEWS, 96, elevations_deg=(20.0, 35.0, 50.0, 60.0))
     proposal = propose_revolution(photographs.views)
     assert proposal is not None
-    photometric = replace(DEFAULTS.photometric, map_rays=60_000, pixels=20_000)
-    mouth = replace(DEFAULTS.mouth, descent_rays=60_000, descent_pixels=15_000)
-    options = replace(DEFAULTS, photometric=photometric, mouth=mouth)
+    options = RevolutionOptions(map_rays=240_000, pixels=60_000)
     with torch.no_grad():
         opened, _ = Refinement(photographs.views, proposal.surface, options).open_mouth()
     assert np.median(normal_errors_deg(photographs, opened)) < 2
@@ -156,9 +152,7 @@ def test_both_ends_are_tried_where_cameras_see_both() -> None:
     proposal = propose_revolution(photographs.views)
     assert proposal is not None
     # The first rounds decide; those that follow refine what they found.
-    photometric = replace(DEFAULTS.photometric, fine=DEFAULTS.photometric.fine[:1])
-    footprints = replace(DEFAULTS.footprints, rounds=DEFAULTS.footprints.rounds[:1])
-    options = replace(DEFAULTS, photometric=photometric, footprints=footprints)
+    options = RevolutionOptions(rounds=1)
     for start in (proposal.surface, proposal.surface.turned_over()):
         surface = refine_revolution(photographs.views, start, options)
         assert surface.is_open

@@ -11,8 +11,8 @@ from panoless.capture.views import Views
 from panoless.geometry.revolution.fit import Refinement
 from panoless.geometry.revolution.footprints import informative_pixels
 from panoless.geometry.revolution.model import SurfaceOfRevolution
-from panoless.geometry.revolution.options import DEFAULTS
-from panoless.geometry.revolution.photometric import Photometry, photometric_equations, solve_map
+from panoless.geometry.revolution.options import RevolutionOptions
+from panoless.geometry.revolution.photometric import RADIANCE_SIGMA, Photometry, photometric_equations, solve_map
 from panoless.geometry.revolution.pixels import PixelBundles
 from panoless.geometry.revolution.profile import ProfileSplines, apply_step, resample_profile
 from panoless.kernels.cubemap import cubemap_directions
@@ -60,10 +60,7 @@ def error_deg(surface: SurfaceOfRevolution, truth: SurfaceOfRevolution, size: in
     return float(np.degrees(np.arccos(cosine)).mean())
 
 
-COARSE = replace(
-    DEFAULTS,
-    footprints=replace(DEFAULTS.footprints, rounds=DEFAULTS.footprints.rounds[:2], pixels=12_000),
-)
+COARSE = RevolutionOptions(rounds=2, pixels=24_000)
 """The two coarse rounds, which take a tenth of the time."""
 
 
@@ -97,7 +94,7 @@ def test_equations_are_the_derivatives_of_the_mean_of_rays() -> None:
 
     def cost(changed: SurfaceOfRevolution) -> float:
         residual = Photometry.of(areas, changed, scene, 6).residual
-        return float((residual**2).sum()) / 2 / DEFAULTS.photometric.radiance_sigma**2
+        return float((residual**2).sum()) / 2 / RADIANCE_SIGMA**2
 
     generator = np.random.default_rng(1)
     for _ in range(3):

@@ -11,8 +11,7 @@ from panoless.capture.silhouettes import mask_contours
 from panoless.geometry.revolution.fit import propose_revolution
 from panoless.geometry.revolution.interior import search_interior
 from panoless.geometry.revolution.model import RAY_EPSILON, SurfaceOfRevolution, revolution_buffers, trace_reflections
-from panoless.geometry.revolution.options import DEFAULTS
-from panoless.geometry.revolution.photometric import Photometry, photometric_equations
+from panoless.geometry.revolution.photometric import RADIANCE_SIGMA, Photometry, photometric_equations
 from panoless.geometry.revolution.pixels import CENTER, PixelBundles, evenly
 from panoless.geometry.revolution.profile import ProfileSplines, apply_step, resample_profile
 from panoless.geometry.revolution.silhouette import (
@@ -197,7 +196,7 @@ def _cost(seen: PixelBundles, found: Photometry, surface: SurfaceOfRevolution, s
     unit = seen.directions / np.linalg.norm(seen.directions, axis=1, keepdims=True)
     counted = found.whole & (np.abs((unit * found.paths.first.normals).sum(1)) > 0.05)
     residual = Photometry.of(seen, surface, scene).residual[counted]
-    return float((residual**2).sum()) / 2 / DEFAULTS.photometric.radiance_sigma**2
+    return float((residual**2).sum()) / 2 / RADIANCE_SIGMA**2
 
 
 def test_a_search_finds_the_funnel_inside() -> None:

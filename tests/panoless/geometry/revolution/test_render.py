@@ -7,7 +7,6 @@ import torch
 
 from panoless.capture.rays import pixel_rays
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_buffers, trace_reflections
-from panoless.geometry.revolution.options import RenderingOptions
 from panoless.geometry.revolution.render import mean_light
 from panoless.kernels.camera import RasterCamera
 from panoless.kernels.cubemap import cubemap_directions
@@ -61,7 +60,7 @@ def test_interpolated_directions_are_those_of_traced_rays() -> None:
     surface, scene, camera = bowl(), environment(), around(3, 64)[2]
     pixels = covered(surface, camera)
     quick = mean_light(surface, scene, camera, pixels)
-    slow = mean_light(surface, scene, camera, pixels, RenderingOptions(largest_bend=0.0))
+    slow = mean_light(surface, scene, camera, pixels, largest_bend=0.0)
     assert float((quick - slow).abs().mean()) < 1e-3
     assert 0 < int(((quick - slow).abs().amax(1) > 0).sum()) < len(pixels)
 

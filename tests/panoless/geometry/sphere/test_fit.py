@@ -28,7 +28,6 @@ from tests.support.mirror_sphere import tiny_config
 from tests.support.synthetic_dataset import environment_radiance, render_sphere, sphere_cameras
 
 SIZE_PX = 64
-OPTIONS = SphereOptions()
 CONFIG = replace(
     tiny_config(),
     model="auto",
@@ -87,11 +86,11 @@ def test_exact_cones_give_the_sphere(seed: int, count: int) -> None:
     center, radius, away = rng.uniform(-1, 1, 3), rng.uniform(0.1, 1.0), rng.normal(size=(count, 3))
     away *= radius * rng.uniform(2.0, 5.0, (count, 1)) / np.linalg.norm(away, axis=1, keepdims=True)
     rays = tangent_rays(center, np.full(3, radius), center + away)
-    cones = Cones.of(rays, OPTIONS)
+    cones = Cones.of(rays)
     found = cones.sphere(0.0)
     # Lines that are nearly parallel amplify rounding.
     np.testing.assert_allclose(np.append(found.center, found.radius), np.append(center, radius), atol=1e-4)
-    assert cones.are_of_a_sphere(OPTIONS)
+    assert cones.are_of_a_sphere()
 
 
 @pytest.mark.parametrize(
@@ -108,14 +107,14 @@ def test_an_egg_is_no_sphere_whatever_the_noise_of_masks(
     rng = np.random.default_rng(1)
     shaken = rays.directions + rng.normal(size=rays.directions.shape) * noise_px / rays.pixels_per_rad[:, None]
     shaken /= np.linalg.norm(shaken, axis=1, keepdims=True)
-    assert Cones.of(replace(rays, directions=shaken), OPTIONS).are_of_a_sphere(OPTIONS) == is_sphere
+    assert Cones.of(replace(rays, directions=shaken)).are_of_a_sphere() == is_sphere
 
 
 @pytest.mark.parametrize("count", [2, 3, 9])
 def test_outlines_give_center_and_radius(count: int) -> None:
     """0.002 is a thirtieth of a pixel; 5×5 samples a pixel make the masks."""
     views = ball_views(count)
-    found = fit_sphere(views, OPTIONS, asked=False)
+    found = fit_sphere(views, asked=False)
     assert found is not None
     center, radius = in_world(views, SphereMirror(found.sphere))
     assert np.abs(center).max() < 2e-3
@@ -127,7 +126,7 @@ def test_outlines_give_center_and_radius(count: int) -> None:
 @pytest.mark.parametrize("radius", [0.0, 2.5])
 def test_one_photograph_is_unwrapped_exactly(radius: float) -> None:
     """Its rays are those of a ball of any size at the distance where it looks so large: a known radius scales both."""
-    config = replace(CONFIG, sphere=replace(OPTIONS, radius=radius))
+    config = replace(CONFIG, sphere=SphereOptions(radius=radius))
     views, (camera,) = ball_views(1, radius), sphere_cameras("train", 1, SIZE_PX)
     geometry, selection = choose_geometry(views, config)
     assert geometry.kind == selection.chosen == "sphere"
@@ -176,7 +175,7 @@ def test_what_is_seen_is_what_was_seen() -> None:
 
 def test_other_shapes_are_no_spheres() -> None:
     views = revolution_views(goblet(), around(3, 48))
-    assert fit_sphere(views, OPTIONS, asked=False) is None
+    assert fit_sphere(views, asked=False) is None
     assert SphereFamily().propose(views, CONFIG, asked=False) is None
 
 
