@@ -21,6 +21,7 @@ from panoless.environment.options import (
     SurroundingsOptions,
     halves_whole,
 )
+from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.geometry.free_form.options import FreeFormOptions
 from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.options import PlaneOptions
@@ -108,6 +109,7 @@ class FitConfig:
     splats: Annotated[SplatConfig, tyro.conf.arg(name="")] = field(default_factory=SplatConfig)
     environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
     mask_repair: Tuned[MaskRepairOptions] = field(default_factory=MaskRepairOptions)
+    first_surface: Tuned[FirstSurfaceOptions] = field(default_factory=FirstSurfaceOptions)
     contrast: Tuned[ContrastOptions] = field(default_factory=ContrastOptions)
     sphere: Tuned[SphereOptions] = field(default_factory=SphereOptions)
     plane: Tuned[PlaneOptions] = field(default_factory=PlaneOptions)

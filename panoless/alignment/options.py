@@ -49,9 +49,6 @@ class PoseOptions:
     """
     settled_deg: Positive = 0.01
     """They end when the median camera turns by less than this. Not tuned."""
-    outlined_deg: Positive = 0.3
-    """Outlines are asked anew, of a kind that finds poses itself, where the median camera was turned by this: on
-    sculpture, 0.13° and 0.06° are left of 2° after once and twice."""
     maps: Count = 4
     """Steps of the poses, each with its own map, before the shape follows."""
     uncertainty_factor: Positive = 6.0
@@ -61,11 +58,6 @@ class PoseOptions:
     least_pose_gain: Share = 0.002
     """Share of the held-out error by which turns that outlines ask for have to lower it. Little, because under a smooth
     environment poses matter little.
-    """
-    least_outlined_gain: Share = 0.3
-    """The same of a kind that finds poses itself. Cameras turned by 0.1° gain 0.66 and 0.62 on sculpture and
-    chrome-block. Masks 2 px too small make outlines ask for poses, too: that gains 0.18 and 0.04 on chrome-block and
-    lump.
     """
     largest_rise: Share = 0.02
     """Rounds whose held-out error is higher than that before them by more than this share are taken back. Between good

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from jaxtyping import Int
 
-from panoless.alignment.align import Alignment, Scene, known_map, pose_prior
-from panoless.capture.poses import Poses, StatedCameras
+from panoless.alignment.align import Alignment, Scene, known_map
+from panoless.capture.poses import Poses
 from panoless.capture.views import Views, split_held_out
 from panoless.config import FitConfig
 from panoless.environment.resolution import prediction_error
@@ -51,8 +51,8 @@ def align_proposal(family: Family, views: Views, proposal: Proposal, config: Fit
     options = config.poses
     if options.mode == "off" or not np.isfinite(proposal.silhouette_px):
         return None
-    if family.finds_poses:
-        return _outlined_proposal(family, views, proposal, config)
+    if family.joint:
+        return None
     outline = family.as_proposed(proposal, config)
     if outline is None:
         return None
@@ -75,25 +75,6 @@ def align_proposal(family: Family, views: Views, proposal: Proposal, config: Fit
     return PosedProposal(nearest, found) if options.mode == "on" or is_nearer else None
 
 
-def _outlined_proposal(family: Family, views: Views, proposal: Proposal, config: FitConfig) -> PosedProposal | None:
-    """The proposal of a kind that finds poses itself at the poses that outlines tell, as often as these ask."""
-    options, cameras, prior = config.poses, StatedCameras.of(views), pose_prior(views, config.poses)
-    found, there = None, views
-    for _ in range(options.silhouette_rounds):
-        told = family.poses_by_outlines(there, proposal, config)
-        if told is None:
-            break
-        poses = told.poses if found is None else found.after(told.poses.stacked)
-        poses = poses.without_common(cameras, poses.likely_prior(cameras, prior, options.stated_floor))[1]
-        again = family.propose(poses.moved(views), config, asked=False)
-        if again is None:
-            break
-        found, there, proposal = poses, poses.moved(views), replace(again, told=told)
-        if told.poses.turn_deg < options.outlined_deg:
-            break
-    return None if found is None else PosedProposal(proposal, found)
-
-
 def fit_with_poses(
     family: Family, source: Family, views: Views, start: PosedProposal, config: FitConfig
 ) -> Geometry | None:
@@ -107,13 +88,9 @@ def fit_with_poses(
     first = geometry = fit_at(family, views, start, config)
     if start.poses is None:
         return first
-    if options.mode == "auto" and start.proposal.fitted is None:
-        believed = _believed(family, views, start, geometry, config)
-        least_gain = options.least_outlined_gain if family.finds_poses else options.least_pose_gain
-        if not _is_asked_for(views, geometry, believed, least_gain, config):
-            return None
-    if family.finds_poses:
-        return geometry
+    judged = options.mode == "auto" and start.proposal.fitted is None
+    if judged and not _is_asked_for(views, geometry, geometry.with_poses(None), options.least_pose_gain, config):
+        return None
     for _ in range(options.rounds):
         before, poses = geometry, _next_poses(views, geometry, config)
         geometry = fit_at(family, views, replace(start, poses=poses).after(before), config)
@@ -141,16 +118,6 @@ def fit_at(family: Family, views: Views, start: PosedProposal, config: FitConfig
         proposal = replace(proposal, fitted=proposal.fitted.with_poses(proposal.fitted.poses.beyond(start.poses)))
     fitted = family.fit(start.poses.moved(views), proposal, config)
     return fitted.with_poses(start.poses if fitted.poses is None else start.poses.after(fitted.poses.stacked))
-
-
-def _believed(family: Family, views: Views, start: PosedProposal, fitted: Geometry, config: FitConfig) -> Geometry:
-    """The same geometry with cameras as they are said to be; one that explains any outlines is fitted on by these, as
-    it settled under others.
-    """
-    believed = fitted.with_poses(None)
-    if not family.finds_poses:
-        return believed
-    return family.fit(views, replace(start.proposal, told=None, fitted=believed), config)
 
 
 @remembered()

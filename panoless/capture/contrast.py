@@ -16,8 +16,6 @@ MEDIANS = 6.0
 """Radiance counts as it is up to the median brightness over this, and as its logarithm above."""
 LEAST_KNEE = 0.002
 """But up to this at least (linear radiance), below which photographs show noise."""
-EXPLAINED = 0.15
-"""Error of held-out views, in logarithms, below which a shape that was fitted to radiance stays."""
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,8 @@ class Corrections:
     """Its standard deviation; None where it was not found."""
     balances: Float[np.ndarray, "V 3"] | None = None
     """Gains of each view's channels against its exposure; None: white balance is the same in all views."""
+    mask_offsets_px: Float[np.ndarray, "V"] | None = None
+    """How far the outline of the mask of each view is moved beside that of all; None: masks are alike."""
 
     @property
     def exposure_stops(self) -> float | None:
@@ -48,6 +50,11 @@ class Corrections:
     def white_balance_stops(self) -> float | None:
         """Standard deviation of log₂ of the balances; None where they are all alike."""
         return None if self.balances is None else float(np.log2(self.balances).std())
+
+    @property
+    def mask_spread_px(self) -> float | None:
+        """Standard deviation of the offsets of masks; None where they are alike."""
+        return None if self.mask_offsets_px is None else float(self.mask_offsets_px.std())
 
     @property
     def channel_gains(self) -> Float[np.ndarray, "V 3"] | None:
@@ -63,8 +70,11 @@ class Corrections:
             train = tuple(with_focal_factor(view, self.focal_factor) for view in train)
         if self.k1:
             train = tuple(undistorted_view(view, self.k1) for view in train)
-        if self.mask_offset_px:
-            train = tuple(with_outline_moved(view, self.mask_offset_px) for view in train)
+        if self.mask_offset_px or self.mask_offsets_px is not None:
+            offsets = self.mask_offset_px + (
+                np.zeros(len(train)) if self.mask_offsets_px is None else self.mask_offsets_px
+            )
+            train = tuple(with_outline_moved(view, float(by)) for view, by in zip(train, offsets, strict=True))
         if self.channel_gains is not None:
             gains = torch.from_numpy(self.channel_gains).float()[..., None, None]
             encoding, exposed = encoding_of(config), zip(train, gains, strict=True)

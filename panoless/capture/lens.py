@@ -47,11 +47,6 @@ class LensChange:
         focal, k1 = (None if each is None else each + next(steps) for each in (self.focal, self.k1))
         return LensChange(focal, k1)
 
-    def of_unknowns(self, focal: float, k1: float) -> Float[np.ndarray, "M"]:
-        """Those of two numbers that belong to an unknown."""
-        both = zip((self.focal, self.k1), (focal, k1), strict=True)
-        return np.array([number for known, number in both if known is not None], np.float64)
-
     def rays(
         self, origins: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"], axes: Float[np.ndarray, "P 3"]
     ) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]]:

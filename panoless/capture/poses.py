@@ -91,21 +91,6 @@ class Poses:
         turns = Rotation.from_matrix(common.rotation.T) * Rotation.from_rotvec(self.turns)
         return common, Poses(turns.as_rotvec(), common.undone(cameras.centers + self.shifts) - cameras.centers)
 
-    def likely_prior(
-        self, cameras: "StatedCameras", prior: Float[np.ndarray, "V 6 6"], floor: float
-    ) -> Float[np.ndarray, "V 6 6"]:
-        """The prior with turns and shifts as large as they turn out to be, and no less than `floor` of their standard
-        deviations.
-
-        Positions of cameras that were only turned are right, and so are turns of those that were only shifted. With
-        x = turns or shifts without what they share under the prior P, σ² becomes (floor² + mean xᵀPx / 3) σ².
-        """
-        own = self.without_common(cameras, prior)[1].stacked
-        parts = [slice(0, 3), slice(3, 6)]
-        squares = [np.einsum("vi,vij,vj->v", own[:, k], prior[:, k, k], own[:, k]).mean() / 3 for k in parts]
-        scale = np.repeat(np.sqrt(floor**2 + np.array(squares)), 3)
-        return prior / np.outer(scale, scale)
-
     def lens_turn(self, cameras: "StatedCameras", prior: Float[np.ndarray, "V 6 6"]) -> Float[np.ndarray, "2"] | None:
         """By how much every camera is turned about its own x and y axis (rad), as by a wrong principal point.
 
@@ -144,12 +129,6 @@ class Poses:
             moved_view(view, turn, shift) for view, turn, shift in zip(views.train, turns, self.shifts, strict=True)
         ]
         return replace(views, train=tuple(moved))
-
-
-def with_pose_covariances(views: Views, covariances: Float[np.ndarray, "V 6 6"]) -> Views:
-    """The views with these covariances of their turns and shifts."""
-    stated = zip(views.train, covariances, strict=True)
-    return replace(views, train=tuple(replace(view, pose_covariance=each) for view, each in stated))
 
 
 def common_and_lens(

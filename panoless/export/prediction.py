@@ -60,6 +60,7 @@ from shinypartial.prediction.format import (
     FoundFloor,
     ModelSelection,
     NearSurroundings,
+    NuisanceBlock,
     PredictionInfo,
     begin_prediction,
     dataset_hash,
@@ -317,6 +318,8 @@ def _model_selection(selection: Selection) -> ModelSelection:
             focal_uncertainty=each.corrections.focal_uncertainty,
             k1=None if each.corrections.k1_uncertainty is None else each.corrections.k1,
             k1_uncertainty=each.corrections.k1_uncertainty,
+            mask_spread_px=each.corrections.mask_spread_px,
+            blocks=tuple(NuisanceBlock(**block) for block in each.blocks),
         )
         for each in selection.candidates
     )

@@ -1,7 +1,7 @@
 """What any mirror can do, and how a kind of mirror is proposed from silhouettes and fitted."""
 
 import weakref
-from collections.abc import Callable, Iterator, MutableMapping
+from collections.abc import Callable, Collection, Iterator, MutableMapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from typing import Any, ClassVar, Protocol, TypeVar, get_args, runtime_checkable
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 from torch.utils.weak import WeakIdKeyDictionary
 
-from panoless.capture.lens import LensChange
+from panoless.capture.corrections import Corrections
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.poses import Poses
 from panoless.capture.rays import unit_rays_camera
@@ -22,6 +22,8 @@ from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays
 from panoless.environment.surroundings import Surroundings
 from panoless.kernels.camera import RasterCamera
+from panoless.problem.evidence import Decision
+from panoless.problem.nuisance import Block
 
 Numbers = TypeVar("Numbers")
 SOLID_SURFACE_ALPHA = 0.9
@@ -186,17 +188,6 @@ class Geometry(Protocol):
 
 
 @dataclass(frozen=True)
-class ToldPoses:
-    """Poses that outlines tell, and how well: of turns (rad) and shifts (normalized frame)."""
-
-    poses: Poses
-    covariances: Float[np.ndarray, "V 6 6"]
-    """Of what outlines leave open."""
-    prior: Float[np.ndarray, "V 6 6"]
-    """Inverse covariances before outlines, as large as turns and shifts turned out to be."""
-
-
-@dataclass(frozen=True)
 class Proposal:
     """A shape from silhouettes alone, and how well it explains them: medians over views."""
 
@@ -206,9 +197,6 @@ class Proposal:
     """Distance of the mask's contour from that of the shape; infinite where no view sees it."""
     overlap: float
     """Intersection of shape and mask over their union, in [0, 1]."""
-    told: ToldPoses | None = None
-    """By outlines, of a kind that finds poses itself, beyond those by which it was proposed; None: these are believed.
-    """
     fitted: Any = None
     """The geometry of an earlier fit to almost the same views. A kind whose fit is long goes on from it, in few steps.
     """
@@ -227,8 +215,8 @@ class Family(Protocol):
     geometry: ClassVar[type[Geometry]]
     label: ClassVar[str]
     """With its article, as sentences name it."""
-    finds_poses: ClassVar[bool]
-    """Whether its fit finds the poses of views itself, or it explains any outlines."""
+    joint: ClassVar[bool]
+    """Whether its fit solves for cameras, exposures and masks beside the shape (see `panoless.problem`)."""
     refines: ClassVar[str | None]
     """The kind whose proposal it takes on where that one is not chosen; None: it makes its own."""
     needs_depth: ClassVar[bool]
@@ -254,24 +242,21 @@ class Family(Protocol):
         """The shape that a fit takes its first step from, which tells how near the surroundings are; None likewise."""
         ...
 
-    def poses_by_outlines(self, views: Views, proposal: Proposal, config: FitConfig) -> ToldPoses | None:
-        """Of a kind that finds poses itself: those that outlines alone tell; None where these believe the cameras."""
-        ...
-
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """The geometry that explains silhouettes and photographs best."""
         ...
 
-    def with_lens(
-        self, views: Views, fitted: Any, unknown: LensChange, config: FitConfig
-    ) -> tuple[Geometry, LensChange] | None:
-        """A fitted geometry with unknowns of the lens beside it: the geometry by views through that lens, and what they
-        are; None for a kind that does not find them.
+    def solve(
+        self,
+        views: Views,
+        proposal: Proposal,
+        kinds: Collection[type[Block]],
+        required: Collection[str],
+        config: FitConfig,
+    ) -> tuple[Geometry, Corrections, list[Decision]]:
+        """Of a joint kind: the geometry with nuisance blocks of those kinds, what these correct, and which of them
+        held-out views need; those that are `required` stay in any case.
         """
-        ...
-
-    def after_as_many_steps(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:
-        """A fitted geometry after the steps of `with_lens` without these unknowns, for comparison."""
         ...
 
 

@@ -1,5 +1,6 @@
 """What kinds in closed form share: exact rays, one map, no steps of optimization."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, cast
 
@@ -8,8 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from panoless.capture.corrections import Corrections
 from panoless.capture.encoding import encoding_of
-from panoless.capture.lens import LensChange
 from panoless.capture.poses import Poses
 from panoless.capture.rays import pixel_rays, unit_rays_camera
 from panoless.capture.views import TrainView, Views, at_most_pixels
@@ -25,7 +26,6 @@ from panoless.geometry.base import (
     Family,
     Geometry,
     Proposal,
-    ToldPoses,
     from_plain,
     observe_views,
     to_plain,
@@ -33,6 +33,8 @@ from panoless.geometry.base import (
 from panoless.kernels.camera import RasterCamera, reflection_directions_world
 from panoless.kernels.constants import SUB_PIXELS
 from panoless.kernels.cubemap import sample_cubemap
+from panoless.problem.evidence import Decision
+from panoless.problem.nuisance import Block
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ class ExactGeometry:
 class ExactFamily:
     """A kind that is fitted at once, without steps."""
 
-    finds_poses: ClassVar[bool] = False
+    joint: ClassVar[bool] = False
     refines: ClassVar[str | None] = None
     needs_depth: ClassVar[bool] = True
     told_by_outlines: ClassVar[bool] = False
@@ -118,19 +120,16 @@ class ExactFamily:
         """The proposal itself."""
         return cast(Family, self).as_proposed(proposal, config)
 
-    def poses_by_outlines(self, views: Views, proposal: Proposal, config: FitConfig) -> ToldPoses | None:
-        """None: they are found beside the shape (see `panoless.alignment`)."""
-        return None
-
-    def with_lens(
-        self, views: Views, fitted: Any, unknown: LensChange, config: FitConfig
-    ) -> tuple[Geometry, LensChange] | None:
-        """None: they are told by how far photographs pull (see `panoless.alignment.lens`)."""
-        return None
-
-    def after_as_many_steps(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:
-        """The same: none are taken."""
-        return cast(Geometry, fitted)
+    def solve(
+        self,
+        views: Views,
+        proposal: Proposal,
+        kinds: Collection[type[Block]],
+        required: Collection[str],
+        config: FitConfig,
+    ) -> tuple[Geometry, Corrections, list[Decision]]:
+        """Never called, as the kind is not joint."""
+        raise ValueError("what is unknown beside this kind is found in turn with it")
 
 
 class SeenByCenters(ExactGeometry):

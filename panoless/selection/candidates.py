@@ -38,6 +38,8 @@ class Candidate:
     """By how much the cameras were turned, median over views; None where they were believed."""
     corrections: Corrections = NO_CORRECTIONS
     """Of the photographs that it was fitted to."""
+    blocks: tuple[dict[str, Any], ...] = ()
+    """Of a joint fit: what was decided of each nuisance block (see `panoless.problem.evidence.Decision`)."""
     principal_point_px: tuple[float, float] | None = None
     """By how much the principal point lies to the right and below of where it is said to be; None where that is not
     told."""
@@ -85,6 +87,8 @@ def describe(candidate: Candidate) -> str:
         parts.append(f"principal point moved by {right:+.1f}, {down:+.1f} px")
     if candidate.corrections.mask_offset_px:
         parts.append(f"masks moved outward by {candidate.corrections.mask_offset_px:.2g} px")
+    if candidate.corrections.mask_spread_px is not None:
+        parts.append(f"masks differ by {candidate.corrections.mask_spread_px:.2g} px")
     if candidate.corrections.exposure_stops is not None:
         parts.append(f"exposures differ by {candidate.corrections.exposure_stops:.2g} stops")
     if candidate.corrections.white_balance_stops is not None:

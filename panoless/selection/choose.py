@@ -5,7 +5,7 @@ every picture as it was.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,8 @@ from panoless.selection.candidates import Candidate, Selection, Verdict, describ
 from panoless.selection.corrections import with_corrections
 from panoless.selection.fitted import Fitted, is_refined, missed_share
 from panoless.selection.held_out import held_out_errors, held_out_parts
-from panoless.selection.surroundings import brought_near, explains_clearly_more, on_floor, proposed_surroundings
+from panoless.selection.joint import fit_jointly
+from panoless.selection.surroundings import explains_clearly_more, on_floor, proposed_surroundings
 from shinypartial.core.errors import InputError
 
 ANY = "auto"
@@ -145,7 +146,7 @@ def _few_come_near(source: Family, views: Views, proposal: Proposal, config: Fit
     as much longer as there are more, and a wrong kind stays far from the masks.
     """
     stride = len(views.train) // config.poses.trial_views
-    if stride < 2 or config.poses.mode != "auto" or source.finds_poses:
+    if stride < 2 or config.poses.mode != "auto" or source.joint:
         return True
     asked = replace(views, train=views.train[::stride])
     few = align_proposal(source, asked, proposal, config)
@@ -185,6 +186,8 @@ def _best_fit(
 ) -> Fitted | None:
     """The fit of a kind, to photographs that are corrected where held-out views ask for it."""
     source = _source(family)
+    if family.joint:
+        return fit_jointly(family, views, proposals[0], config) if proposals else None
 
     def near(proposals: Sequence[PosedProposal]) -> list[PosedProposal]:
         bent = family.refines is not None
@@ -192,9 +195,7 @@ def _best_fit(
 
     def refit(views: Views, before: Fitted, *, anew: bool) -> Fitted | None:
         poses = before.geometry.poses
-        if family.finds_poses and not anew:
-            again = [before.start.after(before.geometry)]
-        elif family.finds_poses or poses is None:
+        if poses is None:
             again = _proposals(source, views, config, asked=False)
         else:
             proposal = proposed(source, poses.moved(views), config)
@@ -227,12 +228,9 @@ def _fit_around(
     """A fit in the surroundings that the proposal asks for, if it explains clearly more than one in a far world; or in
     near ones that are `known` already.
 
-    The far world is tried on from the fit in a near one, and only where it does as well, from the beginning. A
-    kind that finds poses itself is not asked again: its proposal is of the cameras before.
+    The far world is tried on from the fit in a near one, and only where it does as well, from the beginning.
     """
     source, posed = _source(family), views if start.poses is None else start.poses.moved(views)
-    if family.finds_poses and start.proposal.fitted is not None:
-        return fit_with_poses(family, source, views, start, config)
 
     def follow(fitted: Geometry, surroundings: Surroundings) -> Geometry | None:
         return fit_at(family, views, start.after(fitted).in_surroundings(surroundings), config)
@@ -240,8 +238,7 @@ def _fit_around(
     around = proposed_surroundings(family, posed, start.proposal, config)
     if around.is_far:
         start = start if known.is_far else start.in_surroundings(FAR)
-        far = fit_with_poses(family, source, views, start, config)
-        return far if far is None or not family.finds_poses else brought_near(views, far, follow, config)
+        return fit_with_poses(family, source, views, start, config)
     around = around if known.is_far else known
     near = fit_with_poses(family, source, views, start.in_surroundings(around), config)
     if near is None or not known.is_far:
@@ -249,7 +246,7 @@ def _fit_around(
     near = on_floor(views, near, follow, config)
     if config.surroundings.mode == "on":
         return near
-    start = start if family.finds_poses else replace(start, poses=near.poses)
+    start = replace(start, poses=near.poses)
     far = fit_at(family, views, start.after(near).in_surroundings(FAR), config)
     return (
         near
@@ -300,8 +297,7 @@ def _fit_asked(views: Views, config: FitConfig) -> tuple[Geometry, Selection]:
         family.kind,
         Verdict.CHOSEN,
         "asked for",
-        corrections=fitted.corrections,
-        **_found_cameras(fitted.geometry, views, config),
+        **_found(fitted, views, config),
     )
     return fitted.geometry, Selection(family.kind, (asked_for,))
 
@@ -348,7 +344,7 @@ def _examine(
     evidence = start.proposal.silhouette_px, start.proposal.overlap
     views = fitted.corrections.applied(views, config)
     errors = held_out_errors(usable_views(views, geometry), config, geometry)
-    found = {"corrections": fitted.corrections, **_found_cameras(geometry, views, config)}
+    found = _found(fitted, views, config)
     if errors is None:
         return Candidate(family.kind, Verdict.CHOSEN, NONE_HELD_OUT, *evidence, **found), geometry
     error = float(errors.mean())
@@ -357,10 +353,11 @@ def _examine(
     return Candidate(family.kind, verdict, reason, *evidence, error, **found), geometry
 
 
-def _found_cameras(geometry: Geometry, views: Views, config: FitConfig) -> dict[str, Any]:
-    """What a candidate states of cameras whose poses were unknowns."""
-    poses = geometry.poses
+def _found(fitted: Fitted, views: Views, config: FitConfig) -> dict[str, Any]:
+    """What a candidate states of photographs, and of cameras whose poses were unknowns."""
+    poses, blocks = fitted.geometry.poses, tuple(asdict(each) for each in fitted.decisions)
+    found = {"corrections": fitted.corrections, "blocks": blocks}
     if poses is None:
-        return {}
+        return found
     principal = poses.principal_point_px(views, pose_prior(views, config.poses))
-    return {"camera_turn_deg": poses.turn_deg, "principal_point_px": principal}
+    return {**found, "camera_turn_deg": poses.turn_deg, "principal_point_px": principal}

@@ -18,6 +18,7 @@ from panoless.config import FitConfig
 from panoless.geometry.base import Geometry, usable_views
 from panoless.geometry.registry import FAMILIES
 from panoless.journal import remembered
+from panoless.problem.evidence import Decision
 from panoless.selection.held_out import held_out_parts, unexplained
 
 
@@ -28,6 +29,12 @@ class Fitted:
     geometry: Geometry
     start: PosedProposal
     corrections: Corrections = NO_CORRECTIONS
+    decisions: tuple[Decision, ...] = ()
+    """Which nuisance blocks held-out views need, of a joint fit."""
+
+    def with_geometry(self, geometry: Geometry) -> "Fitted":
+        """The same with another geometry."""
+        return replace(self, geometry=geometry)
 
 
 @runtime_checkable

@@ -8,17 +8,13 @@ from jaxtyping import Float
 
 from panoless.alignment.lens import DISTORTION, FOCAL_LENGTH, LensPull, LensUnknown, lens_pull
 from panoless.capture.corrections import Corrections
-from panoless.capture.lens import LensChange
 from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.environment.surroundings import FAR
-from panoless.geometry.base import Family, Geometry
-from panoless.geometry.registry import FAMILIES
+from panoless.geometry.base import Geometry
 from panoless.selection.fitted import Fitted, Refit, errors_in_common, held_out_errors, outline_distance_px
 from panoless.selection.held_out import is_clearly_lower
 from panoless.selection.options import CorrectionOptions, LensLimits
-
-UNKNOWNS = FOCAL_LENGTH, DISTORTION
 
 
 @dataclass(frozen=True)
@@ -50,21 +46,9 @@ def with_lens(views: Views, fitted: Fitted, config: FitConfig, refit: Refit) -> 
     """Fitted anew through another lens, where held-out views are clearly better explained by it and it is told better
     than it is known.
 
-    A kind that finds a lens beside its shape takes more steps for that, so it is compared with a fit after as many
-    without, and goes on from what was found as long as more is. Others are fitted through several lenses, of other
-    focal lengths and of other distortions. Either pulls at the other: where photographs ask for both, that is found
-    first which explains more by itself.
+    It is fitted through several lenses, of other focal lengths and of other distortions. Either pulls at the other:
+    where photographs ask for both, that is found first which explains more by itself.
     """
-    family, before = FAMILIES[fitted.geometry.kind], fitted
-    for _ in range(config.corrections.lens_trials):
-        found = _jointly(family, views, before, config)
-        if found is None:
-            break
-        if found.corrections is before.corrections:
-            return found
-        before = found
-    if before is not fitted:
-        return before
     longer = _by_trials(FOCAL_LENGTH, views, fitted, config, refit)
     bent = _by_trials(DISTORTION, views, fitted, config, refit)
     if bent is fitted:
@@ -74,39 +58,6 @@ def with_lens(views: Views, fitted: Fitted, config: FitConfig, refit: Refit) -> 
         if by_longer.mean() < by_bent.mean():
             return _by_trials(DISTORTION, views, longer, config, refit)
     return _by_trials(FOCAL_LENGTH, views, bent, config, refit)
-
-
-def _jointly(family: Family, views: Views, fitted: Fitted, config: FitConfig) -> Fitted | None:
-    """With unknowns of the lens beside the shape; None for a kind that does not find them. What is hardly changed, or
-    not told, is believed, and the others are found anew.
-    """
-    options, corrected = config.corrections, fitted.corrections.applied(views, config)
-    unknowns: tuple[LensUnknown, ...] = UNKNOWNS
-    while unknowns:
-        asked = LensChange(**{each.name: 0.0 for each in unknowns})
-        found = family.with_lens(corrected, fitted.geometry, asked, config)
-        if found is None:
-            return None
-        geometry, change = found
-        changes = dict(zip(unknowns, change.values.tolist(), strict=True))
-        corrections = fitted.corrections
-        for each in unknowns:
-            corrections = _changed(corrections, each, changes[each], _limits(each, options).joint_sigma)
-        told = replace(fitted, geometry=geometry, corrections=corrections)
-        if options.lens == "on":
-            return told
-        likely = tuple(
-            each
-            for each in unknowns
-            if abs(changes[each]) >= _limits(each, options).settled and _is_likely(told.corrections, each, options)
-        )
-        if likely == unknowns:
-            break
-        unknowns = likely
-    else:
-        return fitted
-    settled = replace(fitted, geometry=family.after_as_many_steps(corrected, fitted.geometry, config))
-    return told if _is_earned(views, settled, told, unknowns, config) else settled
 
 
 def _by_trials(unknown: LensUnknown, views: Views, fitted: Fitted, config: FitConfig, refit: Refit) -> Fitted:

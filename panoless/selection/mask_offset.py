@@ -10,7 +10,6 @@ from panoless.capture.silhouettes import silhouette_distance_px
 from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.geometry.base import Family, Geometry
-from panoless.geometry.registry import FAMILIES
 from panoless.journal import remembered
 from panoless.selection.fitted import (
     Fitted,
@@ -32,8 +31,7 @@ def masks_are_doubted(views: Views, geometry: Geometry, errors: Float[np.ndarray
     options = config.corrections
     if another_takes_on(geometry, errors, config):
         return False
-    goes_on = FAMILIES[geometry.kind].finds_poses
-    if errors.mean() > (config.selection.explained_error if goes_on else options.largest_error):
+    if errors.mean() > options.largest_error:
         return True
     return _is_doubted(outline_pull_px(views, geometry), config)
 
@@ -46,15 +44,9 @@ def _is_doubted(pull_px: float, config: FitConfig) -> bool:
 def with_moved_masks(source: Family, views: Views, fitted: Fitted, config: FitConfig, refit: Refit) -> Fitted:
     """Fitted anew to masks that are larger or smaller, if held-out views are clearly better explained by that; then
     once more where photographs pull that surface's outlines off the moved ones.
-
-    Proposals of moved outlines tell the offset of kinds whose proposals are near to their fits. A kind that goes on
-    from a fit tells it by that: hulls of flat faces say nothing of it.
     """
-    options, goes_on = config.corrections, source.finds_poses
-    if goes_on:
-        offset = followed_offset(views, fitted, config, refit) or _pulled_offset(views, fitted, config)
-    else:
-        offset = find_mask_offset(source, fitted.corrections.applied(views, config), fitted, config)
+    options = config.corrections
+    offset = find_mask_offset(source, fitted.corrections.applied(views, config), fitted, config)
     found = _moved_by(offset, views, fitted, config, refit, anew=True) if offset else None
     if found is None or not _offset_is_earned(views, fitted, found, config):
         return fitted
@@ -62,7 +54,7 @@ def with_moved_masks(source: Family, views: Views, fitted: Fitted, config: FitCo
     if abs(pull) < options.least_pull_px:
         return found
     nearer_px = _within_largest(found.corrections.mask_offset_px + pull / options.pull_share, config)
-    nearer = _moved_by(nearer_px, views, found, config, refit, anew=not goes_on)
+    nearer = _moved_by(nearer_px, views, found, config, refit, anew=True)
     return nearer if nearer is not None and _explains_more(views, found, nearer, config) else found
 
 
@@ -77,67 +69,6 @@ def _moved_by(
     corrections = replace(before.corrections, mask_offset_px=offset_px)
     again = refit(corrections.applied(views, config), before, anew=anew)
     return None if again is None else replace(again, corrections=corrections)
-
-
-def followed_offset(views: Views, fitted: Fitted, config: FitConfig, refit: Refit) -> float:
-    """By how much all masks are too small, in pixels: to where held-out views are clearly better explained as a fit
-    goes on from pixel to pixel, outward or inward.
-
-    Under right masks, or a step away from them, it explains less: chrome-block and sculpture with masks 1 px too
-    small leave 0.71 and 0.56 of the error after a step outward, 1.40 and 1.26 after one inward; drum with masks 1 px
-    too large 1.11 and 0.74; twist with right ones 1.12 and 1.08.
-    """
-    step, largest = config.corrections.followed_step_px, config.corrections.largest_px
-
-    def followed(offset_px: float, before: Fitted) -> tuple[float, Fitted]:
-        """Share of the error that is left, and the fit; as it was where it is not clearly better."""
-        after = _moved_by(offset_px, views, before, config, refit, anew=False)
-        if after is None:
-            return 1.0, before
-        left, better = _left(views, before, after, config)
-        return (left, after) if better else (1.0, before)
-
-    _, best = min((followed(each, fitted) for each in (step, -step)), key=lambda each: each[0])
-    if best is fitted or not _explains_more_than_staying(views, fitted, best, config, refit):
-        return 0.0
-    onward = float(np.copysign(step, best.corrections.mask_offset_px))
-    while abs(best.corrections.mask_offset_px) + step <= largest:
-        _, farther = followed(best.corrections.mask_offset_px + onward, best)
-        if farther is best:
-            break
-        best = farther
-    return best.corrections.mask_offset_px
-
-
-def _pulled_offset(views: Views, fitted: Fitted, config: FitConfig) -> float:
-    """One wide step to where photographs pull the outlines, if they do: a shape that bent for its masks does not come
-    back by going on.
-    """
-    pull = outline_pull_px(fitted.corrections.applied(views, config), fitted.geometry)
-    return float(np.copysign(config.corrections.step_px, pull)) if _is_doubted(pull, config) else 0.0
-
-
-def _explains_more_than_staying(views: Views, fitted: Fitted, moved: Fitted, config: FitConfig, refit: Refit) -> bool:
-    """Whether held-out views are clearly better explained than by a fit that goes on as long under masks as they were:
-    one that has not settled explains more under any.
-    """
-    stayed = _moved_by(fitted.corrections.mask_offset_px, views, fitted, config, refit, anew=False)
-    return stayed is None or _left(views, stayed, moved, config)[1]
-
-
-def _left(views: Views, before: Fitted, after: Fitted, config: FitConfig) -> tuple[float, bool]:
-    """Share of the error that one fit leaves of that of another, and whether that is clearly less; or less beyond its
-    standard errors, where photographs no longer pull its outlines so far off the masks.
-    """
-    was, is_now = errors_in_common(views, before, after, config)
-    left = float(is_now.mean() / max(was.mean(), 1e-12))
-    if is_clearly_lower(is_now, was, config.selection):
-        return left, True
-    if not is_clearly_lower(is_now, was, replace(config.selection, least_gain=0.0)):
-        return left, False
-    options, fits = config.corrections, (before, after)
-    pulls = [abs(outline_pull_px(each.corrections.applied(views, config), each.geometry)) for each in fits]
-    return left, pulls[0] > options.doubted_inward_px and pulls[1] < options.settled_pull * pulls[0]
 
 
 @remembered()

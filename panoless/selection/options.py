@@ -28,8 +28,6 @@ class SelectionOptions:
     of development scenes leave up to 0.143."""
     doubted_share: Share = 0.5
     """One of those is preferred where it leaves less than this share of that. Not tuned."""
-    explained_error: Share = 0.03
-    """A kind that goes on from a fit doubts its masks where it leaves more of the held-out views unexplained."""
     least_gain: Share = 0.05
     """What is preferred has to lower the held-out error by this share."""
     standard_errors: NonNegative = 2.0
@@ -57,8 +55,6 @@ class LensLimits:
     less."""
     prior: Positive
     """Expected error. What is not told better is not believed."""
-    joint_sigma: Positive
-    """Standard deviation of one that was found as an unknown beside the shape."""
     least_gain: Share
     """Share of the held-out error by which it has to lower that, and by `selection.standard_errors`."""
 
@@ -80,9 +76,7 @@ class CorrectionOptions:
     a fit and held-out views gain by it, whenever it is found, or never."""
     largest_error: Share = 0.08
     """Held-out error of a fit above which masks are doubted. Right ones of development scenes leave at most 0.06, masks
-    that are off by 2 px at least 0.10. A kind that goes on from a fit tells of masks in seconds, so they are doubted
-    from `explained_error` of the model selection on: drum leaves 0.018, with masks that are 1 px too large 0.038;
-    chrome-block leaves 0.031 and sculpture 0.026."""
+    that are off by 2 px at least 0.10."""
     step_px: Positive = 2.0
     """Offsets are tried this far apart. Not tuned."""
     halvings: Count = 2
@@ -98,15 +92,10 @@ class CorrectionOptions:
     edges lies inside them. With masks that are 2 px too small it is 0.015 on the trial shape ellipsoid."""
     pull_share: Positive = 0.17
     """Share of a small offset by which outlines of a fit give way. On vase 0.18, on sculpture 0.16."""
-    followed_step_px: Positive = 1.0
-    """By so much masks are moved each time that such a kind goes on. Not tuned."""
     least_pull_px: Positive = 0.005
     """The fit to moved masks stays where its outlines lie nearer to them than this. With masks that are right it is
     0.001 on vase and 0.004 on sculpture. Moved by 1.9 px where 2 were missing, vase is not followed with 0.02, and its
     normals are off by 0.17 instead of 0.05 degrees."""
-    settled_pull: Share = 0.5
-    """Share of a doubted pull that is left a step nearer to the right masks: there any gain beyond its standard errors
-    counts. Not tuned."""
     examined_rays: Count = 100_000
     """Most rays from which a fit is told to leave much unexplained, and gains to explain more. Not tuned."""
     rays: Count = 60_000
@@ -145,7 +134,6 @@ class CorrectionOptions:
         largest_step=0.03,
         settled=0.0015,
         prior=0.02,
-        joint_sigma=0.004,
         least_gain=0.003,
     )
     """Of the logarithm of the focal length. A true one pulls by 0.00002 on vase, 0.0002 on mirror and 0.00014 on
@@ -160,7 +148,6 @@ class CorrectionOptions:
         largest_step=0.15,
         settled=0.01,
         prior=0.1,
-        joint_sigma=0.02,
         least_gain=0.01,
     )
     """Of the radial distortion; lenses of phones have about 0.06. A pinhole pulls by 0.0003 on vase, 0.003 on sculpture

@@ -10,6 +10,7 @@ from torch import Tensor
 from panoless.capture.views import Views
 from panoless.first_surface.completion import complete_surface, hull_surface
 from panoless.first_surface.mesh import TriangleMesh, unit
+from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.first_surface.visual_hull import Hull, carve_hull
 from panoless.splats.model import Surfels
 from panoless.splats.options import SurfelConfig
@@ -20,14 +21,14 @@ INITIAL_ROUGHNESS_LOGIT = -2.2
 RANDOM_OPACITY = 0.1
 
 
-def hull_surfels(views: Views, config: SurfelConfig, seed: int) -> Surfels:
+def hull_surfels(views: Views, config: SurfelConfig, seed: int, options: FirstSurfaceOptions) -> Surfels:
     """Surfels over the part of the first surface that faces some camera, curved as it is, within the outlines.
 
     `thin-plate` takes the completed hull, `hull` the hull itself. Axes follow the principal directions; a radius is
     at most that of `_reach`, so that strong curvature gets smaller surfels, and more of them.
     """
-    hull = carve_hull(views, options.hull_resolution, options.hull_votes, options)
-    surface = complete_surface(hull, views, options) if config.initial == "thin-plate" else hull_surface(hull)
+    hull = carve_hull(views, options.hull_resolution, options.hull_votes)
+    surface = complete_surface(hull, views) if config.initial == "thin-plate" else hull_surface(hull)
     facing = _faces_some_camera(surface, views)
     return surfels_on_mesh(surface, config, seed, facing, hull)
 
@@ -143,9 +144,11 @@ def random_surfels(config: SurfelConfig, seed: int) -> Surfels:
     return surfels_at(points, frames, np.full((config.count, 2), scale), np.zeros((config.count, 3)), logit)
 
 
-def initial_surfels(views: Views, config: SurfelConfig, seed: int) -> Surfels:
+def initial_surfels(
+    views: Views, config: SurfelConfig, seed: int, options: FirstSurfaceOptions = FirstSurfaceOptions()
+) -> Surfels:
     """The surfels that a fit starts from, on the device of the views."""
-    surfels = random_surfels(config, seed) if config.initial == "random" else hull_surfels(views, config, seed)
+    surfels = random_surfels(config, seed) if config.initial == "random" else hull_surfels(views, config, seed, options)
     return surfels.to(views.train[0].mask.device)
 
 

@@ -50,6 +50,23 @@ SCORES, EVALUATION, REPORT = "scores.json", "evaluation", "report.html"
 
 
 @dataclass(frozen=True)
+class NuisanceBlock:
+    """Unknowns beside the model, such as poses, and whether the scene needs them.
+
+    `score` is the mean square of the unknowns over their standard deviations, and needed where it exceeds the `bound`.
+    `value` is the root mean square of the unknowns and `sigma` their standard deviation, both in the `unit`.
+    """
+
+    name: Text
+    kept: bool
+    score: NonNegative
+    bound: NonNegative
+    value: NonNegative
+    sigma: NonNegative
+    unit: str = ""
+
+
+@dataclass(frozen=True)
 class Candidate:
     """A kind of model that was considered, the evidence for it, and what became of it; None: not measured.
 
@@ -61,7 +78,8 @@ class Candidate:
     from the mean of a view. `focal_factor` is the focal length of all views over what is said of it where that was an
     unknown, `focal_uncertainty` its standard deviation, `k1` and `k1_uncertainty` the same of a radial distortion in
     OpenCV's model, and `principal_point_px` how far to the right and below of what is said
-    it found the principal point. `verdict` is a word such as "chosen" or "rejected", `reason` says why.
+    it found the principal point. `mask_spread_px` is the standard deviation of the offsets of single masks, `blocks`
+    lists what was unknown beside the model. `verdict` is a word such as "chosen" or "rejected", `reason` says why.
     """
 
     kind: Text
@@ -80,6 +98,8 @@ class Candidate:
     k1: float | None = None
     k1_uncertainty: NonNegative | None = None
     principal_point_px: tuple[float, float] | None = None
+    mask_spread_px: NonNegative | None = None
+    blocks: tuple[NuisanceBlock, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,17 @@ SIZES = [
     "--model", "surfels",
     "--config.iterations", "4",
     "--config.surfels.count", "40",
-    "--config.surfels.hull-resolution", "24",
     "--config.environment.resolution", "8",
     "--config.environment.solve-resolution", "8",
 ]  # fmt: skip
-TINY = [*SIZES, "--set", "surroundings.mode=off", "material.reflectance=off", "trust.resolution=16"]
+TINY = [
+    *SIZES,
+    "--set",
+    "first_surface.hull_resolution=24",
+    "surroundings.mode=off",
+    "material.reflectance=off",
+    "trust.resolution=16",
+]
 TINY += ["corrections.masks=off", "corrections.exposure=off", "corrections.lens=off"]
 
 
@@ -214,9 +220,7 @@ BAD_VALUES = {
     "no surfels": "--config.surfels.count 0",
     "no texels": "--config.environment.resolution 0",
     "no texels in the end": "--config.environment.solve-resolution -1",
-    "a hull of nothing": "--config.surfels.hull-resolution 1",
     "fewer than no iterations": "--config.iterations -1",
-    "more than all votes": "--config.surfels.hull-votes 1.5",
 }
 
 
@@ -258,7 +262,7 @@ def test_export_of_what_is_no_run(damage: str, workplace: Path, finished: Path, 
         (run / "fit.json").write_text("[1, 2]")
     if damage == "old options":
         content = json.loads((run / "fit.json").read_text())
-        del content["config"]["loss"]["lambda_ssim"]
+        del content["config"]["splats"]["loss"]["lambda_ssim"]
         (run / "fit.json").write_text(json.dumps(content))
     capsys.readouterr()
     assert_refused(capsys, main(["export", "runs/out", "--output", "again"]))

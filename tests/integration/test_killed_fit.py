@@ -38,9 +38,15 @@ sys.exit(main(sys.argv[1:]))
 def command(dataset: Dataset, output: str) -> list[str]:
     """A fit of many short steps, and little beside them."""
     options = ["--model", "surfels", "--config.iterations", str(ITERATIONS), "--config.surfels.count", "100"]
-    options += ["--config.surfels.hull-resolution", "24", "--config.environment.resolution", "16"]
+    options += ["--config.environment.resolution", "16"]
     options += ["--config.environment.solve-resolution", "16"]
-    options += ["--set", "surroundings.mode=off", "material.reflectance=off", "trust.resolution=16"]
+    options += [
+        "--set",
+        "first_surface.hull_resolution=24",
+        "surroundings.mode=off",
+        "material.reflectance=off",
+        "trust.resolution=16",
+    ]
     options += ["corrections.masks=off", "corrections.exposure=off", "corrections.lens=off"]
     return ["fit", str(dataset.root), "--output", output, *options]
 

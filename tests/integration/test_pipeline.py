@@ -39,9 +39,15 @@ def test_generate_fit_evaluate_report(
     monkeypatch.chdir(tmp_path)
     sizes = ["--resolution", "48", "--samples", "4", "--train", "12", "--test", "4"]
     assert shinypartial(["generate", "--scene", "vase", *sizes]) == 0
-    options = ["--config.iterations", "60", "--config.surfels.count", "400", "--config.surfels.hull-resolution", "40"]
+    options = ["--config.iterations", "60", "--config.surfels.count", "400"]
     options += ["--config.environment.resolution", "24", "--config.environment.solve-resolution", "24"]
-    options += ["--set", "corrections.masks=off", "corrections.exposure=off", "corrections.lens=off"]
+    options += [
+        "--set",
+        "first_surface.hull_resolution=40",
+        "corrections.masks=off",
+        "corrections.exposure=off",
+        "corrections.lens=off",
+    ]
     options += ["surroundings.mode=off", "material.reflectance=off", "material.roughness=off", "material.blur=off"]
     assert shinypartial(["validate"]) == 0
     for model in (["surfels"], ["revolution", "--output", "predictions/round"]):

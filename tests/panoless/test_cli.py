@@ -20,6 +20,7 @@ from shinypartial.prediction.format import read_info
 
 TUNED = (
     "mask_repair",
+    "first_surface",
     "contrast",
     "sphere",
     "plane",
@@ -34,8 +35,14 @@ TUNED = (
     "trust",
     "surfels.tuned",
 )
-TINY = ["--config.iterations", "4", "--config.surfels.count", "40", "--config.surfels.hull-resolution", "24"]
-AS_TOLD = ["--set", "corrections.masks=off", "corrections.exposure=off", "corrections.lens=off"]
+TINY = ["--config.iterations", "4", "--config.surfels.count", "40"]
+AS_TOLD = [
+    "--set",
+    "first_surface.hull_resolution=24",
+    "corrections.masks=off",
+    "corrections.exposure=off",
+    "corrections.lens=off",
+]
 AS_TOLD += ["surroundings.mode=off", "material.reflectance=off", "material.roughness=off", "material.blur=off"]
 """Photographs of an object that the kind does not fit are not doubted, and explained by nothing else."""
 MODELS = get_args(get_args(get_type_hints(FitConfig, include_extras=True)["model"])[0])
@@ -45,7 +52,9 @@ def option_names(config: object, prefix: str = "--config.") -> list[str]:
     names: list[str] = []
     for item in fields(config):  # type: ignore[arg-type]
         value, name = getattr(config, item.name), item.name.replace("_", "-")
-        names += option_names(value, f"{prefix}{name}.") if is_dataclass(value) else [prefix + name]
+        # The room of splatting has no part in the names of its options.
+        inner = prefix if name == "splats" else f"{prefix}{name}."
+        names += option_names(value, inner) if is_dataclass(value) else [prefix + name]
     return names
 
 
@@ -71,7 +80,8 @@ def test_help_lists_every_option(capsys: pytest.CaptureFixture[str], monkeypatch
 def test_every_tuned_number_can_be_set(section: str) -> None:
     """To its own value, which changes nothing, and by a wrong word, which is refused."""
     config = FitConfig()
-    values = reduce(dict.__getitem__, section.split("."), write_record(config))
+    record = write_record(config)
+    values = reduce(dict.__getitem__, section.split("."), {**record, **record["splats"]})
     overrides = [f"{section}.{name}={json.dumps(value)}" for name, value in values.items()]
     assert with_overrides(config, overrides) == config
     for override in (f"{section}.of_the_future=1", f"{overrides[0].partition('=')[0]}=word", section):
@@ -90,7 +100,7 @@ def test_a_preset_sets_the_defaults(
     preset: str, form: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = help_text(["fit", *form.format("--preset", preset).split()], capsys, monkeypatch)
-    assert f"default: {PRESETS[preset].iterations})" in text
+    assert f"default: {PRESETS[preset].splats.iterations})" in text
     assert f"default: {preset})" in text
 
 
@@ -165,10 +175,10 @@ def test_options_reach_the_fit_and_are_saved(
     folder = tmp_path / "predictions" / f"{sphere_dataset.name}-paper"
     saved = json.loads((folder / "prediction.json").read_text())["config"]
     assert saved == json.loads((tmp_path / "runs" / folder.name / "fit.json").read_text())["config"]
-    assert saved["iterations"] == 4
-    assert saved["loss"]["lambda_ssim"] == 0.25
+    assert saved["splats"]["iterations"] == 4
+    assert saved["splats"]["loss"]["lambda_ssim"] == 0.25
     assert (saved["selection"]["least_gain"], saved["plane"]["max_vertices"]) == (0.1, 9)
-    assert saved["density"]["enabled"] is False
+    assert saved["splats"]["density"]["enabled"] is False
     assert saved["environment"]["activation"] == "sigmoid"
     lines = capsys.readouterr().out.splitlines()
     assert any(line.startswith("Next: shinypartial evaluate predictions") for line in lines)

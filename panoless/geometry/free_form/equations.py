@@ -5,12 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from panoless.geometry.free_form.beside import BlockRows, outline_pose_rows
-from panoless.geometry.free_form.observations import PixelRays
+from panoless.geometry.free_form.motions import outline_motion_rows
 from panoless.geometry.free_form.options import FreeFormOptions
 from panoless.geometry.free_form.surface import LEAST_SLOPE, LevelSet
 from panoless.kernels.level_set import add_rows, add_squares, apply_rows, evaluate
 from panoless.numeric.robust import bounded_error, robust_weight
+from panoless.problem.nuisance import Nuisance
+from panoless.problem.rays import PixelRays
 
 
 @dataclass(frozen=True)
@@ -51,34 +52,36 @@ def silhouette_rows(
     missed: PixelRays,
     outline_weight: float,
     miss_weight: float,
+    nuisance: Nuisance,
     options: FreeFormOptions,
-) -> tuple[Rows, BlockRows]:
-    """Outlines, along whose rays the least φ should be zero, and pixels on the object that miss it, for which it
-    should be negative.
+) -> tuple[Rows, Float[np.ndarray, "S 1 6"]]:
+    """Outlines, along whose rays the least φ should be δ, and pixels on the object that miss it, for which it should be
+    no more; and how both change with (ω, τ) of their rays.
 
-    The residual is φ/(‖∇φ‖ a t) where φ is least, in pixels, with a the pixel's angle and t the distance. It
-    changes with the pose of its view, too.
+    The residual is φ/(‖∇φ‖ a t) − δ where φ is least, in pixels, with a the pixel's angle, t the distance and δ the
+    offset of the view's mask.
     """
     parts = []
-    for rays, weight, scale in (
-        (outlines, outline_weight, options.outline_scale_px),
-        (missed, miss_weight * options.miss_weight, options.miss_scale_px),
+    for rays, weight, scale, one_sided in (
+        (outlines, outline_weight, options.outline_scale_px, False),
+        (missed, miss_weight * options.miss_weight, options.miss_scale_px, True),
     ):
         near = surface.nearest(rays.origins, rays.directions)
         slope = np.maximum(np.linalg.norm(near.derivatives[:, 1:4], axis=1), LEAST_SLOPE)
         by_value = near.met / (slope * rays.size * np.where(near.met, near.distance / surface.spacing, 1.0))
-        residual = near.derivatives[:, 0] * by_value
-        weights = weight * near.met * robust_weight(residual, scale)
+        residual = near.derivatives[:, 0] * by_value - near.met * nuisance.offsets_px(rays.view)
+        counted = near.met & (residual > 0) if one_sided else near.met
+        residual = residual * counted
+        weights = weight * counted * robust_weight(residual, scale)
         cost = weight * scale**2 * float(np.where(near.met, bounded_error(residual, scale), 1.0).sum())
         distance = np.where(near.met, near.distance, 0.0) / surface.spacing
-        by_pose = outline_pose_rows(near.derivatives[:, 1:4], rays.directions, distance, by_value)
-        by_pose[..., 3:] /= surface.spacing
-        parts.append((near.places, by_value, residual, weights, rays.view, by_pose, cost))
-    places, by_value, residual, weights, view, by_pose = (np.concatenate([part[k] for part in parts]) for k in range(6))
+        by_motion = outline_motion_rows(near.derivatives[:, 1:4], rays.directions, distance, by_value)
+        by_motion[..., 3:] /= surface.spacing
+        parts.append((near.places, by_value, residual, weights, by_motion, cost))
+    places, by_value, residual, weights, by_motion = (np.concatenate([part[k] for part in parts]) for k in range(5))
     rows = np.zeros((len(places), 1, 4))
     rows[:, 0, 0] = by_value
-    cost = sum(part[6] for part in parts) / 2
-    return Rows(places, rows, residual[:, None], weights, cost), BlockRows(view, by_pose, weights)
+    return Rows(places, rows, residual[:, None], weights, sum(part[5] for part in parts) / 2), by_motion
 
 
 def gauge_rows(surface: LevelSet, near: Bool[np.ndarray, "A B C"], weight: float) -> Rows:

@@ -1,38 +1,56 @@
 """A free-form surface from silhouettes and photographs: accepted Gauss–Newton steps, from coarse to fine."""
 
 import math
-from collections.abc import Iterator, MutableMapping, Sequence
+from collections.abc import Collection, Iterator, MutableMapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
-from panoless.capture.lens import LensChange
-from panoless.capture.poses import Poses, StatedCameras, with_pose_covariances
+from panoless.capture.poses import StatedCameras
 from panoless.capture.views import Views, split_held_out
 from panoless.environment.rays import Rays
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
-from panoless.geometry.base import ToldPoses
 from panoless.geometry.free_form.concave import concave_start
 from panoless.geometry.free_form.observations import outline_rays, solid_pixels
 from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.photometric import Sights, Solution, Task
+from panoless.geometry.free_form.steps import solved_equations, take_steps, with_noise
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import Trust, full_trust
 from panoless.journal import remembered
-from panoless.numeric.conjugate_gradients import solve_by_products
 from panoless.numeric.factorize import regularize
 from panoless.numeric.gauss_newton import keep_if_better
+from panoless.problem.evidence import Decision, decided, with_needed
+from panoless.problem.nuisance import (
+    NO_NUISANCE,
+    CameraPoses,
+    Distortion,
+    Exposures,
+    Nuisance,
+    WhiteBalances,
+    nuisance_of,
+)
 from shinypartial.io.progress import Progress
 
-THIRD_DIFFERENCE_DIAGONAL = 3 * 20 + 6 * 3 * 12 + 6 * 8
-"""Of DᵀD: Σ over the kinds of how often one counts in |D³c|² times its squared factors."""
 KNOWN = 1e9
 """Rays a texel that ask for nothing, under which the map stays."""
+SHARED_SCALE = 0.2
+"""Robust scale above which what all views share stays: its derivative under a coarse map has the wrong sign."""
+SATURATED = 0.97
+"""Share of the largest radiance from which a pixel is taken for saturated."""
+LAST_RAYS = 2.5
+"""Factor of the pixels of the last round, which all views take: those before lead to where it starts."""
+JUDGED_RAYS = 40_000
+"""Pixels by which blocks are judged."""
+VARIANCE_STEPS = 60
+"""Conjugate-gradient steps of a variance, which fewer understate."""
+SETTLING_STEPS = 3
+"""In which distortion is found beside what is known."""
 LEAST_BRIGHTNESS = 1e-6
 """Photographs that are black count as this bright (linear radiance)."""
 
@@ -47,10 +65,8 @@ class FitStage:
     damping: float
     settings: FreeFormRound | None = None
     """Of the round that led here."""
-    poses: Poses | None = None
-    """Of the views, where they are unknowns."""
-    lens: LensChange | None = None
-    """Of all views, where it is unknown."""
+    nuisance: Nuisance = NO_NUISANCE
+    """Cameras, exposures and masks, where these are unknown."""
     cost: float = math.inf
     """After that round."""
 
@@ -61,34 +77,28 @@ class FitStage:
         return self.settings
 
 
-@dataclass(frozen=True)
-class Change:
-    """A step of everything that is unknown: coefficients in cells, and what is unknown beside them."""
-
-    coefficients: Float[np.ndarray, "A B C"]
-    beside: list[Float[np.ndarray, "_ _"]]
-
-
 def fit_free_form(
     views: Views,
     start: LevelSet,
     options: FreeFormOptions = DEFAULTS,
     *,
     lids: Sequence[LevelSet] = (),
-    free_poses: bool = False,
-) -> tuple[LevelSet, Trust, Poses | None]:
-    """The surface that explains photographs and outlines best, no finer than held-out views want it, its trust, and the
-    poses of the views where these are unknowns.
+    nuisance: Nuisance = NO_NUISANCE,
+    required: Collection[str] = (),
+) -> tuple[FitStage, list[Decision]]:
+    """The surface that explains photographs and outlines best, no finer than held-out views want it, with the nuisance
+    blocks that the scene needs; and what was decided of each.
 
     Rounds are taken with four fifths of the views as long as the others gain by them, and the last of those once more
     with all, in which outlines count more where photographs agree with them. After the rounds that are always taken,
-    hollows are searched, parts that pixels distrust are mended, details are looked for where much is left, and poses
-    are set `free`, under the prior that views state of them. Hollows are searched under the start, and if there is
+    hollows are searched, blocks that are not `required` are removed unless they are needed, parts that pixels distrust
+    are mended, and details are looked for where much is left. Hollows are searched under the start, and if there is
     none, under the `lids`, other first surfaces.
     """
-    kept, held_out = split_held_out(views.train)
-    solved = replace(views, train=tuple(kept)) if kept and held_out else views
-    tested = replace(views, train=tuple(held_out))
+    kept, others = split_held_out(range(len(views.train)))
+    if not kept or not others:
+        kept, others = list(range(len(views.train))), []
+    solved, tested = (replace(views, train=tuple(views.train[number] for number in part)) for part in (kept, others))
     rounds = *options.rounds, *options.finer
     again = max(settings.steps for settings in (options.rounds[-1], *options.finer, *options.detailing[-1:]))
     progress = Progress("fitting a free-form surface", sum(settings.steps for settings in rounds) + again)
@@ -104,54 +114,64 @@ def fit_free_form(
         return keep_if_better((stage, other), error, least_gain)
 
     with torch.no_grad():
-        stage = coarse_stage(solved, start, options.rounds, options, progress)
+        usual = nuisance.freed([name for name in nuisance.free if name != Distortion.name]).of_views(kept)
+        stage = coarse_stage(solved, start, options.rounds, options, progress, usual)
         begun, hollowed = start, None
         for lid in (start, *lids) if options.concave.search else ():
             hollowed = concave_start(solved, lid, stage.surface, options.concave)
             if hollowed is not None:
                 break
         if hollowed is not None:
-            deeper = coarse_stage(solved, hollowed, options.concave.rounds, options)
-            stage = better(stage, deeper, options.concave.least_held_out_gain) if held_out else deeper
+            deeper = coarse_stage(solved, hollowed, options.concave.rounds, options, nuisance=stage.nuisance)
+            stage = better(stage, deeper, options.concave.least_held_out_gain) if others else deeper
             begun = hollowed if stage is deeper else start
-        if held_out:
+        stage, decisions = _needed(solved, stage, required, options)
+        if others:
             stage = keep_if_better(mended_stages(solved, stage, options), error, options.least_mending_gain)
-            if options.detailing and not free_poses and error(stage) > options.detailed_error:
-                stage = better(stage, _detailed_stage(solved, begun, options), options.least_detailing_gain)
-        if free_poses:
-            stage = take_round(solved, replace(stage, poses=Poses.none(len(solved.train))), stage.last, options)
-        if held_out:
+            if options.detailing and error(stage) > options.detailed_error:
+                stage = better(
+                    stage, _detailed_stage(solved, begun, stage.nuisance, options), options.least_detailing_gain
+                )
             stage = keep_if_better(_stages(solved, stage, options, progress), error, options.least_held_out_gain)
+        stage, later = _needed(solved, _with_distortion(solved, stage, options), required, options)
         skipped = progress.total - progress.done - stage.last.steps
         if skipped > 0:
             progress.advance(steps=skipped)
-        if stage.poses is not None and held_out:
-            stage = replace(stage, poses=_joined(stage.poses, found_poses(solved, tested, stage, options)))
-        stage = take_round(views, stage, stage.last, options, progress, last=True)
-    return stage.surface, stage.trust, stage.poses
+        if others and stage.nuisance.blocks:
+            unseen = predicted(solved, tested, stage, options).nuisance
+            stage = replace(stage, nuisance=joined(stage.nuisance, unseen, len(views.train)))
+        settings = replace(stage.last, rays=round(LAST_RAYS * stage.last.rays))
+        return take_round(views, stage, settings, options, progress, last=True), list((decisions | later).values())
 
 
-def follow_views(
-    views: Views, fitted: FitStage, options: FreeFormOptions = DEFAULTS, *, longer: bool = False
-) -> FitStage:
-    """What an earlier fit led to after its last round was taken again, with views that changed a little, or with the
-    lens among the unknowns. A few steps by fewer pixels tell whether that asks for more of them, or for as many
-    without where `longer`.
+def _needed(
+    views: Views, stage: FitStage, required: Collection[str], options: FreeFormOptions
+) -> tuple[FitStage, dict[str, Decision]]:
+    """A stage without the free blocks that the scene does not need, and what was decided of each."""
+    known = variances(views, stage, options)
+    blocks = [each for each in stage.nuisance.blocks if each.name in stage.nuisance.free]
+    decisions = {each.name: decided(each, known[each.name], required=each.name in required) for each in blocks}
+    return replace(stage, nuisance=with_needed(stage.nuisance, list(decisions.values()))), decisions
+
+
+def _with_distortion(views: Views, stage: FitStage, options: FreeFormOptions) -> FitStage:
+    """A stage after a few steps with the distortion beside what is free, where it is an unknown."""
+    if stage.nuisance.get(Distortion) is None:
+        return stage
+    free = stage.nuisance.freed([*stage.nuisance.free, Distortion.name])
+    settings = replace(stage.last, steps=SETTLING_STEPS, rays=min(stage.last.rays, JUDGED_RAYS))
+    return replace(take_round(views, replace(stage, nuisance=free), settings, options), settings=stage.last)
+
+
+def follow_views(views: Views, fitted: FitStage, options: FreeFormOptions = DEFAULTS) -> FitStage:
+    """What an earlier fit led to after its last round was taken again, with views that changed a little. In near
+    surroundings that takes more steps.
     """
     rounds = [*options.detailing, *options.rounds, *options.finer]
     last = next((each for each in reversed(rounds) if each.cells == fitted.surface.cells), rounds[-1])
-    stage, settings = replace(fitted, settings=last), last
+    stage, settings = replace(fitted, settings=last), replace(last, rays=round(LAST_RAYS * last.rays))
     with torch.no_grad():
-        if stage.lens is not None:
-            glance = replace(
-                settings, steps=options.lens_glance_steps, rays=min(options.lens_glance_rays, settings.rays)
-            )
-            seen = take_round(views, stage, glance, options, last=True)
-            assert seen.lens is not None, "the lens was unknown"
-            least = seen.lens.of_unknowns(options.least_focal_change, options.least_k1_change)
-            if (np.abs(seen.lens.values) < least).all():
-                return seen
-        if longer or stage.lens is not None or not stage.surface.surroundings.is_far:
+        if not stage.surface.surroundings.is_far:
             settings = replace(settings, steps=options.shared_steps)
             options = replace(options, least_gain=options.least_shared_gain)
         return take_round(views, stage, settings, options, Progress("fitting on", settings.steps), last=True)
@@ -163,86 +183,48 @@ def coarse_stage(
     rounds: Sequence[FreeFormRound],
     options: FreeFormOptions,
     progress: Progress | None = None,
-    poses: Poses | None = None,
+    nuisance: Nuisance = NO_NUISANCE,
 ) -> FitStage:
-    """What rounds lead to from a first surface, and from poses where these are unknowns."""
-    stage = FitStage(start, full_trust(start, options.trust_cells), None, options.damping, poses=poses)
+    """What rounds lead to from a first surface and from nuisance blocks."""
+    stage = FitStage(start, full_trust(start, options.trust_cells), None, options.damping, nuisance=nuisance)
     for settings in rounds:
         stage = take_round(views, stage, settings, options, progress)
     return stage
 
 
-def _detailed_stage(views: Views, start: LevelSet, options: FreeFormOptions) -> FitStage:
+def _detailed_stage(views: Views, start: LevelSet, nuisance: Nuisance, options: FreeFormOptions) -> FitStage:
     """What fine grids under coarse maps lead to from a first surface."""
     progress = Progress("looking for details", sum(each.steps for each in options.detailing))
-    return coarse_stage(views, start, options.detailing, options, progress)
+    return coarse_stage(views, start, options.detailing, options, progress, nuisance)
 
 
-def poses_by_outlines(
-    views: Views,
-    starts: Sequence[LevelSet],
-    options: FreeFormOptions = DEFAULTS,
-    *,
-    views_agree: bool = True,
-    always: bool = False,
-) -> ToldPoses | None:
-    """Poses that outlines alone tell, beside a shape that starts from the best of some first surfaces, under the prior
-    that views state of them; but `always` None where a shape under believed poses costs little more. The first start
-    that tells so is believed where `views_agree` on a hull.
+def joined(solved: Nuisance, tested: Nuisance, count: int) -> Nuisance:
+    """Blocks of so many views from those of the two parts."""
+    order = np.argsort(np.concatenate(split_held_out(range(count))))
+    pairs = zip(solved.blocks, tested.blocks, strict=True)
+    return solved.replaced([one.joined(other, order) for one, other in pairs if one.by_view])
 
-    How far a face bulges is nothing to outlines, so a wrong shape can't draw cameras along, as it does by photographs.
-    From one view, a turn looks much like a shift. How large either is in all views is known better: what cameras are
-    turned about their lines of sight, or shifted along these, looks like nothing else. So poses are found again under a
-    prior of the sizes that turns and shifts were found to have.
+
+def predicted(solved: Views, views: Views, stage: FitStage, options: FreeFormOptions) -> Solution:
+    """Views that took no part under the surface, the map and the lens of those that did; their own blocks alone are
+    free.
     """
-    wide, settings = replace(options, outline_scale_px=options.pose_outline_scale_px), options.outline_round
-    glance = replace(wide, outline_points=min(options.pose_glance_points, options.outline_points))
-    with torch.no_grad():
-        cost, least, start = math.inf, math.inf, starts[0]
-        for each in starts:
-            free = coarse_stage(views, each, [settings], glance, poses=Poses.none(len(views.train))).cost
-            if free < least:
-                least, start = free, each
-            if not always:
-                cost = min(cost, coarse_stage(views, each, [settings], glance).cost)
-            if views_agree and least > options.largest_cost_left * cost:
-                return None
-        if least > options.largest_cost_left * cost:
-            return None
-        told = coarse_stage(views, start, [settings], wide, poses=Poses.none(len(views.train)))
-        task, cameras = make_task(views, settings, wide), StatedCameras.of(views)
-        stated = task.pose_prior
-        for _ in range(options.pose_prior_rounds):
-            assert told.poses is not None, "poses were free"
-            prior = told.poses.likely_prior(cameras, stated, options.least_pose_share)
-            views = with_pose_covariances(views, np.linalg.inv(regularize(prior, "the poses")))
-            told = coarse_stage(views, start, [settings], wide, poses=Poses.none(len(views.train)))
-            task = make_task(views, settings, wide)
-        assert told.poses is not None, "poses were free"
-        known = Solution.at(task, told.surface, told.trust, None, 0, told.poses).beside[0].blocks - task.pose_prior
-    precision = regularize(options.outline_trust * known + task.pose_prior, "the poses")
-    return ToldPoses(told.poses, np.linalg.inv(precision), task.pose_prior)
+    settings = replace(stage.last, rays=min(stage.last.rays, JUDGED_RAYS))
+    known = make_task(solved, settings, options, stage.nuisance)
+    under = Solution.at(known, stage.surface, stage.trust, None, options.first_map_rounds, stage.nuisance)
+    own = [each.name for each in stage.nuisance.free_blocks(by_view=True)]
+    nuisance = fresh(views, stage.nuisance).freed(own)
+    settings = replace(settings, rays=JUDGED_RAYS // 4, steps=options.pose_steps, under_known_map=True)
+    solution = Solution.at(
+        make_task(views, settings, options, nuisance), stage.surface, stage.trust, under.environment, 0, nuisance
+    )
+    return take_steps(with_noise(solution), stage.damping, still=True)[0] if own else solution
 
 
-def _joined(solved: Poses, tested: Poses) -> Poses:
-    """Poses of all views from those of the two parts."""
-    order = np.argsort(np.concatenate(split_held_out(range(len(solved.turns) + len(tested.turns)))))
-    both = np.concatenate([solved.stacked, tested.stacked])[order]
-    return Poses(both[:, :3], both[:, 3:])
-
-
-def found_poses(solved: Views, views: Views, stage: FitStage, options: FreeFormOptions) -> Poses:
-    """Poses of views that took no part, under the surface and the map of those that did, which stay as they are."""
-    known = make_task(solved, stage.last, options)
-    under = Solution.at(known, stage.surface, stage.trust, None, options.first_map_rounds, stage.poses)
-    environment = under.environment
-    settings = replace(stage.last, steps=options.pose_steps, under_known_map=True)
-    task = make_task(views, settings, options)
-    poses = Poses.none(len(views.train))
-    solution = Solution.at(task, stage.surface, stage.trust, environment, 0, poses)
-    moved = take_steps(solution, stage.damping, still=True)[0].poses
-    assert moved is not None, "poses were free"
-    return moved
+def fresh(views: Views, nuisance: Nuisance) -> Nuisance:
+    """The same blocks of other views, those of views at their priors."""
+    known = nuisance_of(views)
+    return nuisance.replaced([each for each in known.blocks if each.by_view])
 
 
 def _stages(views: Views, stage: FitStage, options: FreeFormOptions, progress: Progress) -> Iterator[FitStage]:
@@ -289,16 +271,18 @@ def take_round(
     last: bool = False,
 ) -> FitStage:
     """A stage after the steps of a round; in the `last` one outlines count more where photographs agree with them."""
-    surface = stage.surface
+    surface, nuisance = stage.surface, stage.nuisance
+    if settings.robust_scale > SHARED_SCALE:
+        stage = replace(stage, nuisance=nuisance.locked)
     if stage.settings is None or stage.settings.cells != settings.cells:
         surface = surface.resampled(settings.cells)
-    task = make_task(views, settings, options)
+    task = make_task(views, settings, options, stage.nuisance)
     if settings.anchored:
         task = replace(task, anchor=surface.coefficients)
-    solution = Solution.at(
-        task, surface, stage.trust, stage.environment, options.first_map_rounds, stage.poses, stage.lens
-    )
-    if last and solution.outlines_agree:
+    solution = Solution.at(task, surface, stage.trust, stage.environment, options.first_map_rounds, stage.nuisance)
+    if stage.nuisance.free:
+        solution = with_noise(solution)
+    elif last and solution.outlines_agree:
         solution = replace(solution, task=task.outlined(options.agreed_outline_gain))
     solution, damping = take_steps(solution, stage.damping, progress)
     found = replace(
@@ -308,18 +292,21 @@ def take_round(
         environment=solution.environment,
         damping=damping,
         settings=settings,
-        poses=solution.poses,
-        lens=solution.lens,
+        nuisance=solution.nuisance.freed(nuisance.free),
         cost=solution.cost(solution),
     )
-    if solution.poses is None:
+    cameras = solution.nuisance.get(CameraPoses)
+    if cameras is None or cameras.name not in solution.nuisance.free:
         return found
-    # The map follows with the next round, which starts it anew.
-    common, poses = solution.poses.without_common(task.cameras, task.pose_prior)
-    return replace(found, surface=solution.surface.taken_back(common), poses=poses, environment=None)
+    # The map is that of the next round, which starts it from nothing.
+    common, poses = cameras.poses.without_common(task.cameras, cameras.precision)
+    moved = found.nuisance.replaced([replace(cameras, values=poses.stacked)])
+    return replace(found, surface=solution.surface.taken_back(common), nuisance=moved, environment=None)
 
 
-def make_task(views: Views, settings: FreeFormRound, options: FreeFormOptions) -> Task:
+def make_task(
+    views: Views, settings: FreeFormRound, options: FreeFormOptions, nuisance: Nuisance = NO_NUISANCE
+) -> Task:
     """The pixels and outlines of a round, weighted as if `counted_rays` pixels took part.
 
     Under coarse maps pixels are wrong by the robust scale s, not by their noise σ: where outlines hold the surface,
@@ -330,8 +317,10 @@ def make_task(views: Views, settings: FreeFormRound, options: FreeFormOptions) -
     pixels, outlines = solid_pixels(views, settings.rays), outline_rays(views)
     total = max(views.num_solid, 1)
     chosen = outlines.chosen(slice(None, None, max(1, -(-len(outlines.size) // options.outline_points))))
-    counted = 0.0 if settings.outlines_alone else options.counted_rays
-    share = counted / options.radiance_sigma**2 / max(len(pixels.inner_px), 1)
+    if {Exposures.name, WhiteBalances.name} & set(nuisance.free):
+        # A saturated pixel has no radiance to divide by a gain.
+        pixels = replace(pixels, inner_px=np.where(is_saturated(pixels.radiance), 0.0, pixels.inner_px))
+    share = options.counted_rays / options.radiance_sigma**2 / max(len(pixels.inner_px), 1)
     density = options.counted_rays / total * len(outlines.size) / max(len(chosen.size), 1)
     believed = (settings.robust_scale / options.radiance_sigma) ** 2 if settings.held else 1.0
     outlined = settings.outline_gain * believed * density / options.outline_sigma_px**2
@@ -339,112 +328,57 @@ def make_task(views: Views, settings: FreeFormRound, options: FreeFormOptions) -
     return Task(pixels, chosen, share, outlined, settings, options, StatedCameras.of(views), brightness)
 
 
-def take_steps(
-    solution: Solution, damping: float, progress: Progress | None = None, *, still: bool = False
-) -> tuple[Solution, float]:
-    """The steps of a round, each of which lowers the cost with hits, visibility and map made anew; the last damping."""
-    options, settings = solution.task.options, solution.task.settings
-    for index in range(settings.steps):
-        if not still:
-            solution = replace(solution, trust=measured_trust(solution))
-        before = solution
-        solution, shortened = _accepted(solution, gauss_newton_step(solution, damping, still=still))
-        stiffest = damping >= options.damping_range[1]
-        factor = options.damping_more**shortened if shortened else options.damping_less
-        damping = float(np.clip(damping * factor, *options.damping_range))
-        gain = 1 - solution.cost(before) / before.cost(before)
-        last = gain < options.least_gain and (shortened < options.trials or stiffest)
-        if progress is not None:
-            progress.advance(steps=settings.steps - index if last else 1)
-        if last:
-            break
-    return solution, damping
+def is_saturated(radiance: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, "P"]:
+    """Whether a channel of a pixel has the largest radiance of all, but for little."""
+    found: np.ndarray = (radiance >= SATURATED * radiance.max(0, initial=0.0)).any(1)
+    return found
 
 
-def _accepted(solution: Solution, step: Change) -> tuple[Solution, int]:
-    """The solution after the longest of the tried lengths of a step that lowers the cost, and how many times it was
-    shortened; the same solution after none, and the number of trials.
+def variances(views: Views, stage: FitStage, options: FreeFormOptions) -> dict[str, Float[np.ndarray, "B M"]]:
+    """Posterior variances of the free blocks, in units of the noise that residuals show.
+
+    Of those of all views (H⁻¹)ᵢᵢ, with the surface, the blocks of views and the map that follow them; of those of views
+    by the inverse of the own matrix of each view, with the surface and the map as they are.
     """
-    options, before = solution.task.options, solution.cost(solution)
-    for shortened in range(options.trials):
-        length = options.shortening**shortened
-        moved = solution.after(length * step.coefficients, [length * each for each in step.beside])
-        if moved.cost(solution) < before:
-            return moved, shortened
-    return solution, options.trials
-
-
-def gauss_newton_step(solution: Solution, damping: float, *, still: bool = False) -> Change:
-    """−(H + μ diag H)⁻¹ g by conjugate gradients, nowhere longer than the longest step; in a `still` scene only
-    poses move.
-
-    That is preconditioned by its blocks: with H = L Lᵀ of a block its unknowns are y = Lᵀ x.
-    """
-    options, shape = solution.task.options, solution.surface.shape
-    diagonal, size = solution.diagonal(THIRD_DIFFERENCE_DIAGONAL), solution.surface.coefficients.size
-    damped = [each.blocks * (1 + damping * np.eye(each.blocks.shape[1])) for each in solution.beside]
-    back = [np.linalg.inv(np.linalg.cholesky(regularize(blocks, "the poses"))).transpose(0, 2, 1) for blocks in damped]
-    ends = np.cumsum([size, *(each.value.size for each in solution.beside)])
-
-    def unpacked(values: Float[np.ndarray, "N"]) -> Change:
-        parts = zip(back, ends[:-1], ends[1:], strict=True)
-        beside = [np.matmul(of, values[first:last].reshape(*of.shape[:2], 1))[..., 0] for of, first, last in parts]
-        return Change(values[:size].reshape(shape), beside)
-
-    def packed(change: Float[np.ndarray, "A B C"], beside: Sequence[Float[np.ndarray, "_ _"]]) -> np.ndarray:
-        parts = zip(back, beside, strict=True)
-        return np.concatenate(
-            [change.ravel(), *(np.matmul(of.transpose(0, 2, 1), part[..., None]).ravel() for of, part in parts)]
-        )
-
-    def product(values: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
-        change = unpacked(values)
-        by_change, by_others = solution.product(change.coefficients, change.beside)
-        for each, moved, by_moved in zip(solution.beside, change.beside, by_others, strict=True):
-            by_moved += damping * np.einsum("bmm->bm", each.blocks) * moved
-        return packed(by_change + damping * diagonal * change.coefficients, by_others)
-
-    gradient, beside = solution.gradient()
-    free = np.zeros(shape) if still else solution.active / (diagonal * (1 + damping))
-    moving = [np.full(each.value.size, not still or index == 0) for index, each in enumerate(solution.beside)]
-    found = solve_by_products(
-        product,
-        -packed(gradient, beside),
-        np.concatenate([free.ravel(), *moving]),
-        solution.task.settings.solver_steps,
-        options.solver_tolerance,
-    )
-    change = unpacked(found)
-    longest = options.largest_step_cells
-    return replace(change, coefficients=np.clip(change.coefficients, -longest, longest))
-
-
-def measured_trust(solution: Solution) -> Trust:
-    """Trust by the residuals of a solution."""
-    points, clear = solution.surface.points(solution.sights.hits.places), solution.free > 0
-    return solution.trust.measured(points, solution.residual, solution.free, clear, solution.task.options)
+    by_view, shared = (stage.nuisance.free_blocks(by_view=each) for each in (True, False))
+    found: dict[str, np.ndarray] = {}
+    if not by_view and not shared:
+        return found
+    task = make_task(views, stage.last, options, stage.nuisance)
+    solution = Solution.at(task, stage.surface, stage.trust, None, options.first_map_rounds, stage.nuisance)
+    solution = with_noise(solution)
+    converged = replace(solution.task, settings=replace(stage.last, solver_steps=VARIANCE_STEPS))
+    solution = replace(solution, task=converged)
+    factor, start = solution.task.prior_factor, 0
+    if by_view:
+        own = np.einsum("bmm->bm", np.linalg.inv(regularize(solution.beside[0].matrix, "cameras")))
+    for block in by_view:
+        found[block.name], start = factor * own[:, start : start + block.size], start + block.size
+    around = len(stage.surface.surroundings.coefficients)
+    for index, block in enumerate(shared):
+        unit = [np.zeros_like(each.value) for each in solution.beside]
+        unit[-1][0, around + index] = 1.0
+        column = solved_equations(solution, (np.zeros(stage.surface.shape), unit), stage.damping)
+        found[block.name] = np.full((1, 1), factor * max(float(column.beside[-1][0, around + index]), 1e-30))
+    return found
 
 
 def held_out_error(solved: Views, tested: Views, stage: FitStage, options: FreeFormOptions) -> float:
-    """Mean of ‖e‖²/(‖e‖² + s²) over rays of views that neither surface nor map have seen, and 1 for those that miss the
-    surface.
-
-    Where poses are unknowns, those of the tested views are found first: six numbers each, against thousands of pixels.
+    """Mean ‖e‖²/(‖e‖² + s²) over rays of views that neither surface nor map have seen, under a map as fine as any, and
+    1 for those that miss the surface.
     """
-    poses = None if stage.poses is None else found_poses(solved, tested, stage, options)
-    known, _ = _rays(solved, stage.surface, stage.poses, options)
-    unknown, missed = _rays(tested, stage.surface, poses, options)
+    own = predicted(solved, tested, stage, options).nuisance if stage.nuisance.blocks else NO_NUISANCE
+    known, _ = _rays(solved, stage.surface, stage.nuisance, options)
+    unknown, missed = _rays(tested, stage.surface, own, options)
     error = prediction_error([unknown], solve_environment([known], options.held_out_resolution))
     return (len(unknown.directions) * error + missed) / max(len(unknown.directions) + missed, 1)
 
 
-def _rays(views: Views, surface: LevelSet, poses: Poses | None, options: FreeFormOptions) -> tuple[Rays, int]:
+def _rays(views: Views, surface: LevelSet, nuisance: Nuisance, options: FreeFormOptions) -> tuple[Rays, int]:
     """Of pixels well inside the masks: those that see the surroundings, and how many miss the surface."""
-    pixels = solid_pixels(views, options.held_out_rays)
-    rays = pixels.rays if poses is None else pixels.rays.moved(poses)
+    pixels, cameras = solid_pixels(views, options.held_out_rays), StatedCameras.of(views)
+    rays = nuisance.moved(pixels.rays, cameras.rotations[pixels.rays.view, 2])
     sights, inner = Sights.of(surface, rays, 1, options.least_cosine), pixels.inner_px > options.inner_px
-    clear = sights.clear & inner
-    outgoing, radiance = (
-        torch.from_numpy(values[clear]).float() for values in (sights.outgoing[:, 0], pixels.radiance)
-    )
-    return Rays(outgoing, radiance), int((inner & ~sights.hits.met).sum())
+    radiance, clear = pixels.radiance * np.exp(-nuisance.log_gains(rays.view)), sights.clear & inner
+    outgoing, seen = (torch.from_numpy(values[clear]).float() for values in (sights.outgoing[:, 0], radiance))
+    return Rays(outgoing, seen), int((inner & ~sights.hits.met).sum())

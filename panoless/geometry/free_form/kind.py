@@ -1,6 +1,6 @@
 """The free-form surface as a kind of geometry."""
 
-from collections.abc import MutableMapping
+from collections.abc import Collection, MutableMapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -11,11 +11,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
-from panoless.capture.contrast import EXPLAINED, Contrast
-from panoless.capture.lens import LensChange
+from panoless.capture.corrections import Corrections
 from panoless.capture.object_frame import ObjectFrame
-from panoless.capture.poses import Poses, StatedCameras, with_pose_covariances
-from panoless.capture.views import TrainView, Views, at_most_pixels, split_held_out
+from panoless.capture.poses import Poses
+from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays
@@ -25,22 +24,24 @@ from panoless.geometry.base import (
     Mesh,
     Proposal,
     SurfaceBuffers,
-    ToldPoses,
     from_plain,
     poses_from_plain,
     to_plain,
 )
 from panoless.geometry.exact import ExactFamily, ExactGeometry
-from panoless.geometry.free_form.fit import FitStage, fit_free_form, follow_views, held_out_error, poses_by_outlines
-from panoless.geometry.free_form.observations import PixelRays, inner_distance_px
+from panoless.geometry.free_form.fit import FitStage, fit_free_form, follow_views, variances
+from panoless.geometry.free_form.observations import inner_distance_px
 from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions
 from panoless.geometry.free_form.photometric import Sights
 from panoless.geometry.free_form.rendering import free_form_buffers, free_form_light
-from panoless.geometry.free_form.start import FirstSurfaces, first_surfaces, started
+from panoless.geometry.free_form.start import first_surfaces, started
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import Trust, full_trust
 from panoless.kernels.camera import RasterCamera
-from panoless.numeric.factorize import regularize
+from panoless.problem.corrected import Corrected
+from panoless.problem.evidence import Decision, decided
+from panoless.problem.nuisance import Block, nuisance_of
+from panoless.problem.rays import PixelRays
 from shinypartial.io.records import read_record, write_record
 
 
@@ -76,8 +77,6 @@ class FreeFormMirror(ExactGeometry):
     occlusion_test: bool = True
     """Whether pixels that see the object again are left out."""
     options: FreeFormOptions = DEFAULTS
-    contrast: Contrast = Contrast()
-    """Of the photographs that it was fitted to, and in which a fit goes on; a state does not keep it."""
 
     @property
     def surroundings(self) -> Surroundings:
@@ -197,7 +196,7 @@ class FreeFormFamily(ExactFamily):
     kind: ClassVar[str] = "free_form"
     geometry: ClassVar[type[Geometry]] = FreeFormMirror
     label: ClassVar[str] = "a free-form surface"
-    finds_poses: ClassVar[bool] = True
+    joint: ClassVar[bool] = True
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """First surfaces as level sets; one that is closed explains any silhouettes in the end.
@@ -214,91 +213,43 @@ class FreeFormFamily(ExactFamily):
         trust = full_trust(surface, config.free_form.trust_cells)
         return _mirror(surface, trust, None, config)
 
-    def poses_by_outlines(self, views: Views, proposal: Proposal, config: FitConfig) -> ToldPoses | None:
-        """Beside a shape, from the plain first surface or the hull."""
-        stated, always = (
-            with_pose_covariances(views, np.linalg.inv(regularize(_prior(views, config), "the poses"))),
-            config.poses.mode == "on",
-        )
-        first: FirstSurfaces = proposal.shape
-        starts, agree = (first.plain, first.hull), first.views_agree
-        return poses_by_outlines(stated, starts, config.free_form, views_agree=agree, always=always)
-
-    def with_lens(
-        self, views: Views, fitted: Any, unknown: LensChange, config: FitConfig
-    ) -> tuple[Geometry, LensChange] | None:
-        """On from a fit, in rounds with these unknowns, at the poses that it found."""
-        start = replace(_stage(fitted), poses=None, lens=unknown)
-        stage = follow_views(fitted.contrast.applied(fitted.corrected(views)), start, config.free_form)
-        assert stage.lens is not None, "the lens was unknown"
-        factor = float(np.exp(-(stage.lens.focal or 0.0)))
-        surface, trust = stage.surface.scaled(factor), stage.trust.scaled(factor)
-        return replace(_mirror(surface, trust, fitted.poses, config), contrast=fitted.contrast), stage.lens
-
-    def after_as_many_steps(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:
-        """On from a fit, in a round as long as with that unknown."""
-        start = replace(_stage(fitted), poses=None)
-        stage = follow_views(fitted.contrast.applied(fitted.corrected(views)), start, config.free_form, longer=True)
-        return replace(_mirror(stage.surface, stage.trust, fitted.poses, config), contrast=fitted.contrast)
-
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
-        """All coefficients by outlines and photographs together; by logarithms of radiance where this leaves what is
-        dark unexplained and they explain more of it in held-out views.
+        """On from an earlier fit to almost the same views, under cameras as it has them."""
+        before = proposal.fitted
+        assert before is not None, "a fit begins with its nuisance blocks"
+        found = follow_views(before.corrected(views), _stage(before), config.free_form)
+        return _mirror(found.surface, found.trust, before.poses, config)
+
+    def solve(
+        self,
+        views: Views,
+        proposal: Proposal,
+        kinds: Collection[type[Block]],
+        required: Collection[str],
+        config: FitConfig,
+    ) -> tuple[Geometry, Corrections, list[Decision]]:
+        """All coefficients by silhouettes and photographs, with nuisance blocks of those kinds.
+
+        A start that has descended may have bent a lid until pixels agree a little: then hollows are looked for under
+        the plain surface.
         """
-        told = proposal.told
-        if proposal.fitted is not None:
-            posed = views if told is None else with_pose_covariances(views, told.covariances)
-            contrast = proposal.fitted.contrast
-            found = follow_views(contrast.applied(posed), _stage(proposal.fitted), config.free_form)
-            return replace(_mirror(found.surface, found.trust, found.poses, config), contrast=contrast)
-        contrast = Contrast.of(views, config.contrast)
-        shown = contrast.applied(views)
-        fitted = _fitted(views, proposal.shape, told, config)
-        if shown is views or (left := _unexplained(shown, fitted, config)) < EXPLAINED:
-            return fitted
-        first = replace(first_surfaces(shown, config), surroundings=proposal.shape.surroundings)
-        again = replace(_fitted(shown, first, told, config), contrast=contrast)
-        return again if _unexplained(shown, again, config) < left else fitted
+        options, first = config.free_form, proposal.shape
+        start, nuisance = started(views, first, options, nuisance_of(views, kinds))
+        lids = () if np.array_equal(start.coefficients, first.plain.coefficients) else (first.surface,)
+        stage, decisions = fit_free_form(views, start, options, lids=lids, nuisance=nuisance, required=required)
+        with torch.no_grad():
+            known = variances(views, stage, options)
+        found = Corrected.by(stage.nuisance, known)
+        surface, trust = stage.surface.scaled(found.scale), stage.trust.scaled(found.scale)
+        gone = [each for each in decisions if not each.kept]
+        kept = [decided(each, known[each.name], required=True) for each in stage.nuisance.blocks]
+        return _mirror(surface, trust, found.poses, config), found.corrections, [*gone, *kept]
 
 
 def _mirror(surface: LevelSet, trust: Trust, poses: Poses | None, config: FitConfig) -> FreeFormMirror:
     return FreeFormMirror(surface, trust, config.environment.trace, config.free_form, poses=poses)
 
 
-def _fitted(views: Views, first: FirstSurfaces, told: ToldPoses | None, config: FitConfig) -> FreeFormMirror:
-    """From first surfaces on. A start that has descended may have bent a lid until pixels agree a little: then hollows
-    are looked for under the plain surface.
-
-    Poses that are free under covariances that outlines `told` leave the world where it is said to be: these say little
-    of what all cameras share.
-    """
-    options, start = config.free_form, started(views, first, config.free_form)
-    lids = () if np.array_equal(start.coefficients, first.plain.coefficients) else (first.surface,)
-    if told is None:
-        return _mirror(*fit_free_form(views, start, options, lids=lids), config)
-    surface, trust, poses = fit_free_form(
-        with_pose_covariances(views, told.covariances), start, options, lids=lids, free_poses=True
-    )
-    assert poses is not None, "poses were free"
-    common, poses = poses.without_common(StatedCameras.of(views), told.prior)
-    return _mirror(surface.taken_back(common), trust, poses, config)
-
-
-def _prior(views: Views, config: FitConfig) -> Float[np.ndarray, "V 6 6"]:
-    """Inverse covariances of turns (rad) and shifts before anything tells more of them."""
-    options = config.poses
-    return StatedCameras.of(views).prior(np.radians(options.turn_deg), options.shift, options.stated_floor)
-
-
-def _unexplained(views: Views, fitted: FreeFormMirror, config: FitConfig) -> float:
-    """How badly a map of four fifths of the views predicts the others; nothing where there are too few."""
-    known, unknown = split_held_out((views if fitted.poses is None else fitted.poses.moved(views)).train)
-    if not known or not unknown:
-        return 0.0
-    stage, (solved, tested) = _stage(fitted), (replace(views, train=tuple(each)) for each in (known, unknown))
-    return held_out_error(solved, tested, replace(stage, poses=None), config.free_form)
-
-
 def _stage(fitted: FreeFormMirror) -> FitStage:
     """What a fit ended with."""
-    return FitStage(fitted.surface, fitted.trust, None, fitted.options.damping, poses=fitted.poses)
+    return FitStage(fitted.surface, fitted.trust, None, fitted.options.damping)

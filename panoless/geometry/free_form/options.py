@@ -32,8 +32,6 @@ class FreeFormRound:
     is 0: on sculpture with cameras turned by 0.5° it would take the mean from 3.8° to 6.4°."""
     anchored: bool = False
     """Whether the surface's change is to be smooth, in place of the surface: details that it has then stay."""
-    outlines_alone: bool = False
-    """Whether photographs have no say."""
     held: bool = False
     """Whether outlines hold the surface: pixels count as if their σ was the robust scale."""
     outline_gain: Positive = 1.0
@@ -175,9 +173,9 @@ class FreeFormOptions:
     """
 
     rounds: NonEmpty[FreeFormRound] = (
-        FreeFormRound(20, 16, 0.30, 1, 40_000, 100.0, 5, outline_gain=9.0),
-        FreeFormRound(28, 64, 0.80, 4, 60_000, 30.0, 8, outline_gain=9.0),
-        FreeFormRound(28, 64, 0.15, 4, 80_000, 30.0, 4, solver_steps=20),
+        FreeFormRound(20, 16, 0.30, 1, 16_000, 100.0, 5, outline_gain=9.0),
+        FreeFormRound(28, 64, 0.80, 4, 24_000, 30.0, 8, outline_gain=9.0),
+        FreeFormRound(28, 64, 0.15, 4, 32_000, 30.0, 4, solver_steps=20),
     )
     """From coarse to fine, always taken: the first texels are as wide as a ray turns when its normal does by 2.8°.
 
@@ -189,8 +187,8 @@ class FreeFormOptions:
     0.14°, 0.14° and 0.17° for 0.69°, 0.17° and 0.22°. In the third they would hide that masks are 1 px too small.
     """
     finer: tuple[FreeFormRound, ...] = (
-        FreeFormRound(42, 128, 0.10, 4, 100_000, 10.0, 5, solver_steps=20),
-        FreeFormRound(60, 128, 0.10, 4, 130_000, 3.0, 4, solver_steps=20),
+        FreeFormRound(42, 128, 0.10, 4, 40_000, 10.0, 5, solver_steps=20),
+        FreeFormRound(60, 128, 0.10, 4, 52_000, 3.0, 4, solver_steps=20),
     )
     """Each taken if held-out views gain by the one before it. The last one that was is taken again with all views."""
     mending: tuple[FreeFormRound, ...] = (
@@ -349,46 +347,10 @@ class FreeFormOptions:
     """No coefficient moves by more in one step."""
     least_surroundings_share: Positive = 1e-3
     """Share of the trace of the surroundings' matrix that is added to its diagonal. Not tuned."""
-    focal_prior: Positive = 0.02
-    """Expected error of the logarithm of the focal length, where it is unknown."""
-    k1_prior: Positive = 0.1
-    """Expected radial distortion, where that is. Not tuned: lenses of phones have about 0.06."""
     shared_steps: Count = 8
     """Most steps in which these, or how near the surroundings are, are found on from a fit."""
-    lens_glance_steps: Count = 2
-    """Steps by which is told whether they are looked for at all…"""
-    lens_glance_rays: Count = 60_000
-    """…by so many pixels at most…"""
-    least_k1_change: NonNegative = 0.01
-    """…which have to change the distortion by this, half of what is told of it…"""
-    least_focal_change: NonNegative = 0.002
-    """…or log focal length by this. On sculpture, by 40,000 pixels, one step changes it by 0.0003 where
-    it is right, and by 0.0055 and more where it is off by 0.5 % or 2 %."""
     least_shared_gain: Share = 3e-4
     """Steps end, where that is unknown, when one lowers the cost by less than this share."""
-    outline_round: FreeFormRound = FreeFormRound(20, 4, 0.3, 1, 2_000, 1.0, 12, outlines_alone=True)
-    """By which outlines alone tell poses. On the trial shape brick with cameras turned by 0.5° they leave 0.08°; λ of
-    10 and 100 leave 0.33° and 0.90°, because poses make up for edges that such a surface is too smooth for."""
-    pose_outline_scale_px: Positive = 10.0
-    """Robust scale of outlines in these: they are this far off where cameras are by 2°."""
-    largest_cost_left: NonNegative = 0.8
-    """Poses are found where free ones leave no more than this share of the cost that believed ones do in it. With true
-    cameras it is 0.94 to 0.99 on sculpture, horseshoe, chrome-block and five trial shapes, and 0.75 on the trial shape
-    tray. With cameras turned by 0.1° it is 0.26 to 0.47 on the first three, and by 0.5° 0.72 on the trial shape crown,
-    whose points this surface is too coarse for. Held-out views refuse what is not needed."""
-    pose_glance_points: Count = 8000
-    """Most outline points by which is told whether that is so."""
-    outline_trust: Positive = 10.0
-    """Photographs find poses under a prior of so many times the precision that outlines tell them with. On sculpture,
-    horseshoe and chrome-block with cameras turned by 0.5°, normals end with medians of 0.13°, 0.18° and 0.44°; 100
-    leaves less of the turns, and normals of 0.13°, 0.21° and 0.47°."""
-    pose_prior_rounds: Natural = 2
-    """Times that outlines are asked again under a prior of turns and shifts as large as these turned out to be. With
-    cameras turned by 0.5° it takes what is left of turns from 0.041° to 0.019° on sculpture, from 0.150° to 0.084° on
-    chrome-block, and from 0.037° to 0.024° on horseshoe; with cameras shifted by 0.3 % of their distance from 0.177° to
-    0.090° on chrome-block, and by little on the others. With both it takes 0.039° to 0.054° on sculpture."""
-    least_pose_share: Positive = 0.1
-    """Share of the stated standard deviations below which such a prior never goes. Not tuned."""
     pose_steps: Count = 6
     """Most steps of finding poses of views that took no part in a fit."""
     least_held_out_gain: Share = 0.002

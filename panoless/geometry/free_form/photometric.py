@@ -9,15 +9,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from panoless.capture.lens import LensChange
-from panoless.capture.poses import Poses, StatedCameras
+from panoless.capture.poses import StatedCameras
 from panoless.capture.views import concatenated
 from panoless.environment.cubemap import resample
 from panoless.environment.footprints import PixelFootprints
-from panoless.geometry.free_form.beside import Beside, BlockRows, pixel_pose_rows
 from panoless.geometry.free_form.equations import Rows, gauge_rows, joined_rows, silhouette_rows
 from panoless.geometry.free_form.map import smoothed_map, splatted_map
-from panoless.geometry.free_form.observations import PixelRays, Pixels
+from panoless.geometry.free_form.motions import pixel_motion_rows
+from panoless.geometry.free_form.observations import Pixels
 from panoless.geometry.free_form.options import FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.surface import Hits, LevelSet
 from panoless.geometry.free_form.trust import Trust
@@ -30,8 +29,10 @@ from panoless.kernels.level_set import (
     without_means,
 )
 from panoless.kernels.reference.cubemap import padded_texels
-from panoless.numeric.factorize import regularize
 from panoless.numeric.robust import bounded_error, robust_weight
+from panoless.problem.nuisance import NO_NUISANCE, Block, Nuisance, block_diagonal
+from panoless.problem.rays import PixelRays
+from panoless.problem.rows import BlockRows, Linearized
 
 
 @dataclass(frozen=True)
@@ -91,21 +92,17 @@ class Task:
     """Mean over all pixels and channels (linear radiance)."""
     anchor: Float[np.ndarray, "A B C"] | None = None
     """Coefficients the change from which is to be smooth; None: the surface is."""
-
-    @cached_property
-    def pose_prior(self) -> Float[np.ndarray, "V 6 6"]:
-        """Weights of squared turns and shifts: the inverse of what the views state."""
-        return np.linalg.inv(regularize(np.array(self.cameras.covariances), "the poses"))
+    prior_factor: float = 1.0
+    """Of the precision of nuisance blocks, in whose units pixels count more than they are worth."""
 
     def outlined(self, gain: float) -> "Task":
         """The same with another factor of the outlines' weight."""
         settings = replace(self.settings, outline_gain=gain)
         return replace(self, settings=settings, outline_weight=self.outline_weight * gain / self.settings.outline_gain)
 
-    def seen_from(self, rays: PixelRays, poses: Poses | None, lens: LensChange | None) -> PixelRays:
+    def seen_from(self, rays: PixelRays, nuisance: Nuisance) -> PixelRays:
         """Rays where their cameras are, through the lens that they have."""
-        rays = rays if lens is None else rays.through_lens(lens, self.cameras.rotations[rays.view, 2])
-        return rays if poses is None else rays.moved(poses)
+        return nuisance.moved(rays, self.cameras.rotations[rays.view, 2])
 
 
 def photon_gain(seen: Float[np.ndarray, "P 3"], brightness: float, share: float) -> Float[np.ndarray, "P"]:
@@ -135,10 +132,8 @@ class Solution:
     texels: Int[np.ndarray, "P"]
     free: Float[np.ndarray, "P"]
     """Weights of the pixels without trust and robust weights."""
-    poses: Poses | None = None
-    """Of the views; None: as they are said to be."""
-    lens: LensChange | None = None
-    """Of all views, where it is unknown; None: it is believed."""
+    nuisance: Nuisance = NO_NUISANCE
+    """Cameras, exposures and masks, where these are unknown."""
 
     @classmethod
     def at(
@@ -148,20 +143,18 @@ class Solution:
         trust: Trust,
         start: Float[Tensor, "6 3 M M"] | None,
         rounds: int,
-        poses: Poses | None = None,
-        lens: LensChange | None = None,
+        nuisance: Nuisance = NO_NUISANCE,
     ) -> "Solution":
         """With the map solved in so many robust rounds from another one, or from nothing."""
         options, settings = task.options, task.settings
-        rays = task.seen_from(task.pixels.rays, poses, lens)
+        rays = task.seen_from(task.pixels.rays, nuisance)
+        radiance = task.pixels.radiance * np.exp(-nuisance.log_gains(rays.view))
         sights = Sights.of(surface, rays, settings.samples, options.least_cosine)
         clear = sights.clear & (task.pixels.inner_px > options.inner_px)
         texel = np.pi / 2 / settings.resolution
         free = clear / (1 + (sights.turn / (options.wide_texels * texel)) ** 2)
         weights = free * trust.at(surface.points(sights.hits.places))
-        areas = PixelFootprints(
-            torch.from_numpy(sights.outgoing).float(), torch.from_numpy(task.pixels.radiance).float()
-        )
+        areas = PixelFootprints(torch.from_numpy(sights.outgoing).float(), torch.from_numpy(radiance).float())
         if start is None:
             environment = splatted_map(areas, torch.from_numpy(weights).float(), settings.resolution)
         else:
@@ -180,13 +173,13 @@ class Solution:
         padded = padded_texels(environment).reshape(6, length, length, 3).double().numpy()
         light, slopes, texels = seen_with_slopes(padded, sights.outgoing)
         counted = gain_of(light)
-        residual, slopes = (light - task.pixels.radiance) * counted[:, None], slopes * counted[:, None, None]
-        return cls(task, surface, sights, trust, environment, counted, residual, slopes, texels, free, poses, lens)
+        residual, slopes = (light - radiance) * counted[:, None], slopes * counted[:, None, None]
+        return cls(task, surface, sights, trust, environment, counted, residual, slopes, texels, free, nuisance)
 
     @cached_property
     def rays(self) -> PixelRays:
         """Of the pixels, from where their cameras are."""
-        return self.task.seen_from(self.task.pixels.rays, self.poses, self.lens)
+        return self.task.seen_from(self.task.pixels.rays, self.nuisance)
 
     @cached_property
     def weights(self) -> Float[np.ndarray, "P"]:
@@ -217,30 +210,31 @@ class Solution:
         return self._silhouettes[0]
 
     @cached_property
-    def pose_rows(self) -> tuple[BlockRows, BlockRows]:
-        """By the poses of views: of photographs, and of silhouettes."""
+    def _motion_rows(self) -> Float[np.ndarray, "P 3 6"]:
+        """Of photographs, by the motions of their rays."""
         hits = self.sights.hits
         distance = np.where(hits.met, hits.distance, 0.0) / self.surface.spacing
-        rows = pixel_pose_rows(
+        rows = pixel_motion_rows(
             hits.derivatives, self.rays.directions, distance, self.mirrored_slopes, self.photographs.rows[..., 1:]
         )
         rows[..., 3:] /= self.surface.spacing
-        return BlockRows(self.rays.view, rows, self.photographs.weights), self._silhouettes[1]
+        return rows
 
     @cached_property
     def _silhouette_rays(self) -> tuple[PixelRays, PixelRays]:
         """Of outlines, and of pixels that miss the surface."""
-        outlines = self.task.seen_from(self.task.outlines, self.poses, self.lens)
+        outlines = self.task.seen_from(self.task.outlines, self.nuisance)
         return outlines, self.rays.chosen(~self.sights.hits.met)
 
     @cached_property
-    def _silhouettes(self) -> tuple[Rows, BlockRows]:
+    def _silhouettes(self) -> tuple[Rows, Float[np.ndarray, "S 1 6"]]:
         sigmas = self.task.options.radiance_sigma / self.task.options.outline_sigma_px
         return silhouette_rows(
             self.surface,
             *self._silhouette_rays,
             self.task.outline_weight,
             self.task.photograph_weight * sigmas**2,
+            self.nuisance,
             self.task.options,
         )
 
@@ -316,10 +310,7 @@ class Solution:
         residual = np.where(self.sights.clear[:, None], residual, before.residual)
         photographs = scale**2 * float((before.weights * bounded_error(residual, scale)).sum()) / 2
         prior = self.prior(before)
-        if self.poses is not None:
-            prior += float(np.einsum("vi,vij,vj", self.poses.stacked, self.task.pose_prior, self.poses.stacked)) / 2
-        if self.lens is not None:
-            prior += float((self._lens_precision * self.lens.values**2).sum()) / 2
+        prior += self.task.prior_factor * self.nuisance.prior_cost
         return photographs + self.constraints.cost + prior
 
     @cached_property
@@ -338,53 +329,72 @@ class Solution:
         return self.beyond_map(self.photographs.residual)
 
     @cached_property
-    def beside(self) -> tuple[Beside, ...]:
-        """What is unknown beside the surface: poses of the views, then what all views share."""
-        of_poses = () if self.poses is None else (self._beside_poses(self.poses),)
-        of_all = () if self.lens is None and self.surface.surroundings.is_far else (self._beside_shared(),)
-        return of_poses + of_all
+    def beside(self) -> tuple[Linearized, ...]:
+        """What is free beside the surface: blocks of views, then the walls and blocks of all views."""
+        by_view, shared = (self.nuisance.free_blocks(by_view=each) for each in (True, False))
+        of_views = (self._of_views(by_view),) if by_view else ()
+        of_all = () if not shared and self.surface.surroundings.is_far else (self._of_all(shared),)
+        return of_views + of_all
 
     @property
     def _curvature(self) -> float:
         """Factor of the photographs' part of the matrix: one where cameras or surroundings are unknown, too."""
         return 1.0 if self.beside else self.task.options.photograph_curvature
 
-    def _beside_poses(self, poses: Poses) -> Beside:
-        count, (seen, outlined) = len(poses.turns), self.pose_rows
-        if not self.task.settings.outlines_alone:
-            outlined = replace(outlined, rows=np.zeros_like(outlined.rows))
-        blocks = seen.blocks(count) + outlined.blocks(count) + self.task.pose_prior
-        return Beside(seen, outlined, poses.stacked, self.task.pose_prior, blocks)
+    def _rows_of(self, block: Block) -> tuple[Float[np.ndarray, "P 3 M"], Float[np.ndarray, "S 1 M"]]:
+        """Of photographs and of silhouettes, by the unknowns of a block.
+
+        c/g is compared with E, so that ∂e/∂log g = c/g, for which the prediction E stands: it has no noise.
+        """
+        task, pair = self.task, []
+        outlines = concatenated(list(self._silhouette_rays))
+        for rays, by_motion in ((self.rays, self._motion_rows), (outlines, self._silhouettes[1])):
+            motions = block.motions(rays, task.cameras.rotations[rays.view, 2])
+            still = np.zeros((*by_motion.shape[:2], block.size))
+            pair.append(still if motions is None else np.matmul(by_motion, motions))
+        seen, outlined = pair
+        by_gain = block.gain_rows()
+        if by_gain is not None:
+            seen = seen + self._light[..., None] * by_gain
+        if block.offsets_px is not None:
+            outlined = outlined - 1.0
+        return seen, outlined
 
     @property
-    def _lens_precision(self) -> Float[np.ndarray, "M"]:
-        """Of what is unknown of the lens."""
-        assert self.lens is not None, "the lens was unknown"
-        return self.lens.of_unknowns(self.task.options.focal_prior, self.task.options.k1_prior) ** -2.0
+    def _light(self) -> Float[np.ndarray, "P 3"]:
+        """The prediction, times the gain of residuals."""
+        radiance = self.task.pixels.radiance * np.exp(-self.nuisance.log_gains(self.rays.view))
+        return self.residual + radiance * self.gain[:, None]
 
-    def _beside_shared(self) -> Beside:
-        """Coefficients of the surroundings, and then unknowns of the lens. The prior of the former only damps."""
-        around, options = len(self.surface.surroundings.coefficients), self.task.options
-        photographs, silhouettes = self.photographs, self.silhouettes
-        seen = [self.surface.surroundings.rows(self.slopes, self.points, self.sights.mirrored)[..., :around]]
-        outlined = [np.zeros((*silhouettes.residual.shape, around))]
-        if self.lens is not None:
-            rays = self.rays, concatenated(list(self._silhouette_rays))
-            for found, of, by_pose in zip((seen, outlined), rays, self.pose_rows, strict=True):
-                motions = self.lens.motions(of.origins, of.directions, self.task.cameras.rotations[of.view, 2])
-                found.append(np.matmul(by_pose.rows, motions))
-        rows = np.concatenate(seen, 2) * (photographs.weights > 0)[:, None, None]
-        beyond = np.stack([self.beyond_map(np.ascontiguousarray(column)) for column in np.moveaxis(rows, 2, 0)], 2)
-        of_silhouettes = BlockRows(
-            np.zeros(len(silhouettes.weights), int), np.concatenate(outlined, 2), silhouettes.weights
+    def _of_views(self, blocks: Sequence[Block]) -> Linearized:
+        count = len(blocks[0].values)
+        seen, outlined = (np.concatenate(each, 2) for each in zip(*map(self._rows_of, blocks), strict=True))
+        view = np.concatenate([each.view for each in self._silhouette_rays])
+        photographs = BlockRows(self.rays.view, seen, self.photographs.weights)
+        silhouettes = BlockRows(view, outlined, self.silhouettes.weights)
+        precision = self.task.prior_factor * block_diagonal([each.precision for each in blocks])
+        matrix = photographs.blocks(count) + silhouettes.blocks(count) + precision
+        return Linearized(
+            photographs, silhouettes, np.concatenate([each.values for each in blocks], 1), precision, matrix
         )
-        matrix = np.einsum("pck,p,pcl->kl", rows, photographs.weights, beyond) + of_silhouettes.blocks(1)[0]
-        least = options.least_surroundings_share * max(float(np.trace(matrix)), 1e-30)
-        of_lens = (np.zeros(0), np.zeros(0)) if self.lens is None else (self._lens_precision, self.lens.values)
-        precision = np.diag(np.append([least] * around, of_lens[0]))[None]
-        value = np.append([0.0] * around, of_lens[1])
-        of_photographs = BlockRows(np.zeros(len(photographs.weights), int), rows, photographs.weights)
-        return Beside(of_photographs, of_silhouettes, value[None], precision, matrix + precision)
+
+    def _of_all(self, blocks: Sequence[Block]) -> Linearized:
+        """Coefficients of the walls, whose prior only damps, and then the blocks of all views."""
+        around = len(self.surface.surroundings.coefficients)
+        photographs, silhouettes = self.photographs, self.silhouettes
+        walls = self.surface.surroundings.rows(self.slopes, self.points, self.sights.mirrored)[..., :around]
+        pairs = [(walls, np.zeros((*silhouettes.residual.shape, around))), *map(self._rows_of, blocks)]
+        seen, outlined = (np.concatenate(each, 2) for each in zip(*pairs, strict=True))
+        seen = seen * (photographs.weights > 0)[:, None, None]
+        beyond = np.stack([self.beyond_map(np.ascontiguousarray(column)) for column in np.moveaxis(seen, 2, 0)], 2)
+        all_alike = [np.zeros(len(each.weights), int) for each in (photographs, silhouettes)]
+        of_silhouettes = BlockRows(all_alike[1], outlined, silhouettes.weights)
+        matrix = np.einsum("pck,p,pcl->kl", seen, photographs.weights, beyond) + of_silhouettes.blocks(1)[0]
+        least = self.task.options.least_surroundings_share * max(float(np.trace(matrix)), 1e-30)
+        parts = [least * np.eye(around)[None], *(self.task.prior_factor * each.precision for each in blocks)]
+        precision, value = block_diagonal(parts), np.concatenate([np.zeros(around), *(b.values[0] for b in blocks)])
+        of_photographs = BlockRows(all_alike[0], seen, photographs.weights)
+        return Linearized(of_photographs, of_silhouettes, value[None], precision, matrix + precision)
 
     def gradient(self) -> tuple[Float[np.ndarray, "A B C"], list[Float[np.ndarray, "_ _"]]]:
         """Of the cost, over active coefficients and over what is unknown beside them."""
@@ -415,17 +425,15 @@ class Solution:
         return total * self.active, [each.backward(seen, constrained[:count], moved) for each, moved in pulled]
 
     def after(self, change: Float[np.ndarray, "A B C"], beside: Sequence[Float[np.ndarray, "_ _"]]) -> "Solution":
-        """Moved by a step, with hits, visibility and map made anew."""
+        """Moved by a step, with hits, visibility and map computed again."""
         surface, moved = self.surface, list(beside)
         surface = replace(surface, coefficients=surface.coefficients + change)
-        poses = None if self.poses is None else self.poses.after(moved.pop(0))
-        shared = moved[0][0] if moved else np.zeros(0)
+        by_view = moved.pop(0) if self.nuisance.free_blocks(by_view=True) else None
+        shared, around = (moved[0][0] if moved else np.zeros(0)), len(surface.surroundings.coefficients)
         if not surface.surroundings.is_far:
-            around = surface.surroundings.after_walls(shared[: len(surface.surroundings.coefficients)])
-            surface = replace(surface, surroundings=around)
-        lens = None if self.lens is None else self.lens.after(shared[-len(self.lens.values) :])
-        rounds = self.task.options.map_rounds
-        return Solution.at(self.task, surface, self.trust, self.environment, rounds, poses, lens)
+            surface = replace(surface, surroundings=surface.surroundings.after_walls(shared[:around]))
+        nuisance = self.nuisance.stepped(by_view, shared[around:] if moved else None)
+        return Solution.at(self.task, surface, self.trust, self.environment, self.task.options.map_rounds, nuisance)
 
     def diagonal(self, smoothing_diagonal: float) -> Float[np.ndarray, "A B C"]:
         """The matrix's diagonal, but for what the map takes over; at least a millionth of its largest."""

@@ -10,13 +10,13 @@ from torch import Tensor
 from panoless.capture.rays import pose_of
 from panoless.geometry.base import SurfaceBuffers, beside_outline, buffers_from_arrays
 from panoless.geometry.exact import shade_centers
-from panoless.geometry.free_form.observations import PixelRays
 from panoless.geometry.free_form.options import FreeFormOptions
 from panoless.geometry.free_form.photometric import Sights
 from panoless.geometry.free_form.spread import FinalRays
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.kernels.camera import RasterCamera
 from panoless.kernels.cubemap import sample_cubemap
+from panoless.problem.rays import PixelRays
 
 
 def free_form_buffers(surface: LevelSet, camera: RasterCamera, options: FreeFormOptions) -> SurfaceBuffers:

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from panoless.capture.rays import reflect
-from panoless.geometry.free_form.observations import PixelRays
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.kernels.reference.cubemap import project_to_face
 from panoless.numeric.robust import bounded_error
+from panoless.problem.rays import PixelRays
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,6 @@ from panoless.geometry.height_field.model import (
     height_field_buffers,
     visible_reflections,
 )
-from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.kernels.camera import RasterCamera
 from shinypartial.core.errors import InputError
 

@@ -21,7 +21,7 @@ from panoless.geometry.revolution.fit import follow_views, propose_revolution, r
 from panoless.geometry.revolution.lip import CLEARANCE_PX, beside_lip
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_buffers, revolution_rays
 from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
-from panoless.geometry.revolution.render import mean_light
+from panoless.geometry.revolution.render import SAMPLES, mean_light
 from panoless.kernels.camera import RasterCamera
 from shinypartial.core.errors import InputError
 from shinypartial.io.records import read_record, write_record

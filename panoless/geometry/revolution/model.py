@@ -17,7 +17,6 @@ from panoless.capture.views import TrainView
 from panoless.environment.rays import Rays
 from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import SurfaceBuffers, buffers_from_arrays
-from panoless.geometry.revolution.options import DEFAULTS, MapOptions
 from panoless.kernels.camera import RasterCamera
 from panoless.kernels.revolution import first_hits, follow
 from shinypartial.core.sphere import pixel_footprint_sr

@@ -17,8 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from panoless.capture.rays import pixel_rays
-from panoless.geometry.revolution.model import SurfaceOfRevolution, trace_reflections
-from panoless.geometry.revolution.options import DEFAULTS, RenderingOptions
+from panoless.geometry.revolution.model import MAX_BOUNCES, SurfaceOfRevolution, trace_reflections
 from panoless.kernels.camera import RasterCamera
 from panoless.kernels.cubemap import sample_cubemap
 

@@ -19,11 +19,14 @@ from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, fro
 from panoless.geometry.exact import ExactFamily, ExactGeometry
 from panoless.geometry.sphere.fit import SAMPLES, fit_sphere
 from panoless.geometry.sphere.model import CENTER, Sphere, mirrored, parts_of_pixel, sphere_buffers
-from panoless.geometry.sphere.options import SphereOptions
 from panoless.kernels.camera import RasterCamera
 from panoless.kernels.cubemap import sample_cubemap
 from shinypartial.core.errors import InputError
-from shinypartial.io.records import read_record, write_record
+
+WIDEST_FOOTPRINT_RAD = 0.2
+"""Pixels that span more tell the map by their centers only."""
+OPERATOR_TRUST = 0.01
+"""Rays that show who takes the pictures count so little that any other view of their directions decides."""
 
 MERIDIANS = 128
 RINGS = 64

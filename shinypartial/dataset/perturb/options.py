@@ -37,7 +37,7 @@ class MaskErrors:
     dilate_px: NonNegative = 0.0
     """Move the outline outward by this many pixels, after the erosion."""
     offset_px: NonNegative = 0.0
-    """Move the outline of each view by a distance of its own, drawn evenly up to this many pixels, inward or outward."""
+    """Move the outline of each view by a distance drawn evenly up to this many pixels, inward or outward."""
     wobble_px: NonNegative = 0.0
     """Standard deviation in pixels by which the outline of each view then wanders in and out, over some 20 pixels, as
     outlines of segmenters and by hand do."""

@@ -45,7 +45,6 @@ def test_motions_are_the_derivatives_of_rays(unknown: LensChange) -> None:
 def test_unknowns_keep_their_order_and_their_names() -> None:
     assert LensChange(0.1, 0.2).after(np.array([1.0, 2.0])) == LensChange(1.1, 2.2)
     assert LensChange(k1=0.2).after(np.array([1.0])) == LensChange(k1=1.2)
-    assert LensChange(k1=0.2).of_unknowns(3.0, 4.0).tolist() == [4.0]
 
 
 def smooth_view(size: int = 96) -> TrainView:

@@ -405,7 +405,7 @@ def plane_prediction(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Pa
     offset = (plane.offset - float(plane.normal @ center)) / radius
     shift = np.array([plane.tangent_u @ center, plane.tangent_v @ center])
     placed = replace(plane, offset=offset, boundary=(plane.boundary - shift) / radius)
-    chosen = Candidate("plane", Verdict.CHOSEN, "surfels are no better", 0.05, 1.0, 0.01, 0.02)
+    chosen = Candidate("plane", Verdict.CHOSEN, "explains held-out views", 0.05, 1.0, 0.01)
     state = finished_state(PlaneMirror(placed), ObjectFrame(center, radius), chosen)
     folder = tmp_path_factory.mktemp("predictions") / "plane"
     acquire_prediction(folder)
@@ -441,8 +441,8 @@ def test_a_plane_is_described_as_what_it_is(plane_prediction: tuple[Path, Path])
     """Three numbers and four corners; one primitive; the reason in words; no surfels of an earlier fit beside it."""
     folder, _ = plane_prediction
     info = read_info(folder)
-    expected = "plane (surfels are no better; silhouettes 0.05 px away, overlap 100%; "
-    assert info.model == expected + "held-out error 0.0100, 0.0200 with surfels)"
+    expected = "plane (explains held-out views; silhouettes 0.05 px away, overlap 100%; "
+    assert info.model == expected + "held-out error 0.0100)"
     assert info.primitives == 1
     assert info.parameter_counts == {"plane parameters": 3 + 8, "environment parameters": 6 * 3 * 64 * 64}
     assert info.model_bytes == sum((folder / name).stat().st_size for name in ("plane.ply", "environment.exr"))

@@ -329,9 +329,9 @@ def test_a_fit_loads_neither_metrics_nor_blender(tmp_path: Path, sphere_dataset:
         "found = [name for name in sys.modules if f'{name}.'.startswith(tuple(f'{b}.' for b in [*rooms, 'bpy']))]; "
         "assert not found, found; sys.exit(code)"
     )
-    options = ["--config.iterations", "3", "--config.surfels.count", "50", "--config.surfels.hull-resolution", "24"]
+    options = ["--config.iterations", "3", "--config.surfels.count", "50"]
     options += ["--config.environment.resolution", "16", "--config.environment.solve-resolution", "16"]
-    options += ["--model", "surfels"]
+    options += ["--model", "surfels", "--set", "first_surface.hull_resolution=24"]
     command = [sys.executable, "-c", program, "fit", str(sphere_dataset.root), "--output", "out", *options]
     environment = {
         "PYTHONPATH": str(ROOT),

@@ -272,9 +272,9 @@ def test_the_commands_take_and_export_snapshots(
     tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    options = ["--config.iterations", "4", "--config.surfels.count", "40", "--config.surfels.hull-resolution", "24"]
+    options = ["--config.iterations", "4", "--config.surfels.count", "40"]
     options += ["--config.environment.resolution", "16", "--config.environment.solve-resolution", "16"]
-    options += ["--model", "surfels", "--set", "surroundings.mode=off", "material.reflectance=off"]
+    options += ["--model", "surfels", "--set", "first_surface.hull_resolution=24", "surroundings.mode=off"]
     assert main(["fit", str(sphere_dataset.root), "--output", "p", "--snapshots", "2", *options]) == 0
     assert "panoless export runs/p --output p --snapshots" in capsys.readouterr().out
     assert main(["export", "runs/p", "--output", "p", "--snapshots"]) == 0

@@ -1,6 +1,5 @@
 """What photographs get wrong is found by what a geometry explains of them, and only where there is something wrong."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,10 +8,9 @@ import torch
 
 from panoless.alignment.search import PosedProposal
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections, with_outline_moved
-from panoless.capture.lens import LensChange, with_focal_factor
+from panoless.capture.lens import with_focal_factor
 from panoless.capture.views import Views
-from panoless.config import FitConfig
-from panoless.geometry.base import Geometry, Proposal
+from panoless.geometry.base import Proposal
 from panoless.geometry.height_field.kind import HeightFieldMirror
 from panoless.geometry.height_field.model import flat_height_field
 from panoless.geometry.plane.kind import PlaneFamily, PlaneMirror
@@ -23,7 +21,6 @@ from panoless.selection.candidates import Candidate, Selection, Verdict, selecti
 from panoless.selection.choose import choose_geometry
 from panoless.selection.corrections import with_corrections
 from panoless.selection.fitted import Fitted, outline_pull_px
-from panoless.selection.lens import with_lens
 from panoless.selection.options import CorrectionOptions
 from shinypartial.core.conventions import SOLID_ALPHA
 from shinypartial.dataset.perturb.masks import dilated, eroded
@@ -141,32 +138,6 @@ def test_a_distortion_is_found_and_a_pinhole_believed(k1: float) -> None:
         assert 0 < found.k1_uncertainty < 0.05
 
 
-class Slow(PlaneFamily):
-    """A kind whose fit, a tilted mirror, ends before it is right; it finds focal lengths beside its shape."""
-
-    def with_lens(
-        self, views: Views, fitted: Geometry, unknown: LensChange, config: FitConfig
-    ) -> tuple[Geometry, LensChange]:
-        """Steps that make the shape right, and with it a focal length that is wrong."""
-        return MIRROR, unknown.after(unknown.of_unknowns(0.02, 0.0))
-
-    def after_as_many_steps(self, views: Views, fitted: Geometry, config: FitConfig) -> Geometry:
-        """Which the same steps do without it."""
-        return MIRROR
-
-
-def test_a_focal_length_is_not_believed_for_what_more_steps_explain(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Held-out views are explained better by the fit with it than by the first one, and as well by one without."""
-    monkeypatch.setitem(FAMILIES, "plane", Slow())
-    views = unsaturated()
-    turned = np.linalg.qr(np.eye(3) + 0.05 * np.random.default_rng(1).normal(size=(3, 3)))[0]
-    tilted = replace(MIRROR, plane=replace(MIRROR.plane, normal=turned @ MIRROR.plane.normal))
-    before = Fitted(tilted, PosedProposal(Proposal(MIRROR.plane, 0.0, 1.0)))
-    found = with_lens(views, before, replace(CONFIG, corrections=FOCAL), silhouettes_plane)
-    assert found.geometry is MIRROR
-    assert found.corrections == NO_CORRECTIONS
-
-
 def with_masks(views: Views, offset_px: float) -> Views:
     """Masks that another program has moved, and black where there is no object."""
     train = []
@@ -184,102 +155,6 @@ def test_outlines_of_the_true_surface_lie_where_masks_were(offset_px: float) -> 
     """Outside of masks that were shrunk, inside of those that were grown."""
     views = with_masks(reflecting_views(MIRROR.plane, arc(6, size=64)), offset_px)
     assert outline_pull_px(views, MIRROR) == pytest.approx(-offset_px, abs=0.1)
-
-
-@pytest.mark.parametrize(
-    ("small_px", "tried"),
-    [(2.0, [1, -1, 2, 3]), (-1.0, [1, -1, -2]), (0.0, [1, -1]), (0.6, [1, -1, 2]), (9.0, [1, -1, 2, 3, 4, 5, 6])],
-)
-def test_masks_are_followed_as_long_as_held_out_views_gain(
-    monkeypatch: pytest.MonkeyPatch, small_px: float, tried: list[float]
-) -> None:
-    """From pixel to pixel, each on from the fit before, up to the largest offset."""
-    ways = Followed(monkeypatch, lambda offset, _: 0.1 + abs(offset - small_px))
-    found = ways.offset()
-    assert [after for _, after in dict.fromkeys(ways.compared)] == tried
-    assert all(after - before in (-1, 1) for before, after in ways.compared)
-    assert found == min((0.0, *tried), key=lambda offset: abs(offset - small_px))
-
-
-@pytest.mark.parametrize(("by_step", "by_masks", "found"), [(0.3, 0.0, 0.0), (0.0, 0.1, -1.0)])
-def test_a_fit_that_has_not_settled_moves_no_masks(
-    monkeypatch: pytest.MonkeyPatch, by_step: float, by_masks: float, found: float
-) -> None:
-    """Errors that fall by a round of steps, under any masks, say nothing of masks; those under smaller ones do."""
-    ways = Followed(monkeypatch, lambda offset, rounds: 1 - by_step * rounds - by_masks * (offset == -1))
-    assert ways.offset() == found
-
-
-@pytest.mark.parametrize(("pull", "found"), [(lambda offset: 0.9 - 0.6 * offset, 1.0), (lambda offset: 0.9, 0.0)])
-def test_a_small_gain_moves_masks_where_the_pull_at_outlines_goes_with_it(
-    monkeypatch: pytest.MonkeyPatch, pull: Callable[[float], float], found: float
-) -> None:
-    """By 2 %, where 5 % is asked for otherwise."""
-    ways = Followed(monkeypatch, lambda offset, _: 1 - 0.02 * (offset == 1), pull)
-    assert ways.offset() == found
-
-
-@pytest.mark.parametrize(("pull_px", "found"), [(0.05, 2.0), (-0.05, -2.0), (0.0, 0.0), (-0.02, 0.0)])
-def test_a_shape_that_bent_for_its_masks_is_fitted_anew_where_photographs_pull_it(
-    monkeypatch: pytest.MonkeyPatch, pull_px: float, found: float
-) -> None:
-    """On from its fit nothing is gained; a fit that begins again, two pixels farther, leaves a fifth."""
-    anew_after = 100
-    ways = Followed(
-        monkeypatch,
-        lambda offset, rounds: 0.1 if (offset, rounds) == (found, anew_after) else 0.5,
-        lambda offset: 0.0 if offset else pull_px,
-    )
-
-    def refit(_views: Views, _before: Fitted, *, anew: bool) -> Fitted:
-        return ways.fitted(anew_after if anew else 1)
-
-    views = reflecting_views(MIRROR.plane, arc(3, size=16))
-    moved = mask_offset.with_moved_masks(FAMILIES["free_form"], views, ways.first, CONFIG, refit)
-    assert moved.corrections.mask_offset_px == found
-
-
-class Followed:
-    """Fits that go on from one another, with errors by their masks' offset and their rounds of steps, and pulls of
-    outlines by the offset.
-    """
-
-    def __init__(
-        self,
-        monkeypatch: pytest.MonkeyPatch,
-        error: Callable[[float, int], float],
-        pull: Callable[[float], float] = lambda _: 0.0,
-    ) -> None:
-        self.compared: list[tuple[float, float]] = []
-        self.first = self.fitted(0)
-
-        def errors(_views: Views, before: Fitted, after: Fitted, _config: FitConfig) -> list[np.ndarray]:
-            self.compared.append((before.corrections.mask_offset_px, after.corrections.mask_offset_px))
-            each = (
-                (one.corrections.mask_offset_px, round(one.start.proposal.silhouette_px)) for one in (before, after)
-            )
-            return [np.full(8, error(*of)) for of in each]
-
-        def applied(corrections: Corrections, _views: Views, _config: FitConfig) -> float:
-            return corrections.mask_offset_px
-
-        monkeypatch.setattr(mask_offset, "errors_in_common", errors)
-        monkeypatch.setattr(Corrections, "applied", applied)
-        monkeypatch.setattr(mask_offset, "outline_pull_px", lambda offset, _: pull(offset))
-
-    @staticmethod
-    def fitted(rounds: int) -> Fitted:
-        """The rounds stand where a proposal has its distance."""
-        return Fitted(MIRROR, PosedProposal(Proposal(MIRROR.plane, rounds, 1)))
-
-    def offset(self) -> float:
-        """What is found."""
-
-        def refit(_views: Views, before: Fitted, *, anew: bool) -> Fitted:
-            assert not anew
-            return self.fitted(round(before.start.proposal.silhouette_px) + 1)
-
-        return mask_offset.followed_offset(reflecting_views(MIRROR.plane, arc(3, size=16)), self.first, CONFIG, refit)
 
 
 @pytest.mark.slow

@@ -249,7 +249,7 @@ def test_a_dish_is_recovered_from_its_visual_hull(dish: tuple[Body, Views]) -> N
     views = body_views(body, 30, 80)
     proposal = FreeFormFamily().propose(views, FitConfig(), asked=True)
     assert proposal is not None
-    surface = fit_free_form(views, proposal.shape.surface, replace(DEFAULTS, finer=()))[0]
+    surface = fit_free_form(views, proposal.shape.surface, replace(DEFAULTS, finer=()))[0].surface
     errors = normal_errors_deg(surface, body, views, cameras_around(7, 60)[1::2])
     assert np.median(errors) < 0.3
     assert (errors < 5).mean() > 0.95

@@ -1,0 +1,57 @@
+"""What nuisance blocks amount to: corrections of photographs, and poses in the world that the dataset states."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from panoless.capture.corrections import Corrections
+from panoless.capture.poses import Poses
+from panoless.problem.nuisance import (
+    CameraPoses,
+    Distortion,
+    Exposures,
+    FocalLength,
+    MaskOffset,
+    MaskOffsets,
+    Nuisance,
+    WhiteBalances,
+)
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """Corrections and poses, and the factor from the world of the blocks to the one that is stated."""
+
+    corrections: Corrections
+    poses: Poses | None
+    scale: float
+
+    @classmethod
+    def by(cls, nuisance: Nuisance, variances: dict[str, Float[np.ndarray, "B M"]]) -> "Corrected":
+        """With the standard deviations of the focal length and the distortion by their variances.
+
+        Cameras that are eˢ as far away see the same as those where they are stated of a world that is e⁻ˢ as large.
+        """
+        focal, bent, cameras = (nuisance.get(kind) for kind in (FocalLength, Distortion, CameraPoses))
+        exposures, balances = nuisance.get(Exposures), nuisance.get(WhiteBalances)
+        offset, offsets = nuisance.get(MaskOffset), nuisance.get(MaskOffsets)
+        change = 0.0 if focal is None else float(focal.values[0, 0])
+        found = Corrections(
+            focal_factor=float(np.exp(change)), mask_offset_px=0.0 if offset is None else -float(offset.values[0, 0])
+        )
+        if focal is not None:
+            found = replace(found, focal_uncertainty=found.focal_factor * float(np.sqrt(variances[focal.name][0, 0])))
+        if bent is not None:
+            found = replace(
+                found, k1=float(bent.values[0, 0]), k1_uncertainty=float(np.sqrt(variances[bent.name][0, 0]))
+            )
+        if offsets is not None:
+            found = replace(found, mask_offsets_px=-offsets.values[:, 0])
+        if exposures is not None or balances is not None:
+            count = len((exposures or balances).values)  # type: ignore[union-attr]
+            gains = np.ones(count) if exposures is None else np.exp(exposures.values[:, 0])
+            found = replace(found, gains=gains, balances=None if balances is None else np.exp(balances.log_gains()))
+        scale = float(np.exp(-change))
+        poses = None if cameras is None else Poses(cameras.values[:, :3], cameras.values[:, 3:] * scale)
+        return cls(found, poses, scale)

@@ -1,0 +1,66 @@
+"""The fit of a kind that solves for cameras, exposures and masks beside its shape."""
+
+from panoless.alignment.search import PosedProposal, fit_at
+from panoless.capture.encoding import encoding_of
+from panoless.capture.views import Views
+from panoless.config import FitConfig
+from panoless.environment.surroundings import FAR, Surroundings
+from panoless.geometry.base import Family, Geometry
+from panoless.problem.nuisance import (
+    Block,
+    CameraPoses,
+    Distortion,
+    Exposures,
+    FocalLength,
+    MaskOffset,
+    MaskOffsets,
+    WhiteBalances,
+)
+from panoless.selection.fitted import Fitted
+from panoless.selection.surroundings import brought_near, explains_clearly_more, on_floor, proposed_surroundings
+
+
+def nuisance_kinds(config: FitConfig) -> tuple[list[type[Block]], list[str]]:
+    """Blocks that a configuration leaves open, and the names of those that it wants in any case. Exposures of a high
+    dynamic range are as stated.
+    """
+    corrections = config.corrections
+    kinds: list[type[Block]] = []
+    if config.poses.mode != "off":
+        kinds.append(CameraPoses)
+    if corrections.lens != "off":
+        kinds += [FocalLength, Distortion]
+    if corrections.exposure != "off" and not encoding_of(config).high_dynamic_range:
+        kinds += [Exposures, WhiteBalances]
+    if corrections.masks != "off":
+        kinds += [MaskOffset, MaskOffsets]
+    required = [CameraPoses.name] if config.poses.mode == "on" else []
+    return kinds, [*required, *([FocalLength.name, Distortion.name] if corrections.lens == "on" else [])]
+
+
+def fit_jointly(family: Family, views: Views, start: PosedProposal, config: FitConfig) -> Fitted:
+    """A fit in the surroundings that the proposal asks for, if it explains clearly more than one in a far world; else
+    in nearer ones as long as these explain clearly more.
+    """
+
+    def solved(around: Surroundings) -> Fitted:
+        proposal = start.in_surroundings(around).proposal
+        geometry, corrections, decisions = family.solve(views, proposal, *nuisance_kinds(config), config)
+        return Fitted(geometry, start, corrections, tuple(decisions))
+
+    around = proposed_surroundings(family, views, start.proposal, config)
+    found = solved(around)
+    corrected = found.corrections.applied(views, config)
+
+    def follow(fitted: Geometry, surroundings: Surroundings) -> Geometry | None:
+        return fit_at(family, corrected, start.after(fitted).in_surroundings(surroundings), config)
+
+    if around.is_far:
+        return found.with_geometry(brought_near(corrected, found.geometry, follow, config))
+    near = on_floor(corrected, found.geometry, follow, config)
+    if config.surroundings.mode == "on":
+        return found.with_geometry(near)
+    far = follow(near, FAR)
+    if far is None or explains_clearly_more(corrected, near, far, config):
+        return found.with_geometry(near)
+    return solved(FAR)
