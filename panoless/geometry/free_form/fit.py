@@ -126,6 +126,10 @@ def fit_free_form(
             stage = better(stage, deeper, options.concave.least_held_out_gain) if others else deeper
             begun = hollowed if stage is deeper else start
         stage, decisions = _needed(solved, stage, required, options)
+        if not all(each.kept for each in decisions.values()):
+            # A surface that gave way to blocks does not come back from them by going on.
+            rounds = options.rounds if begun is start else options.concave.rounds
+            stage = coarse_stage(solved, begun, rounds, options, nuisance=stage.nuisance)
         if others:
             stage = keep_if_better(mended_stages(solved, stage, options), error, options.least_mending_gain)
             if options.detailing and error(stage) > options.detailed_error:
