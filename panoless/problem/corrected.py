@@ -51,7 +51,11 @@ class Corrected:
         if exposures is not None or balances is not None:
             count = len((exposures or balances).values)  # type: ignore[union-attr]
             gains = np.ones(count) if exposures is None else np.exp(exposures.values[:, 0])
-            found = replace(found, gains=gains, balances=None if balances is None else np.exp(balances.log_gains()))
+            found = replace(
+                found,
+                gains=gains,
+                balances=None if balances is None else np.exp(balances.values @ balances.gain_rows().T),
+            )
         scale = float(np.exp(-change))
         poses = None if cameras is None else Poses(cameras.values[:, :3], cameras.values[:, 3:] * scale)
         return cls(found, poses, scale)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from panoless.problem.nuisance import Block, Nuisance
+from panoless.problem.nuisance import Block
 
 DEVIATIONS = 2.0
 """Of the mean square beyond 1, from which a block is needed."""
@@ -44,10 +44,3 @@ def decided(block: Block, variances: Float[np.ndarray, "B M"], *, required: bool
     bound = 1 + DEVIATIONS * math.sqrt(2 / block.values.size)
     sigma = block.scale * math.sqrt(float(variances[:, block.measured].mean()))
     return Decision(block.name, required or score > bound, score, bound, block.rms, sigma, block.unit)
-
-
-def with_needed(nuisance: Nuisance, decisions: list[Decision]) -> Nuisance:
-    """Without the blocks that were decided not to be needed."""
-    for each in decisions:
-        nuisance = nuisance if each.kept else nuisance.without(each.name)
-    return nuisance

@@ -33,6 +33,8 @@ class Block:
     unit: ClassVar[str] = ""
     scale: ClassVar[float] = 1.0
     """Of a number of the block, in that unit."""
+    moves_silhouettes: ClassVar[bool] = False
+    """Whether its numbers are pixels by which silhouettes of masks lie outside of those of the object."""
     values: Float[np.ndarray, "B M"]
     precision: Float[np.ndarray, "B M M"]
     """Inverse covariances of the prior."""
@@ -71,56 +73,55 @@ class Block:
         """(ω, τ) of rays by the unknowns; None: rays stay."""
         return None
 
-    def log_gains(self) -> Float[np.ndarray, "B 3"] | None:
-        """log g of the channels of each group, where c = g E is seen; None: g is 1."""
+    def gain_rows(self) -> Float[np.ndarray, "3 M"] | None:
+        """∂ log g of the channels by the unknowns of their group, where c = g E is seen; None: g is 1."""
         return None
 
-    def gain_rows(self) -> Float[np.ndarray, "3 M"] | None:
-        """∂ log g of the channels by the unknowns of their group; None: gains stay."""
-        return None
+    def log_gains(self) -> Float[np.ndarray, "B 3"] | None:
+        """log g of the channels of each group, which is linear in the unknowns; None: g is 1."""
+        rows = self.gain_rows()
+        return None if rows is None else self.values @ rows.T
+
+
+class Lens(Block):
+    """An unknown of the lens of all views."""
+
+    by_view = False
 
     @property
-    def offsets_px(self) -> Float[np.ndarray, "B"] | None:
-        """By how many pixels silhouettes of masks lie outside of those of the object; None: they do not."""
-        return None
+    def lens(self) -> LensChange:
+        """As a change of the lens."""
+        raise NotImplementedError
+
+    def moved(self, rays: PixelRays, axes: Float[np.ndarray, "P 3"]) -> PixelRays:
+        """Through that lens."""
+        return rays.through_lens(self.lens, axes)
+
+    def motions(self, rays: PixelRays, axes: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 6 M"]:
+        """See `LensChange.motions`."""
+        return self.lens.motions(rays.origins, rays.directions, axes)
 
 
-class FocalLength(Block):
+class FocalLength(Lens):
     """s: cameras are eˢ as far away as stated and see through a lens of eˢ times the focal length."""
 
     name = "focal length"
-    by_view = False
     unit, scale = "%", 100.0
 
-    def moved(self, rays: PixelRays, axes: Float[np.ndarray, "P 3"]) -> PixelRays:
-        """Through the longer lens, from farther away."""
-        return rays.through_lens(self._lens, axes)
-
-    def motions(self, rays: PixelRays, axes: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 6 M"]:
-        """ω = s (d·a) d × a, τ = s o."""
-        return self._lens.motions(rays.origins, rays.directions, axes)
-
     @property
-    def _lens(self) -> LensChange:
+    def lens(self) -> LensChange:
+        """Of that focal length."""
         return LensChange(focal=float(self.values[0, 0]))
 
 
-class Distortion(Block):
+class Distortion(Lens):
     """k₁ of the radial distortion of all views."""
 
     name = "distortion"
-    by_view = False
-
-    def moved(self, rays: PixelRays, axes: Float[np.ndarray, "P 3"]) -> PixelRays:
-        """Through the lens without that distortion."""
-        return rays.through_lens(self._lens, axes)
-
-    def motions(self, rays: PixelRays, axes: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 6 M"]:
-        """ω = k₁ |q|² (d·a) d × a."""
-        return self._lens.motions(rays.origins, rays.directions, axes)
 
     @property
-    def _lens(self) -> LensChange:
+    def lens(self) -> LensChange:
+        """Of that distortion."""
         return LensChange(k1=float(self.values[0, 0]))
 
 
@@ -169,10 +170,6 @@ class Exposures(Deviations):
     name = "exposures"
     unit, scale = "stops", 1 / math.log(2)
 
-    def log_gains(self) -> Float[np.ndarray, "B 3"]:
-        """The same in all channels."""
-        return np.repeat(self.values, 3, 1)
-
     def gain_rows(self) -> Float[np.ndarray, "3 M"]:
         """Ones."""
         return np.ones((3, 1))
@@ -185,11 +182,6 @@ class WhiteBalances(Deviations):
     size = 2
     unit, scale = "stops", 1 / math.log(2)
 
-    def log_gains(self) -> Float[np.ndarray, "B 3"]:
-        """Of zero mean over the channels."""
-        found: np.ndarray = self.values @ CHROMATICITIES
-        return found
-
     def gain_rows(self) -> Float[np.ndarray, "3 M"]:
         """The directions."""
         return CHROMATICITIES.T
@@ -201,11 +193,7 @@ class MaskOffset(Block):
     name = "mask offset"
     by_view = False
     unit = "px"
-
-    @property
-    def offsets_px(self) -> Float[np.ndarray, "B"]:
-        """δ."""
-        return self.values[:, 0]
+    moves_silhouettes = True
 
 
 class MaskOffsets(Deviations):
@@ -213,11 +201,7 @@ class MaskOffsets(Deviations):
 
     name = "mask offsets"
     unit = "px"
-
-    @property
-    def offsets_px(self) -> Float[np.ndarray, "B"]:
-        """The same."""
-        return self.values[:, 0]
+    moves_silhouettes = True
 
 
 BLOCKS: tuple[type[Block], ...] = (
@@ -254,11 +238,11 @@ class Nuisance:
     @property
     def locked(self) -> "Nuisance":
         """With those free that differ by view, and no others: what all views share is known by a fine map alone."""
-        return self.freed([each.name for each in self.blocks if each.by_view])
+        return self.freed([each.name for each in self.free_blocks(by_view=True)])
 
-    def without(self, name: str) -> "Nuisance":
-        """With a block at the mean of its prior: it is gone."""
-        left = Nuisance(tuple(each for each in self.blocks if each.name != name))
+    def without(self, names: Collection[str]) -> "Nuisance":
+        """With blocks at the means of their priors: they are gone."""
+        left = Nuisance(tuple(each for each in self.blocks if each.name not in names))
         return left.freed(self.free)
 
     def of_views(self, numbers: Sequence[int]) -> "Nuisance":
@@ -291,8 +275,9 @@ class Nuisance:
                 start += each.size
         return self.replaced(changed)
 
-    def moved(self, rays: PixelRays, axes: Float[np.ndarray, "P 3"]) -> PixelRays:
+    def moved(self, rays: PixelRays, cameras: StatedCameras) -> PixelRays:
         """Rays through the lens of all views, from where their cameras are."""
+        axes = cameras.rotations[rays.view, 2]
         for block in self.blocks:
             rays = block.moved(rays, axes)
         return rays
@@ -302,10 +287,14 @@ class Nuisance:
         parts = [found for each in self.blocks if (found := each.log_gains()) is not None]
         return sum(parts)[view] if parts else 0.0  # type: ignore[index]
 
+    def equalized(self, radiance: Float[np.ndarray, "P 3"], view: Int[np.ndarray, "P"]) -> Float[np.ndarray, "P 3"]:
+        """c/g of the pixels of those views: what they would have seen at equal exposures."""
+        return radiance * np.exp(-self.log_gains(view))
+
     def offsets_px(self, view: Int[np.ndarray, "S"]) -> Float[np.ndarray, "S"]:
         """By how many pixels the masks of those views are too large."""
-        parts = [(each, found) for each in self.blocks if (found := each.offsets_px) is not None]
-        return sum((found[view] if each.by_view else found[0] for each, found in parts), np.zeros(len(view)))
+        moving = (each for each in self.blocks if each.moves_silhouettes)
+        return sum((each.values[view if each.by_view else 0, 0] for each in moving), np.zeros(len(view)))
 
     @property
     def prior_cost(self) -> float:

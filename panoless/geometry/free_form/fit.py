@@ -1,6 +1,5 @@
 """A free-form surface from silhouettes and photographs: accepted Gauss–Newton steps, from coarse to fine."""
 
-import math
 from collections.abc import Collection, Iterator, MutableMapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -25,7 +24,7 @@ from panoless.geometry.free_form.trust import Trust, full_trust
 from panoless.journal import remembered
 from panoless.numeric.factorize import regularize
 from panoless.numeric.gauss_newton import keep_if_better
-from panoless.problem.evidence import Decision, decided, with_needed
+from panoless.problem.evidence import Decision, decided
 from panoless.problem.nuisance import (
     NO_NUISANCE,
     CameraPoses,
@@ -67,8 +66,11 @@ class FitStage:
     """Of the round that led here."""
     nuisance: Nuisance = NO_NUISANCE
     """Cameras, exposures and masks, where these are unknown."""
-    cost: float = math.inf
-    """After that round."""
+
+    @classmethod
+    def begun(cls, surface: LevelSet, options: FreeFormOptions, nuisance: Nuisance = NO_NUISANCE) -> "FitStage":
+        """A surface that is trusted everywhere, before its first round."""
+        return cls(surface, full_trust(surface, options.trust_cells), None, options.damping, nuisance=nuisance)
 
     @property
     def last(self) -> FreeFormRound:
@@ -141,8 +143,8 @@ def fit_free_form(
         skipped = progress.total - progress.done - stage.last.steps
         if skipped > 0:
             progress.advance(steps=skipped)
-        if others and stage.nuisance.blocks:
-            unseen = predicted(solved, tested, stage, options).nuisance
+        if others:
+            unseen = predicted(solved, tested, stage, options)
             stage = replace(stage, nuisance=joined(stage.nuisance, unseen, len(views.train)))
         settings = replace(stage.last, rays=round(LAST_RAYS * stage.last.rays))
         return take_round(views, stage, settings, options, progress, last=True), list((decisions | later).values())
@@ -155,7 +157,8 @@ def _needed(
     known = variances(views, stage, options)
     blocks = [each for each in stage.nuisance.blocks if each.name in stage.nuisance.free]
     decisions = {each.name: decided(each, known[each.name], required=each.name in required) for each in blocks}
-    return replace(stage, nuisance=with_needed(stage.nuisance, list(decisions.values()))), decisions
+    needless = [each.name for each in decisions.values() if not each.kept]
+    return replace(stage, nuisance=stage.nuisance.without(needless)), decisions
 
 
 def _with_distortion(views: Views, stage: FitStage, options: FreeFormOptions) -> FitStage:
@@ -190,7 +193,7 @@ def coarse_stage(
     nuisance: Nuisance = NO_NUISANCE,
 ) -> FitStage:
     """What rounds lead to from a first surface and from nuisance blocks."""
-    stage = FitStage(start, full_trust(start, options.trust_cells), None, options.damping, nuisance=nuisance)
+    stage = FitStage.begun(start, options, nuisance)
     for settings in rounds:
         stage = take_round(views, stage, settings, options, progress)
     return stage
@@ -209,26 +212,21 @@ def joined(solved: Nuisance, tested: Nuisance, count: int) -> Nuisance:
     return solved.replaced([one.joined(other, order) for one, other in pairs if one.by_view])
 
 
-def predicted(solved: Views, views: Views, stage: FitStage, options: FreeFormOptions) -> Solution:
-    """Views that took no part under the surface, the map and the lens of those that did; their own blocks alone are
-    free.
+def predicted(solved: Views, views: Views, stage: FitStage, options: FreeFormOptions) -> Nuisance:
+    """The blocks of views that took no part, under the surface, the map and the lens of those that did. Their own alone
+    are free.
     """
+    own = [each for each in nuisance_of(views).blocks if each.by_view]
+    nuisance = stage.nuisance.replaced(own).freed([each.name for each in stage.nuisance.free_blocks(by_view=True)])
+    if not nuisance.free:
+        return nuisance
     settings = replace(stage.last, rays=min(stage.last.rays, JUDGED_RAYS))
     known = make_task(solved, settings, options, stage.nuisance)
     under = Solution.at(known, stage.surface, stage.trust, None, options.first_map_rounds, stage.nuisance)
-    own = [each.name for each in stage.nuisance.free_blocks(by_view=True)]
-    nuisance = fresh(views, stage.nuisance).freed(own)
     settings = replace(settings, rays=JUDGED_RAYS // 4, steps=options.pose_steps, under_known_map=True)
-    solution = Solution.at(
-        make_task(views, settings, options, nuisance), stage.surface, stage.trust, under.environment, 0, nuisance
-    )
-    return take_steps(with_noise(solution), stage.damping, still=True)[0] if own else solution
-
-
-def fresh(views: Views, nuisance: Nuisance) -> Nuisance:
-    """The same blocks of other views, those of views at their priors."""
-    known = nuisance_of(views)
-    return nuisance.replaced([each for each in known.blocks if each.by_view])
+    task = make_task(views, settings, options, nuisance)
+    solution = Solution.at(task, stage.surface, stage.trust, under.environment, 0, nuisance)
+    return take_steps(with_noise(solution), stage.damping, still=True)[0].nuisance
 
 
 def _stages(views: Views, stage: FitStage, options: FreeFormOptions, progress: Progress) -> Iterator[FitStage]:
@@ -297,7 +295,6 @@ def take_round(
         damping=damping,
         settings=settings,
         nuisance=solution.nuisance.freed(nuisance.free),
-        cost=solution.cost(solution),
     )
     cameras = solution.nuisance.get(CameraPoses)
     if cameras is None or cameras.name not in solution.nuisance.free:
@@ -371,7 +368,7 @@ def held_out_error(solved: Views, tested: Views, stage: FitStage, options: FreeF
     """Mean ‖e‖²/(‖e‖² + s²) over rays of views that neither surface nor map have seen, under a map as fine as any, and
     1 for those that miss the surface.
     """
-    own = predicted(solved, tested, stage, options).nuisance if stage.nuisance.blocks else NO_NUISANCE
+    own = predicted(solved, tested, stage, options)
     known, _ = _rays(solved, stage.surface, stage.nuisance, options)
     unknown, missed = _rays(tested, stage.surface, own, options)
     error = prediction_error([unknown], solve_environment([known], options.held_out_resolution))
@@ -381,8 +378,8 @@ def held_out_error(solved: Views, tested: Views, stage: FitStage, options: FreeF
 def _rays(views: Views, surface: LevelSet, nuisance: Nuisance, options: FreeFormOptions) -> tuple[Rays, int]:
     """Of pixels well inside the masks: those that see the surroundings, and how many miss the surface."""
     pixels, cameras = solid_pixels(views, options.held_out_rays), StatedCameras.of(views)
-    rays = nuisance.moved(pixels.rays, cameras.rotations[pixels.rays.view, 2])
+    rays = nuisance.moved(pixels.rays, cameras)
     sights, inner = Sights.of(surface, rays, 1, options.least_cosine), pixels.inner_px > options.inner_px
-    radiance, clear = pixels.radiance * np.exp(-nuisance.log_gains(rays.view)), sights.clear & inner
+    radiance, clear = nuisance.equalized(pixels.radiance, rays.view), sights.clear & inner
     outgoing, seen = (torch.from_numpy(values[clear]).float() for values in (sights.outgoing[:, 0], radiance))
     return Rays(outgoing, seen), int((inner & ~sights.hits.met).sum())

@@ -100,10 +100,6 @@ class Task:
         settings = replace(self.settings, outline_gain=gain)
         return replace(self, settings=settings, outline_weight=self.outline_weight * gain / self.settings.outline_gain)
 
-    def seen_from(self, rays: PixelRays, nuisance: Nuisance) -> PixelRays:
-        """Rays where their cameras are, through the lens that they have."""
-        return nuisance.moved(rays, self.cameras.rotations[rays.view, 2])
-
 
 def photon_gain(seen: Float[np.ndarray, "P 3"], brightness: float, share: float) -> Float[np.ndarray, "P"]:
     """By how much a residual counts more than at the mean brightness m: 1/√(1 − s + s E/m), with E what is seen.
@@ -147,8 +143,8 @@ class Solution:
     ) -> "Solution":
         """With the map solved in so many robust rounds from another one, or from nothing."""
         options, settings = task.options, task.settings
-        rays = task.seen_from(task.pixels.rays, nuisance)
-        radiance = task.pixels.radiance * np.exp(-nuisance.log_gains(rays.view))
+        rays = nuisance.moved(task.pixels.rays, task.cameras)
+        radiance = nuisance.equalized(task.pixels.radiance, rays.view)
         sights = Sights.of(surface, rays, settings.samples, options.least_cosine)
         clear = sights.clear & (task.pixels.inner_px > options.inner_px)
         texel = np.pi / 2 / settings.resolution
@@ -179,7 +175,7 @@ class Solution:
     @cached_property
     def rays(self) -> PixelRays:
         """Of the pixels, from where their cameras are."""
-        return self.task.seen_from(self.task.pixels.rays, self.nuisance)
+        return self.nuisance.moved(self.task.pixels.rays, self.task.cameras)
 
     @cached_property
     def weights(self) -> Float[np.ndarray, "P"]:
@@ -223,7 +219,7 @@ class Solution:
     @cached_property
     def _silhouette_rays(self) -> tuple[PixelRays, PixelRays]:
         """Of outlines, and of pixels that miss the surface."""
-        outlines = self.task.seen_from(self.task.outlines, self.nuisance)
+        outlines = self.nuisance.moved(self.task.outlines, self.task.cameras)
         return outlines, self.rays.chosen(~self.sights.hits.met)
 
     @cached_property
@@ -347,8 +343,7 @@ class Solution:
         c/g is compared with E, so that ∂e/∂log g = c/g, for which the prediction E stands: it has no noise.
         """
         task, pair = self.task, []
-        outlines = concatenated(list(self._silhouette_rays))
-        for rays, by_motion in ((self.rays, self._motion_rows), (outlines, self._silhouettes[1])):
+        for rays, by_motion in ((self.rays, self._motion_rows), (self._outlined, self._silhouettes[1])):
             motions = block.motions(rays, task.cameras.rotations[rays.view, 2])
             still = np.zeros((*by_motion.shape[:2], block.size))
             pair.append(still if motions is None else np.matmul(by_motion, motions))
@@ -356,22 +351,26 @@ class Solution:
         by_gain = block.gain_rows()
         if by_gain is not None:
             seen = seen + self._light[..., None] * by_gain
-        if block.offsets_px is not None:
+        if block.moves_silhouettes:
             outlined = outlined - 1.0
         return seen, outlined
 
-    @property
+    @cached_property
+    def _outlined(self) -> PixelRays:
+        """The rays of silhouettes in one."""
+        return concatenated(list(self._silhouette_rays))
+
+    @cached_property
     def _light(self) -> Float[np.ndarray, "P 3"]:
         """The prediction, times the gain of residuals."""
-        radiance = self.task.pixels.radiance * np.exp(-self.nuisance.log_gains(self.rays.view))
+        radiance = self.nuisance.equalized(self.task.pixels.radiance, self.rays.view)
         return self.residual + radiance * self.gain[:, None]
 
     def _of_views(self, blocks: Sequence[Block]) -> Linearized:
         count = len(blocks[0].values)
         seen, outlined = (np.concatenate(each, 2) for each in zip(*map(self._rows_of, blocks), strict=True))
-        view = np.concatenate([each.view for each in self._silhouette_rays])
         photographs = BlockRows(self.rays.view, seen, self.photographs.weights)
-        silhouettes = BlockRows(view, outlined, self.silhouettes.weights)
+        silhouettes = BlockRows(self._outlined.view, outlined, self.silhouettes.weights)
         precision = self.task.prior_factor * block_diagonal([each.precision for each in blocks])
         matrix = photographs.blocks(count) + silhouettes.blocks(count) + precision
         return Linearized(

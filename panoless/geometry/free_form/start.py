@@ -5,7 +5,6 @@ pixels agree best.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 
 from panoless.capture.poses import StatedCameras
@@ -20,7 +19,6 @@ from panoless.geometry.free_form.fit import FitStage, coarse_stage
 from panoless.geometry.free_form.observations import solid_pixels
 from panoless.geometry.free_form.options import FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.surface import LevelSet, level_set_of
-from panoless.geometry.free_form.trust import full_trust
 from panoless.numeric.gauss_newton import keep_if_better
 from panoless.problem.nuisance import NO_NUISANCE, Nuisance
 from shinypartial.io.progress import Progress
@@ -55,13 +53,9 @@ def first_surfaces(views: Views, config: FitConfig) -> FirstSurfaces:
     def level_set(mesh: TriangleMesh) -> LevelSet:
         return level_set_of(mesh, options.start_cells, options.margin)
 
-    pixels_disagree = _disagreement(views, options, options.start_pixels, options.start_resolution)
-
-    def disagreement(surface: LevelSet) -> float:
-        return pixels_disagree(FitStage(surface, full_trust(surface, options.trust_cells), None, options.damping))
-
+    disagreement = _disagreement(views, options, options.start_pixels, options.start_resolution)
     plates = {tension: level_set(completed(known, tension, rounds=1)) for tension in options.start_tensions}
-    best = min(plates, key=lambda tension: disagreement(plates[tension]))
+    best = min(plates, key=lambda tension: disagreement(FitStage.begun(plates[tension], options)))
     plain, hull = level_set(completed(known, best)), level_set(known.surface)
     return FirstSurfaces(plain, hull, tuple(plates.values()))
 
@@ -91,7 +85,7 @@ def started(
         return coarse_stage(views, stage.surface, options.rounds[:1], options, progress, stage.nuisance)
 
     def begun(surface: LevelSet) -> FitStage:
-        return FitStage(surface, full_trust(surface, options.trust_cells), None, options.damping, nuisance=nuisance)
+        return FitStage.begun(surface, options, nuisance)
 
     with torch.no_grad():
         known = settled(begun(plain))
@@ -120,8 +114,7 @@ def _disagreement(views: Views, options: FreeFormOptions, pixels: int, resolutio
     def measured(stage: FitStage) -> float:
         if not inner.any():
             return 1.0
-        moved = stage.nuisance.moved(rays, cameras.rotations[rays.view, 2])
-        equal = radiance * np.exp(-stage.nuisance.log_gains(rays.view))
+        moved, equal = stage.nuisance.moved(rays, cameras), stage.nuisance.equalized(radiance, rays.view)
         return Scored(moved, equal, options.concave)(stage.surface, resolution)
 
     return measured

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from panoless.problem.corrected import Corrected
-from panoless.problem.evidence import decided, with_needed
+from panoless.problem.evidence import decided
 from panoless.problem.nuisance import BLOCKS, Block, Nuisance, nuisance_of
 from panoless.problem.rays import PixelRays
 from panoless.problem.rows import BlockRows
@@ -111,7 +111,7 @@ def test_a_block_is_needed_where_its_values_exceed_their_noise(kind: type[Block]
 def test_what_is_decided_is_left_out_and_what_is_required_stays(nuisance: Nuisance) -> None:
     known = {each.name: np.ones_like(each.values) for each in nuisance.blocks}
     decisions = [decided(each, known[each.name], required=each.name == "poses") for each in nuisance.blocks]
-    left = with_needed(nuisance, decisions)
+    left = nuisance.without([each.name for each in decisions if not each.kept])
     assert [each.name for each in left.blocks] == ["poses"] == list(left.free)
     assert {each.score for each in decisions} == {0.0}
 
