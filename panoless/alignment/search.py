@@ -51,12 +51,7 @@ def align_proposal(family: Family, views: Views, proposal: Proposal, config: Fit
     options = config.poses
     if options.mode == "off" or not np.isfinite(proposal.silhouette_px):
         return None
-    if family.joint:
-        return None
-    outline = family.as_proposed(proposal, config)
-    if outline is None:
-        return None
-    alignment = Alignment(views, options)
+    outline, alignment = family.as_proposed(proposal, config), Alignment(views, options)
     if options.mode == "auto" and (
         proposal.overlap < options.least_overlap or alignment.left_by_turns(outline) > options.largest_share_left
     ):
@@ -66,11 +61,9 @@ def align_proposal(family: Family, views: Views, proposal: Proposal, config: Fit
     for _ in range(options.silhouette_rounds):
         poses = alignment.without_motion_of_object(alignment.aligned(Scene(outline), poses))
         again = family.propose(poses.moved(views), config, asked=False)
-        outline = None if again is None else family.as_proposed(again, config)
-        settled = again is None or again.silhouette_px > (1 - options.least_fall) * nearest.silhouette_px
-        if again is None or outline is None or settled:
+        if again is None or again.silhouette_px > (1 - options.least_fall) * nearest.silhouette_px:
             break
-        nearest, found = again, poses
+        nearest, found, outline = again, poses, family.as_proposed(again, config)
     is_nearer = nearest.silhouette_px <= options.largest_share_left * proposal.silhouette_px
     return PosedProposal(nearest, found) if options.mode == "on" or is_nearer else None
 

@@ -232,14 +232,12 @@ class Family(Protocol):
         """
         ...
 
-    def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry | None:
-        """A proposal as a geometry, which tells what is wrong with cameras and masks; None for a kind that has none to
-        show.
-        """
+    def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
+        """A proposal as a geometry, which tells what is wrong with cameras and masks."""
         ...
 
-    def before_steps(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry | None:
-        """The shape that a fit takes its first step from, which tells how near the surroundings are; None likewise."""
+    def before_steps(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
+        """The shape that a fit takes its first step from, which tells how near the surroundings are."""
         ...
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
@@ -255,7 +253,7 @@ class Family(Protocol):
         config: FitConfig,
     ) -> tuple[Geometry, Corrections, list[Decision]]:
         """Of a joint kind: the geometry with nuisance blocks of those kinds, what these correct, and which of them
-        held-out views need; those that are `required` stay in any case.
+        the scene needs; those that are `required` stay in any case.
         """
         ...
 

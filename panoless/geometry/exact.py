@@ -116,7 +116,7 @@ class ExactFamily:
     needs_depth: ClassVar[bool] = True
     told_by_outlines: ClassVar[bool] = False
 
-    def before_steps(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry | None:
+    def before_steps(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """The proposal itself."""
         return cast(Family, self).as_proposed(proposal, config)
 

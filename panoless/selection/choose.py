@@ -136,6 +136,8 @@ def _proposals(source: Family, views: Views, config: FitConfig, *, asked: bool) 
     proposal = proposed(source, views, config, asked=asked)
     if proposal is None:
         return []
+    if source.joint:
+        return [PosedProposal(proposal)]
     worthwhile = asked or _few_come_near(source, views, proposal, config)
     aligned = align_proposal(source, views, proposal, config) if worthwhile else None
     return [PosedProposal(proposal)] if aligned is None else [aligned, PosedProposal(proposal)]
@@ -146,7 +148,7 @@ def _few_come_near(source: Family, views: Views, proposal: Proposal, config: Fit
     as much longer as there are more, and a wrong kind stays far from the masks.
     """
     stride = len(views.train) // config.poses.trial_views
-    if stride < 2 or config.poses.mode != "auto" or source.joint:
+    if stride < 2 or config.poses.mode != "auto":
         return True
     asked = replace(views, train=views.train[::stride])
     few = align_proposal(source, asked, proposal, config)
@@ -279,9 +281,9 @@ def _bends_in_few_steps(other: Family, geometry: Geometry, views: Views, config:
     """With the cameras where the geometry has them, from the shape before the first step on."""
     posed = geometry.corrected(views)
     proposal = proposed(_source(other), posed, config)
-    start = None if proposal is None else other.before_steps(posed, proposal, config)
-    if proposal is None or start is None:
+    if proposal is None:
         return False
+    start = other.before_steps(posed, proposal, config)
     bent = other.fit(posed, replace(proposal, fitted=start), config)
     return explains_clearly_more(posed, bent, geometry.with_poses(None), config)
 

@@ -23,12 +23,9 @@ def with_corrections(source: Family, views: Views, first: Fitted, config: FitCon
     `source` makes the proposals of the kind. Exposures come first: they need no other geometry to be told. The lens
     comes last, and only of fits that explain the photographs with masks and exposures as they are: what is left
     of other errors pulls at it as well.
-    A kind that explains any outlines has only begun to be fitted, and tells nothing yet.
     """
     options, best = config.corrections, first
     if options.masks == options.exposure == options.lens == "off" or held_out_parts(views) is None:
-        return first
-    if source.as_proposed(first.start.proposal, config) is None:
         return first
     errors, equal = examined(views, first, config), None
     if options.exposure == "auto" and not encoding_of(config).high_dynamic_range:

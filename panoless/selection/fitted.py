@@ -30,7 +30,7 @@ class Fitted:
     start: PosedProposal
     corrections: Corrections = NO_CORRECTIONS
     decisions: tuple[Decision, ...] = ()
-    """Which nuisance blocks held-out views need, of a joint fit."""
+    """Which nuisance blocks the scene needs, of a joint fit."""
 
     def with_geometry(self, geometry: Geometry) -> "Fitted":
         """The same with another geometry."""

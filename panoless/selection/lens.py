@@ -93,7 +93,7 @@ def _by_trials(unknown: LensUnknown, views: Views, fitted: Fitted, config: FitCo
     if options.lens == "on":
         return told
     is_likely = _is_likely(told.corrections, unknown, options)
-    return told if is_likely and _is_earned(views, fitted, told, (unknown,), config) else fitted
+    return told if is_likely and _is_earned(views, fitted, told, unknown, config) else fitted
 
 
 def _limits(unknown: LensUnknown, options: CorrectionOptions) -> LensLimits:
@@ -159,16 +159,16 @@ def _errors(
     return errors_in_common(views, before, after, finer(best))
 
 
-def _is_earned(views: Views, before: Fitted, after: Fitted, unknowns: Sequence[LensUnknown], config: FitConfig) -> bool:
+def _is_earned(views: Views, before: Fitted, after: Fitted, unknown: LensUnknown, config: FitConfig) -> bool:
     """Whether held-out views are clearly better explained; or, by a focal length in place of near surroundings, no
     worse, and outlines are.
     """
     errors = _errors(views, before, after, config)
-    least_gain = max(_limits(each, config.corrections).least_gain for each in unknowns)
+    least_gain = _limits(unknown, config.corrections).least_gain
     if is_clearly_lower(errors[1], errors[0], replace(config.selection, least_gain=least_gain)):
         return True
     in_place = after.geometry.surroundings.is_far and not before.geometry.surroundings.is_far
-    if FOCAL_LENGTH not in unknowns or not in_place:
+    if unknown is not FOCAL_LENGTH or not in_place:
         return False
     distances = [
         outline_distance_px(each.corrections.applied(views, config), each.geometry) for each in (before, after)

@@ -47,14 +47,14 @@ def with_moved_masks(source: Family, views: Views, fitted: Fitted, config: FitCo
     """
     options = config.corrections
     offset = find_mask_offset(source, fitted.corrections.applied(views, config), fitted, config)
-    found = _moved_by(offset, views, fitted, config, refit, anew=True) if offset else None
+    found = _moved_by(offset, views, fitted, config, refit) if offset else None
     if found is None or not _offset_is_earned(views, fitted, found, config):
         return fitted
     pull = outline_pull_px(found.corrections.applied(views, config), found.geometry)
     if abs(pull) < options.least_pull_px:
         return found
     nearer_px = _within_largest(found.corrections.mask_offset_px + pull / options.pull_share, config)
-    nearer = _moved_by(nearer_px, views, found, config, refit, anew=True)
+    nearer = _moved_by(nearer_px, views, found, config, refit)
     return nearer if nearer is not None and _explains_more(views, found, nearer, config) else found
 
 
@@ -62,12 +62,10 @@ def _within_largest(offset_px: float, config: FitConfig) -> float:
     return float(np.clip(offset_px, -config.corrections.largest_px, config.corrections.largest_px))
 
 
-def _moved_by(
-    offset_px: float, views: Views, before: Fitted, config: FitConfig, refit: Refit, *, anew: bool
-) -> Fitted | None:
-    """Fitted to masks that are moved outward by so much in all, on from a fit or anew."""
+def _moved_by(offset_px: float, views: Views, before: Fitted, config: FitConfig, refit: Refit) -> Fitted | None:
+    """Fitted from scratch to masks that are moved outward by so much in all."""
     corrections = replace(before.corrections, mask_offset_px=offset_px)
-    again = refit(corrections.applied(views, config), before, anew=anew)
+    again = refit(corrections.applied(views, config), before, anew=True)
     return None if again is None else replace(again, corrections=corrections)
 
 
@@ -88,10 +86,9 @@ def find_mask_offset(source: Family, views: Views, fitted: Fitted, config: FitCo
             return np.inf
         moved = Corrections(offset).applied(views, config)
         proposal = source.propose(moved if poses is None else poses.moved(moved), config, asked=False)
-        outline = None if proposal is None else source.as_proposed(proposal, config)
-        if outline is None:
+        if proposal is None:
             return np.inf
-        common = with_solid(moved, inner)
+        outline, common = source.as_proposed(proposal, config), with_solid(moved, inner)
         return float(sum(held_out_errors(each, outline.with_poses(poses), config).mean() for each in (moved, common)))
 
     step = options.step_px

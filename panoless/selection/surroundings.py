@@ -63,8 +63,6 @@ def proposed_surroundings(family: Family, views: Views, proposal: Proposal, conf
         return FAR
     with torch.no_grad():
         geometry = family.before_steps(views, proposal, config)
-        if geometry is None:
-            return FAR
         if options.mode == "auto" and not _asks_for_near(views, geometry, floor=options.floor == "auto"):
             return FAR
         seen = leaving_rays(views, geometry, options.rays)
