@@ -13,7 +13,6 @@ from typing import Annotated, Any, Literal, TypeVar
 import tyro
 from msgspec import Meta
 
-from panoless.alignment.options import PoseOptions
 from panoless.capture.options import ContrastOptions, MaskRepairOptions
 from panoless.environment.options import (
     COARSEST,
@@ -27,7 +26,7 @@ from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.plane.options import PlaneOptions
 from panoless.geometry.revolution.options import RevolutionOptions
 from panoless.geometry.sphere.options import SphereOptions
-from panoless.selection.options import CorrectionOptions, SelectionOptions
+from panoless.selection.options import CorrectionOptions, PoseOptions, SelectionOptions
 from panoless.splats.options import SplatConfig
 from panoless.trust.options import TrustOptions
 from shinypartial.core.errors import InputError

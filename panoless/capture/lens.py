@@ -36,17 +36,6 @@ class LensChange:
     k1: float | None = None
     """The radial distortion."""
 
-    @property
-    def values(self) -> Float[np.ndarray, "M"]:
-        """Of the unknowns, in that order."""
-        return np.array([each for each in (self.focal, self.k1) if each is not None], np.float64)
-
-    def after(self, change: Float[np.ndarray, "M"]) -> "LensChange":
-        """Changed by a step of the unknowns."""
-        steps = iter(change.tolist())
-        focal, k1 = (None if each is None else each + next(steps) for each in (self.focal, self.k1))
-        return LensChange(focal, k1)
-
     def rays(
         self, origins: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"], axes: Float[np.ndarray, "P 3"]
     ) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]]:

@@ -51,6 +51,8 @@ class Poses:
 
     turns: Float[np.ndarray, "V 3"]
     shifts: Float[np.ndarray, "V 3"]
+    sigmas: Float[np.ndarray, "V 6"] | None = None
+    """Standard deviations of both, where a fit determined them."""
 
     @classmethod
     def none(cls, views: int) -> "Poses":
@@ -71,11 +73,6 @@ class Poses:
         """Turned and shifted once more."""
         turns = Rotation.from_rotvec(change[:, :3]) * Rotation.from_rotvec(self.turns)
         return Poses(turns.as_rotvec(), self.shifts + change[:, 3:])
-
-    def beyond(self, first: "Poses") -> "Poses":
-        """What turns and shifts cameras from the first poses to these: `first.after` of it is these."""
-        turns = Rotation.from_rotvec(self.turns) * Rotation.from_rotvec(first.turns).inv()
-        return Poses(turns.as_rotvec(), self.shifts - first.shifts)
 
     def without_common(self, cameras: "StatedCameras", prior: Float[np.ndarray, "V 6 6"]) -> tuple[Similarity, "Poses"]:
         """What turns, shifts and scales all cameras alike, by least squares under the weights of the prior, and the

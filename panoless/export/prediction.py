@@ -328,12 +328,13 @@ def _model_selection(selection: Selection) -> ModelSelection:
 
 def _found_cameras(dataset: Dataset, state: FitState) -> tuple[FoundCamera, ...] | None:
     """Poses and exposures of the training views, where they were unknowns."""
-    poses, sigmas, corrections = state.geometry.poses, state.pose_uncertainty, state.selection.corrections
+    poses, corrections = state.geometry.poses, state.selection.corrections
+    sigmas = None if poses is None else poses.sigmas
     if poses is None and corrections.gains is None:
         return None
     to_world, none = np.repeat([180 / np.pi, state.frame.radius], 3), [None] * len(dataset.train)
     placed = none if poses is None else list(poses.stacked * to_world)
-    spread = none if sigmas is None else list(sigmas.numpy() * to_world)
+    spread = none if sigmas is None else list(sigmas * to_world)
     gains = none if (channels := corrections.channel_gains) is None else list(channels)
     return tuple(
         FoundCamera(frame.name, _three(pose, 0), _three(pose, 3), _three(sigma, 0), _three(sigma, 3), _three(gain, 0))

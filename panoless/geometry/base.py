@@ -207,6 +207,10 @@ class Proposal:
         return replace(self, shape=replace(self.shape, surroundings=surroundings), fitted=fitted)
 
 
+Propose = Callable[[Views], Proposal | None]
+"""Of views: a shape by their silhouettes."""
+
+
 @runtime_checkable
 class Family(Protocol):
     """A kind of geometry as a candidate in model selection."""
@@ -215,8 +219,6 @@ class Family(Protocol):
     geometry: ClassVar[type[Geometry]]
     label: ClassVar[str]
     """With its article, as sentences name it."""
-    joint: ClassVar[bool]
-    """Whether its fit solves for cameras, exposures and masks beside the shape (see `panoless.problem`)."""
     refines: ClassVar[str | None]
     """The kind whose proposal it takes on where that one is not chosen; None: it makes its own."""
     needs_depth: ClassVar[bool]
@@ -251,10 +253,15 @@ class Family(Protocol):
         kinds: Collection[type[Block]],
         required: Collection[str],
         config: FitConfig,
+        propose: Propose,
     ) -> tuple[Geometry, Corrections, list[Decision]]:
-        """Of a joint kind: the geometry with nuisance blocks of those kinds, what these correct, and which of them
-        the scene needs; those that are `required` stay in any case.
+        """The geometry with nuisance blocks of those kinds, what these correct, and which of them the scene needs;
+        those that are `required` stay in any case. `propose` makes a proposal of corrected views.
         """
+        ...
+
+    def by_outlines(self, views: Views, proposal: Proposal, kinds: Collection[type[Block]], config: FitConfig) -> Poses:
+        """Poses of cameras by silhouettes alone."""
         ...
 
 

@@ -1,5 +1,6 @@
 """What nuisance blocks amount to: corrections of photographs, and poses in the world that the dataset states."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -7,6 +8,8 @@ from jaxtyping import Float
 
 from panoless.capture.corrections import Corrections
 from panoless.capture.poses import Poses
+from panoless.capture.views import Views
+from panoless.config import FitConfig
 from panoless.problem.nuisance import (
     CameraPoses,
     Distortion,
@@ -28,8 +31,8 @@ class Corrected:
     scale: float
 
     @classmethod
-    def by(cls, nuisance: Nuisance, variances: dict[str, Float[np.ndarray, "B M"]]) -> "Corrected":
-        """With the standard deviations of the focal length and the distortion by their variances.
+    def by(cls, nuisance: Nuisance, variances: Mapping[str, Float[np.ndarray, "B M"]] | None = None) -> "Corrected":
+        """With the standard deviations of cameras and lens by the variances, where these are known.
 
         Cameras that are eˢ as far away see the same as those where they are stated of a world that is e⁻ˢ as large.
         """
@@ -40,12 +43,13 @@ class Corrected:
         found = Corrections(
             focal_factor=float(np.exp(change)), mask_offset_px=0.0 if offset is None else -float(offset.values[0, 0])
         )
-        if focal is not None:
-            found = replace(found, focal_uncertainty=found.focal_factor * float(np.sqrt(variances[focal.name][0, 0])))
+        sigmas = {name: np.sqrt(each) for name, each in (variances or {}).items()}
+        if focal is not None and focal.name in sigmas:
+            found = replace(found, focal_uncertainty=found.focal_factor * float(sigmas[focal.name][0, 0]))
         if bent is not None:
-            found = replace(
-                found, k1=float(bent.values[0, 0]), k1_uncertainty=float(np.sqrt(variances[bent.name][0, 0]))
-            )
+            found = replace(found, k1=float(bent.values[0, 0]))
+            if bent.name in sigmas:
+                found = replace(found, k1_uncertainty=float(sigmas[bent.name][0, 0]))
         if offsets is not None:
             found = replace(found, mask_offsets_px=-offsets.values[:, 0])
         if exposures is not None or balances is not None:
@@ -57,5 +61,14 @@ class Corrected:
                 balances=None if balances is None else np.exp(balances.values @ balances.gain_rows().T),
             )
         scale = float(np.exp(-change))
-        poses = None if cameras is None else Poses(cameras.values[:, :3], cameras.values[:, 3:] * scale)
+        poses = None
+        if cameras is not None:
+            sizes = np.repeat([1.0, scale], 3)
+            moved, known = cameras.values * sizes, sigmas.get(cameras.name)
+            poses = Poses(moved[:, :3], moved[:, 3:], None if known is None else known * sizes)
         return cls(found, poses, scale)
+
+    def applied(self, views: Views, config: FitConfig) -> Views:
+        """Photographs without these errors, from cameras that are where they were."""
+        corrected = self.corrections.applied(views, config)
+        return corrected if self.poses is None else self.poses.moved(corrected)

@@ -3,11 +3,14 @@
 A block of n unknowns xᵢ with the posterior standard deviations σᵢ, in units of the noise that residuals show, is needed
 where
 
-1/n Σ (xᵢ/σᵢ)² > 1 + 2 √(2/n):
+1/n Σ (xᵢ/σᵢ)² > (1 − 2/9n + z √(2/9n))³, z = 2.78:
 
-two standard deviations beyond what a block has that is zero in truth. Held-out views do not decide: a pose that makes
-up for a surface that is still too coarse explains views that took no part better, too. Nor do covariances: a turn and a
-shift that cancel each other are known well, and the first to bend for such a surface.
+which one in 370 blocks exceeds that are zero in truth (the quantile of χ²ₙ/n by Wilson and Hilferty 1931). Model errors set a floor to σᵢ. Where the
+covariance C of a block is known, with the surface, the map and the other blocks that follow it, the sum is xᵀ C⁻¹ x
+(Wald's statistic): exposures that drift with the camera's place are what a map takes over, and mean nothing. Of a level
+set the σᵢ are those of each view: a turn and a shift that cancel each other are known well, and the first to bend for a
+surface that is still too coarse. Held-out views do not decide: a pose that makes up for such a surface explains views
+that took no part better, too.
 """
 
 import math
@@ -18,8 +21,8 @@ from jaxtyping import Float
 
 from panoless.problem.nuisance import Block
 
-DEVIATIONS = 2.0
-"""Of the mean square beyond 1, from which a block is needed."""
+DEVIATIONS = 2.78
+"""z: standard deviations of a normal number that are exceeded as seldom."""
 
 
 @dataclass(frozen=True)
@@ -31,16 +34,29 @@ class Decision:
     score: float
     """1/n Σ (xᵢ/σᵢ)²."""
     bound: float
-    """1 + 2 √(2/n)."""
+    """(1 − 2/9n + z √(2/9n))³."""
     value: float
     sigma: float
     """Standard deviation of a number of the block."""
     unit: str
 
 
-def decided(block: Block, variances: Float[np.ndarray, "B M"], *, required: bool = False) -> Decision:
-    """Whether a block is needed, by the posterior variances of its unknowns; one that is `required` is kept."""
-    score = float((block.values**2 / variances).mean())
-    bound = 1 + DEVIATIONS * math.sqrt(2 / block.values.size)
+def decided(
+    block: Block,
+    variances: Float[np.ndarray, "B M"],
+    covariance: Float[np.ndarray, "N N"] | None = None,
+    *,
+    required: bool = False,
+) -> Decision:
+    """Whether a block is needed, by the posterior variances of its unknowns or by their covariance, to both of which
+    what model errors amount to is added; one that is `required` is kept.
+    """
+    value, floor = block.values.ravel(), block.floor**2
+    if covariance is None:
+        score = float((value**2 / (variances.ravel() + floor)).mean())
+    else:
+        score = float(value @ np.linalg.solve(covariance + floor * np.eye(value.size), value)) / value.size
+    share = 2 / (9 * value.size)
+    bound = (1 - share + DEVIATIONS * math.sqrt(share)) ** 3
     sigma = block.scale * math.sqrt(float(variances[:, block.measured].mean()))
     return Decision(block.name, required or score > bound, score, bound, block.rms, sigma, block.unit)

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from panoless.capture.lens import LensChange
 from panoless.capture.poses import Poses, StatedCameras
 from panoless.capture.views import Views
+from panoless.environment.surroundings import Surroundings
 from panoless.problem.rays import PixelRays
 
 CHROMATICITIES = np.array([[1.0, -1.0, 0.0], [1.0, 1.0, -2.0]]) / np.sqrt([[2.0], [6.0]])
@@ -33,6 +34,8 @@ class Block:
     unit: ClassVar[str] = ""
     scale: ClassVar[float] = 1.0
     """Of a number of the block, in that unit."""
+    floor: ClassVar[float] = 0.0
+    """Standard deviation of an unknown by errors of surface, map and masks, which noise does not show."""
     moves_silhouettes: ClassVar[bool] = False
     """Whether its numbers are pixels by which silhouettes of masks lie outside of those of the object."""
     values: Float[np.ndarray, "B M"]
@@ -107,6 +110,7 @@ class FocalLength(Lens):
 
     name = "focal length"
     unit, scale = "%", 100.0
+    floor = 0.001
 
     @property
     def lens(self) -> LensChange:
@@ -118,6 +122,7 @@ class Distortion(Lens):
     """k₁ of the radial distortion of all views."""
 
     name = "distortion"
+    floor = 0.005
 
     @property
     def lens(self) -> LensChange:
@@ -131,6 +136,7 @@ class CameraPoses(Block):
     name = "poses"
     size = 6
     unit, scale = "°", 180 / math.pi
+    floor = 2e-4
 
     @property
     def measured(self) -> slice:
@@ -169,6 +175,7 @@ class Exposures(Deviations):
 
     name = "exposures"
     unit, scale = "stops", 1 / math.log(2)
+    floor = 0.005
 
     def gain_rows(self) -> Float[np.ndarray, "3 M"]:
         """Ones."""
@@ -181,10 +188,29 @@ class WhiteBalances(Deviations):
     name = "white balances"
     size = 2
     unit, scale = "stops", 1 / math.log(2)
+    floor = 0.005
 
     def gain_rows(self) -> Float[np.ndarray, "3 M"]:
         """The directions."""
         return CHROMATICITIES.T
+
+
+class Walls(Block):
+    """κ = 1/D: how near the walls are that the object mirrors, beside what is known of them (inverse radii)."""
+
+    name = "walls"
+    by_view = False
+    unit = "1/radius"
+    floor = 0.001
+
+    def stepped(self, step: Float[np.ndarray, "1 1"]) -> "Walls":
+        """No farther than infinitely far."""
+        return replace(self, values=np.maximum(self.values + step, 0.0))
+
+    def around(self, known: Surroundings) -> Surroundings:
+        """Surroundings with those walls."""
+        near = known.with_degree(max(known.degree, 0))
+        return near.after_walls(np.pad(self.values[0], (0, len(near.coefficients) - 1)))
 
 
 class MaskOffset(Block):
@@ -193,6 +219,7 @@ class MaskOffset(Block):
     name = "mask offset"
     by_view = False
     unit = "px"
+    floor = 0.05
     moves_silhouettes = True
 
 
@@ -201,6 +228,7 @@ class MaskOffsets(Deviations):
 
     name = "mask offsets"
     unit = "px"
+    floor = 0.05
     moves_silhouettes = True
 
 
@@ -210,6 +238,7 @@ BLOCKS: tuple[type[Block], ...] = (
     CameraPoses,
     Exposures,
     WhiteBalances,
+    Walls,
     MaskOffset,
     MaskOffsets,
 )
@@ -282,6 +311,11 @@ class Nuisance:
             rays = block.moved(rays, axes)
         return rays
 
+    def around(self, known: Surroundings) -> Surroundings:
+        """What is known of the surroundings, with the walls where these are an unknown."""
+        walls = self.get(Walls)
+        return known if walls is None else walls.around(known)
+
     def log_gains(self, view: Int[np.ndarray, "P"]) -> Float[np.ndarray, "P 3"] | float:
         """log g of the pixels of those views; 0 where no block changes it."""
         parts = [found for each in self.blocks if (found := each.log_gains()) is not None]
@@ -323,10 +357,11 @@ SIGMAS: dict[type[Block], float] = {
     Distortion: 0.1,
     Exposures: 0.2,
     WhiteBalances: 0.1,
+    Walls: 0.1,
     MaskOffset: 1.0,
     MaskOffsets: 1.0,
 }
-"""Standard deviations of the other blocks: of log focal length, k₁, log gains, and pixels."""
+"""Standard deviations of the other blocks: of log focal length, k₁, log gains, 1/D, and pixels."""
 
 
 def nuisance_of(views: Views, kinds: Collection[type[Block]] = BLOCKS) -> Nuisance:

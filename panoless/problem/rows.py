@@ -7,6 +7,15 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int
 
+from panoless.capture.poses import StatedCameras
+from panoless.problem.nuisance import Block
+from panoless.problem.rays import PixelRays
+
+CHI_MEDIAN = 1.538
+"""Median length of a vector of three normal numbers, in their standard deviation."""
+CORRELATED = 16.0
+"""Pixels that err alike under a map that is too coarse, or a surface that is wrong: patches of 4 × 4."""
+
 
 @dataclass(frozen=True)
 class BlockRows:
@@ -69,3 +78,22 @@ class Linearized:
         count = len(value)
         pulled = self.photographs.backward(seen, count) + self.silhouettes.backward(outlined, count)
         return pulled + np.matmul(self.precision, value[..., None])[..., 0]
+
+
+def rows_of(
+    block: Block,
+    rays: PixelRays,
+    cameras: StatedCameras,
+    by_motion: Float[np.ndarray, "P C 6"],
+    light: Float[np.ndarray, "P C"] | None = None,
+) -> Float[np.ndarray, "P C M"]:
+    """Derivatives by the unknowns of a block: of photographs that show a `light`, or of silhouettes.
+
+    c/g is compared with E, so that ∂e/∂log g = c/g, for which the prediction E stands: it has no noise.
+    """
+    motions = block.motions(rays, cameras.rotations[rays.view, 2])
+    rows = np.zeros((*by_motion.shape[:2], block.size)) if motions is None else np.matmul(by_motion, motions)
+    by_gain = block.gain_rows()
+    if light is None:
+        return rows - 1.0 if block.moves_silhouettes else rows
+    return rows if by_gain is None else rows + light[..., None] * by_gain

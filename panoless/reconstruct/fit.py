@@ -8,7 +8,6 @@ from typing import cast
 
 import torch
 
-from panoless.alignment.align import Alignment
 from panoless.capture.configured import configured_views
 from panoless.capture.views import Views
 from panoless.config import FitConfig, check_config
@@ -95,10 +94,6 @@ def _finished(
         photographs, shown = complete(state, photographs, config)
     with timed(state.seconds, "judge"):
         state.verdict = assess(state, photographs, shown, read_ball_evidence(dataset))
-        if state.geometry.poses is not None:
-            with torch.no_grad():
-                found = Alignment(photographs, config.poses).uncertainty(state.geometry)
-            state.pose_uncertainty = torch.from_numpy(found)
     note_peak_memory(state)
     save_state(folder, state)
     return state.to(MAIN_MEMORY)

@@ -50,8 +50,6 @@ class FitState:
     """Of the object, where held-out views ask for one; None: it is smooth."""
     blur_px: float | None = None
     """Standard deviation of a Gaussian that blurred the pictures, where held-out views ask for one."""
-    pose_uncertainty: Float[Tensor, "V 6"] | None = None
-    """Standard deviations of the cameras' turns (rad) and shifts (normalized frame), where these were found."""
     verdict: Trust | None = None
     """How far it is to be trusted; None before the end, and in runs of an earlier version."""
 

@@ -12,13 +12,13 @@ from jaxtyping import Float, Int
 
 from panoless.capture.views import Views
 from panoless.geometry.free_form.hollows import HALF_SIDE, SIDE, Chart, Hollow, Relief
-from panoless.geometry.free_form.observations import Pixels, solid_pixels
 from panoless.geometry.free_form.options import ConcaveOptions
 from panoless.geometry.free_form.spread import FinalRays, disagreement
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.journal import remembered
 from panoless.numeric.evolution import evolve
 from panoless.numeric.robust import bounded_error
+from panoless.problem.observations import Pixels, solid_pixels
 from panoless.problem.rays import PixelRays
 from shinypartial.io.progress import Progress
 

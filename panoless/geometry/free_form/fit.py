@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
@@ -15,7 +15,6 @@ from panoless.environment.rays import Rays
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
 from panoless.geometry.free_form.concave import concave_start
-from panoless.geometry.free_form.observations import outline_rays, solid_pixels
 from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.photometric import Sights, Solution, Task
 from panoless.geometry.free_form.steps import solved_equations, take_steps, with_noise
@@ -34,14 +33,13 @@ from panoless.problem.nuisance import (
     WhiteBalances,
     nuisance_of,
 )
+from panoless.problem.observations import is_saturated, outline_rays, solid_pixels
 from shinypartial.io.progress import Progress
 
 KNOWN = 1e9
 """Rays a texel that ask for nothing, under which the map stays."""
 SHARED_SCALE = 0.2
 """Robust scale above which what all views share stays: its derivative under a coarse map has the wrong sign."""
-SATURATED = 0.97
-"""Share of the largest radiance from which a pixel is taken for saturated."""
 LAST_RAYS = 2.5
 """Factor of the pixels of the last round, which all views take: those before lead to where it starts."""
 JUDGED_RAYS = 40_000
@@ -327,12 +325,6 @@ def make_task(
     outlined = settings.outline_gain * believed * density / options.outline_sigma_px**2
     brightness = max(float(pixels.radiance.mean()), LEAST_BRIGHTNESS)
     return Task(pixels, chosen, share, outlined, settings, options, StatedCameras.of(views), brightness)
-
-
-def is_saturated(radiance: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, "P"]:
-    """Whether a channel of a pixel has the largest radiance of all, but for little."""
-    found: np.ndarray = (radiance >= SATURATED * radiance.max(0, initial=0.0)).any(1)
-    return found
 
 
 def variances(views: Views, stage: FitStage, options: FreeFormOptions) -> dict[str, Float[np.ndarray, "B M"]]:

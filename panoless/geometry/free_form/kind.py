@@ -23,6 +23,7 @@ from panoless.geometry.base import (
     Geometry,
     Mesh,
     Proposal,
+    Propose,
     SurfaceBuffers,
     from_plain,
     poses_from_plain,
@@ -30,7 +31,6 @@ from panoless.geometry.base import (
 )
 from panoless.geometry.exact import ExactFamily, ExactGeometry
 from panoless.geometry.free_form.fit import FitStage, fit_free_form, follow_views, variances
-from panoless.geometry.free_form.observations import inner_distance_px
 from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions
 from panoless.geometry.free_form.photometric import Sights
 from panoless.geometry.free_form.rendering import free_form_buffers, free_form_light
@@ -40,7 +40,8 @@ from panoless.geometry.free_form.trust import Trust, full_trust
 from panoless.kernels.camera import RasterCamera
 from panoless.problem.corrected import Corrected
 from panoless.problem.evidence import Decision, decided
-from panoless.problem.nuisance import Block, nuisance_of
+from panoless.problem.nuisance import Block, Walls, nuisance_of
+from panoless.problem.observations import inner_distance_px
 from panoless.problem.rays import PixelRays
 from shinypartial.io.records import read_record, write_record
 
@@ -196,7 +197,6 @@ class FreeFormFamily(ExactFamily):
     kind: ClassVar[str] = "free_form"
     geometry: ClassVar[type[Geometry]] = FreeFormMirror
     label: ClassVar[str] = "a free-form surface"
-    joint: ClassVar[bool] = True
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """First surfaces as level sets; one that is closed explains any silhouettes in the end.
@@ -214,11 +214,11 @@ class FreeFormFamily(ExactFamily):
         return _mirror(surface, trust, None, config)
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
-        """On from an earlier fit to almost the same views, under cameras as it has them."""
+        """On from an earlier fit to almost the same views."""
         before = proposal.fitted
         assert before is not None, "a fit begins with its nuisance blocks"
-        found = follow_views(before.corrected(views), _stage(before), config.free_form)
-        return _mirror(found.surface, found.trust, before.poses, config)
+        found = follow_views(views, _stage(before), config.free_form)
+        return _mirror(found.surface, found.trust, None, config)
 
     def solve(
         self,
@@ -227,6 +227,7 @@ class FreeFormFamily(ExactFamily):
         kinds: Collection[type[Block]],
         required: Collection[str],
         config: FitConfig,
+        propose: Propose,
     ) -> tuple[Geometry, Corrections, list[Decision]]:
         """All coefficients by silhouettes and photographs, with nuisance blocks of those kinds.
 
@@ -234,7 +235,9 @@ class FreeFormFamily(ExactFamily):
         the plain surface.
         """
         options, first = config.free_form, proposal.shape
-        start, nuisance = started(views, first, options, nuisance_of(views, kinds))
+        start, nuisance = started(
+            views, first, options, nuisance_of(views, [each for each in kinds if each is not Walls])
+        )
         lids = () if np.array_equal(start.coefficients, first.plain.coefficients) else (first.surface,)
         stage, decisions = fit_free_form(views, start, options, lids=lids, nuisance=nuisance, required=required)
         with torch.no_grad():

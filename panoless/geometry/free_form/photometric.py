@@ -16,7 +16,6 @@ from panoless.environment.footprints import PixelFootprints
 from panoless.geometry.free_form.equations import Rows, gauge_rows, joined_rows, silhouette_rows
 from panoless.geometry.free_form.map import smoothed_map, splatted_map
 from panoless.geometry.free_form.motions import pixel_motion_rows
-from panoless.geometry.free_form.observations import Pixels
 from panoless.geometry.free_form.options import FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.surface import Hits, LevelSet
 from panoless.geometry.free_form.trust import Trust
@@ -31,6 +30,7 @@ from panoless.kernels.level_set import (
 from panoless.kernels.reference.cubemap import padded_texels
 from panoless.numeric.robust import bounded_error, robust_weight
 from panoless.problem.nuisance import NO_NUISANCE, Block, Nuisance, block_diagonal
+from panoless.problem.observations import Pixels
 from panoless.problem.rays import PixelRays
 from panoless.problem.rows import BlockRows, Linearized
 

@@ -16,11 +16,11 @@ from panoless.first_surface.mesh import TriangleMesh
 from panoless.first_surface.visual_hull import carve_hull
 from panoless.geometry.free_form.concave import Scored
 from panoless.geometry.free_form.fit import FitStage, coarse_stage
-from panoless.geometry.free_form.observations import solid_pixels
 from panoless.geometry.free_form.options import FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.surface import LevelSet, level_set_of
 from panoless.numeric.gauss_newton import keep_if_better
 from panoless.problem.nuisance import NO_NUISANCE, Nuisance
+from panoless.problem.observations import solid_pixels
 from shinypartial.io.progress import Progress
 
 

@@ -10,14 +10,11 @@ from panoless.geometry.free_form.photometric import Solution
 from panoless.geometry.free_form.trust import Trust
 from panoless.numeric.conjugate_gradients import solve_by_products
 from panoless.numeric.factorize import regularize
+from panoless.problem.rows import CHI_MEDIAN, CORRELATED
 from shinypartial.io.progress import Progress
 
 THIRD_DIFFERENCE_DIAGONAL = 3 * 20 + 6 * 3 * 12 + 6 * 8
 """Of DᵀD: Σ over the kinds of how often one counts in |D³c|² times its squared factors."""
-CHI_MEDIAN = 1.538
-"""Median length of a vector of three normal numbers, in their standard deviation."""
-CORRELATED = 16.0
-"""Pixels that err alike under a map that is too coarse, or a surface that is wrong: patches of 4 × 4."""
 OUTLINE_GAIN = 9.0
 """Factor of the weight of silhouettes where the offsets of their masks are free: as if they were right to 0.05 px."""
 

@@ -20,6 +20,7 @@ from panoless.geometry.height_field.model import (
     height_field_buffers,
     visible_reflections,
 )
+from panoless.geometry.height_field.unknowns import HeightFieldUnknowns
 from panoless.kernels.camera import RasterCamera
 from shinypartial.core.errors import InputError
 
@@ -100,6 +101,14 @@ class HeightFieldFamily(ExactFamily):
         """The dome or bowl over the plane that photographs agree on best, or the plane."""
         flat = flat_height_field(proposal.shape, config.height_field.cells)
         return HeightFieldMirror(best_dome(views, flat))
+
+    def unknowns(self, views: Views, proposal: Proposal, config: FitConfig) -> HeightFieldUnknowns:
+        """See there."""
+        return HeightFieldUnknowns(flat_height_field(proposal.shape, config.height_field.cells))
+
+    def begun(self, views: Views, surface: HeightFieldUnknowns, config: FitConfig) -> HeightFieldUnknowns:
+        """With the dome or bowl more that photographs agree on best."""
+        return HeightFieldUnknowns(best_dome(views, surface.height_field))
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """Heights, plane and boundary by silhouettes and photographs together."""

@@ -15,6 +15,7 @@ from panoless.geometry.base import SOLID_SURFACE_ALPHA, Geometry, Mesh, Proposal
 from panoless.geometry.exact import ExactFamily, SeenByCenters, looked_up, mirrored_directions
 from panoless.geometry.plane.fit import fit_plane
 from panoless.geometry.plane.model import Plane, plane_buffers, unoccluded_share
+from panoless.geometry.plane.unknowns import PlaneUnknowns
 from panoless.kernels.camera import RasterCamera
 from shinypartial.core.errors import InputError
 
@@ -88,6 +89,10 @@ class PlaneFamily(ExactFamily):
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The plane within its boundary."""
         return PlaneMirror(proposal.shape, config.environment.trace)
+
+    def unknowns(self, views: Views, proposal: Proposal, config: FitConfig) -> PlaneUnknowns:
+        """See there."""
+        return PlaneUnknowns(proposal.shape)
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """The proposal itself: silhouettes tell a plane to the end. After an earlier fit, they are asked again."""

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from panoless.capture.rays import camera_rays, pose_of
 from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import SurfaceBuffers, buffers_from_arrays
 from panoless.kernels.camera import RasterCamera
-from panoless.numeric.polygon import projected_coverage
+from panoless.numeric.polygon import depth_inside, projected_coverage
 from shinypartial.core.conventions import PIXEL_CENTER
 
 
@@ -46,6 +46,23 @@ class Plane:
     def points(self, coordinates: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P 3"]:
         """Plane coordinates to points in space."""
         return self.offset * self.normal + coordinates @ np.stack([self.tangent_u, self.tangent_v])
+
+
+def passes_frame(
+    plane: Plane,
+    points: Float[np.ndarray, "P 3"],
+    outgoing: Float[np.ndarray, "P 3"],
+    height: float,
+    margin: Float[np.ndarray, "P"],
+) -> Bool[np.ndarray, "P"]:
+    """Whether rays that leave points pass what stands at a height over the boundary, by a margin or more."""
+    rising = outgoing @ plane.normal
+    if height <= 0:
+        return rising > 0
+    rise = np.maximum(height + plane.offset - points @ plane.normal, 0.0) / np.where(rising > 0, rising, 1.0)
+    places = points + rise[:, None] * outgoing
+    coordinates = np.stack([places @ plane.tangent_u, places @ plane.tangent_v], 1)
+    return (rising > 0) & (depth_inside(coordinates, plane.boundary) > margin)
 
 
 def plane_buffers(plane: Plane, camera: RasterCamera) -> SurfaceBuffers:

@@ -44,6 +44,14 @@ class BoundaryResiduals:
     along: Float[np.ndarray, "P"]
     """The nearest point is so far along this side of the boundary, 0 at its first vertex, 1 at its second."""
     pixels_per_unit: Float[np.ndarray, "P"]
+    outward: Float[np.ndarray, "P 2"]
+    """Direction outward from the side in plane coordinates, of that length."""
+    beyond: Float[np.ndarray, "P"]
+    """ν·v, in pixels."""
+    parallax: Float[np.ndarray, "P"]
+    """z/(H − z)."""
+    rise: Float[np.ndarray, "P"]
+    """z/(H − z)²."""
     valid: Bool[np.ndarray, "P"]
     """In front of a camera that faces the mirror."""
     counted: Bool[np.ndarray, "P"]
@@ -136,6 +144,10 @@ def boundary_residuals(
         side=side,
         along=along,
         pixels_per_unit=pixels_per_unit,
+        outward=outward,
+        beyond=beyond,
+        parallax=parallax,
+        rise=parallax / above,
         valid=valid,
         counted=valid & ~at_corner,
     )

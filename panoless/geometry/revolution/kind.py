@@ -22,6 +22,8 @@ from panoless.geometry.revolution.lip import CLEARANCE_PX, beside_lip
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_buffers, revolution_rays
 from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
 from panoless.geometry.revolution.render import SAMPLES, mean_light
+from panoless.geometry.revolution.silhouette import contour_rays
+from panoless.geometry.revolution.unknowns import STIFF_PX, RevolutionUnknowns
 from panoless.kernels.camera import RasterCamera
 from shinypartial.core.errors import InputError
 from shinypartial.io.records import read_record, write_record
@@ -132,6 +134,14 @@ class RevolutionFamily(ExactFamily):
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The outside, closed flat at both ends."""
         return RevolutionMirror(proposal.shape, config.environment.trace, config.revolution)
+
+    def unknowns(self, views: Views, proposal: Proposal, config: FitConfig) -> RevolutionUnknowns:
+        """See there."""
+        return RevolutionUnknowns(proposal.shape, contour_rays(views).pixel)
+
+    def begun(self, views: Views, surface: RevolutionUnknowns, config: FitConfig) -> RevolutionUnknowns:
+        """With a stiff profile."""
+        return replace(surface, knot_px=STIFF_PX)
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """Profile and axis by what is reflected."""

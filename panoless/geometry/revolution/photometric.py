@@ -155,6 +155,8 @@ class NormalMotion:
     mirrored: MirroredRays
     along: Float[np.ndarray, "Q 3 2"]
     """τ and e_φ."""
+    bends: Float[np.ndarray, "Q 2"]
+    """Principal curvatures in these directions: how the normal turns along them."""
     turns: Float[np.ndarray, "Q 2 8"]
     index: Int[np.ndarray, "Q 4"]
 
@@ -201,6 +203,7 @@ def normal_motion(
         kept=kept,
         mirrored=MirroredRays(rays @ surface.frame, chosen.normals, chosen.points, surface.surroundings),
         along=np.stack([profile_direction @ surface.frame, azimuth @ surface.frame], 2),
+        bends=np.stack([bend, around], 1),
         turns=np.stack([turn_profile, turn_azimuth], 1),
         index=index,
     )

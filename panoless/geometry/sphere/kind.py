@@ -19,6 +19,7 @@ from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, fro
 from panoless.geometry.exact import ExactFamily, ExactGeometry
 from panoless.geometry.sphere.fit import SAMPLES, fit_sphere
 from panoless.geometry.sphere.model import CENTER, Sphere, mirrored, parts_of_pixel, sphere_buffers
+from panoless.geometry.sphere.unknowns import SphereUnknowns
 from panoless.kernels.camera import RasterCamera
 from panoless.kernels.cubemap import sample_cubemap
 from shinypartial.core.errors import InputError
@@ -172,6 +173,10 @@ class SphereFamily(ExactFamily):
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The sphere."""
         return SphereMirror(proposal.shape)
+
+    def unknowns(self, views: Views, proposal: Proposal, config: FitConfig) -> SphereUnknowns:
+        """See there."""
+        return SphereUnknowns(proposal.shape, config.sphere.radius > 0)
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """The proposal itself: outlines tell a sphere to the end. After an earlier fit, they are asked again."""

@@ -95,7 +95,7 @@ def test_rows_and_their_adjoint_agree_with_a_dense_matrix() -> None:
 
 @pytest.mark.parametrize("kind", BLOCKS, ids=[kind.name for kind in BLOCKS])
 def test_a_block_is_needed_where_its_values_exceed_their_noise(kind: type[Block], nuisance: Nuisance) -> None:
-    """Of a hundred of noise at most ten, of those five times as large nearly all, or half of single numbers."""
+    """Of a hundred of noise at most three, of those five times as large nearly all, or half of single numbers."""
     block, rng = nuisance.get(kind), np.random.default_rng(4)
     assert block is not None
     sigmas = 0.01 * rng.uniform(0.5, 2.0, block.values.shape)
@@ -103,9 +103,10 @@ def test_a_block_is_needed_where_its_values_exceed_their_noise(kind: type[Block]
     for factor in kept:
         for _ in range(100):
             values = factor * sigmas * rng.normal(size=sigmas.shape)
-            kept[factor] += decided(replace(block, values=values), sigmas**2).kept
-    assert kept[1] <= 10
-    assert kept[5] >= (50 if block.values.size == 1 else 97)
+            of = replace(block, values=values * np.sqrt(1 + (block.floor / sigmas) ** 2))
+            kept[factor] += decided(of, sigmas**2).kept
+    assert kept[1] <= 3
+    assert kept[5] >= (40 if block.values.size == 1 else 97)
 
 
 def test_what_is_decided_is_left_out_and_what_is_required_stays(nuisance: Nuisance) -> None:

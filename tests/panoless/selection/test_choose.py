@@ -7,27 +7,29 @@ import numpy as np
 import pytest
 import torch
 
-from panoless.alignment.options import PoseOptions
-from panoless.alignment.search import PosedProposal, align_proposal
 from panoless.capture.poses import Poses
 from panoless.capture.views import Views
 from panoless.config import FitConfig
-from panoless.geometry.base import Family, Geometry, Proposal, usable_views
+from panoless.geometry.base import Geometry, Proposal, usable_views
 from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.plane.model import unoccluded_share
 from panoless.geometry.registry import FAMILIES
 from panoless.geometry.revolution.kind import RevolutionFamily
 from panoless.reconstruct.fit import begin, fit
 from panoless.reconstruct.snapshots import SnapshotSchedule
-from panoless.selection import choose
 from panoless.selection.candidates import Candidate, Selection, Verdict
-from panoless.selection.choose import _is_near, choose_geometry, least_unexplained, much_less_unexplained
+from panoless.selection.choose import (
+    Start,
+    begun,
+    choose_geometry,
+    is_near,
+    least_unexplained,
+    much_less_unexplained,
+)
 from panoless.selection.options import CorrectionOptions
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.perturb.masks import wobbling
 from shinypartial.dataset.schema import Dataset
-from tests.panoless.alignment.test_search import goblet_views, wrong_turns
-from tests.support.mirror_body import body_views, ellipsoid
 from tests.support.mirror_plane import NORMAL, RECTANGLE, arc, make_plane_dataset, plane_of, reflecting_views
 from tests.support.mirror_revolution import around, goblet, pillar_views, revolution_views
 from tests.support.mirror_sphere import tiny_config
@@ -97,10 +99,10 @@ def test_outlines_that_contradict_each_other_refuse_no_kind_for_what_they_err_by
             for index, view in enumerate(right.train)
         ),
     )
-    start, far = (PosedProposal(Proposal(None, away, 0.95)) for away in (1.3, 9.0))
+    start, far = (Start(Proposal(None, away, 0.95)) for away in (1.3, 9.0))
     for views, near in ((right, False), (wandering, True)):
-        assert _is_near(start, views, CONFIG, bent=False) == near
-        assert not _is_near(far, views, CONFIG, bent=False)
+        assert is_near(start, views, CONFIG, bent=False) == near
+        assert not is_near(far, views, CONFIG, bent=False)
 
 
 @pytest.mark.slow
@@ -178,29 +180,18 @@ def test_a_box_is_refused_by_its_silhouettes() -> None:
     assert selection.sentence.startswith("free_form (explains held-out views;")
 
 
-@pytest.mark.parametrize(
-    ("views", "asked"),
-    [
-        (wrong_turns(goblet_views()).moved(goblet_views()), [6, 12]),
-        (wrong_turns(body_views(ellipsoid(), 14, 64)).moved(body_views(ellipsoid(), 14, 64)), [7]),
-    ],
-)
-def test_few_cameras_tell_whether_turns_are_worthwhile(
-    monkeypatch: pytest.MonkeyPatch, views: Views, asked: list[int]
-) -> None:
-    """All of a goblet are turned back, as a few come near to its masks; of an ellipsoid, which is no surface of
-    revolution, only those few are asked.
-    """
-    numbers = []
-
-    def align(family: Family, views: Views, proposal: Proposal, config: FitConfig) -> PosedProposal | None:
-        numbers.append(len(views.train))
-        return align_proposal(family, views, proposal, config)
-
-    monkeypatch.setattr(choose, "align_proposal", align)
-    config = replace(FitConfig(), poses=PoseOptions(trial_views=6))
-    assert len(choose._proposals(RevolutionFamily(), views, config, asked=False)) == len(asked)
-    assert numbers == asked
+def test_silhouettes_turn_cameras_where_that_brings_a_shape_near() -> None:
+    """Those of a goblet come back; of true ones nothing is turned."""
+    views = revolution_views(goblet(), around(12, 96))
+    rng = np.random.default_rng(0)
+    turns = rng.normal(size=(12, 3))
+    turns *= np.radians(0.5) / np.linalg.norm(turns, axis=1, keepdims=True)
+    wrong = Poses(turns, np.zeros((12, 3))).moved(views)
+    starts = [begun(RevolutionFamily(), each, FitConfig(), asked=False) for each in (views, wrong)]
+    assert all(each is not None for each in starts)
+    assert starts[0].poses is None
+    assert starts[1].poses is not None
+    assert starts[1].proposal.silhouette_px < 2 * starts[0].proposal.silhouette_px
 
 
 def test_a_fit_remembers_why_it_took_its_kind() -> None:

@@ -7,9 +7,8 @@ import pytest
 import torch
 from jaxtyping import Float
 
-from panoless.alignment.search import PosedProposal
 from panoless.capture.rays import pixel_rays, reflect
-from panoless.capture.views import TrainView, Views
+from panoless.capture.views import TrainView
 from panoless.config import FitConfig
 from panoless.environment.options import SurroundingsOptions
 from panoless.environment.surroundings import Floor, Surroundings
@@ -19,7 +18,6 @@ from panoless.geometry.height_field.model import flat_height_field
 from panoless.geometry.plane.kind import PlaneFamily
 from panoless.geometry.plane.model import Plane
 from panoless.kernels.camera import RasterCamera
-from panoless.selection.choose import _first_fit
 from panoless.selection.surroundings import brought_near, explains_clearly_more, on_floor, proposed_surroundings
 from tests.support.mirror_height_field import height_field_views
 from tests.support.mirror_plane import RECTANGLE, arc, camera_at, disc, plane_of, reflecting_views
@@ -114,32 +112,6 @@ def test_a_far_world_stays_far() -> None:
     family = PlaneFamily()
     proposal = Proposal(plane_of(RECTANGLE), 0.1, 1.0)
     assert proposed_surroundings(family, FAR_VIEWS, proposal, CONFIG).is_far
-
-
-class CountedPlanes(PlaneFamily):
-    """Planes that count how often they are fitted."""
-
-    fits = 0
-
-    def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
-        """Counted."""
-        self.fits += 1
-        return super().fit(views, proposal, config)
-
-
-def test_surroundings_that_a_fit_before_found_are_not_compared_with_a_far_world() -> None:
-    plane = plane_of(RECTANGLE)
-    views = replace(FAR_VIEWS, train=tuple(in_room(view, plane, 4.0) for view in FAR_VIEWS.train))
-    family, known = CountedPlanes(), Surroundings(np.array([0.25]))
-    start = [PosedProposal(Proposal(plane, 0.1, 1.0))]
-    first = _first_fit(family, start, views, CONFIG)
-    assert first is not None
-    assert not first.geometry.surroundings.is_far
-    assert family.fits == 2
-    again = _first_fit(family, start, views, CONFIG, known)
-    assert again is not None
-    assert again.geometry.surroundings is known
-    assert family.fits == 3
 
 
 def test_a_fit_in_a_far_world_is_brought_into_ever_nearer_walls() -> None:

@@ -12,10 +12,10 @@ from panoless.geometry.free_form.concave import concave_start, unexplained_parts
 from panoless.geometry.free_form.fit import fit_free_form
 from panoless.geometry.free_form.hollows import Chart, Hollow, Relief, smooth_maximum
 from panoless.geometry.free_form.kind import FreeFormFamily
-from panoless.geometry.free_form.observations import solid_pixels
 from panoless.geometry.free_form.options import DEFAULTS, ConcaveOptions
 from panoless.geometry.free_form.spread import FinalRays, cells_of, disagreement
 from panoless.geometry.free_form.surface import LevelSet
+from panoless.problem.observations import solid_pixels
 from tests.panoless.geometry.free_form.test_fit import normal_errors_deg
 from tests.support.mirror_body import (
     Body,

@@ -28,7 +28,6 @@ from panoless.geometry.free_form.fit import (
     take_round,
 )
 from panoless.geometry.free_form.kind import FreeFormFamily, FreeFormMirror
-from panoless.geometry.free_form.observations import outline_rays, solid_pixels
 from panoless.geometry.free_form.options import DEFAULTS, ConcaveOptions, DescentOptions, FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.photometric import Sights, Solution
 from panoless.geometry.free_form.start import FirstSurfaces, first_surfaces, started
@@ -38,6 +37,7 @@ from panoless.geometry.free_form.trust import full_trust
 from panoless.kernels.level_set import seen_with_slopes
 from panoless.kernels.reference.cubemap import padded_texels
 from panoless.problem.nuisance import BLOCKS, NO_NUISANCE, Block, Exposures, MaskOffsets, Nuisance, nuisance_of
+from panoless.problem.observations import outline_rays, solid_pixels
 from shinypartial.core.camera import Camera, Similarity
 from tests.support.mirror_body import (
     Body,

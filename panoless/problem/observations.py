@@ -3,14 +3,17 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from panoless.capture.masks import remembered
-from panoless.capture.silhouettes import mask_contours
+from panoless.capture.silhouettes import MaskContours, mask_contours
 from panoless.capture.views import Views, concatenated, every_kth_pixel
 from panoless.problem.rays import PixelRays
 from shinypartial.core.conventions import SOLID_ALPHA
+
+SATURATED = 0.97
+"""Share of the largest radiance from which a pixel is taken for saturated."""
 
 
 @dataclass(frozen=True)
@@ -20,6 +23,10 @@ class Pixels:
     rays: PixelRays
     radiance: Float[np.ndarray, "P 3"]
     inner_px: Float[np.ndarray, "P"]
+
+    def chosen(self, index: Bool[np.ndarray, "P"] | Int[np.ndarray, "M"]) -> "Pixels":
+        """Some of them."""
+        return Pixels(self.rays.chosen(index), self.radiance[index], self.inner_px[index])
 
 
 @remembered
@@ -43,10 +50,32 @@ def solid_pixels(views: Views, count: int) -> Pixels:
     return Pixels(concatenated(rays), np.concatenate(radiance), np.concatenate(inner))
 
 
-def outline_rays(views: Views) -> PixelRays:
-    """Rays through all contours of the masks."""
-    contours = mask_contours(views, longest_only=False)
+def outline_rays(views: Views, *, longest_only: bool = False) -> PixelRays:
+    """Rays through all contours of the masks, or through the longest of each."""
+    contours = mask_contours(views, longest_only=longest_only)
     length = np.linalg.norm(contours.rays, axis=1)
     focal = np.array([view.camera.fx for view in views.train])[contours.view]
-    steps = np.zeros((len(length), 2, 3))
+    steps = dual(np.stack([contours.columns, contours.rows], 1) * length[:, None, None])
     return PixelRays(contours.centers, contours.rays / length[:, None], steps, 1 / (focal * length), contours.view)
+
+
+def contours_of(rays: PixelRays) -> MaskContours:
+    """Rays of contours, of unit direction, with how far a shift in space moves their pixel, times the distance."""
+    moved = dual(rays.steps)
+    return MaskContours(rays.view, rays.origins, rays.directions, moved[:, 0], moved[:, 1])
+
+
+def dual(pairs: Float[np.ndarray, "P 2 3"]) -> Float[np.ndarray, "P 2 3"]:
+    """The two vectors in the plane of each pair whose products with it are one and zero."""
+    first, second = pairs[:, 0], pairs[:, 1]
+    aa, ab, bb = (
+        (one * other).sum(1, keepdims=True) for one, other in ((first, first), (first, second), (second, second))
+    )
+    area = np.maximum(aa * bb - ab**2, np.finfo(float).tiny)
+    return np.stack([(bb * first - ab * second) / area, (aa * second - ab * first) / area], 1)
+
+
+def is_saturated(radiance: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, "P"]:
+    """Whether a channel of a pixel has the largest radiance of all, but for little."""
+    found: np.ndarray = (radiance >= SATURATED * radiance.max(0, initial=0.0)).any(1)
+    return found

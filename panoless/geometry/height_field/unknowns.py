@@ -1,0 +1,101 @@
+"""A height field as a surface of few numbers: plane, boundary and coefficients.
+
+At a fixed ray d, in the axes of the plane, a height δ moves the hit by δ/(d_z − ∇h·d) along the ray, so the slope that
+is seen there changes by ∇δ + (D²h d) δ/(d_z − ∇h·d). How far a map can follow a tilt of the whole mirror depends on its
+texels: coarse ones hold against it, and where they do means nothing.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from panoless.environment.surroundings import Surroundings
+from panoless.geometry.height_field.fit import BENDING, apply_height_field_step
+from panoless.geometry.height_field.model import HeightField
+from panoless.geometry.height_field.silhouette import edge_jacobian, edge_residuals
+from panoless.geometry.plane.model import passes_frame
+from panoless.geometry.plane.unknowns import LIMIT, boundary_motion_rows, vertices_kept
+from panoless.problem.observations import contours_of
+from panoless.problem.parametric import LEAST_COSINE, MirrorHits, Regularization, Silhouette, StepLimit
+from panoless.problem.rays import PixelRays
+
+
+@dataclass(frozen=True)
+class HeightFieldUnknowns:
+    """Those of the plane and its boundary, and then the coefficients."""
+
+    height_field: HeightField
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """Of the plane."""
+        return self.height_field.plane.surroundings
+
+    @property
+    def first(self) -> int:
+        """The number of the first coefficient."""
+        return 4 + self.height_field.plane.boundary.size
+
+    @property
+    def count(self) -> int:
+        """Of all numbers."""
+        return self.first + self.height_field.coefficients.size
+
+    @property
+    def limit(self) -> StepLimit:
+        """Of the plane."""
+        return LIMIT
+
+    @property
+    def unseen(self) -> Float[np.ndarray, "D 3"]:
+        """A shift and the tilts of the whole."""
+        tilts = self.height_field.tilts()
+        return np.concatenate([np.zeros((self.first, tilts.shape[1])), tilts])
+
+    def hits(self, rays: PixelRays) -> MirrorHits:
+        """Where rays meet the front and their reflections pass the rim."""
+        field = self.height_field
+        plane, frame, directions = field.plane, field.frame, rays.directions @ field.frame.T
+        found = field.hits(rays.origins, rays.directions)
+        normals, met = found.normals @ frame, found.met
+        facing = (normals * rays.directions).sum(1)
+        distance = np.where(met, found.distance, 0.0)
+        points = rays.origins + distance[:, None] * rays.directions
+        outgoing = rays.directions - 2 * facing[:, None] * normals
+        height = max(plane.frame_height, field.clearance)
+        met = met & (facing < -LEAST_COSINE)
+        met &= passes_frame(plane, points, outgoing, height, distance * rays.size)
+        index, basis = field.basis(found.places)
+        _, _, _, h_uu, h_uv, h_vv = (basis * field.coefficients.ravel()[index]).sum(2)
+        second = np.stack([h_uu, h_uv, h_uv, h_vv], 1).reshape(-1, 2, 2)
+        rate = directions[:, 2] - (found.slopes * directions[:, :2]).sum(1)
+        slide = np.matmul(second, directions[:, :2, None])[..., 0] / np.where(met, rate, -1.0)[:, None]
+        slopes = basis[1:3].transpose(1, 0, 2) + slide[..., None] * basis[0][:, None]
+        by_slope = found.normals_by_slopes(frame)
+        shape = np.matmul(np.matmul(by_slope, second), frame[:2])
+        return MirrorHits(met, distance, points, normals, shape, np.matmul(by_slope, slopes), self.first + index)
+
+    def silhouette(self, rays: PixelRays) -> Silhouette:
+        """How far rays pass outside of the mirror's edge or of the frame."""
+        found = edge_residuals(contours_of(rays), self.height_field)
+        jacobian = edge_jacobian(found, self.height_field)
+        motions = boundary_motion_rows(found, self.height_field.plane, rays)
+        return Silhouette(found.pixels, found.counted, found.valid, jacobian, motions)
+
+    def regularization(self, matrix: Float[np.ndarray, "D D"]) -> Regularization:
+        """The bending energy, and what keeps vertices."""
+        field, found = self.height_field, vertices_kept(matrix, self.height_field.plane)
+        part = slice(self.first, None)
+        found[part, part] = BENDING * np.trace(matrix[part, part]) / field.coefficients.size * field.bending()
+        value = np.zeros(self.count)
+        value[part] = field.coefficients.ravel()
+        return Regularization(found, value)
+
+    def settled(self) -> "HeightFieldUnknowns":
+        """Itself."""
+        return self
+
+    def stepped(self, step: Float[np.ndarray, "D"]) -> "HeightFieldUnknowns":
+        """Moved."""
+        return HeightFieldUnknowns(apply_height_field_step(self.height_field, step))

@@ -1,0 +1,134 @@
+"""A surface of revolution as a surface of few numbers: its axis, and splines of the shift of its profile."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from panoless.environment.surroundings import Surroundings
+from panoless.geometry.revolution.model import SurfaceOfRevolution, trace_reflections
+from panoless.geometry.revolution.photometric import normal_motion
+from panoless.geometry.revolution.profile import ProfileSplines, apply_step, resample_profile
+from panoless.geometry.revolution.silhouette import (
+    LARGEST_TURN_RAD,
+    ContourRays,
+    axis_motion,
+    parameter_columns,
+    silhouette_residuals,
+)
+from panoless.numeric.gauss_newton import jacobian_of_rows
+from panoless.problem.parametric import LEAST_COSINE, MirrorHits, Regularization, Silhouette, StepLimit
+from panoless.problem.rays import PixelRays
+
+AXIS_NUMBERS = 4
+KNOT_PX, STIFF_PX = 3.0, 8.0
+"""Spacing of the splines (px): for silhouettes, and for photographs, under which a proposal changes smoothly."""
+BENDING = 1e-3
+"""Penalty on second differences of a step, in mean diagonals of the normal matrix."""
+
+
+@dataclass(frozen=True)
+class RevolutionUnknowns:
+    """Turns and shifts of the axis, and the coefficients of the splines."""
+
+    surface: SurfaceOfRevolution
+    pixel: float
+    """Length of a pixel at the object."""
+    knot_px: float = KNOT_PX
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """Of the surface."""
+        return self.surface.surroundings
+
+    @cached_property
+    def splines(self) -> ProfileSplines:
+        """Along the profile."""
+        return ProfileSplines.of(self.surface, self.knot_px * self.pixel)
+
+    @property
+    def count(self) -> int:
+        """Four, and the coefficients."""
+        return AXIS_NUMBERS + self.splines.count
+
+    @property
+    def limit(self) -> StepLimit:
+        """Of the axis."""
+        return StepLimit(LARGEST_TURN_RAD, slice(AXIS_NUMBERS))
+
+    @property
+    def unseen(self) -> None:
+        """None."""
+        return
+
+    def hits(self, rays: PixelRays) -> MirrorHits:
+        """Where rays meet the outside and are mirrored once. What silhouettes leave open, its ends, is left out."""
+        paths = trace_reflections(self.surface, rays.origins, rays.directions)
+        first, count = paths.first, len(rays.size)
+        once = np.flatnonzero((paths.bounces == 1) & (first.side > 0) & (first.side < self.surface.lip))
+        motion = normal_motion(rays.directions[once], first.of(once), self.surface, self.splines, self.pixel)
+        kept = once[motion.kept]
+        clear, distance = np.zeros(count, dtype=bool), np.where(first.met, first.distance, 0.0)
+        clear[kept] = -(first.normals[kept] * rays.directions[kept]).sum(1) > LEAST_COSINE
+        shape, rows = np.zeros((count, 3, 3)), np.zeros((count, 3, 8))
+        columns = np.zeros((count, 8), dtype=np.int64)
+        shape[kept] = np.matmul(motion.along * motion.bends[:, None], motion.along.transpose(0, 2, 1))
+        rows[kept] = np.matmul(motion.along, motion.turns)
+        columns[kept] = parameter_columns(motion.index)
+        return MirrorHits(clear, distance, first.points, first.normals, shape, rows, columns)
+
+    def silhouette(self, rays: PixelRays) -> Silhouette:
+        """How far rays pass outside of the profile."""
+        surface, count = self.surface, len(rays.size)
+        lengths = np.linalg.norm(rays.origins, axis=1) * rays.size
+        found = silhouette_residuals(
+            ContourRays(rays.view, rays.origins, rays.directions, lengths), surface, self.pixel
+        )
+        # At a corner, such as the edge of the base, sides have other normals than what the ray touches.
+        base = found.side <= 0
+        side, along = np.maximum(found.side, 1), np.where(base, 0.0, found.along)
+        values, index = self.splines.values(side, along)
+        directions = rays.directions @ surface.frame.T
+        azimuth = np.stack([-found.points[:, 1], found.points[:, 0], np.zeros(count)], 1)
+        touched = np.cross(directions, azimuth)
+        touched /= np.maximum(np.linalg.norm(touched, axis=1, keepdims=True), 1e-12)
+        outward = np.where(base[:, None], self._radial(found.points), found.normals)
+        touched *= np.sign((touched * outward).sum(1, keepdims=True))
+        angle = surface.angles[side, 0]
+        steep = np.sin(angle)[:, None] * self._radial(found.points) - np.cos(angle)[:, None] * np.eye(3)[2]
+        share = np.where(base, (steep * touched).sum(1), 1.0)
+        inverse = found.valid[:, None] / lengths[:, None]
+        rows = np.concatenate([-axis_motion(found.points, touched), -values * share[:, None]], 1) * inverse
+        normals = touched @ surface.frame
+        points = found.points @ surface.frame + surface.origin
+        distance = ((points - rays.origins) * rays.directions).sum(1)
+        by_shift = normals * inverse
+        by_turn = np.cross(rays.directions, distance[:, None] * by_shift)
+        return Silhouette(
+            np.where(found.side >= 0, found.pixels, 0.0),
+            found.valid,
+            found.side >= 0,
+            jacobian_of_rows(rows, parameter_columns(index), self.count),
+            np.nan_to_num(np.concatenate([by_turn, by_shift], 1)),
+        )
+
+    def _radial(self, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+        """Unit directions from the axis, in its frame."""
+        across = points * [1, 1, 0]
+        return across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+
+    def regularization(self, matrix: Float[np.ndarray, "D D"]) -> Regularization:
+        """Second differences of a step."""
+        found = np.zeros_like(matrix)
+        weight = BENDING * np.trace(matrix[AXIS_NUMBERS:, AXIS_NUMBERS:]) / max(self.splines.count, 1)
+        found[AXIS_NUMBERS:, AXIS_NUMBERS:] = self.splines.bending(weight)
+        return Regularization(found)
+
+    def stepped(self, step: Float[np.ndarray, "D"]) -> "RevolutionUnknowns":
+        """Moved."""
+        return replace(self, surface=apply_step(self.surface, self.splines, step))
+
+    def settled(self) -> "RevolutionUnknowns":
+        """With vertices about a pixel apart."""
+        return replace(self, surface=resample_profile(self.surface, self.pixel))

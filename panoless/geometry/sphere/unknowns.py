@@ -1,0 +1,90 @@
+"""A sphere as a surface of few numbers: center and radius."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from panoless.environment.surroundings import Surroundings
+from panoless.geometry.sphere.fit import OutlineRays, OutlineResiduals
+from panoless.geometry.sphere.model import Sphere
+from panoless.numeric.gauss_newton import jacobian_of_rows
+from panoless.problem.parametric import LEAST_COSINE, MirrorHits, Regularization, Silhouette, StepLimit
+from panoless.problem.rays import PixelRays
+
+
+@dataclass(frozen=True)
+class SphereUnknowns:
+    """c and ρ, the radius where it is not known."""
+
+    sphere: Sphere
+    radius_known: bool = False
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """Of the sphere."""
+        return self.sphere.surroundings
+
+    @property
+    def count(self) -> int:
+        """Four."""
+        return 4
+
+    @property
+    def limit(self) -> StepLimit:
+        """A fifth of the object's radius."""
+        return StepLimit(0.2, slice(4))
+
+    @property
+    def unseen(self) -> None:
+        """None."""
+        return
+
+    def hits(self, rays: PixelRays) -> MirrorHits:
+        """n = (x − c)/ρ with S = 1/ρ; at a fixed ray x moves by d (n·δc + δρ)/(n·d)."""
+        found, directions = self.sphere.hits(rays.origins, rays.directions), rays.directions
+        facing = (found.normals * directions).sum(1)
+        clear = found.met & (facing < -LEAST_COSINE)
+        by_numbers = np.concatenate([found.normals, np.ones((len(facing), 1))], 1)
+        rows = directions[:, :, None] * (by_numbers / np.where(clear, facing, -1.0)[:, None])[:, None]
+        rows[:, :, :3] -= np.eye(3)
+        rows[:, :, 3] -= found.normals
+        rows /= self.sphere.radius
+        if self.radius_known:
+            rows[:, :, 3] = 0.0
+        distance = np.linalg.norm(found.points - rays.origins, axis=1)
+        shape = np.tile(np.eye(3) / self.sphere.radius, (len(facing), 1, 1))
+        columns = np.tile(np.arange(4), (len(facing), 1))
+        return MirrorHits(clear, distance, found.points, found.normals, shape, rows, columns)
+
+    def silhouette(self, rays: PixelRays) -> Silhouette:
+        """The angle by which rays pass outside (see `OutlineResiduals`)."""
+        touching = OutlineRays(rays.view, rays.origins, rays.directions, 1 / rays.size)
+        found = OutlineResiduals(self.sphere, touching)
+        rows = found.rows * [1, 1, 1, not self.radius_known]
+        toward = self.sphere.center - rays.origins
+        passing = (toward * rays.directions).sum(1)[:, None] * rays.directions - toward
+        outward = passing / np.maximum(np.linalg.norm(passing, axis=1, keepdims=True), 1e-12)
+        by_turn = np.cross(rays.directions, outward) / rays.size[:, None]
+        columns, seen = np.tile(np.arange(4), (len(rays.size), 1)), np.ones(len(rays.size), dtype=bool)
+        return Silhouette(
+            found.pixels,
+            seen,
+            seen,
+            jacobian_of_rows(rows, columns, 4),
+            np.concatenate([by_turn, -found.rows[:, :3]], 1),
+        )
+
+    def regularization(self, matrix: Float[np.ndarray, "4 4"]) -> Regularization:
+        """A radius that is known stays."""
+        known = np.zeros((4, 4))
+        known[3, 3] = self.radius_known * max(float(np.trace(matrix)), 1.0)
+        return Regularization(known)
+
+    def settled(self) -> "SphereUnknowns":
+        """Itself."""
+        return self
+
+    def stepped(self, step: Float[np.ndarray, "4"]) -> "SphereUnknowns":
+        """Moved."""
+        return SphereUnknowns(self.sphere.moved(step), self.radius_known)

@@ -1,0 +1,104 @@
+"""Surfaces of few numbers with cameras, exposures and masks: what is wrong is found, all at once, and only that."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from panoless.capture.corrections import with_outline_moved
+from panoless.capture.lens import with_focal_factor
+from panoless.capture.poses import Poses
+from panoless.capture.views import Views
+from panoless.config import FitConfig
+from panoless.geometry.height_field.model import flat_height_field
+from panoless.geometry.registry import FAMILIES
+from panoless.problem.corrected import Corrected
+from panoless.problem.nuisance import CameraPoses, Exposures, FocalLength, MaskOffsets
+from panoless.problem.solve import Solved, solve
+from panoless.selection.joint import nuisance_kinds
+from tests.support.mirror_body import body_views, sphere
+from tests.support.mirror_height_field import height_field_views
+from tests.support.mirror_plane import RECTANGLE, arc, disc, plane_of, reflecting_views
+from tests.support.mirror_revolution import around, goblet, revolution_views
+
+CONFIG = FitConfig()
+
+
+def views_of(kind: str, count: int, size: int) -> Views:
+    """Of a mirror of that kind, in half of the light."""
+    if kind == "sphere":
+        views = body_views(sphere(0.8), count, size)
+    elif kind == "plane":
+        views = reflecting_views(plane_of(RECTANGLE), arc(count, size=size))
+    elif kind == "height_field":
+        views = height_field_views(flat_height_field(plane_of(disc(24)), 6).domed(0.3), arc(count, 15.0, size=size))
+    else:
+        views = revolution_views(goblet(), around(count, size))
+    return replace(views, train=tuple(replace(view, radiance=view.radiance * 0.6) for view in views.train))
+
+
+def solved(kind: str, views: Views) -> Solved:
+    """By a kind, from its own proposal."""
+    family = FAMILIES[kind]
+    source = family if family.refines is None else FAMILIES[family.refines]
+    proposal = source.propose(views, CONFIG, asked=True)
+    assert proposal is not None
+    with torch.no_grad():
+        return solve(
+            views,
+            family.unknowns(views, proposal, CONFIG),
+            *nuisance_kinds(CONFIG),
+            lambda state: family.begun(Corrected.by(state.nuisance).applied(views, CONFIG), state.surface, CONFIG),
+        )
+
+
+KINDS = [
+    ("sphere", 14, 80),
+    *(pytest.param(kind, 20, 64, marks=pytest.mark.slow) for kind in ("plane", "height_field", "revolution")),
+]
+
+
+@pytest.mark.parametrize(("kind", "count", "size"), KINDS)
+def test_right_photographs_need_no_block(kind: str, count: int, size: int) -> None:
+    found = solved(kind, views_of(kind, count, size))
+    assert not [each.name for each in found.decisions if each.kept]
+    assert not found.state.nuisance.blocks
+
+
+@pytest.mark.parametrize(("kind", "count", "size"), KINDS[:3])
+def test_turns_exposures_and_masks_are_found_together(kind: str, count: int, size: int) -> None:
+    """Turns of 0.3° in part, as few pixels determine them; exposures to a third, masks to a tenth of a pixel."""
+    rng = np.random.default_rng(7)
+    turns = rng.normal(size=(count, 3))
+    turns *= np.radians(0.3) / np.linalg.norm(turns, axis=1, keepdims=True)
+    gains = np.exp2(0.15 * rng.normal(size=count))
+    gains /= np.exp(np.log(gains).mean())
+    offsets = rng.uniform(-1, 1, count)
+    views = Poses(turns, np.zeros((count, 3))).moved(views_of(kind, count, size))
+    train = (
+        with_outline_moved(replace(view, radiance=view.radiance * float(gain)), float(offset))
+        for view, gain, offset in zip(views.train, gains, offsets, strict=True)
+    )
+    found = solved(kind, replace(views, train=tuple(train)))
+    nuisance, kept = found.state.nuisance, {each.name for each in found.decisions if each.kept}
+    assert {"poses", "exposures", "mask offsets"} <= kept
+    assert not {"distortion", "white balances"} & kept
+    cameras, exposures, masks = (nuisance.get(block) for block in (CameraPoses, Exposures, MaskOffsets))
+    assert cameras is not None
+    assert exposures is not None
+    assert masks is not None
+    assert np.sqrt(((exposures.values[:, 0] - np.log(gains)) ** 2).mean()) < np.log(gains).std() / 3
+    assert (masks.values[:, 0] - offsets).std() < 0.1
+    assert np.median(np.linalg.norm(cameras.values[:, :3] + turns, axis=1)) < np.radians(0.25)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.97, 1.03])
+def test_a_wrong_focal_length_is_found_with_a_flat_mirror(factor: float) -> None:
+    """To half a percent with views of 64 px."""
+    views = views_of("plane", 20, 64)
+    found = solved("plane", replace(views, train=tuple(with_focal_factor(view, factor) for view in views.train)))
+    focal = found.state.nuisance.get(FocalLength)
+    assert focal is not None
+    assert np.exp(focal.values[0, 0]) == pytest.approx(1 / factor, abs=0.005)
