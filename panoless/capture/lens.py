@@ -17,7 +17,6 @@ import torch
 from jaxtyping import Float
 from torch.nn.functional import grid_sample
 
-from panoless.capture.poses import moved_view
 from panoless.capture.views import TrainView
 from shinypartial.core.conventions import PIXEL_CENTER, SOLID_ALPHA
 
@@ -62,16 +61,6 @@ def with_focal_factor(view: TrainView, factor: float) -> TrainView:
     """A view through a lens of so many times the focal length."""
     camera = view.camera
     return replace(view, camera=replace(camera, fx=factor * camera.fx, fy=factor * camera.fy))
-
-
-def zoomed(view: TrainView, change: float) -> TrainView:
-    """A view after the logarithm of the focal length has changed."""
-    return with_focal_factor(view, float(np.exp(change)))
-
-
-def farther(view: TrainView, change: float) -> TrainView:
-    """A view after the logarithm s of distance and focal length has changed."""
-    return zoomed(moved_view(view, np.eye(3), np.expm1(change) * view.position), change)
 
 
 def farther_rays(

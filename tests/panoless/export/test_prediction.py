@@ -373,13 +373,13 @@ def test_found_cameras_and_exposures_are_in_world_units(tmp_path: Path) -> None:
     """Cameras of a dataset that are turned and shifted as stated are those that the fit ended with."""
     plane, frame = plane_of(RECTANGLE), ObjectFrame(np.zeros(3), 2.0)
     dataset, rng = make_plane_dataset(tmp_path / "plane", plane, train=3), np.random.default_rng(5)
-    poses, sigmas = Poses(*rng.normal(size=(2, 3, 3)) * 0.1), torch.from_numpy(rng.uniform(size=(3, 6)))
+    poses = Poses(*rng.normal(size=(2, 3, 3)) * 0.1, rng.uniform(size=(3, 6)))
     gains = np.array([0.8, 1.0, 1.2])
     chosen = Candidate("plane", Verdict.CHOSEN, "it fits", corrections=Corrections(gains=gains))
     state = finished_state(PlaneMirror(plane, poses=poses), frame, chosen)
     folder = tmp_path / "prediction"
     acquire_prediction(folder)
-    export_prediction(dataset, replace(state, pose_uncertainty=sigmas), tiny_config(), folder)
+    export_prediction(dataset, state, tiny_config(), folder)
     cameras = read_info(folder).cameras
     assert cameras is not None
     assert [each.name for each in cameras] == [each.name for each in dataset.train]
@@ -392,8 +392,8 @@ def test_found_cameras_and_exposures_are_in_world_units(tmp_path: Path) -> None:
         turned = Rotation.from_rotvec(found.turn_deg, degrees=True).as_matrix() @ stated.camera.camera_to_world[:3, :3]
         np.testing.assert_allclose(rotation.T, turned, atol=1e-6)
         np.testing.assert_allclose(2 * center, stated.camera.position_world + found.shift, atol=1e-6)
-        np.testing.assert_allclose(np.radians(found.turn_sigma_deg), sigmas[index, :3])
-        np.testing.assert_allclose(found.shift_sigma, 2 * sigmas[index, 3:])
+        np.testing.assert_allclose(np.radians(found.turn_sigma_deg), poses.sigmas[index, :3])
+        np.testing.assert_allclose(found.shift_sigma, 2 * poses.sigmas[index, 3:])
         assert found.gain == (gains[index],) * 3
 
 
