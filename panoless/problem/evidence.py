@@ -7,11 +7,11 @@ where
 
 which one in 370 blocks exceeds that are zero in truth (the quantile of χ²ₙ/n by Wilson and Hilferty 1931).
 
-Model errors set a floor to σᵢ. Where the covariance C of a block is known, with the surface, the map and the other blocks
-that follow it, the sum is xᵀ C⁻¹ x (Wald's statistic): exposures that drift with the camera's place are what a map takes
-over, and mean nothing. Of a level set the σᵢ are those of each view: a turn and a shift that cancel each other are known
-well, and the first to bend for a surface that is still too coarse. Held-out views do not decide: a pose that makes up for
-such a surface explains views that took no part better, too.
+Model errors set a floor to σᵢ. Where the covariance C of a block is known, with the surface, the map and the other
+blocks that follow it, the sum is xᵀ C⁻¹ x (Wald's statistic): exposures that drift with the camera's place are what a
+map takes over, and mean nothing. Of a level set the σᵢ are those of each view: a turn and a shift that cancel each
+other are known well, and the first to bend for a surface that is still too coarse. Held-out views do not decide: a
+pose that makes up for such a surface explains views that took no part better, too.
 """
 
 import math

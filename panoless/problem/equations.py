@@ -1,0 +1,357 @@
+"""Photographs and silhouettes of a surface of few numbers with nuisance blocks, linearized (see `solve`)."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from panoless.capture.poses import StatedCameras
+from panoless.capture.views import Views
+from panoless.environment.following import FollowingMap
+from panoless.environment.mirrored import MirroredRays, slopes_of
+from panoless.environment.rays import Rays
+from panoless.environment.solve import solve_environment
+from panoless.environment.surroundings import Surroundings
+from panoless.numeric.factorize import regularize
+from panoless.numeric.gauss_newton import damped_step, normal_equations
+from panoless.numeric.robust import bounded_error, robust_scale, robust_weight
+from panoless.problem.nuisance import (
+    Exposures,
+    Nuisance,
+    Walls,
+    WhiteBalances,
+)
+from panoless.problem.observations import Pixels, is_saturated, outline_rays, solid_pixels
+from panoless.problem.parametric import MirrorHits, ParametricSurface, Silhouette
+from panoless.problem.rays import PixelRays
+from panoless.problem.rows import CHI_MEDIAN, CORRELATED, rows_of
+from shinypartial.core.sphere import tangents
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+CONTOUR_SIGMA_PX = 0.05
+"""Standard deviation of a contour point (px): less than its error, because errors of the map are common to all rays of
+a texel."""
+RADIANCE_SIGMA = 0.05
+"""Standard deviation of a pixel (linear radiance) where nothing beside the surface is unknown."""
+LEAST_SIGMA = 0.005
+"""Of a pixel (linear radiance)."""
+NOISE_MULTIPLE = 3.0
+"""The robust scale of silhouettes is at least so many medians of their distances."""
+OUTLINE_POINTS = 20_000
+"""Most contour points of all views."""
+INNER_PX = 1.5
+"""Pixels nearer to the edge of their mask (px) mix object and background."""
+COUNTED_RAYS = 30_000
+"""Rays count as so many where there are more: errors of surface and map repeat between them."""
+LEAST_CLEAR = 50
+"""Fewer rays that see the surroundings have no say."""
+DAMPINGS = (1e-6, 1e-3, 1e-1, 10.0)
+"""Of a step, in shares of the matrix' diagonal (Levenberg and Marquardt), tried in turn."""
+CONTOUR_SCALE_PX = 0.5
+"""Robust scale of silhouettes beside photographs (px)."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """Gauss–Newton steps, the map solved before each."""
+
+    resolution: int
+    """Texels along a face side of the map; 0: silhouettes alone."""
+    robust_scale: float
+    """Residual (linear radiance; px of silhouettes alone) beyond which a pixel loses its vote."""
+    rays: int
+    """About so many pixels of all views take part."""
+    steps: int
+    """Most steps."""
+
+
+@dataclass(frozen=True)
+class State:
+    """All unknowns but the map."""
+
+    surface: ParametricSurface
+    nuisance: Nuisance
+
+    @property
+    def around(self) -> Surroundings:
+        """What is mirrored."""
+        return self.nuisance.around(self.surface.surroundings)
+
+    def stepped(self, step: Float[np.ndarray, "D"]) -> "State":
+        """Changed: the surface's numbers, those of views, and those that all views share."""
+        of_views, shared = (self.nuisance.free_blocks(by_view=each) for each in (True, False))
+        first, each = self.surface.count, sum(block.size for block in of_views)
+        last = first + each * (len(of_views[0].values) if of_views else 0)
+        nuisance = self.nuisance.stepped(
+            step[first:last].reshape(-1, each) if of_views else None, step[last:] if shared else None
+        )
+        return State(self.surface.stepped(step[:first]), nuisance)
+
+
+@dataclass(frozen=True)
+class Data:
+    """What a round is solved for."""
+
+    pixels: Pixels | None
+    outlines: PixelRays
+    cameras: StatedCameras
+    settings: Round
+    last: bool
+    """Whether photographs under this map determine all of the surface."""
+
+    @classmethod
+    def of(cls, views: Views, settings: Round, last: int, free: Collection[str] = ()) -> "Data":
+        """Of views, with maps of so many texels in the `last` round. A saturated pixel has no radiance to divide by a
+        gain that is `free`.
+        """
+        outlines = outline_rays(views, longest_only=True)
+        chosen = outlines.chosen(slice(None, None, max(1, len(outlines.size) // OUTLINE_POINTS)))
+        pixels = solid_pixels(views, settings.rays) if settings.resolution else None
+        if pixels is not None:
+            kept = pixels.inner_px > INNER_PX
+            if {Exposures.name, WhiteBalances.name} & set(free):
+                kept &= ~is_saturated(pixels.radiance)
+            pixels = pixels.chosen(kept)
+        return cls(pixels, chosen, StatedCameras.of(views), settings, settings.resolution >= last)
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """Pixels that see the surroundings, under a map solved from them."""
+
+    chosen: Int[np.ndarray, "Q"]
+    rays: PixelRays
+    hits: MirrorHits
+    mirrored: MirroredRays
+    environment: Float[Tensor, "6 3 L L"]
+    light: Float[np.ndarray, "Q 3"]
+    residual: Float[np.ndarray, "Q 3"]
+    sigma: float
+    following: FollowingMap
+
+    @classmethod
+    def at(cls, data: Data, state: State, *, estimated: bool) -> "Photographs | None":
+        """Of a state, with `estimated` noise; None where too few pixels see the surroundings."""
+        assert data.pixels is not None, "photographs take part"
+        rays = state.nuisance.moved(data.pixels.rays, data.cameras)
+        hits = state.surface.hits(rays)
+        chosen = np.flatnonzero(hits.clear)
+        if len(chosen) < LEAST_CLEAR:
+            return None
+        rays, hits = rays.chosen(chosen), chosen_hits(hits, chosen)
+        radiance = state.nuisance.equalized(data.pixels.radiance[chosen], rays.view)
+        mirrored = MirroredRays(rays.directions, hits.normals, hits.points, state.around)
+        directions, seen = (torch.from_numpy(each).float() for each in (mirrored.looked_up, radiance))
+        environment = solve_environment([Rays(directions, seen)], data.settings.resolution)
+        light = mirrored.light(environment)
+        residual = light - radiance
+        sigma = RADIANCE_SIGMA
+        if estimated:
+            sigma = max(float(np.median(np.linalg.norm(residual, axis=1))) / CHI_MEDIAN, LEAST_SIGMA)
+        weights = robust_weight(residual, data.settings.robust_scale) / sigma**2
+        if estimated:
+            weights *= min(COUNTED_RAYS / len(chosen), 1.0)
+        following = FollowingMap.of(mirrored.looked_up, weights, data.settings.resolution)
+        return cls(chosen, rays, hits, mirrored, environment, light, residual, sigma, following)
+
+    def rows(self) -> tuple[Float[np.ndarray, "Q 3 K"], Float[np.ndarray, "Q 3 6"]]:
+        """Of the light, by the surface's numbers and by (ω, τ) of the rays.
+
+        A hit moves by (1 − d nᵀ/(d·n)) (τ + t ω × d) along the surface, the normal by S times that, and the mirrored
+        direction with normal and ray.
+        """
+        hits, directions = self.hits, self.rays.directions
+        across = np.stack(tangents(hits.normals), 2)
+        by_normal = np.matmul(self.mirrored.light_by_turns(self.environment, across), across.transpose(0, 2, 1))
+        along = np.matmul(by_normal, hits.shape)
+        facing = (directions * hits.normals).sum(1)
+        slide = np.matmul(along, directions[:, :, None]) * (hits.normals / facing[:, None])[:, None]
+        by_shift = along - slide
+        by_ray = self.mirrored.by_ray(self.mirrored.slopes(self.environment))
+        by_turn = np.cross(directions[:, None], by_ray + hits.distance[:, None, None] * by_shift)
+        return np.matmul(by_normal, hits.rows), np.concatenate([by_turn, by_shift], 2)
+
+    def wall_rows(self) -> Float[np.ndarray, "Q 3 1"]:
+        """Of the light, by 1/D of the walls."""
+        slopes = slopes_of(self.environment, self.mirrored.looked_up)
+        found = self.mirrored.surroundings.rows(slopes, self.mirrored.points, self.mirrored.mirrored)
+        return found[..., :1]
+
+    def cost(self, data: Data, state: State) -> float:
+        """½ Σ w ‖(1 − Π) e‖² of another state, under this map. A ray that no longer sees the surroundings costs what it
+        did before, so it is not lost for gain.
+        """
+        assert data.pixels is not None, "photographs take part"
+        rays = state.nuisance.moved(data.pixels.rays.chosen(self.chosen), data.cameras)
+        hits = state.surface.hits(rays)
+        mirrored = MirroredRays(rays.directions, hits.normals, hits.points, state.around)
+        radiance = state.nuisance.equalized(data.pixels.radiance[self.chosen], rays.view)
+        residual = mirrored.light(self.environment) - radiance
+        return self.following.cost(np.where(hits.clear[:, None], residual, self.residual))
+
+
+def chosen_hits(hits: MirrorHits, chosen: Int[np.ndarray, "Q"]) -> MirrorHits:
+    """Some of them."""
+    return MirrorHits(*(values[chosen] for values in vars(hits).values()))
+
+
+@dataclass(frozen=True)
+class Equations:
+    """A state, linearized."""
+
+    data: Data
+    state: State
+    photographs: Photographs | None
+    outlines: PixelRays
+    silhouette: Silhouette
+    distance_px: Float[np.ndarray, "S"]
+    scale_px: float
+    gradient: Float[np.ndarray, "D"]
+    matrix: Float[np.ndarray, "D D"]
+    regularizing: Float[np.ndarray, "_ _"]
+    anchor: Float[np.ndarray, "_"] | None
+
+    @classmethod
+    def at(cls, data: Data, state: State) -> "Equations":
+        """With the map solved for the state."""
+        surface, nuisance, count = state.surface, state.nuisance, state.surface.count
+        by_view, shared = (nuisance.free_blocks(by_view=each) for each in (True, False))
+        views, size, others = len(data.cameras.centers), sum(b.size for b in by_view), len(shared)
+        unknowns = count + views * size + others
+        free = bool(by_view or shared)
+        numbers = np.arange(size), count + views * size + np.arange(others)
+
+        def beside(rays: PixelRays, by_motion: np.ndarray, seen: Photographs | None) -> tuple[np.ndarray, ...]:
+            light = None if seen is None else seen.light
+            rows = [
+                seen.wall_rows()
+                if seen is not None and isinstance(each, Walls)
+                else rows_of(each, rays, data.cameras, by_motion, light)
+                for each in (*by_view, *shared)
+            ]
+            empty = np.zeros((*by_motion.shape[:2], 0))
+            columns = [count + size * rays.view[:, None] + numbers[0], np.tile(numbers[1], (len(rays.view), 1))]
+            return np.concatenate([empty, *rows], 2), np.concatenate(columns, 1)
+
+        gradient, matrix = np.zeros(unknowns), np.zeros((unknowns, unknowns))
+        photographs = None
+        if data.pixels is not None:
+            photographs = Photographs.at(data, state, estimated=free)
+        if photographs is not None:
+            by_surface, by_motion = photographs.rows()
+            rows, columns = beside(photographs.rays, by_motion, photographs)
+            gradient, matrix = photographs.following.sparse_equations(
+                np.concatenate([by_surface, rows], 2),
+                np.concatenate([photographs.hits.columns, columns], 1),
+                unknowns,
+                photographs.residual,
+            )
+            if surface.unseen is not None and not data.last:
+                hidden = np.concatenate([surface.unseen, np.zeros((unknowns - count, surface.unseen.shape[1]))])
+                gradient = gradient - hidden @ (hidden.T @ gradient)
+                matrix = matrix - hidden @ (hidden.T @ matrix)
+                matrix = matrix - (matrix @ hidden) @ hidden.T
+        outlines = nuisance.moved(data.outlines, data.cameras)
+        silhouette = surface.silhouette(outlines)
+        distance = silhouette.pixels - nuisance.offsets_px(outlines.view)
+        least = CONTOUR_SCALE_PX if data.settings.resolution else data.settings.robust_scale
+        scale = robust_scale(distance[silhouette.counted], least, NOISE_MULTIPLE)
+        weights = silhouette.counted * robust_weight(distance, scale) / CONTOUR_SIGMA_PX**2
+        rows, columns = beside(outlines, silhouette.by_motion[:, None], None)
+        by_outlines, of_outlines = normal_equations(
+            _jacobian(silhouette, rows[:, 0], columns, unknowns), distance, weights
+        )
+        gradient, matrix = gradient + by_outlines, matrix + of_outlines
+        start = 0
+        for block in by_view:
+            for view in range(views):
+                place = count + size * view + start
+                where = slice(place, place + block.size)
+                gradient[where] += CORRELATED * block.precision[view] @ block.values[view]
+                matrix[where, where] += CORRELATED * block.precision[view]
+            start += block.size
+        for number, block in zip(numbers[1], shared, strict=True):
+            gradient[number] += CORRELATED * block.precision[0, 0, 0] * block.values[0, 0]
+            matrix[number, number] += CORRELATED * block.precision[0, 0, 0]
+        found = surface.regularization(matrix[:count, :count])
+        matrix[:count, :count] += found.matrix
+        if found.value is not None:
+            gradient[:count] += found.matrix @ found.value
+        return cls(
+            data,
+            state,
+            photographs,
+            outlines,
+            silhouette,
+            distance,
+            scale,
+            gradient,
+            matrix,
+            found.matrix,
+            found.value,
+        )
+
+    def cost(self, state: State, step: Float[np.ndarray, "D"]) -> float:
+        """Of a state after a step."""
+        total = CORRELATED * state.nuisance.prior_cost
+        if self.anchor is not None:
+            value = self.anchor + step[: len(self.anchor)]
+            total += float(value @ self.regularizing @ value) / 2
+        if self.photographs is not None:
+            total += self.photographs.cost(self.data, state)
+        rays = state.nuisance.moved(self.data.outlines, self.data.cameras)
+        found = state.surface.silhouette(rays)
+        distance = found.pixels - state.nuisance.offsets_px(rays.view)
+        lost = np.where(found.valid, bounded_error(distance, self.scale_px), 1.0)[self.silhouette.counted]
+        return total + (self.scale_px / CONTOUR_SIGMA_PX) ** 2 * float(lost.sum()) / 2
+
+    def after_step(self) -> tuple[State, float]:
+        """The state after the least damped of the tried steps that lowers the cost, and by which share of it."""
+        limit, diagonal = self.state.surface.limit, np.diag(self.matrix)
+        before = self.cost(self.state, np.zeros_like(diagonal))
+        for damping in DAMPINGS:
+            damped = self.matrix + damping * np.diag(diagonal)
+            step = damped_step(self.gradient, damped, largest=limit.largest, limited=limit.limited)
+            moved = self.state.stepped(step)
+            cost = self.cost(moved, step)
+            if cost < before:
+                return moved, 1 - cost / before
+        return self.state, 0.0
+
+    def covariances(self) -> dict[str, Float[np.ndarray, "N N"]]:
+        """Posterior covariances of the numbers of each free block, group after group: the part of C H⁻¹, with the
+        surface, the other blocks and the map that follow.
+        """
+        by_view, shared = (self.state.nuisance.free_blocks(by_view=each) for each in (True, False))
+        if not by_view and not shared:
+            return {}
+        whole = CORRELATED * np.linalg.inv(regularize(self.matrix, "cameras and exposures"))
+        found: dict[str, np.ndarray] = {}
+        size, first = sum(each.size for each in by_view), self.state.surface.count
+        start = first
+        for block in by_view:
+            places = start + size * np.arange(len(block.values))[:, None] + np.arange(block.size)
+            found[block.name] = whole[np.ix_(places.ravel(), places.ravel())]
+            start += block.size
+        last = len(whole) - len(shared)
+        for number, block in enumerate(shared):
+            found[block.name] = whole[last + number, last + number].reshape(1, 1)
+        return found
+
+
+def _jacobian(
+    silhouette: Silhouette, rows: Float[np.ndarray, "S M"], columns: Int[np.ndarray, "S M"], unknowns: int
+) -> "csr_matrix":
+    """Derivatives of the distances by all unknowns: those of the surface, and rows in columns."""
+    from scipy import sparse
+
+    own = silhouette.jacobian
+    padded = sparse.csr_matrix((own.data, own.indices, own.indptr), shape=(own.shape[0], unknowns))
+    starts = np.arange(len(rows) + 1) * rows.shape[1]
+    return padded + sparse.csr_matrix((rows.ravel(), columns.ravel(), starts), shape=(len(rows), unknowns))
