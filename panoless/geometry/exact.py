@@ -38,7 +38,7 @@ from panoless.problem.corrected import Corrected
 from panoless.problem.evidence import Decision
 from panoless.problem.nuisance import Block, nuisance_of
 from panoless.problem.parametric import ParametricSurface
-from panoless.problem.solve import LEAST_VIEWS, by_outlines, solve
+from panoless.problem.solve import LEAST_VIEWS, MOST_VIEWS, by_outlines, solve
 
 PROPOSALS = 3
 """Most by corrected silhouettes."""
@@ -152,13 +152,13 @@ class ExactFamily:
         which are corrected by what a surface of few numbers leaves to the blocks.
         """
         family = cast(Family, self)
-        if not kinds or len(views.train) < LEAST_VIEWS:
+        if not kinds or not LEAST_VIEWS <= len(views.train) <= MOST_VIEWS:
             return family.fit(views, proposal, config), NO_CORRECTIONS, []
         with torch.no_grad():
-            proposal = self._proposed_again(views, proposal, kinds, config, propose)
+            start = self._proposed_again(views, proposal, kinds, config, propose)
             found = solve(
                 views,
-                self.unknowns(views, proposal, config),
+                self.unknowns(views, start, config),
                 kinds,
                 required,
                 lambda state: self.begun(Corrected.by(state.nuisance).applied(views, config), state.surface, config),
@@ -169,7 +169,7 @@ class ExactFamily:
         corrected = by.applied(views, config)
         again = propose(corrected)
         if again is None:
-            again = proposal
+            again = start
         around = found.state.nuisance.around(proposal.shape.surroundings).scaled(by.scale)
         geometry = family.fit(corrected, again.in_surroundings(around), config)
         return geometry.with_poses(by.poses), by.corrections, list(found.decisions)

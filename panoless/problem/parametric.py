@@ -109,3 +109,7 @@ class ParametricSurface(Protocol):
     def settled(self) -> "ParametricSurface":
         """The same surface, sampled evenly, before a round."""
         ...
+
+    def refined(self) -> "ParametricSurface":
+        """The same surface with more numbers, where the kind has any."""
+        ...

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from panoless.capture.views import Views
+from panoless.journal import remembered
 from panoless.problem.equations import Data, Equations, Round, State
 from panoless.problem.evidence import Decision, decided
 from panoless.problem.nuisance import (
@@ -26,13 +27,14 @@ from panoless.problem.nuisance import (
     nuisance_of,
 )
 from panoless.problem.parametric import ParametricSurface
+from shinypartial.io.progress import Progress
 
 LEAST_FALL = 1e-3
 """A round ends with a step that lowers its cost by a smaller share."""
 SHARED_RESOLUTION = 64
 """Texels along a face side from which what all views share is free."""
-LEAST_VIEWS = 5
-"""With fewer, nothing beside the surface is an unknown."""
+LEAST_VIEWS, MOST_VIEWS = 5, 400
+"""With fewer, or with more, whose dense equations would need gigabytes, nothing beside the surface is an unknown."""
 OUTLINES = tuple(Round(0, scale, 0, 2) for scale in (4.0, 2.0, 1.0, 0.5))
 """By silhouettes alone."""
 ROUNDS = (
@@ -42,7 +44,7 @@ ROUNDS = (
 )
 """With several rays a texel: a texel that one ray sees follows it wherever it goes."""
 FINISH = Round(128, 0.1, 250_000, 3)
-"""Once the scene is known to need blocks: with distortion, which all others hide."""
+"""Where blocks seem needed: with distortion, which others hide, and a finer surface, for which poses make up."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,7 @@ class Solved:
     variances: dict[str, Float[np.ndarray, "B M"]]
 
 
+@remembered()
 def take_round(views: Views, state: State, settings: Round, last: int) -> State:
     """A state after the steps of one round."""
     names = state.nuisance.free
@@ -74,7 +77,7 @@ def by_outlines(views: Views, surface: ParametricSurface, nuisance: Nuisance) ->
     """A surface and cameras by silhouettes alone."""
     state = State(surface, nuisance)
     for settings in OUTLINES:
-        state = take_round(views, state, settings, ROUNDS[-1].resolution)
+        state = take_round(views, state, settings, FINISH.resolution)
     return state
 
 
@@ -94,7 +97,7 @@ def solve(
     last = rounds[-1]
 
     def judged(state: State, settings: Round) -> tuple[list[Decision], dict[str, np.ndarray]]:
-        data = Data.of(views, settings, last.resolution, state.nuisance.free)
+        data = Data.of(views, settings, FINISH.resolution, state.nuisance.free)
         covariances, decisions, known = Equations.at(data, state).covariances(), [], {}
         for block in state.nuisance.blocks:
             covariance = covariances[block.name]
@@ -102,12 +105,15 @@ def solve(
             decisions.append(decided(block, known[block.name], covariance, required=block.name in required))
         return decisions, known
 
+    progress = Progress("solving for cameras, exposures and masks", len(rounds) + 2)
     usual = [kind for kind in kinds if kind is not Distortion]
     state = by_outlines(views, surface, nuisance_of(views, usual))
     if begin is not None:
         state = replace(state, surface=begin(state))
+    progress.advance()
     for each in rounds:
-        state = take_round(views, state, each, last.resolution)
+        state = take_round(views, state, each, FINISH.resolution)
+        progress.advance()
     gone, settings = list[Decision](), last
     while True:
         decisions, known = judged(state, settings)
@@ -115,8 +121,10 @@ def solve(
         gone += needless
         left = state.nuisance.without([each.name for each in needless])
         if not left.blocks or (not needless and settings is FINISH):
+            progress.advance(steps=progress.total - progress.done)
             return Solved(replace(state, nuisance=left), (*gone, *(each for each in decisions if each.kept)), known)
-        if settings is last and Distortion in kinds:
-            bent = nuisance_of(views, [Distortion, *(type(each) for each in left.blocks)])
-            left = bent.replaced(left.blocks)
-        settings, state = FINISH, take_round(views, replace(state, nuisance=left), FINISH, last.resolution)
+        if settings is last:
+            more = [Distortion] if Distortion in kinds else []
+            left = nuisance_of(views, [*more, *(type(each) for each in left.blocks)]).replaced(left.blocks)
+            state = replace(state, surface=state.surface.refined())
+        settings, state = FINISH, take_round(views, replace(state, nuisance=left), FINISH, FINISH.resolution)

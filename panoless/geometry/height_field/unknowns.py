@@ -99,3 +99,7 @@ class HeightFieldUnknowns:
     def stepped(self, step: Float[np.ndarray, "D"]) -> "HeightFieldUnknowns":
         """Moved."""
         return HeightFieldUnknowns(apply_height_field_step(self.height_field, step))
+
+    def refined(self) -> "HeightFieldUnknowns":
+        """With half as large cells."""
+        return HeightFieldUnknowns(self.height_field.with_halved_cells())

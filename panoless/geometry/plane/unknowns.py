@@ -86,6 +86,10 @@ class PlaneUnknowns:
         """Turned and shifted, with another boundary."""
         return PlaneUnknowns(apply_plane_step(self.plane, step))
 
+    def refined(self) -> "PlaneUnknowns":
+        """Itself."""
+        return self
+
 
 def with_frame(found: BoundaryResiduals, plane: Plane) -> BoundaryResiduals:
     """Without derivatives by the height of a frame that there is not."""

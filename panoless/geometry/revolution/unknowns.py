@@ -132,3 +132,7 @@ class RevolutionUnknowns:
     def settled(self) -> "RevolutionUnknowns":
         """With vertices about a pixel apart."""
         return replace(self, surface=resample_profile(self.surface, self.pixel))
+
+    def refined(self) -> "RevolutionUnknowns":
+        """Itself."""
+        return self

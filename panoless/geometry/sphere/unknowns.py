@@ -88,3 +88,7 @@ class SphereUnknowns:
     def stepped(self, step: Float[np.ndarray, "4"]) -> "SphereUnknowns":
         """Moved."""
         return SphereUnknowns(self.sphere.moved(step), self.radius_known)
+
+    def refined(self) -> "SphereUnknowns":
+        """Itself."""
+        return self
