@@ -40,7 +40,7 @@ def _children(package: str, leave_out: tuple[str, ...]) -> list[str]:
 install_import_hook(checked_modules(), TYPE_CHECKER)
 
 settings.register_profile("local", deadline=None, max_examples=50)
-settings.register_profile("ci", deadline=None, max_examples=20, derandomize=True)
+settings.register_profile("ci", deadline=None, max_examples=10, derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "local")
 
 #: Folders and files whose few tests render or fit for long: with workers, who takes them last lets the others wait.

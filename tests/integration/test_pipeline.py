@@ -32,6 +32,7 @@ def assert_complete(prediction: Path, model: str, largest_error_deg: float, leas
     assert scores["render"]["alpha_iou"] > least_overlap
 
 
+@pytest.mark.slow
 def test_generate_fit_evaluate_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -32,7 +32,7 @@ from panoless.numeric.robust import bounded_error, robust_weight
 from panoless.problem.nuisance import NO_NUISANCE, Block, Nuisance, block_diagonal
 from panoless.problem.observations import Pixels
 from panoless.problem.rays import PixelRays
-from panoless.problem.rows import BlockRows, Linearized
+from panoless.problem.rows import BlockRows, Linearized, rows_of
 
 
 @dataclass(frozen=True)
@@ -338,22 +338,10 @@ class Solution:
         return 1.0 if self.beside else self.task.options.photograph_curvature
 
     def _rows_of(self, block: Block) -> tuple[Float[np.ndarray, "P 3 M"], Float[np.ndarray, "S 1 M"]]:
-        """Of photographs and of silhouettes, by the unknowns of a block.
-
-        c/g is compared with E, so that ∂e/∂log g = c/g, for which the prediction E stands: it has no noise.
-        """
-        task, pair = self.task, []
-        for rays, by_motion in ((self.rays, self._motion_rows), (self._outlined, self._silhouettes[1])):
-            motions = block.motions(rays, task.cameras.rotations[rays.view, 2])
-            still = np.zeros((*by_motion.shape[:2], block.size))
-            pair.append(still if motions is None else np.matmul(by_motion, motions))
-        seen, outlined = pair
-        by_gain = block.gain_rows()
-        if by_gain is not None:
-            seen = seen + self._light[..., None] * by_gain
-        if block.moves_silhouettes:
-            outlined = outlined - 1.0
-        return seen, outlined
+        """Of photographs and of silhouettes, by the unknowns of a block."""
+        cameras = self.task.cameras
+        seen = rows_of(block, self.rays, cameras, self._motion_rows, self._light)
+        return seen, rows_of(block, self._outlined, cameras, self._silhouettes[1])
 
     @cached_property
     def _outlined(self) -> PixelRays:

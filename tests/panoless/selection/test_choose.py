@@ -74,7 +74,8 @@ def verdicts(selection: Selection) -> dict[str, Verdict]:
 
 
 @pytest.mark.parametrize(
-    ("bend", "frame_height"), [(0.0, 0.0), (0.0, 0.1), pytest.param(0.1, 0.0, marks=pytest.mark.slow), (0.1, 0.1)]
+    ("bend", "frame_height"),
+    [(0.0, 0.0), (0.0, 0.1), *(pytest.param(0.1, frame, marks=pytest.mark.slow) for frame in (0.0, 0.1))],
 )
 def test_a_flat_mirror_takes_the_plane_and_a_bent_one_in_the_same_boundary_does_not(
     bend: float, frame_height: float
@@ -180,6 +181,7 @@ def test_a_box_is_refused_by_its_silhouettes() -> None:
     assert selection.sentence.startswith("free_form (explains held-out views;")
 
 
+@pytest.mark.slow
 def test_silhouettes_turn_cameras_where_that_brings_a_shape_near() -> None:
     """Those of a goblet come back; of true ones nothing is turned."""
     views = revolution_views(goblet(), around(12, 96))

@@ -48,6 +48,7 @@ def in_room(view: TrainView, plane: Plane, radius: float, depth: float | None = 
     return replace(view, radiance=torch.where(view.mask > 0, image, view.radiance))
 
 
+@pytest.mark.slow
 def test_a_flat_mirror_in_a_room_tells_how_near_it_is() -> None:
     """Within 5 % of four radii at 48 px, where a fit that believes in a far world explains clearly less."""
     plane = plane_of(RECTANGLE)
@@ -84,6 +85,7 @@ def above() -> list[RasterCamera]:
     ]
 
 
+@pytest.mark.slow
 def test_a_flat_mirror_on_a_table_tells_how_high_it_stands() -> None:
     """Depth within 5 % at 64 px, though the disk that is taken reaches too far. Above a floor that leans by 10° a fit
     goes on above one that leans by less than 3°.

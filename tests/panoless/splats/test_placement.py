@@ -105,6 +105,7 @@ def test_surfels_cover_the_visible_sphere(hull: Surfels, views: Views) -> None:
     assert float(gaps.max()) < 3 * float(hull.scales.mean())
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_surfels(views: Views) -> None:
     for config in (replace(CONFIG, count=50), SurfelConfig(initial="random", count=50)):
         first, again, other = (initial_surfels(views, config, seed) for seed in (3, 3, 4))
