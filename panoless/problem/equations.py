@@ -208,7 +208,6 @@ class Equations:
     data: Data
     state: State
     photographs: Photographs | None
-    outlines: PixelRays
     silhouette: Silhouette
     distance_px: Float[np.ndarray, "S"]
     scale_px: float
@@ -287,7 +286,6 @@ class Equations:
             data,
             state,
             photographs,
-            outlines,
             silhouette,
             distance,
             scale,
@@ -303,11 +301,14 @@ class Equations:
         if self.anchor is not None:
             value = self.anchor + step[: len(self.anchor)]
             total += float(value @ self.regularizing @ value) / 2
-        if self.photographs is not None:
-            total += self.photographs.cost(self.data, state)
-        rays = state.nuisance.moved(self.data.outlines, self.data.cameras)
-        found = state.surface.silhouette(rays)
-        distance = found.pixels - state.nuisance.offsets_px(rays.view)
+        seen, found, distance = self.photographs, self.silhouette, self.distance_px
+        if state is self.state:
+            total += 0.0 if seen is None else seen.following.cost(seen.residual)
+        else:
+            total += 0.0 if seen is None else seen.cost(self.data, state)
+            rays = state.nuisance.moved(self.data.outlines, self.data.cameras)
+            found = state.surface.silhouette(rays)
+            distance = found.pixels - state.nuisance.offsets_px(rays.view)
         lost = np.where(found.valid, bounded_error(distance, self.scale_px), 1.0)[self.silhouette.counted]
         return total + (self.scale_px / CONTOUR_SIGMA_PX) ** 2 * float(lost.sum()) / 2
 

@@ -50,6 +50,13 @@ class Silhouette:
     """By a turn ω (rad) and a shift τ (normalized frame) of the ray."""
 
 
+def motion_rows(
+    by_shift: Float[np.ndarray, "S 3"], directions: Float[np.ndarray, "S 3"], distance: Float[np.ndarray, "S"]
+) -> Float[np.ndarray, "S 6"]:
+    """w·(τ + t ω × d) by (ω, τ): what a point at the distance t of a ray d does with the derivative w by its shift."""
+    return np.concatenate([np.cross(directions, distance[:, None] * by_shift), by_shift], 1)
+
+
 @dataclass(frozen=True)
 class Regularization:
     """½ vᵀ E v beside the data, with v the `value` and its change; without a value it only damps steps."""
@@ -68,7 +75,7 @@ class StepLimit:
 
 @runtime_checkable
 class ParametricSurface(Protocol):
-    """A surface of D numbers, which is immutable."""
+    """A surface of D numbers, which is immutable. A kind inherits what it does not say otherwise."""
 
     @property
     def surroundings(self) -> Surroundings:
@@ -88,7 +95,7 @@ class ParametricSurface(Protocol):
     @property
     def unseen(self) -> Float[np.ndarray, "D U"] | None:
         """Orthonormal changes that photographs under a coarse map do not determine; None where there are none."""
-        ...
+        return None
 
     def hits(self, rays: PixelRays) -> MirrorHits:
         """Where rays meet it."""
@@ -107,9 +114,9 @@ class ParametricSurface(Protocol):
         ...
 
     def settled(self) -> "ParametricSurface":
-        """The same surface, sampled evenly, before a round."""
-        ...
+        """The same surface, sampled evenly, before a round; itself where the kind has no samples."""
+        return self
 
     def refined(self) -> "ParametricSurface":
-        """The same surface with more numbers, where the kind has any."""
-        ...
+        """The same surface with more numbers; itself where the kind has no more."""
+        return self

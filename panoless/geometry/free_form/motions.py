@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from panoless.kernels.constants import LEAST_SLANT
+from panoless.problem.parametric import motion_rows
 
 
 def pixel_motion_rows(
@@ -41,6 +42,4 @@ def outline_motion_rows(
     by_value: Float[np.ndarray, "P"],
 ) -> Float[np.ndarray, "P 1 6"]:
     """by_value ∇φ·(τ + t ω × d): a silhouette's residual by the motion of its ray, where φ is least on it."""
-    by_shift = by_value[:, None] * gradient
-    by_turn = np.cross(directions, distance[:, None] * by_shift)
-    return np.concatenate([by_turn, by_shift], 1)[:, None]
+    return motion_rows(by_value[:, None] * gradient, directions, distance)[:, None]

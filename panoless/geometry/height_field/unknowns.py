@@ -17,12 +17,19 @@ from panoless.geometry.height_field.silhouette import edge_jacobian, edge_residu
 from panoless.geometry.plane.model import passes_frame
 from panoless.geometry.plane.unknowns import LIMIT, boundary_motion_rows, vertices_kept
 from panoless.problem.observations import contours_of
-from panoless.problem.parametric import LEAST_COSINE, MirrorHits, Regularization, Silhouette, StepLimit
+from panoless.problem.parametric import (
+    LEAST_COSINE,
+    MirrorHits,
+    ParametricSurface,
+    Regularization,
+    Silhouette,
+    StepLimit,
+)
 from panoless.problem.rays import PixelRays
 
 
 @dataclass(frozen=True)
-class HeightFieldUnknowns:
+class HeightFieldUnknowns(ParametricSurface):
     """Those of the plane and its boundary, and then the coefficients."""
 
     height_field: HeightField
@@ -91,10 +98,6 @@ class HeightFieldUnknowns:
         value = np.zeros(self.count)
         value[part] = field.coefficients.ravel()
         return Regularization(found, value)
-
-    def settled(self) -> "HeightFieldUnknowns":
-        """Itself."""
-        return self
 
     def stepped(self, step: Float[np.ndarray, "D"]) -> "HeightFieldUnknowns":
         """Moved."""

@@ -307,7 +307,7 @@ def _equations(
     from scipy import sparse
 
     vertices, weights = len(plane.boundary), residuals.weights(scale)
-    residuals = replace(residuals, by_plane=residuals.by_plane * [1, 1, 1, frame])
+    residuals = residuals.framed(frame)
     jacobian = boundary_jacobian(residuals, vertices)
     _, matrix = normal_equations(jacobian, residuals.pixels, weights)
     matrix[4:, 4:] += vertex_pull(residuals, weights, vertices) * np.eye(2 * vertices)

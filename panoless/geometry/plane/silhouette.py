@@ -2,7 +2,7 @@
 and the boundary's vertices.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -56,6 +56,10 @@ class BoundaryResiduals:
     """In front of a camera that faces the mirror."""
     counted: Bool[np.ndarray, "P"]
     """Valid, and not at a corner."""
+
+    def framed(self, frame: bool) -> "BoundaryResiduals":
+        """With derivatives by the height of the frame, or without where there is none."""
+        return replace(self, by_plane=self.by_plane * [1, 1, 1, frame])
 
     def ends(self, vertices: int) -> Int[np.ndarray, "P 2"]:
         """The first and the second vertex of each side, of so many."""

@@ -3,7 +3,7 @@
 Photographs do not determine it: what a tilt changes, a map that is turned the other way changes back.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +18,14 @@ from panoless.geometry.plane.silhouette import (
     boundary_residuals,
 )
 from panoless.problem.observations import contours_of
-from panoless.problem.parametric import LEAST_COSINE, MirrorHits, Regularization, Silhouette, StepLimit
+from panoless.problem.parametric import (
+    LEAST_COSINE,
+    MirrorHits,
+    ParametricSurface,
+    Regularization,
+    Silhouette,
+    StepLimit,
+)
 from panoless.problem.rays import PixelRays
 
 PLANE_NUMBERS = 4
@@ -27,7 +34,7 @@ LIMIT = StepLimit(0.2, slice(PLANE_NUMBERS))
 
 
 @dataclass(frozen=True)
-class PlaneUnknowns:
+class PlaneUnknowns(ParametricSurface):
     """Normal, offset and frame, and the boundary's vertices."""
 
     plane: Plane
@@ -47,11 +54,6 @@ class PlaneUnknowns:
         """Of the plane."""
         return LIMIT
 
-    @property
-    def unseen(self) -> None:
-        """None: photographs have no rows at all."""
-        return
-
     def hits(self, rays: PixelRays) -> MirrorHits:
         """Where rays meet the plane and their reflections pass the frame; the normal is the same everywhere."""
         plane, count = self.plane, len(rays.size)
@@ -69,7 +71,7 @@ class PlaneUnknowns:
     def silhouette(self, rays: PixelRays) -> Silhouette:
         """How far rays pass outside of the boundary or of the frame."""
         found = boundary_residuals(contours_of(rays), self.plane)
-        jacobian = boundary_jacobian(with_frame(found, self.plane), len(self.plane.boundary))
+        jacobian = boundary_jacobian(found.framed(self.plane.frame_height > 0), len(self.plane.boundary))
         return Silhouette(
             found.pixels, found.counted, found.valid, jacobian, boundary_motion_rows(found, self.plane, rays)
         )
@@ -78,22 +80,9 @@ class PlaneUnknowns:
         """Along a straight side nothing else keeps a vertex where it is."""
         return Regularization(vertices_kept(matrix, self.plane))
 
-    def settled(self) -> "PlaneUnknowns":
-        """Itself."""
-        return self
-
     def stepped(self, step: Float[np.ndarray, "D"]) -> "PlaneUnknowns":
         """Turned and shifted, with another boundary."""
         return PlaneUnknowns(apply_plane_step(self.plane, step))
-
-    def refined(self) -> "PlaneUnknowns":
-        """Itself."""
-        return self
-
-
-def with_frame(found: BoundaryResiduals, plane: Plane) -> BoundaryResiduals:
-    """Without derivatives by the height of a frame that there is not."""
-    return replace(found, by_plane=found.by_plane * [1, 1, 1, plane.frame_height > 0])
 
 
 def vertices_kept(matrix: Float[np.ndarray, "D D"], plane: Plane) -> Float[np.ndarray, "D D"]:

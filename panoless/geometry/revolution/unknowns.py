@@ -18,7 +18,15 @@ from panoless.geometry.revolution.silhouette import (
     silhouette_residuals,
 )
 from panoless.numeric.gauss_newton import jacobian_of_rows
-from panoless.problem.parametric import LEAST_COSINE, MirrorHits, Regularization, Silhouette, StepLimit
+from panoless.problem.parametric import (
+    LEAST_COSINE,
+    MirrorHits,
+    ParametricSurface,
+    Regularization,
+    Silhouette,
+    StepLimit,
+    motion_rows,
+)
 from panoless.problem.rays import PixelRays
 
 AXIS_NUMBERS = 4
@@ -29,7 +37,7 @@ BENDING = 1e-3
 
 
 @dataclass(frozen=True)
-class RevolutionUnknowns:
+class RevolutionUnknowns(ParametricSurface):
     """Turns and shifts of the axis, and the coefficients of the splines."""
 
     surface: SurfaceOfRevolution
@@ -56,11 +64,6 @@ class RevolutionUnknowns:
     def limit(self) -> StepLimit:
         """Of the axis."""
         return StepLimit(LARGEST_TURN_RAD, slice(AXIS_NUMBERS))
-
-    @property
-    def unseen(self) -> None:
-        """None."""
-        return
 
     def hits(self, rays: PixelRays) -> MirrorHits:
         """Where rays meet the outside and are mirrored once. What silhouettes leave open, its ends, is left out."""
@@ -104,13 +107,12 @@ class RevolutionUnknowns:
         points = found.points @ surface.frame + surface.origin
         distance = ((points - rays.origins) * rays.directions).sum(1)
         by_shift = normals * inverse
-        by_turn = np.cross(rays.directions, distance[:, None] * by_shift)
         return Silhouette(
             np.where(found.side >= 0, found.pixels, 0.0),
             found.valid,
             found.side >= 0,
             jacobian_of_rows(rows, parameter_columns(index), self.count),
-            np.nan_to_num(np.concatenate([by_turn, by_shift], 1)),
+            np.nan_to_num(motion_rows(by_shift, rays.directions, distance)),
         )
 
     def _radial(self, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
@@ -132,7 +134,3 @@ class RevolutionUnknowns:
     def settled(self) -> "RevolutionUnknowns":
         """With vertices about a pixel apart."""
         return replace(self, surface=resample_profile(self.surface, self.pixel))
-
-    def refined(self) -> "RevolutionUnknowns":
-        """Itself."""
-        return self

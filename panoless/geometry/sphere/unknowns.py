@@ -9,12 +9,19 @@ from panoless.environment.surroundings import Surroundings
 from panoless.geometry.sphere.fit import OutlineRays, OutlineResiduals
 from panoless.geometry.sphere.model import Sphere
 from panoless.numeric.gauss_newton import jacobian_of_rows
-from panoless.problem.parametric import LEAST_COSINE, MirrorHits, Regularization, Silhouette, StepLimit
+from panoless.problem.parametric import (
+    LEAST_COSINE,
+    MirrorHits,
+    ParametricSurface,
+    Regularization,
+    Silhouette,
+    StepLimit,
+)
 from panoless.problem.rays import PixelRays
 
 
 @dataclass(frozen=True)
-class SphereUnknowns:
+class SphereUnknowns(ParametricSurface):
     """c and ρ, the radius where it is not known."""
 
     sphere: Sphere
@@ -34,11 +41,6 @@ class SphereUnknowns:
     def limit(self) -> StepLimit:
         """A fifth of the object's radius."""
         return StepLimit(0.2, slice(4))
-
-    @property
-    def unseen(self) -> None:
-        """None."""
-        return
 
     def hits(self, rays: PixelRays) -> MirrorHits:
         """n = (x − c)/ρ with S = 1/ρ; at a fixed ray x moves by d (n·δc + δρ)/(n·d)."""
@@ -81,14 +83,6 @@ class SphereUnknowns:
         known[3, 3] = self.radius_known * max(float(np.trace(matrix)), 1.0)
         return Regularization(known)
 
-    def settled(self) -> "SphereUnknowns":
-        """Itself."""
-        return self
-
     def stepped(self, step: Float[np.ndarray, "4"]) -> "SphereUnknowns":
         """Moved."""
         return SphereUnknowns(self.sphere.moved(step), self.radius_known)
-
-    def refined(self) -> "SphereUnknowns":
-        """Itself."""
-        return self
