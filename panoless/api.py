@@ -128,6 +128,7 @@ def fit(
     snapshots: int = 0,
     snapshot_seconds: tuple[float, ...] = (),
     device: Literal["cpu", "cuda"] = "cpu",
+    time_limit: float | None = None,
     set: tuple[str, ...] = (),
     config: FitConfig | None = None,
 ) -> Reconstruction:
@@ -137,8 +138,9 @@ def fit(
     without it the newest below ./datasets is taken. `config` replaces the preset's values, `model` and `set`, such
     as `("plane.max_vertices=64",)`, change some of them.
     `output` is the prediction folder, predictions/DATASET-PRESET by default; checkpoints lie in the run folder of the
-    same name below ./runs. A call that was interrupted continues after its last finished stage, and one that had ended
-    returns what is there. Raises InputError for what can't be read or fitted.
+    same name below ./runs. After `time_limit` minutes the fit ends at its next checkpoint with what it has; the same
+    call with more time goes on from there. A call that was interrupted continues after its last finished stage, and one
+    that had ended returns what is there. Raises InputError for what can't be read or fitted.
     """
     if preset not in PRESETS:
         raise InputError(expected=f"a preset: {', '.join(PRESETS)}", found=repr(preset), remedy="Choose one of them.")
@@ -159,7 +161,8 @@ def fit(
     refuse_run_folder(prediction, run_folder)
     with folder_lock(prediction):
         acquire_prediction(prediction)
-        state = reconstruct(data, config, run_folder, schedule, place)
+        limit = None if time_limit is None else 60 * time_limit
+        state = reconstruct(data, config, run_folder, schedule, place, limit)
         if not is_exported(prediction, state, config, data):
             export_prediction(data, state, config, prediction)
     return Reconstruction(prediction)

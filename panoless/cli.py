@@ -33,7 +33,8 @@ class Fit(LongCommand):
     """Fit a dataset: its surface, an environment map and a visibility map; then export the prediction."""
 
     FIRST: ClassVar = (
-        "dataset preset output viewer device set config.model config.tint config.downscale config.environment.range"
+        "dataset preset output time_limit viewer device set config.model config.tint config.downscale "
+        "config.environment.range"
     )
     dataset: Annotated[Path | None, tyro.conf.Positional] = None
     """Dataset folder, also plain NeRF-synthetic, or a bundled one: tiny-vase; else the newest in ./datasets."""
@@ -50,6 +51,8 @@ class Fit(LongCommand):
     """Show the fit in the browser while it runs, and the result afterwards."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the fit computes; `cuda` (NVIDIA or AMD) needs torch for it and Triton: docs/how-to/use-a-gpu.md."""
+    time_limit: float | None = None
+    """Minutes after which the fit ends at its next checkpoint with what it has; the same command with more goes on."""
     set: Annotated[
         tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="OPTION=VALUE [OPTION=VALUE ...]")
     ] = ()
@@ -68,6 +71,7 @@ class Fit(LongCommand):
             snapshots=self.snapshots,
             snapshot_seconds=self.snapshot_seconds,
             device=self.device,
+            time_limit=self.time_limit,
             config=config,
         )
         print(f"Prediction written to {result.folder}")

@@ -26,6 +26,7 @@ from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
 import panoless
+from panoless.deadline import check_time, is_past_limit
 from shinypartial.io.events import begin_stage
 from shinypartial.io.files import atomic_write
 from shinypartial.io.progress import Progress
@@ -68,6 +69,9 @@ class Journal:
             result = compute()
         finally:
             parts = self._parts.pop()
+        if is_past_limit():
+            self._parts[-1] += parts
+            return result
         seconds = time.monotonic() - start + self.seconds - before
         places = {id(each): place for place, each in reversed(list(enumerate(met)))}
         buffer = io.BytesIO()
@@ -121,6 +125,7 @@ def remembered(
 
         @functools.wraps(function)
         def call(*args: Given.args, **kwargs: Given.kwargs) -> Result:
+            check_time()
             journal = _current.get()
             if journal is None:
                 return function(*args, **kwargs)

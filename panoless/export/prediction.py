@@ -77,6 +77,7 @@ PICTURES = "pictures"
 SUPERSAMPLING = 2
 FORMER_KINDS = ("sheet", "lathe")
 """Names of PLY files that an earlier version wrote."""
+PRELIMINARY = "; preliminary, because the time limit ended the search"
 EXPORT_THREADS = 2
 JPEG_QUALITY = 92
 
@@ -143,7 +144,7 @@ def export_prediction(
         curves=state.curves,
         primitives=state.geometry.num_primitives,
         model_bytes=sum((folder / name).stat().st_size for name in (mesh_file, ENVIRONMENT)),
-        model=state.selection.sentence,
+        model=state.selection.sentence + (PRELIMINARY if state.is_preliminary else ""),
         model_selection=_model_selection(state.selection),
         cameras=_found_cameras(dataset, state),
         verdict=state.verdict,

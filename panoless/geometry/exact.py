@@ -15,6 +15,7 @@ from panoless.capture.poses import Poses
 from panoless.capture.rays import pixel_rays, unit_rays_camera
 from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
+from panoless.deadline import improving
 from panoless.environment.direct import scaled_to_map
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays, normalize_confidence
@@ -153,9 +154,11 @@ class ExactFamily:
         """
         family = cast(Family, self)
         if not kinds or not LEAST_VIEWS <= len(views.train) <= MOST_VIEWS:
-            return family.fit(views, proposal, config), NO_CORRECTIONS, []
+            return _fitted(family, views, proposal, config), NO_CORRECTIONS, []
         with torch.no_grad():
-            start = self._proposed_again(views, proposal, kinds, config, propose)
+            start = proposal
+            with improving():
+                start = self._proposed_again(views, proposal, kinds, config, propose)
             found = solve(
                 views,
                 self.unknowns(views, start, config),
@@ -164,14 +167,14 @@ class ExactFamily:
                 lambda state: self.begun(Corrected.by(state.nuisance).applied(views, config), state.surface, config),
             )
         if not found.state.nuisance.blocks:
-            return family.fit(views, proposal, config), NO_CORRECTIONS, list(found.decisions)
+            return _fitted(family, views, proposal, config), NO_CORRECTIONS, list(found.decisions)
         by = Corrected.by(found.state.nuisance, found.variances)
         corrected = by.applied(views, config)
         again = propose(corrected)
         if again is None:
             again = start
         around = found.state.nuisance.around(proposal.shape.surroundings).scaled(by.scale)
-        geometry = family.fit(corrected, again.in_surroundings(around), config)
+        geometry = _fitted(family, corrected, again.in_surroundings(around), config)
         return geometry.with_poses(by.poses), by.corrections, list(found.decisions)
 
     def _proposed_again(
@@ -195,6 +198,13 @@ class ExactFamily:
         found = Corrected.by(state.nuisance).poses
         assert found is not None, "cameras are unknowns"
         return found
+
+
+def _fitted(family: Family, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
+    """The fit of a kind; the proposal where the time limit ends it."""
+    with improving():
+        return family.fit(views, proposal, config)
+    return family.as_proposed(proposal, config)
 
 
 class SeenByCenters(ExactGeometry):

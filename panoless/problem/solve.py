@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from panoless.capture.views import Views
+from panoless.deadline import improving, is_past_limit
 from panoless.journal import remembered
 from panoless.problem.equations import Data, Equations, Round, State
 from panoless.problem.evidence import Decision, decided
@@ -107,20 +108,23 @@ def solve(
 
     progress = Progress("solving for cameras, exposures and masks", len(rounds) + 2)
     usual = [kind for kind in kinds if kind is not Distortion]
-    state = by_outlines(views, surface, nuisance_of(views, usual))
+    state = State(surface, nuisance_of(views, usual))
+    with improving():
+        state = by_outlines(views, surface, state.nuisance)
     if begin is not None:
         state = replace(state, surface=begin(state))
     progress.advance()
-    for each in rounds:
-        state = take_round(views, state, each, FINISH.resolution)
-        progress.advance()
+    with improving():
+        for each in rounds:
+            state = take_round(views, state, each, FINISH.resolution)
+            progress.advance()
     gone, settings = list[Decision](), last
     while True:
         decisions, known = judged(state, settings)
         needless = [each for each in decisions if not each.kept]
         gone += needless
         left = state.nuisance.without([each.name for each in needless])
-        if not left.blocks or (not needless and settings is FINISH):
+        if not left.blocks or (not needless and settings is FINISH) or is_past_limit():
             progress.advance(steps=progress.total - progress.done)
             return Solved(replace(state, nuisance=left), (*gone, *(each for each in decisions if each.kept)), known)
         if settings is last:

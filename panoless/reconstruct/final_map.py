@@ -10,6 +10,7 @@ from panoless.capture.contrast import exposed
 from panoless.capture.encoding import encoding_of
 from panoless.capture.views import Views
 from panoless.config import FitConfig
+from panoless.deadline import improving
 from panoless.environment.lobe import Lobe
 from panoless.environment.resolution import count_rays
 from panoless.environment.roughness import sharpened_map, with_smaller_lamps
@@ -43,7 +44,10 @@ def complete(state: FitState, views: Views, config: FitConfig) -> tuple[Views, F
         usable = replace(usable, train=tuple(replace(part, radiance=view.radiance) for part, view in shown))
         config = replace(config, tint=state.reflectance.tint)
         state.reflectance = state.reflectance.exposed(1 / exposure)
-    softness = earned_softness(usable, state.geometry, config) if state.training is None else Softness()
+    softness = Softness()
+    if state.training is None:
+        with improving():
+            softness = earned_softness(usable, state.geometry, config)
     state.roughness, state.blur_px = softness.roughness, softness.blur_px
     taken = exposed(usable if state.blur_px is None else replace(usable, blur_px=state.blur_px), 1 / exposure)
     state.environment, state.visibility = _solved(

@@ -11,6 +11,7 @@ import torch
 from panoless.capture.configured import configured_views
 from panoless.capture.views import Views
 from panoless.config import FitConfig, check_config
+from panoless.deadline import improving, is_past_limit, time_limit
 from panoless.geometry.base import usable_views
 from panoless.journal import forget, journal_in
 from panoless.kernels.backend import gpu_kernels_installed
@@ -43,9 +44,11 @@ def fit(
     folder: Path,
     schedule: SnapshotSchedule = NO_SNAPSHOTS,
     device: torch.device = MAIN_MEMORY,
+    time_limit_s: float | None = None,
 ) -> FitState:
     """Fit a dataset in a run folder; a killed fit continues after its last finished stage or from its last checkpoint,
-    a finished one is returned.
+    a finished one is returned. Past the time limit nothing is improved further: the state is completed as it is, and
+    the next fit in that folder goes on from the last checkpoint.
 
     The views, the surfels and the environment are placed on `device` once and stay there; the state that is returned
     lies in main memory. Raises InputError when another fit is writing to the folder, or snapshots are asked of a
@@ -55,12 +58,15 @@ def fit(
     with folder_lock(folder):
         acquire_run(folder, dataset.root, dataset_hash(dataset), config, photographs_hash(dataset))
         state = load_state(folder)
+        if state is not None and state.is_preliminary:
+            state = None
         if state is None or state.environment is None:
-            with journal_in(folder), _noting_what_is_repeated(folder):
+            with journal_in(folder), _noting_what_is_repeated(folder), time_limit(time_limit_s):
                 state = _finished(state, dataset, config, schedule, folder, device)
         elif state.training is not None:
             require_snapshots(folder, schedule)
-        forget(folder)
+        if not state.is_preliminary:
+            forget(folder)
         return state
 
 
@@ -95,6 +101,9 @@ def _finished(
     with timed(state.seconds, "judge"):
         state.verdict = assess(state, photographs, shown, read_ball_evidence(dataset))
     note_peak_memory(state)
+    state.is_preliminary = is_past_limit()
+    if state.is_preliminary:
+        warn("the time limit ended the search: the result is preliminary. Run again with more time to go on from it.")
     save_state(folder, state)
     return state.to(MAIN_MEMORY)
 
@@ -130,10 +139,10 @@ def begin(views: Views, config: FitConfig) -> FitState:
         return _begin_surfels(views, config)
     geometry, selection = choose_geometry(views, config)
     corrected = selection.corrections.applied(views, config)
-    shown = without_scattered_light(views, corrected, geometry, selection.held_out_error, config)
-    if shown is not None:
-        geometry, selection = choose_geometry(*shown)
-        corrected = selection.corrections.applied(views, config)
+    with improving():
+        shown = without_scattered_light(views, corrected, geometry, selection.held_out_error, config)
+        if shown is not None:
+            geometry, selection = choose_geometry(*shown)
     return FitState(geometry, views.object_frame, selection)
 
 

@@ -52,6 +52,8 @@ class FitState:
     """Standard deviation of a Gaussian that blurred the pictures, where held-out views ask for one."""
     verdict: Trust | None = None
     """How far it is to be trusted; None before the end, and in runs of an earlier version."""
+    is_preliminary: bool = False
+    """Whether the time limit ended its search."""
 
     @property
     def iteration(self) -> int:

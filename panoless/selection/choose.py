@@ -15,6 +15,7 @@ from panoless.capture.poses import Poses, StatedCameras
 from panoless.capture.silhouettes import silhouette_distance_px
 from panoless.capture.views import Views
 from panoless.config import FitConfig
+from panoless.deadline import improving, is_past_limit
 from panoless.first_surface.visual_hull import contradiction_px
 from panoless.geometry.base import Family, Geometry, Proposal, usable_views
 from panoless.geometry.exact import LARGEST_SHARE_LEFT
@@ -23,7 +24,7 @@ from panoless.journal import remembered
 from panoless.problem.nuisance import SHIFT, STATED_FLOOR, TURN_DEG
 from panoless.selection.candidates import Candidate, Selection, Verdict, describe
 from panoless.selection.fitted import Fitted, is_refined, missed_share
-from panoless.selection.held_out import held_out_errors, held_out_parts
+from panoless.selection.held_out import held_out_errors, held_out_parts, is_matte
 from panoless.selection.joint import fit_jointly, followed, nuisance_kinds, proposed
 from panoless.selection.surroundings import explains_clearly_more
 from shinypartial.core.errors import InputError
@@ -34,6 +35,7 @@ BENT = "a bend explains clearly more"
 EXPLAINS = "explains held-out views"
 OTHER = "another kind is preferred"
 TOO_MUCH = "leaves too much unexplained"
+MATTE = "one color a place explains the views, as of a matte object: no mirror was fitted"
 NONE_HELD_OUT = "too few views to hold one out"
 LEAST_OVERLAP = 0.75
 """No turns are looked for where a shape overlaps less with the masks: mirror and vase do by 0.86 and 0.83 with turns of
@@ -59,6 +61,8 @@ def choose_geometry(views: Views, config: FitConfig) -> tuple[Geometry, Selectio
     table, refused = list[Candidate](), dict[str, Start | None]()
     fitted = list[tuple[Candidate, Geometry]]()
     for family in families:
+        if fitted and is_past_limit():
+            break
         source = _source(family)
         start = refused.get(source.kind) if family.refines else begun(source, views, config, asked=False)
         candidate, geometry = _examine(family, start, views, config)
@@ -68,10 +72,15 @@ def choose_geometry(views: Views, config: FitConfig) -> tuple[Geometry, Selectio
             continue
         explains = candidate.verdict == Verdict.CHOSEN
         corrected = candidate.corrections.applied(views, config)
-        if explains and _bends_rather(family, geometry, start, corrected, config):
+        bends = False
+        with improving():
+            bends = explains and candidate.reason != MATTE and _bends_rather(family, geometry, start, corrected, config)
+        if bends:
             table[-1] = candidate = replace(candidate, verdict=Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason=BENT)
             explains = False
         fitted.append((candidate, geometry))
+        if candidate.reason == MATTE:
+            break
         if explains and (family.told_by_outlines or error_of(fitted[-1]) <= config.selection.doubted_error):
             break
     chosen = [each for each in fitted if each[0].verdict == Verdict.CHOSEN]
@@ -282,6 +291,9 @@ def _examine(family: Family, start: Start | None, views: Views, config: FitConfi
     evidence = start.proposal.silhouette_px, start.proposal.overlap
     if not is_near(start, views, config, bent=family.refines is not None):
         return Candidate(family.kind, Verdict.REFUSED_BY_SILHOUETTES, "misses the silhouettes", *evidence), None
+    surface = family.as_proposed(start.proposal, config)
+    if is_matte(views, surface, config):
+        return Candidate(family.kind, Verdict.CHOSEN, MATTE, *evidence, 0.0), surface
     fitted = fit_jointly(family, _source(family), views, start.proposal, config)
     geometry, found = fitted.geometry, _found(fitted, views)
     views = fitted.corrections.applied(views, config)

@@ -6,12 +6,21 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from panoless.capture.contrast import Contrast
 from panoless.capture.views import Views, split_held_out
 from panoless.config import FitConfig
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
-from panoless.geometry.base import Geometry, observe_views
+from panoless.geometry.base import Geometry, observe_views, usable_views
+from panoless.geometry.places import WithoutMirror, surfaces_of
 from panoless.selection.options import SelectionOptions
+
+MATTE_SHARE = 0.6
+"""Error under one color a place, in that under other models, below which an object is matte."""
+MATTE_VIEWS = 24
+"""Views by which that is judged, of those that tell the colors and of the others."""
+LEAST_COLORS = 0.01
+"""Error under one color a view from which photographs tell places apart."""
 
 
 def held_out_errors(views: Views, config: FitConfig, geometry: Geometry) -> Float[np.ndarray, "V"] | None:
@@ -36,6 +45,24 @@ def unexplained(solved: Views, tested: Views, geometry: Geometry, rays: int, res
     with torch.no_grad():
         environment = solve_environment(list(observe_views(solved, geometry, rays)), resolution)
         return np.array([prediction_error([batch], environment) for batch in observe_views(tested, geometry, rays)])
+
+
+def is_matte(views: Views, geometry: Geometry, config: FitConfig) -> bool:
+    """Whether one color a place on a surface explains most of what neither one color a view nor a mirror does.
+
+    A place on a mirror shows other surroundings to each camera, also where the surface is a visual hull; a place on a
+    matte object shows one color.
+    """
+    usable = usable_views(views, geometry)
+    with torch.no_grad():
+        parts = surfaces_of(usable, geometry, MATTE_VIEWS)
+        if not all(parts):
+            return False
+        plain = WithoutMirror.of(usable, *parts, Contrast.of(usable, config.contrast), config.selection.compared_rays)
+    if plain.one_color < LEAST_COLORS or plain.matte > MATTE_SHARE * plain.one_color:
+        return False
+    errors = held_out_errors(usable, config, geometry)
+    return errors is not None and plain.matte < MATTE_SHARE * float(errors.mean())
 
 
 def is_clearly_lower(errors: Float[np.ndarray, "V"], of: Float[np.ndarray, "V"], options: SelectionOptions) -> bool:

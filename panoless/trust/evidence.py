@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from panoless.capture.contrast import Contrast
@@ -28,15 +28,12 @@ from panoless.environment.resolution import densest_resolution
 from panoless.environment.sharpening import HARD, MIDDLE, SMOOTHNESS, TRIAL_STEPS, deblur_map
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, overlap, pixel_areas, usable_views
+from panoless.geometry.places import SCALE, Cells, Mean, WithoutMirror, surfaces_of
 from panoless.geometry.registry import FAMILIES
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.robust import NORMAL_MEDIAN, bounded_error, robust_scale, robust_weight
 from shinypartial.dataset.schema import BallEvidence
 
-SCALE = 0.1
-"""Scale s of errors ‖e‖²/(‖e‖² + s²) of linear radiance."""
-CELLS = 48
-"""Along a side of the grid on which a matte surface has its colors."""
 LEAST_NOISE = 1e-3
 """Standard deviation of noise that no sensor goes below."""
 PART_CELLS = 24
@@ -150,12 +147,11 @@ def gather_evidence(
     seen = tuple(views.train[index] for index in used)
     views, usable = replace(views, train=seen), replace(views, train=tuple(found[index] for index in used))
     solid, kept = (max(each.num_solid, 1) for each in (views, usable))
-    looked_at = [_evenly(part, config.trust.views) for part in split_held_out(usable.train)]
-    surfaces = [[(view, geometry.buffers(view.camera)) for view in part] for part in looked_at]
+    surfaces = surfaces_of(usable, geometry, config.trust.views)
     light = _light(usable, surfaces, geometry, visibility, config, by_confidence=ball is not None)
     silhouettes = [_silhouette(*each) for part in surfaces for each in part]
     distance, shift, overlap, missed, surplus = np.array(silhouettes).reshape(-1, 5).T
-    focal = np.array([view.camera.fx for part in looked_at for view in part])
+    focal = np.array([view.camera.fx for part in surfaces for view, _ in part])
     return Evidence(
         **light,
         silhouette_px=_median(distance),
@@ -192,11 +188,6 @@ def _rim_px(
     family = FAMILIES.get(geometry.kind)
     by_outlines = family is not None and family.told_by_outlines
     return silhouette_px if by_outlines and light["unexplained"] is None else None
-
-
-def _evenly(views: Sequence[TrainView], count: int) -> list[TrainView]:
-    """About `count` of the views."""
-    return list(views[:: -(-len(views) // count) or 1])
 
 
 def _median(values: Float[np.ndarray, "V"]) -> float:
@@ -237,11 +228,10 @@ def _light(
     solved = replace(views, train=tuple(split_held_out(views.train)[0]))
     tested = replace(views, train=tuple(view for view, _ in held_out))
     environment = _predicting_map(_seen_areas(solved, geometry, config), config)
-    contrast, device = Contrast.of(views, config.contrast), views.train[0].mask.device
-    places, parts = _Cells.empty(CELLS, 3, device), _Cells.empty(PART_CELLS, 1, device)
-    for view, surface in kept:
-        places.add(view, surface, view.solid, contrast.shown(view.radiance_at(view.solid)))
-    errors, confidence, explained, plain = [], [], _Mean(), {"one_color": _Mean(), "matte": _Mean()}
+    contrast = Contrast.of(views, config.contrast)
+    parts = Cells.empty(PART_CELLS, 1, views.train[0].mask.device)
+    plain = WithoutMirror.of(views, kept, held_out, contrast, config.trust.rays)
+    errors, confidence, explained = [], [], Mean()
     saturation = encoding_of(config).saturation.to(environment)
     for areas in _seen_areas(tested, geometry, config):
         rays, seen = areas.rays(), areas.seen(environment).minimum(saturation)
@@ -256,18 +246,15 @@ def _light(
         shaded = geometry.shade(environment, view.camera, pixels, normals).minimum(saturation)
         shown = contrast.shown(shaded) - radiance
         parts.add(view, surface, pixels, bounded_error(shown, SCALE)[:, None])
-        guesses = {"one_color": radiance.mean(0), "matte": places.means(view, surface, pixels)}
-        for name, guess in guesses.items():
-            plain[name].add(bounded_error(guess - radiance, SCALE), torch.ones_like(radiance[:, 0]))
     if explained.weight <= 0:
         return nothing
     every, sure = torch.cat(errors), torch.cat(confidence)
     noise = float(np.median([_noise(view) for view in contrast.applied(views).train]))
     return {
         "unexplained": explained.value,
-        "one_color": plain["one_color"].value,
-        "matte": plain["matte"].value,
-        "unexplained_part": parts.share_above(PART_UNEXPLAINED * plain["matte"].value),
+        "one_color": plain.one_color,
+        "matte": plain.matte,
+        "unexplained_part": parts.share_above(PART_UNEXPLAINED * plain.matte),
         "noise": noise if contrast.knee is not None else noise / encoding_of(config).exposure,
         "error_in_noise": float(every.abs().median()) / max(noise, LEAST_NOISE),
         "rank_correlation": _rank_correlation(sure, every.square().sum(1)),
@@ -290,65 +277,6 @@ def _predicting_map(areas: Sequence[PixelFootprints], config: FitConfig) -> Floa
     environment = solve_environment(rays, min(config.trust.resolution, densest_resolution(rays)))
     saturation, lamps = encoding_of(config).saturation, replace(HARD, saturated_weight=1.0)
     return deblur_map(Footprints(list(areas)), environment, saturation, SMOOTHNESS[MIDDLE], lamps, steps=TRIAL_STEPS)
-
-
-@dataclass
-class _Mean:
-    """A weighted mean of what was added."""
-
-    summed: float = 0.0
-    weight: float = 0.0
-
-    def add(self, values: Float[Tensor, "P"], weights: Float[Tensor, "P"]) -> None:
-        """Count values in."""
-        self.summed += float((values * weights).sum())
-        self.weight += float(weights.sum())
-
-    @property
-    def value(self) -> float:
-        """Zero where nothing was added."""
-        return self.summed / max(self.weight, 1e-9)
-
-
-@dataclass
-class _Cells:
-    """Summed values of pixels, and their number, by the cells of a grid through which the surface passes."""
-
-    side: int
-    summed: Float[Tensor, "N C"]
-    count: Float[Tensor, "N"]
-
-    @classmethod
-    def empty(cls, side: int, values: int, device: torch.device) -> "_Cells":
-        """Before any pixel."""
-        return cls(side, torch.zeros(side**3, values, device=device), torch.zeros(side**3, device=device))
-
-    def add(
-        self, view: TrainView, surface: SurfaceBuffers, pixels: Int[Tensor, "P"], values: Float[Tensor, "P C"]
-    ) -> None:
-        """Count pixels of a view in."""
-        index = self._index(view, surface, pixels)
-        self.summed.index_add_(0, index, values)
-        self.count.index_add_(0, index, torch.ones_like(values[:, 0]))
-
-    def means(self, view: TrainView, surface: SurfaceBuffers, pixels: Int[Tensor, "P"]) -> Float[Tensor, "P C"]:
-        """Of the cells that pixels see; that of all cells where nothing was added."""
-        index, overall = self._index(view, surface, pixels), self.summed.sum(0) / self.count.sum().clamp(min=1)
-        count = self.count[index][:, None]
-        return torch.where(count > 0, self.summed[index] / count.clamp(min=1), overall)
-
-    def share_above(self, limit: float) -> float:
-        """The share of the pixels that lie in cells whose mean is above a limit."""
-        above = self.summed[:, 0] > limit * self.count
-        return float(self.count[above].sum() / self.count.sum().clamp(min=1))
-
-    def _index(self, view: TrainView, surface: SurfaceBuffers, pixels: Int[Tensor, "P"]) -> Int[Tensor, "P"]:
-        """Cells of the cube of side 2 in which pixels see the surface; the nearest for what lies beyond."""
-        rays = view.rays_camera.flatten(1)[:, pixels]
-        points_camera = rays / rays[2] * surface.depth.flatten()[pixels]
-        points = view.camera_to_world_rotation @ (points_camera - view.camera.world_to_camera[:3, 3:])
-        grid = ((points + 1) / 2 * self.side).long().clamp(0, self.side - 1)
-        return (grid[0] * self.side + grid[1]) * self.side + grid[2]
 
 
 class _Silhouette(NamedTuple):
