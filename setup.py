@@ -10,7 +10,7 @@ from setuptools.command.build_py import build_py
 #: Folders of the checkout, and where a wheel has them.
 FOLDERS = {"blender_scenes": "shinypartial/data/blender_scenes", "blender_extension": "panoless/blender_extension"}
 PICTURE = re.compile(r"^!\[[^\]]*\]\((?!https?:)[^)]*\)\n+(\*.*?\n\n)?", re.MULTILINE | re.DOTALL)
-SITE = re.compile(r"^## Documentation\n.*?(?=^The method starts)", re.MULTILINE | re.DOTALL)
+SITE = re.compile(r"^## Documentation\n.*?(?=^## )", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[([^\]]+)\]\((?!https?:)[^)]*\)")
 
 

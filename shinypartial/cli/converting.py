@@ -98,7 +98,7 @@ class Import:
     """Make a prediction folder of what another method's code wrote, to be evaluated like any other."""
 
     layout: tyro.conf.Positional[LayoutName]
-    """Whose code wrote it. docs/how-to/compare-methods.md says from which files of which commit a layout was taken."""
+    """Whose code wrote it; docs/how-to/compare-methods.md lists the commits that define the layouts."""
     folder: tyro.conf.Positional[Path]
     """The method's output folder (its --model_path)."""
     dataset: Path = field(kw_only=True)

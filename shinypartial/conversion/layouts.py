@@ -1,6 +1,6 @@
 """Where other methods' code leaves its results and how it encodes them, as data: one entry a method.
 
-Every entry says which file of which commit told it; docs/how-to/compare-methods.md says it to readers.
+Every entry names the file and the commit that define it; docs/how-to/compare-methods.md lists the commits.
 """
 
 from dataclasses import dataclass, replace
