@@ -2,7 +2,7 @@
 
 from panoless.config import EnvironmentConfig, FitConfig
 from panoless.first_surface.options import FirstSurfaceOptions
-from panoless.geometry.free_form.options import FreeFormOptions, FreeFormRound
+from panoless.geometry.free_form.options import FreeFormOptions
 from panoless.splats.options import SplatConfig, SurfelConfig
 from panoless.splats.presets import METHODS
 
@@ -14,14 +14,7 @@ PRESETS: dict[str, FitConfig] = {
         splats=SplatConfig(iterations=300, surfels=SurfelConfig(count=3000)),
         first_surface=FirstSurfaceOptions(hull_resolution=64),
         environment=EnvironmentConfig(resolution=64, rays=2_000_000),
-        free_form=FreeFormOptions(
-            rounds=(
-                FreeFormRound(20, 16, 0.30, 1, 20_000, 100.0, 5, outline_gain=9.0),
-                FreeFormRound(28, 64, 0.80, 4, 40_000, 30.0, 8, outline_gain=9.0),
-                FreeFormRound(28, 64, 0.15, 4, 40_000, 30.0, 4, solver_steps=20),
-            ),
-            finer=(),
-        ),
+        free_form=FreeFormOptions(finest_cells=28),
     ),
     "default": FitConfig(),
     "best": FitConfig(

@@ -25,7 +25,7 @@ from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays
 from panoless.export.prediction import cube_to_latlong
 from panoless.geometry.exact import ExactGeometry
-from panoless.geometry.free_form.options import DEFAULTS
+from panoless.geometry.free_form.kind import WIDEST_FOOTPRINT_RAD
 from panoless.kernels.constants import SUB_PIXELS
 from panoless.reconstruct.state import read_description
 from shinypartial.core.camera import ray_directions_world, reflect
@@ -58,7 +58,7 @@ class TrueMirror(ExactGeometry):
         found = []
         for view, pixels in at_most_pixels(views, max_pixels):
             directions, steps, clear = (each[pixels.numpy()] for each in self.known[id(view.mask)])
-            kept = clear & (np.linalg.norm(steps, axis=2).max(1) < DEFAULTS.widest_footprint_rad)
+            kept = clear & (np.linalg.norm(steps, axis=2).max(1) < WIDEST_FOOTPRINT_RAD)
             right, down = np.array(SUB_PIXELS[4]).T[..., None]
             over = directions[kept, None] + right * steps[kept, None, 0] + down * steps[kept, None, 1]
             chosen = pixels[torch.from_numpy(kept)]

@@ -1,7 +1,7 @@
 """Fit shapes that are no scenes of the benchmark, whose first surfaces are far off, and write their figures.
 
     python docs/examples/other_shapes.py                      # every shape: about an hour on one core
-    python docs/examples/other_shapes.py --shapes brick torus --set free_form.descent.rounds='[]'
+    python docs/examples/other_shapes.py --shapes brick torus --set free_form.starts=false
     python docs/examples/other_shapes.py --shapes torus --worse rotation=0.5 room=10
 
 Each shape is rendered, fitted with the preset `fast` and scored by commands in processes of their own. With --worse,

@@ -51,11 +51,7 @@ REVOLUTION = shlex.split("""
     --set revolution.photometric.pixels=10000 revolution.mouth.judged_pixels=5000
     revolution.lip.length_px=5 revolution.map.pixels=100000 revolution.footprints.pixels=5000
 """)
-FREE_FORM = shlex.split("""
-    --set free_form.concave.search=false free_form.descent.rounds=[] free_form.start_tensions=[10]
-    free_form.footprints=20000 free_form.render_samples=1 free_form.render_directions=1 free_form.rounds='[{
-    "cells": 16, "resolution": 8, "robust_scale": 0.3, "samples": 1, "rays": 3000, "smoothing": 100, "steps": 2}]'
-""")
+FREE_FORM = shlex.split("--set free_form.hollows=false free_form.starts=false free_form.finest_cells=20")
 
 
 @dataclass(frozen=True)

@@ -118,16 +118,7 @@ def test_kinds_that_were_examined_before_a_kill_are_not_fitted_again(
 
 
 SHORT = {
-    "free_form": (
-        "free_form.concave.search=false",
-        "free_form.descent.rounds=[]",
-        "free_form.detailing=[]",
-        "free_form.finer=[]",
-        "free_form.mending=[]",
-        "free_form.start_tensions=[10]",
-        'free_form.rounds=[{"cells": 16, "resolution": 8, "robust_scale": 0.3, "samples": 1, "rays": 3000, '
-        '"smoothing": 100, "steps": 2}]',
-    ),
+    "free_form": ("free_form.hollows=false", "free_form.starts=false", "free_form.finest_cells=20"),
     "revolution": (
         "revolution.photometric.pixels=10000",
         "revolution.mouth.judged_pixels=5000",

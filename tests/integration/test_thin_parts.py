@@ -8,25 +8,15 @@ import pytest
 
 import panoless
 from panoless.config import FitConfig
+from panoless.geometry.free_form.options import FreeFormOptions
 from shinypartial.core.errors import InputError
 from tests.support.mirror_body import rods_and_speck, write_plain_dataset
 from tests.support.mirror_sphere import tiny_config
 
 SURFELS: FitConfig = tiny_config("fast", iterations=2, count=60)
-SHORT = (replace(SURFELS.free_form.rounds[0], rays=2000, steps=1),)
 CONFIG = replace(
     SURFELS,
-    free_form=replace(
-        SURFELS.free_form,
-        start_cells=24,
-        outline_points=2000,
-        rounds=SHORT,
-        finer=(),
-        mending=(),
-        detailing=(),
-        descent=replace(SURFELS.free_form.descent, rounds=()),
-        concave=replace(SURFELS.free_form.concave, rounds=SHORT),
-    ),
+    free_form=FreeFormOptions(starts=False, finest_cells=20),
     poses=replace(SURFELS.poses, mode="off"),
     corrections=replace(SURFELS.corrections, masks="off", exposure="off", lens="off"),
 )

@@ -1,17 +1,27 @@
-"""What a level set is asked for, linearized: rows of derivatives with their residuals and weights."""
+"""The terms of a level set's cost, linearized: rows of derivatives with their residuals and weights."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from panoless.geometry.free_form.motions import outline_motion_rows
-from panoless.geometry.free_form.options import FreeFormOptions
 from panoless.geometry.free_form.surface import LEAST_SLOPE, LevelSet
 from panoless.kernels.level_set import add_rows, add_squares, apply_rows, evaluate
 from panoless.numeric.robust import bounded_error, robust_weight
 from panoless.problem.nuisance import Nuisance
 from panoless.problem.rays import PixelRays
+
+OUTLINE_SCALE_PX = 2.0
+"""Robust scale of outlines."""
+MISS_WEIGHT = 3.0
+"""Weight of a pixel on the object that misses the surface, against an outline's point of gain one."""
+MISS_SCALE_PX = 20.0
+"""Its robust scale."""
+GAUGE = 10.0
+"""Weight of (‖∇φ‖ − 1)² at a node near the surface…"""
+GAUGE_CELLS = 2.0
+"""…that is within so many cells of it."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +63,6 @@ def silhouette_rows(
     outline_weight: float,
     miss_weight: float,
     nuisance: Nuisance,
-    options: FreeFormOptions,
 ) -> tuple[Rows, Float[np.ndarray, "S 1 6"]]:
     """Outlines, along whose rays the least φ should be δ, and pixels on the object that miss it, for which it should be
     no more; and how both change with (ω, τ) of their rays.
@@ -63,8 +72,8 @@ def silhouette_rows(
     """
     parts = []
     for rays, weight, scale, one_sided in (
-        (outlines, outline_weight, options.outline_scale_px, False),
-        (missed, miss_weight * options.miss_weight, options.miss_scale_px, True),
+        (outlines, outline_weight, OUTLINE_SCALE_PX, False),
+        (missed, miss_weight * MISS_WEIGHT, MISS_SCALE_PX, True),
     ):
         near = surface.nearest(rays.origins, rays.directions)
         slope = np.maximum(np.linalg.norm(near.derivatives[:, 1:4], axis=1), LEAST_SLOPE)
@@ -84,9 +93,9 @@ def silhouette_rows(
     return Rows(places, rows, residual[:, None], weights, sum(part[5] for part in parts) / 2), by_motion
 
 
-def gauge_rows(surface: LevelSet, near: Bool[np.ndarray, "A B C"], weight: float) -> Rows:
-    """‖∇φ‖ − 1 at nodes near the surface: φ is a distance there, to first order."""
-    inside = near.copy()
+def gauge_rows(surface: LevelSet, values: Float[np.ndarray, "A B C"]) -> Rows:
+    """‖∇φ‖ − 1 at nodes near the surface, where φ is a distance to first order, by its values at all nodes."""
+    inside = np.abs(values) < GAUGE_CELLS
     for axis in range(3):
         np.moveaxis(inside, axis, 0)[[0, -1]] = False
     places = surface.nodes()[inside]
@@ -95,4 +104,4 @@ def gauge_rows(surface: LevelSet, near: Bool[np.ndarray, "A B C"], weight: float
     rows = np.zeros((len(places), 1, 4))
     rows[:, 0, 1:] = gradient / np.maximum(length, 1e-9)[:, None]
     residual = length[:, None] - 1
-    return Rows(places, rows, residual, np.full(len(places), weight), weight * float((residual**2).sum()) / 2)
+    return Rows(places, rows, residual, np.full(len(places), GAUGE), GAUGE * float((residual**2).sum()) / 2)

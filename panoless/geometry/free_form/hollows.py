@@ -6,7 +6,6 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from panoless.geometry.free_form.options import ConcaveOptions
 from panoless.geometry.free_form.surface import NODE, LevelSet
 from panoless.numeric.factorize import regularize
 from shinypartial.core.sphere import tangents
@@ -16,7 +15,13 @@ KNOTS = np.linspace(0, np.pi / 2, 5)
 HALF_SIDE, SIDE = 1.8, 73
 """Half the side of a chart in its radii, and points along the side."""
 FAR_CELLS = 8.0
-"""Most distance from a hollow's wall that is told."""
+"""Most distance from a hollow's wall that counts."""
+ROUNDING_CELLS = 0.7
+"""Width over which hollow and surface melt together at the rim."""
+RIM_SHARE = 0.08
+"""The lid is fitted to the surface within so much of the rim, in ways to it."""
+LID_STIFFNESS = 0.02
+"""Weight of a lid's squared curvatures, in heights."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +52,7 @@ class Hollow:
     """A hollow under a lid, given in radii of a chart.
 
     Its rim lies at log r(θ) = size + a₂ cos 2θ + b₂ sin 2θ + a₃ cos 3θ + b₃ sin 3θ about its middle. With ρ the share
-    of the way to the rim, δ what lies below the lid in depths, and ψ = atan2(ρ, δ), it holds the points whose
+    of the way to the rim, δ what lies below the lid in depths, and ψ = atan2(ρ, δ), it contains the points whose
     g = √(ρ² + δ²)/s(ψ) < 1. The reach s is a monotone cubic through its values at the knots, so walls may be steep; an
     ellipsoid has s = 1. The middle shifts by the lean down to the depth.
     """
@@ -108,7 +113,6 @@ class Relief:
 
     surface: LevelSet
     chart: Chart
-    options: ConcaveOptions
 
     @cached_property
     def grid(self) -> tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N N"]]:
@@ -152,22 +156,20 @@ class Relief:
     def lid(self, hollow: Hollow) -> Float[np.ndarray, "6"]:
         """Coefficients of 1, u, v, u², uv and v² of the height that passes through the surface along a rim."""
         u, v = self.grid
-        at_rim = (np.abs(hollow.share(u, v) - 1) < self.options.rim_share) & np.isfinite(self.heights)
+        at_rim = (np.abs(hollow.share(u, v) - 1) < RIM_SHARE) & np.isfinite(self.heights)
         rows, heights = _quadric(u[at_rim], v[at_rim]), self.heights[at_rim]
-        stiff = np.diag([1e-6, 1e-6, 1e-6, 1.0, 1.0, 1.0]) * self.options.lid_stiffness * max(len(rows), 1)
+        stiff = np.diag([1e-6, 1e-6, 1e-6, 1.0, 1.0, 1.0]) * LID_STIFFNESS * max(len(rows), 1)
         found: np.ndarray = np.linalg.solve(regularize(rows.T @ rows + stiff, "a lid"), rows.T @ heights)
         return found
 
-    def carved(self, hollow: Hollow) -> LevelSet:
+    def carved(self, hollow: Hollow, rounding_cells: float = ROUNDING_CELLS) -> LevelSet:
         """The surface without the hollow and what lies above its lid: max(φ, (1 − g)/‖∇g‖)."""
         u, v, w = np.moveaxis(self.places, -1, 0)
         level = hollow.level(u, v, _quadric(u, v) @ self.lid(hollow) - w)
         slope = np.sqrt(sum(each**2 for each in np.gradient(level)))
         values = self.values.copy()
         hollowed = (1 - level) / np.maximum(slope, 1e-3)
-        values[self.box] = smooth_maximum(
-            values[self.box], np.minimum(hollowed, FAR_CELLS), self.options.rounding_cells
-        )
+        values[self.box] = smooth_maximum(values[self.box], np.minimum(hollowed, FAR_CELLS), rounding_cells)
         return self.surface.interpolating(values)
 
 

@@ -30,10 +30,10 @@ from panoless.geometry.base import (
     to_plain,
 )
 from panoless.geometry.exact import ExactFamily, ExactGeometry
-from panoless.geometry.free_form.fit import FitStage, fit_free_form, follow_views, variances
-from panoless.geometry.free_form.options import DEFAULTS, FreeFormOptions
-from panoless.geometry.free_form.photometric import Sights
+from panoless.geometry.free_form.fit import FitStage, continued_fit, fit_free_form, variances
+from panoless.geometry.free_form.photometric import BAND_CELLS, Sights
 from panoless.geometry.free_form.rendering import free_form_buffers, free_form_light
+from panoless.geometry.free_form.schedule import Schedule
 from panoless.geometry.free_form.start import first_surfaces, started
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import Trust, full_trust
@@ -43,7 +43,19 @@ from panoless.problem.evidence import Decision, decided
 from panoless.problem.nuisance import Block, Walls, nuisance_of
 from panoless.problem.observations import inner_distance_px
 from panoless.problem.rays import PixelRays
-from shinypartial.io.records import read_record, write_record
+
+LEAST_VIEWS = 5
+"""With fewer views none is held out, and model selection leaves the kind out."""
+LEAST_MAP_COSINE = 0.03
+"""Between the ray and the surface's normal, for a pixel to count for the final map."""
+MAP_INNER_PX = 1.0
+"""Its pixels lie farther inside their mask."""
+FOOTPRINTS = 2_000_000
+"""Most pixels whose areas sharpen it, for memory."""
+WIDEST_FOOTPRINT_RAD = 0.15
+"""Pixels that mirror more in one direction take no part in that…"""
+LEAST_FOOTPRINT_TRUST = 0.3
+"""…nor do pixels that are trusted less."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +89,6 @@ class FreeFormMirror(ExactGeometry):
     trust: Trust
     occlusion_test: bool = True
     """Whether pixels that see the object again are left out."""
-    options: FreeFormOptions = DEFAULTS
 
     @property
     def surroundings(self) -> Surroundings:
@@ -91,7 +102,7 @@ class FreeFormMirror(ExactGeometry):
     @property
     def num_parameters(self) -> int:
         """The coefficients whose support meets the surface."""
-        return int((np.abs(self.surface.at_nodes()) < self.options.band_cells).sum())
+        return int((np.abs(self.surface.at_nodes()) < BAND_CELLS).sum())
 
     def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
         """Solid pixels that see the surroundings by way of the surface, but for the outermost ones."""
@@ -112,7 +123,7 @@ class FreeFormMirror(ExactGeometry):
 
     def _seeing(self, view: TrainView, pixels: Int[Tensor, "P"], clear: Bool[np.ndarray, "P"]) -> Bool[np.ndarray, "P"]:
         """Which of the pixels that are `clear` lie well inside the mask."""
-        return clear & (inner_distance_px(view.mask)[pixels.cpu().numpy()] > self.options.map_inner_px)
+        return clear & (inner_distance_px(view.mask)[pixels.cpu().numpy()] > MAP_INNER_PX)
 
     def _sights(self, view: TrainView, pixels: Int[Tensor, "P"], samples: int) -> Sights:
         """What pixels of a view see."""
@@ -122,17 +133,13 @@ class FreeFormMirror(ExactGeometry):
         return Sights.along(self.surface, rays, samples, hits, traces.clear[index])
 
     def _traced(self, view: TrainView, pixels: Int[Tensor, "P"]) -> "tuple[PixelRays, _Traces]":
-        """Rays of pixels of a view, and its traces. Each is traced once, because selection, map and verdict ask for the
-        same.
-        """
+        """Rays of pixels of a view, and its traces, once for selection, map and verdict."""
         index, known = pixels.cpu().numpy(), self._traces.get(view.mask)
         if known is None or not known.are_of(view.camera):
             self._traces[view.mask] = known = _Traces.none(view.camera)
         rays, new = PixelRays.centers(view.camera, index), np.isnan(known.distance[index])
         if new.any():
-            found = Sights.of(
-                self.surface, rays.chosen(new), 1, self.options.least_map_cosine, occlusion_test=self.occlusion_test
-            )
+            found = Sights.of(self.surface, rays.chosen(new), 1, LEAST_MAP_COSINE, occlusion_test=self.occlusion_test)
             known.distance[index[new]], known.clear[index[new]] = found.hits.distance, found.clear
         return rays, known
 
@@ -142,15 +149,15 @@ class FreeFormMirror(ExactGeometry):
         return WeakIdKeyDictionary()
 
     def footprints(self, views: Views, max_pixels: int) -> Footprints | None:
-        """Four directions over each of at most `footprints` pixels that are trusted and turn little."""
-        chosen = at_most_pixels(views, min(max_pixels, self.options.footprints))
+        """Four directions over each of at most `FOOTPRINTS` pixels that are trusted and turn little."""
+        chosen = at_most_pixels(views, min(max_pixels, FOOTPRINTS))
         return Footprints.of(self._footprints(*each) for each in chosen)
 
     def _footprints(self, view: TrainView, pixels: Int[Tensor, "P"]) -> PixelFootprints:
         """Those of the pixels of one view."""
         sights = self._sights(view, pixels, 4)
-        trusted = self.trust.at(self.surface.points(sights.hits.places)) > self.options.least_footprint_trust
-        kept = sights.clear & trusted & (sights.turn < self.options.widest_footprint_rad)
+        trusted = self.trust.at(self.surface.points(sights.hits.places)) > LEAST_FOOTPRINT_TRUST
+        kept = sights.clear & trusted & (sights.turn < WIDEST_FOOTPRINT_RAD)
         directions = torch.from_numpy(sights.outgoing[kept]).float().to(view.radiance.device)
         return PixelFootprints(directions, view.radiance_at(pixels[torch.from_numpy(kept).to(pixels.device)]))
 
@@ -162,11 +169,11 @@ class FreeFormMirror(ExactGeometry):
         normals_camera: Float[Tensor, "3 P"],
     ) -> Float[Tensor, "P 3"]:
         """Means over the pixels' areas; where the object sees itself, along the ray that leaves in the end."""
-        return free_form_light(self.surface, environment, camera, pixels, normals_camera, self.options)
+        return free_form_light(self.surface, environment, camera, pixels, normals_camera)
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
         """By intersection; alpha by a grid of rays at outlines."""
-        return free_form_buffers(self.surface, camera, self.options)
+        return free_form_buffers(self.surface, camera)
 
     def mesh(self, frame: ObjectFrame) -> Mesh:
         """Marching cubes, with the exact normals of the vertices and the trust there, `confidence` in [0, 1]."""
@@ -176,19 +183,14 @@ class FreeFormMirror(ExactGeometry):
 
     def state_dict(self) -> dict[str, Any]:
         """All numbers as lists and plain values."""
-        options = write_record(self.options)
         surface, trust, poses = to_plain(self.surface), to_plain(self.trust), to_plain(self.poses)
-        known = {"occlusion_test": self.occlusion_test, "options": options}
-        return {"surface": surface, "trust": trust, "poses": poses, **known}
+        return {"surface": surface, "trust": trust, "poses": poses, "occlusion_test": self.occlusion_test}
 
     @classmethod
     def from_state_dict(cls, content: dict[str, Any]) -> "FreeFormMirror":
         """The geometry that `state_dict` was taken from."""
-        options = read_record(
-            FreeFormOptions, content["options"], "the options of a free-form surface", allow_unknown=True
-        )
         surface, trust = from_plain(LevelSet, content["surface"]), from_plain(Trust, content["trust"])
-        return cls(surface, trust, content["occlusion_test"], options, poses=poses_from_plain(content))
+        return cls(surface, trust, content["occlusion_test"], poses=poses_from_plain(content))
 
 
 class FreeFormFamily(ExactFamily):
@@ -203,21 +205,20 @@ class FreeFormFamily(ExactFamily):
 
         None where there are too few views to judge it by.
         """
-        if len(views.train) < config.free_form.least_views and not asked:
+        if len(views.train) < LEAST_VIEWS and not asked:
             return None
         return Proposal(first_surfaces(views, config), 0.0, 1.0)
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The first surface, trusted everywhere."""
         surface = proposal.shape.surface
-        trust = full_trust(surface, config.free_form.trust_cells)
-        return _mirror(surface, trust, None, config)
+        return _mirror(surface, full_trust(surface), None, config)
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """On from an earlier fit to almost the same views."""
         before = proposal.fitted
         assert before is not None, "a fit begins with its nuisance blocks"
-        found = follow_views(views, _stage(before), config.free_form)
+        found = continued_fit(views, FitStage(before.surface, before.trust), Schedule.of(config.free_form))
         return _mirror(found.surface, found.trust, None, config)
 
     def solve(
@@ -234,14 +235,14 @@ class FreeFormFamily(ExactFamily):
         A start that has descended may have bent a lid until pixels agree a little: then hollows are looked for under
         the plain surface.
         """
-        options, first = config.free_form, proposal.shape
+        schedule, first = Schedule.of(config.free_form), proposal.shape
         start, nuisance = started(
-            views, first, options, nuisance_of(views, [each for each in kinds if each is not Walls])
+            views, first, schedule, nuisance_of(views, [each for each in kinds if each is not Walls])
         )
         lids = () if np.array_equal(start.coefficients, first.plain.coefficients) else (first.surface,)
-        stage, decisions = fit_free_form(views, start, options, lids=lids, nuisance=nuisance, required=required)
+        stage, decisions = fit_free_form(views, start, schedule, lids=lids, nuisance=nuisance, required=required)
         with torch.no_grad():
-            known = variances(views, stage, options)
+            known = variances(views, stage)
         found = Corrected.by(stage.nuisance, known)
         surface, trust = stage.surface.scaled(found.scale), stage.trust.scaled(found.scale)
         gone = [each for each in decisions if not each.kept]
@@ -250,9 +251,4 @@ class FreeFormFamily(ExactFamily):
 
 
 def _mirror(surface: LevelSet, trust: Trust, poses: Poses | None, config: FitConfig) -> FreeFormMirror:
-    return FreeFormMirror(surface, trust, config.environment.trace, config.free_form, poses=poses)
-
-
-def _stage(fitted: FreeFormMirror) -> FitStage:
-    """What a fit ended with."""
-    return FitStage(fitted.surface, fitted.trust, None, fitted.options.damping)
+    return FreeFormMirror(surface, trust, config.environment.trace, poses=poses)

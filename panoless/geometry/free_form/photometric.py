@@ -1,4 +1,4 @@
-"""What pixels see by way of a level set under a map that follows it, and what it costs."""
+"""What pixels see by way of a level set under a map that adapts to it, and the cost."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,15 +9,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from panoless.capture.poses import StatedCameras
 from panoless.capture.views import concatenated
 from panoless.environment.cubemap import resample
 from panoless.environment.footprints import PixelFootprints
 from panoless.geometry.free_form.equations import Rows, gauge_rows, joined_rows, silhouette_rows
 from panoless.geometry.free_form.map import smoothed_map, splatted_map
 from panoless.geometry.free_form.motions import pixel_motion_rows
-from panoless.geometry.free_form.options import FreeFormOptions, FreeFormRound
 from panoless.geometry.free_form.surface import Hits, LevelSet
+from panoless.geometry.free_form.task import OUTLINE_SIGMA_PX, RADIANCE_SIGMA, Task
 from panoless.geometry.free_form.trust import Trust
 from panoless.kernels.level_set import (
     mirror_rows,
@@ -30,9 +29,28 @@ from panoless.kernels.level_set import (
 from panoless.kernels.reference.cubemap import padded_texels
 from panoless.numeric.robust import bounded_error, robust_weight
 from panoless.problem.nuisance import NO_NUISANCE, Block, Nuisance, block_diagonal
-from panoless.problem.observations import Pixels
 from panoless.problem.rays import PixelRays
 from panoless.problem.rows import BlockRows, Linearized, rows_of
+
+INNER_PX = 1.5
+"""Pixels nearer to the outline of their mask are left out: they mix two things."""
+LEAST_COSINE = 0.12
+"""Between the ray and the surface's normal, for a pixel to count for the shape."""
+PHOTON_SHARE = 0.75
+"""Share of a pixel's variance that grows with its light."""
+WIDE_TEXELS = 4.0
+"""A pixel that mirrors so many texels has half the weight."""
+BAND_CELLS = 3.5
+"""Coefficients within so many cells of the surface are unknowns: all whose support meets it."""
+PHOTOGRAPH_CURVATURE = 0.5
+"""Factor of the photographs' part of the Gauss–Newton matrix where the surface alone is unknown: their cost bends less
+where the map follows."""
+LEAST_WALLS_SHARE = 1e-3
+"""Share of the trace of the walls' matrix that is added to its diagonal."""
+AGREED_OUTLINE_PX = 0.1
+"""Photographs and masks agree where the outlines are this near to those of the masks…"""
+AGREED_PULL_PX = 0.01
+"""…and pulled no more than this."""
 
 
 @dataclass(frozen=True)
@@ -74,40 +92,14 @@ class Sights:
         return cls(hits, outgoing.mean(1), looked_up, turn, clear)
 
 
-@dataclass(frozen=True)
-class Task:
-    """What one round of steps is solved for."""
-
-    pixels: Pixels
-    outlines: PixelRays
-    photograph_weight: float
-    """Of a pixel, in units of 1/σ²."""
-    outline_weight: float
-    """Of an outline's point."""
-    settings: FreeFormRound
-    options: FreeFormOptions
-    cameras: StatedCameras
-    """Of all views."""
-    brightness: float
-    """Mean over all pixels and channels (linear radiance)."""
-    anchor: Float[np.ndarray, "A B C"] | None = None
-    """Coefficients the change from which is to be smooth; None: the surface is."""
-    prior_factor: float = 1.0
-    """Of the precision of nuisance blocks, in whose units pixels count more than they are worth."""
-
-    def outlined(self, gain: float) -> "Task":
-        """The same with another factor of the outlines' weight."""
-        settings = replace(self.settings, outline_gain=gain)
-        return replace(self, settings=settings, outline_weight=self.outline_weight * gain / self.settings.outline_gain)
-
-
-def photon_gain(seen: Float[np.ndarray, "P 3"], brightness: float, share: float) -> Float[np.ndarray, "P"]:
+def photon_gain(seen: Float[np.ndarray, "P 3"], brightness: float) -> Float[np.ndarray, "P"]:
     """By how much a residual counts more than at the mean brightness m: 1/√(1 − s + s E/m), with E what is seen.
 
     The share s of the variance grows with the light, as that of photons does and that of what a map gets wrong: so a
-    dark ground under a bright sky has a say, too. E is the prediction, not the pixel, whose own error would weigh it.
+    dark ground under a bright sky counts, too. E is the prediction, not the pixel, whose own error would weigh it.
     """
-    gain: Float[np.ndarray, "P"] = 1 / np.sqrt(1 - share + share * np.maximum(seen.mean(1), 0.0) / brightness)
+    light = np.maximum(seen.mean(1), 0.0)
+    gain: Float[np.ndarray, "P"] = 1 / np.sqrt(1 - PHOTON_SHARE + PHOTON_SHARE * light / brightness)
     return gain
 
 
@@ -142,13 +134,13 @@ class Solution:
         nuisance: Nuisance = NO_NUISANCE,
     ) -> "Solution":
         """With the map solved in so many robust rounds from another one, or from nothing."""
-        options, settings = task.options, task.settings
+        settings = task.settings
         rays = nuisance.moved(task.pixels.rays, task.cameras)
         radiance = nuisance.equalized(task.pixels.radiance, rays.view)
-        sights = Sights.of(surface, rays, settings.samples, options.least_cosine)
-        clear = sights.clear & (task.pixels.inner_px > options.inner_px)
+        sights = Sights.of(surface, rays, settings.samples, LEAST_COSINE)
+        clear = sights.clear & (task.pixels.inner_px > INNER_PX)
         texel = np.pi / 2 / settings.resolution
-        free = clear / (1 + (sights.turn / (options.wide_texels * texel)) ** 2)
+        free = clear / (1 + (sights.turn / (WIDE_TEXELS * texel)) ** 2)
         weights = free * trust.at(surface.points(sights.hits.places))
         areas = PixelFootprints(torch.from_numpy(sights.outgoing).float(), torch.from_numpy(radiance).float())
         if start is None:
@@ -156,19 +148,16 @@ class Solution:
         else:
             environment = start if start.shape[-1] == settings.resolution else resample(start, settings.resolution)
 
-        def gain_of(seen: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
-            return photon_gain(seen, task.brightness, settings.photon_share)
-
         for _ in range(rounds):
             seen = areas.seen(environment)
-            gain = torch.from_numpy(gain_of(seen.double().numpy())).float()
+            gain = torch.from_numpy(photon_gain(seen.double().numpy(), task.brightness)).float()
             agreed = robust_weight((seen - areas.radiance) * gain[:, None], settings.robust_scale)
             votes = torch.from_numpy(weights).float() * gain**2 * agreed
-            environment = smoothed_map(environment, areas, votes, options.map_smoothness, options.map_steps)
+            environment = smoothed_map(environment, areas, votes)
         length = settings.resolution + 2
         padded = padded_texels(environment).reshape(6, length, length, 3).double().numpy()
         light, slopes, texels = seen_with_slopes(padded, sights.outgoing)
-        counted = gain_of(light)
+        counted = photon_gain(light, task.brightness)
         residual, slopes = (light - radiance) * counted[:, None], slopes * counted[:, None, None]
         return cls(task, surface, sights, trust, environment, counted, residual, slopes, texels, free, nuisance)
 
@@ -224,34 +213,32 @@ class Solution:
 
     @cached_property
     def _silhouettes(self) -> tuple[Rows, Float[np.ndarray, "S 1 6"]]:
-        sigmas = self.task.options.radiance_sigma / self.task.options.outline_sigma_px
+        sigmas = RADIANCE_SIGMA / OUTLINE_SIGMA_PX
         return silhouette_rows(
             self.surface,
             *self._silhouette_rays,
             self.task.outline_weight,
             self.task.photograph_weight * sigmas**2,
             self.nuisance,
-            self.task.options,
         )
 
     @property
     def outlines_agree(self) -> bool:
-        """Whether outlines lie within `agreed_outline_px` of their masks' in the median, and within `agreed_pull_px` in
+        """Whether outlines lie within `AGREED_OUTLINE_PX` of their masks' in the median, and within `AGREED_PULL_PX` in
         the median over views of the median with a sign, which wrong masks move.
         """
-        view, options = self.task.outlines.view, self.task.options
+        view = self.task.outlines.view
         met = self.silhouettes.weights[: len(view)] > 0
         if not met.any():
             return False
         view, apart = view[met], self.silhouettes.residual[: len(view), 0][met]
         pulled = np.median([np.median(apart[view == each]) for each in np.unique(view)])
-        return bool(np.median(np.abs(apart)) <= options.agreed_outline_px and abs(pulled) <= options.agreed_pull_px)
+        return bool(np.median(np.abs(apart)) <= AGREED_OUTLINE_PX and abs(pulled) <= AGREED_PULL_PX)
 
     @cached_property
     def gauge(self) -> Rows:
         """‖∇φ‖ = 1 near the surface."""
-        near = np.abs(self._values) < self.task.options.gauge_cells
-        return gauge_rows(self.surface, near, self.task.options.gauge)
+        return gauge_rows(self.surface, self._values)
 
     @cached_property
     def constraints(self) -> Rows:
@@ -261,7 +248,7 @@ class Solution:
     @cached_property
     def active(self) -> Bool[np.ndarray, "A B C"]:
         """Coefficients that are unknowns."""
-        return np.abs(self._values) < self.task.options.band_cells
+        return np.abs(self._values) < BAND_CELLS
 
     @cached_property
     def _values(self) -> Float[np.ndarray, "A B C"]:
@@ -293,8 +280,8 @@ class Solution:
     @property
     def _rough(self) -> Float[np.ndarray, "A B C"]:
         """What is to be smooth."""
-        anchor, coefficients = self.task.anchor, self.surface.coefficients
-        return coefficients if anchor is None else coefficients - anchor
+        reference, coefficients = self.task.reference, self.surface.coefficients
+        return coefficients if reference is None else coefficients - reference
 
     def cost(self, before: "Solution") -> float:
         """Half the sum of all robust squares, pixels weighed as in a solution `before`, and with its gain and unknowns.
@@ -313,7 +300,7 @@ class Solution:
     def _texel_total(self) -> Float[np.ndarray, "T"]:
         count = 6 * self.task.settings.resolution**2
         total = np.bincount(self.texels, self.photographs.weights, count)
-        return np.maximum(total + self.task.options.texel_prior * self.task.photograph_weight, np.finfo(float).tiny)
+        return np.maximum(total + self.task.texel_prior * self.task.photograph_weight, np.finfo(float).tiny)
 
     def beyond_map(self, residual: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
         """(1 − Π) e: what the map does not take over."""
@@ -335,7 +322,7 @@ class Solution:
     @property
     def _curvature(self) -> float:
         """Factor of the photographs' part of the matrix: one where cameras or surroundings are unknown, too."""
-        return 1.0 if self.beside else self.task.options.photograph_curvature
+        return 1.0 if self.beside else PHOTOGRAPH_CURVATURE
 
     def _rows_of(self, block: Block) -> tuple[Float[np.ndarray, "P 3 M"], Float[np.ndarray, "S 1 M"]]:
         """Of photographs and of silhouettes, by the unknowns of a block."""
@@ -377,7 +364,7 @@ class Solution:
         all_alike = [np.zeros(len(each.weights), int) for each in (photographs, silhouettes)]
         of_silhouettes = BlockRows(all_alike[1], outlined, silhouettes.weights)
         matrix = np.einsum("pck,p,pcl->kl", seen, photographs.weights, beyond) + of_silhouettes.blocks(1)[0]
-        least = self.task.options.least_surroundings_share * max(float(np.trace(matrix)), 1e-30)
+        least = LEAST_WALLS_SHARE * max(float(np.trace(matrix)), 1e-30)
         parts = [least * np.eye(around)[None], *(self.task.prior_factor * each.precision for each in blocks)]
         precision, value = block_diagonal(parts), np.concatenate([np.zeros(around), *(b.values[0] for b in blocks)])
         of_photographs = BlockRows(all_alike[0], seen, photographs.weights)
@@ -420,7 +407,7 @@ class Solution:
         if not surface.surroundings.is_far:
             surface = replace(surface, surroundings=surface.surroundings.after_walls(shared[:around]))
         nuisance = self.nuisance.stepped(by_view, shared[around:] if moved else None)
-        return Solution.at(self.task, surface, self.trust, self.environment, self.task.options.map_rounds, nuisance)
+        return Solution.at(self.task, surface, self.trust, self.environment, self.task.map_rounds, nuisance)
 
     def diagonal(self, smoothing_diagonal: float) -> Float[np.ndarray, "A B C"]:
         """The matrix's diagonal, but for what the map takes over; at least a millionth of its largest."""

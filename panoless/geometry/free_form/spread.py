@@ -64,17 +64,17 @@ def disagreement(
 ) -> Float[np.ndarray, "P"]:
     """ρ = ‖e‖²/(‖e‖² + s²) with e a pixel's color less the mean of those from other views in its cell of directions.
 
-    A pixel whose ray never left, or has its cell to itself, is compared with the mean of all. Pixels of the same view
-    are left out because neighbors there agree whatever the shape.
+    A pixel whose ray never left, or is alone in its cell, is compared with the mean of all. Pixels of the same view are
+    left out because neighbors in it agree whatever the shape.
     """
     found = bounded_error(radiance - radiance.mean(0), scale)
     if not left.any():
         return found
     colors, cells = radiance[left], cells_of(directions[left], resolution)
     _, cell = np.unique(cells, return_inverse=True)
-    _, own = np.unique(cell * (int(view.max()) + 1) + view[left], return_inverse=True)
-    count = np.bincount(cell)[cell] - np.bincount(own)[own]
-    others = np.stack([np.bincount(cell, each)[cell] - np.bincount(own, each)[own] for each in colors.T], 1)
+    _, of_view = np.unique(cell * (int(view.max()) + 1) + view[left], return_inverse=True)
+    count = np.bincount(cell)[cell] - np.bincount(of_view)[of_view]
+    others = np.stack([np.bincount(cell, each)[cell] - np.bincount(of_view, each)[of_view] for each in colors.T], 1)
     compared = np.flatnonzero(count > 0)
     error = others[compared] / count[compared, None] - colors[compared]
     found[np.flatnonzero(left)[compared]] = bounded_error(error, scale)

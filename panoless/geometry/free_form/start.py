@@ -16,17 +16,39 @@ from panoless.first_surface.mesh import TriangleMesh
 from panoless.first_surface.visual_hull import carve_hull
 from panoless.geometry.free_form.concave import Scored
 from panoless.geometry.free_form.fit import FitStage, coarse_stage
-from panoless.geometry.free_form.options import FreeFormOptions, FreeFormRound
+from panoless.geometry.free_form.photometric import INNER_PX
+from panoless.geometry.free_form.schedule import Round, Schedule
 from panoless.geometry.free_form.surface import LevelSet, level_set_of
 from panoless.numeric.gauss_newton import keep_if_better
 from panoless.problem.nuisance import NO_NUISANCE, Nuisance
 from panoless.problem.observations import solid_pixels
 from shinypartial.io.progress import Progress
 
+TENSIONS = (0.0, 10.0, 30.0, 100.0)
+"""Tensions τ of the plate between contacts (1/length² in the normalized frame) among which the pixels choose."""
+USUAL_TENSION = 30.0
+"""The one of a single plate."""
+CELLS = 40
+"""Cells along the longest side of the first surface, before its first round."""
+MARGIN = 0.175
+"""Between the start and the sides of its box, in its longest side: the support of a spline on the first grid, and
+some room to move."""
+PIXELS, RESOLUTION = 8000, 12
+"""Pixels of all views by which first surfaces are compared, in so many cells of directions along a face side."""
+JUDGED_PIXELS, JUDGED_RESOLUTION = 40_000, 24
+"""The same for what descended. Finer, as surfaces that end well and badly differ by little then."""
+DESCENTS = 3
+"""First surfaces that go on after the first round of a descent: the best one then may not be the best in the end."""
+LEAST_DISAGREEMENT = 0.15
+"""Of pixels under the plain surface, after the first round of the fit, from which all first surfaces descend; below it
+the plain one does."""
+LEAST_GAIN = 0.02
+"""Share of the disagreement, after the first round of the fit, by which what descended has to lower it."""
+
 
 @dataclass(frozen=True)
 class FirstSurfaces:
-    """What a fit may start from, in one world: the plate whose pixels disagree least, held inside the hull, the hull
+    """What a fit may start from, in one world: the plate whose pixels disagree least, kept inside the hull, the hull
     itself, and the plates, which descend as the hull does.
     """
 
@@ -37,84 +59,87 @@ class FirstSurfaces:
 
     @property
     def surface(self) -> LevelSet:
-        """The plain one there."""
+        """The plain one in these surroundings."""
         return replace(self.plain, surroundings=self.surroundings)
 
 
 def first_surfaces(views: Views, config: FitConfig) -> FirstSurfaces:
     """First surfaces as level sets, under the tensions of the plate that leave least disagreement.
 
-    Outlines don't tell how far an object bulges between their contacts: a stone does, a box does not. Plates are
-    solved once, without what holds them inside the hull, which hardly changes their disagreement.
+    Silhouettes do not show how far an object bulges between their contacts: a stone does, a box does not. Plates are
+    solved once, without the bound of the hull, which hardly changes their disagreement.
     """
-    options, carved = config.free_form, config.first_surface
+    carved, tensions = config.first_surface, TENSIONS if config.free_form.starts else (USUAL_TENSION,)
     known = trusted_hull(carve_hull(views, carved.hull_resolution, carved.hull_votes), views)
 
     def level_set(mesh: TriangleMesh) -> LevelSet:
-        return level_set_of(mesh, options.start_cells, options.margin)
+        return level_set_of(mesh, CELLS, MARGIN)
 
-    disagreement = _disagreement(views, options, options.start_pixels, options.start_resolution)
-    plates = {tension: level_set(completed(known, tension, rounds=1)) for tension in options.start_tensions}
-    best = min(plates, key=lambda tension: disagreement(FitStage.begun(plates[tension], options)))
+    disagreement = _disagreement(views, PIXELS, RESOLUTION)
+    plates = {tension: level_set(completed(known, tension, rounds=1)) for tension in tensions}
+    best = min(plates, key=lambda tension: disagreement(FitStage.begun(plates[tension])))
     plain, hull = level_set(completed(known, best)), level_set(known.surface)
     return FirstSurfaces(plain, hull, tuple(plates.values()))
 
 
 def started(
-    views: Views, first: FirstSurfaces, options: FreeFormOptions, nuisance: Nuisance = NO_NUISANCE
+    views: Views, first: FirstSurfaces, schedule: Schedule, nuisance: Nuisance = NO_NUISANCE
 ) -> tuple[LevelSet, Nuisance]:
     """What a first surface descends to with its nuisance blocks, if pixels agree better under that than under the plain
     surface, both after the first round of the fit.
 
-    Where they agree well enough under the plain surface, it alone descends, held by outlines. Elsewhere each plate and
-    the hull do, held and not; after the first round of that, pixels tell which ways go on to the end.
+    Where they agree well enough under the plain surface, it alone descends, dominated by silhouettes. Elsewhere each
+    plate and the hull do, with and without that; after the first round, those with the least disagreement go on to the
+    end. Without a descent, the plain surface is the start.
     """
-    descent, plain = options.descent, first.surface
-    if not descent.rounds:
+    plain = first.surface
+    if not schedule.descent:
         return plain, nuisance
-    short = replace(options, outline_points=min(descent.outline_points, options.outline_points))
-    ways = {held: [replace(each, held=held) for each in descent.rounds] for held in (True, False)}
-    begin, *onward = (each.steps for each in (*descent.rounds, options.rounds[0]))
-    disagreement = _disagreement(views, options, options.start_pixels, options.start_resolution)
-    judged = _disagreement(views, options, descent.judged_pixels, descent.judged_resolution)
+    ways = {
+        dominated: [replace(each, silhouette_dominated=dominated) for each in schedule.descent]
+        for dominated in (True, False)
+    }
+    begin, *onward = (each.steps for each in (*schedule.descent, schedule.coarse[0]))
+    disagreement = _disagreement(views, PIXELS, RESOLUTION)
+    judged = _disagreement(views, JUDGED_PIXELS, JUDGED_RESOLUTION)
 
-    def taken(stage: FitStage, rounds: Sequence[FreeFormRound], progress: Progress) -> FitStage:
-        return coarse_stage(views, stage.surface, rounds, short, progress, stage.nuisance)
+    def taken(stage: FitStage, rounds: Sequence[Round], progress: Progress | None = None) -> FitStage:
+        return coarse_stage(views, stage.surface, rounds, progress, stage.nuisance)
 
     def settled(stage: FitStage, progress: Progress | None = None) -> FitStage:
-        return coarse_stage(views, stage.surface, options.rounds[:1], options, progress, stage.nuisance)
-
-    def begun(surface: LevelSet) -> FitStage:
-        return FitStage.begun(surface, options, nuisance)
+        return taken(stage, schedule.coarse[:1], progress)
 
     with torch.no_grad():
-        known = settled(begun(plain))
-        if disagreement(known) < descent.least_disagreement:
+        begun = FitStage.begun(plain, nuisance)
+        known = settled(begun)
+        if disagreement(known) < LEAST_DISAGREEMENT:
             progress = Progress("looking for a start", begin + sum(onward))
-            ended = [taken(begun(plain), ways[True], progress)]
+            ended = [taken(begun, ways[True], progress)]
         else:
             starts = [replace(each, surroundings=first.surroundings) for each in (*first.plates, first.hull)]
-            progress = Progress("looking for a start", len(starts) * len(ways) * begin + descent.followed * sum(onward))
+            progress = Progress("looking for a start", len(starts) * len(ways) * begin + DESCENTS * sum(onward))
             tried = [
-                (held, taken(begun(each), rounds[:1], progress)) for each in starts for held, rounds in ways.items()
+                (dominated, taken(FitStage.begun(each, nuisance), rounds[:1], progress))
+                for each in starts
+                for dominated, rounds in ways.items()
             ]
             tried.sort(key=lambda way: disagreement(way[1]))
-            ended = [taken(stage, ways[held][1:], progress) for held, stage in tried[: descent.followed]]
+            ended = [taken(stage, ways[dominated][1:], progress) for dominated, stage in tried[:DESCENTS]]
         best = min(((each, judged(settled(each, progress))) for each in ended), key=lambda each: each[1])
-        found = keep_if_better(((begun(plain), judged(known)), best), lambda each: each[1], descent.least_gain)[0]
+        found = keep_if_better(((begun, judged(known)), best), lambda each: each[1], LEAST_GAIN)[0]
         return found.surface, found.nuisance
 
 
-def _disagreement(views: Views, options: FreeFormOptions, pixels: int, resolution: int) -> Callable[[FitStage], float]:
+def _disagreement(views: Views, pixels: int, resolution: int) -> Callable[[FitStage], float]:
     """How badly about so many pixels of all views agree under a surface, compared in cells of that resolution."""
     chosen, cameras = solid_pixels(views, pixels), StatedCameras.of(views)
-    inner = chosen.inner_px > options.inner_px
+    inner = chosen.inner_px > INNER_PX
     rays, radiance = chosen.rays.chosen(inner), chosen.radiance[inner]
 
     def measured(stage: FitStage) -> float:
         if not inner.any():
             return 1.0
         moved, equal = stage.nuisance.moved(rays, cameras), stage.nuisance.equalized(radiance, rays.view)
-        return Scored(moved, equal, options.concave)(stage.surface, resolution)
+        return Scored(moved, equal)(stage.surface, resolution)
 
     return measured

@@ -7,6 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from panoless.geometry.free_form.photometric import Solution
+from panoless.geometry.free_form.schedule import OUTLINE_GAIN
+from panoless.geometry.free_form.task import RADIANCE_SIGMA
 from panoless.geometry.free_form.trust import Trust
 from panoless.numeric.conjugate_gradients import solve_by_products
 from panoless.numeric.factorize import regularize
@@ -15,8 +17,20 @@ from shinypartial.io.progress import Progress
 
 THIRD_DIFFERENCE_DIAGONAL = 3 * 20 + 6 * 3 * 12 + 6 * 8
 """Of DᵀD: Σ over the kinds of how often one counts in |D³c|² times its squared factors."""
-OUTLINE_GAIN = 9.0
-"""Factor of the weight of silhouettes where the offsets of their masks are free: as if they were right to 0.05 px."""
+DAMPING = 1e-3
+"""First μ of Marquardt's damping μ diag(H)."""
+DAMPING_LESS, DAMPING_MORE = 0.3, 4.0
+"""Factors of μ after a whole step, and for each time that one was shortened."""
+DAMPING_RANGE = (1e-5, 1.0)
+"""Bounds of μ."""
+SHORTENING = 0.35
+"""Factor of a step that raises the cost."""
+TRIALS = 4
+"""Lengths that are tried."""
+SOLVER_TOLERANCE = 1e-5
+"""Conjugate-gradient steps end when the preconditioned residual's energy has fallen to this share."""
+LONGEST_STEP_CELLS = 1.0
+"""No coefficient moves by more in one step."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +50,7 @@ def with_noise(solution: Solution) -> Solution:
     task, clear = solution.task, solution.free > 0
     size = np.linalg.norm(solution.residual[clear], axis=1)
     sigma = float(np.median(size)) / CHI_MEDIAN if len(size) else 0.0
-    factor = max(sigma / task.options.radiance_sigma, 1.0) ** 2
+    factor = max(sigma / RADIANCE_SIGMA, 1.0) ** 2
     weight = task.outline_weight / task.settings.outline_gain * OUTLINE_GAIN * factor
     return replace(solution, task=replace(task, prior_factor=CORRELATED * factor, outline_weight=weight))
 
@@ -44,18 +58,20 @@ def with_noise(solution: Solution) -> Solution:
 def take_steps(
     solution: Solution, damping: float, progress: Progress | None = None, *, still: bool = False
 ) -> tuple[Solution, float]:
-    """The steps of a round, each of which lowers the cost with hits, visibility and map made anew; the last damping."""
-    options, settings = solution.task.options, solution.task.settings
+    """The steps of a round, each of which lowers the cost with hits, visibility and map computed again; the last
+    damping.
+    """
+    settings = solution.task.settings
     for index in range(settings.steps):
         if not still:
             solution = replace(solution, trust=measured_trust(solution))
         before = solution
         solution, shortened = _accepted(solution, gauss_newton_step(solution, damping, still=still))
-        stiffest = damping >= options.damping_range[1]
-        factor = options.damping_more**shortened if shortened else options.damping_less
-        damping = float(np.clip(damping * factor, *options.damping_range))
+        stiffest = damping >= DAMPING_RANGE[1]
+        factor = DAMPING_MORE**shortened if shortened else DAMPING_LESS
+        damping = float(np.clip(damping * factor, *DAMPING_RANGE))
         gain = 1 - solution.cost(before) / before.cost(before)
-        last = gain < options.least_gain and (shortened < options.trials or stiffest)
+        last = gain < settings.least_gain and (shortened < TRIALS or stiffest)
         if progress is not None:
             progress.advance(steps=settings.steps - index if last else 1)
         if last:
@@ -67,21 +83,21 @@ def _accepted(solution: Solution, step: Change) -> tuple[Solution, int]:
     """The solution after the longest of the tried lengths of a step that lowers the cost, and how many times it was
     shortened; the same solution after none, and the number of trials.
     """
-    options, before = solution.task.options, solution.cost(solution)
-    for shortened in range(options.trials):
-        length = options.shortening**shortened
+    before = solution.cost(solution)
+    for shortened in range(TRIALS):
+        length = SHORTENING**shortened
         moved = solution.after(length * step.coefficients, [length * each for each in step.beside])
         if moved.cost(solution) < before:
             return moved, shortened
-    return solution, options.trials
+    return solution, TRIALS
 
 
 def gauss_newton_step(solution: Solution, damping: float, *, still: bool = False) -> Change:
     """−(H + μ diag H)⁻¹ g, nowhere longer than the longest step; in a `still` scene only blocks of views move."""
     gradient, beside = solution.gradient()
     change = solved_equations(solution, (-gradient, [-each for each in beside]), damping, still=still)
-    longest = solution.task.options.largest_step_cells
-    return replace(change, coefficients=np.clip(change.coefficients, -longest, longest))
+    coefficients = np.clip(change.coefficients, -LONGEST_STEP_CELLS, LONGEST_STEP_CELLS)
+    return replace(change, coefficients=coefficients)
 
 
 def solved_equations(
@@ -95,8 +111,8 @@ def solved_equations(
 
     That is preconditioned by its blocks: with H = L Lᵀ of a block its unknowns are y = Lᵀ x.
     """
-    options, shape = solution.task.options, solution.surface.shape
-    diagonal, size = solution.diagonal(THIRD_DIFFERENCE_DIAGONAL), solution.surface.coefficients.size
+    shape, size = solution.surface.shape, solution.surface.coefficients.size
+    diagonal = solution.diagonal(THIRD_DIFFERENCE_DIAGONAL)
     damped = [each.matrix * (1 + damping * np.eye(each.matrix.shape[1])) for each in solution.beside]
     back = [
         np.linalg.inv(np.linalg.cholesky(regularize(blocks, "cameras and exposures"))).transpose(0, 2, 1)
@@ -130,7 +146,7 @@ def solved_equations(
             packed(*right_side),
             np.concatenate([free.ravel(), *moving]),
             solution.task.settings.solver_steps,
-            options.solver_tolerance,
+            SOLVER_TOLERANCE,
         )
     )
 
@@ -138,4 +154,4 @@ def solved_equations(
 def measured_trust(solution: Solution) -> Trust:
     """Trust by the residuals of a solution."""
     points, clear = solution.surface.points(solution.sights.hits.places), solution.free > 0
-    return solution.trust.measured(points, solution.residual, solution.free, clear, solution.task.options)
+    return solution.trust.measured(points, solution.residual, solution.free, clear)

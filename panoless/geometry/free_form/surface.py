@@ -13,7 +13,7 @@ from panoless.kernels.level_set import empty_cells, evaluate, first_hits, neares
 from shinypartial.core.camera import Similarity
 
 NEAREST = 6
-"""Vertices whose tangent planes tell the distance from a mesh."""
+"""Vertices whose tangent planes give the distance from a mesh."""
 LEAF = 64
 """Vertices in a leaf of the tree that is searched; most nodes are far from all, where large leaves are faster."""
 LEAST_SLOPE = 0.3

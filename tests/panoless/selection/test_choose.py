@@ -11,6 +11,7 @@ from panoless.capture.poses import Poses
 from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.geometry.base import Geometry, Proposal, usable_views
+from panoless.geometry.free_form.options import FreeFormOptions
 from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.plane.model import unoccluded_share
 from panoless.geometry.registry import FAMILIES
@@ -40,7 +41,6 @@ SIZE_PX = 56
 def coarse_config() -> FitConfig:
     """As few surfels and steps as tell kinds apart, and maps as coarse as views of these few pixels resolve."""
     config = tiny_config(iterations=200, count=200)
-    coarsest = replace(config.free_form.rounds[0], rays=5000)
     return replace(
         config,
         model="auto",
@@ -50,15 +50,7 @@ def coarse_config() -> FitConfig:
         corrections=CorrectionOptions(masks="off", exposure="off", lens="off"),
         height_field=replace(config.height_field, rounds=3),
         revolution=replace(config.revolution, rounds=1),
-        free_form=replace(
-            config.free_form,
-            rounds=(coarsest, replace(coarsest, resolution=32, robust_scale=0.2, steps=4)),
-            finer=(),
-            detailing=(),
-            concave=replace(config.free_form.concave, search=False),
-            descent=replace(config.free_form.descent, rounds=()),
-            start_tensions=config.free_form.start_tensions[::2],
-        ),
+        free_form=FreeFormOptions(hollows=False, starts=False, finest_cells=20),
     )
 
 

@@ -7,12 +7,12 @@ import pytest
 
 from panoless.capture.views import Views
 from panoless.config import FitConfig
-from panoless.geometry.free_form import fit
+from panoless.geometry.free_form import concave, fit
 from panoless.geometry.free_form.concave import concave_start, unexplained_parts, unexplained_patches
 from panoless.geometry.free_form.fit import fit_free_form
 from panoless.geometry.free_form.hollows import Chart, Hollow, Relief, smooth_maximum
 from panoless.geometry.free_form.kind import FreeFormFamily
-from panoless.geometry.free_form.options import DEFAULTS, ConcaveOptions
+from panoless.geometry.free_form.schedule import COARSE, Schedule
 from panoless.geometry.free_form.spread import FinalRays, cells_of, disagreement
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.problem.observations import solid_pixels
@@ -29,19 +29,27 @@ from tests.support.mirror_body import (
 OUTER, HOLLOW_MIDDLE, HOLLOW_AXES = (0.8, 1.0, 0.9), (0.75, 0.1, -0.05), (0.7, 0.7, 0.55)
 RIM = 0.57
 """Height along x at which the two ellipsoids meet, about: the lid that outlines see."""
-OPTIONS = ConcaveOptions(
-    rays=12_000,
-    pixels=1_000,
-    least_pixels=100,
-    least_part=200,
-    cells=32,
-    resolutions=(6, 8),
-    evaluations=(120, 120),
-    descents=1,
-    insets=(0.93, 0.86, 0.79),
-    depths=(0.6, 0.7, 0.8, 0.9),
-    exponents=(1.7, 2.5),
-)
+QUICK = {
+    "RAYS": 12_000,
+    "PIXELS": 1_000,
+    "LEAST_PIXELS": 100,
+    "LEAST_PART": 200,
+    "CELLS": 32,
+    "RESOLUTIONS": (6, 8),
+    "EVALUATIONS": (120, 120),
+    "DESCENTS": 1,
+    "INSETS": (0.93, 0.86, 0.79),
+    "DEPTHS": (0.6, 0.7, 0.8, 0.9),
+    "EXPONENTS": (1.7, 2.5),
+}
+"""Few candidates, pixels and cells."""
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A short search."""
+    for name, value in QUICK.items():
+        monkeypatch.setattr(concave, name, value)
 
 
 def level_set_of(body: Body, views: Views, cells: int = 36) -> LevelSet:
@@ -74,7 +82,7 @@ def test_pixels_that_see_one_map_agree_and_those_of_a_wrong_surface_do_not() -> 
     assert wrong > 0.95 * nothing
 
 
-def test_pixels_of_one_view_say_nothing() -> None:
+def test_pixels_of_one_view_are_not_compared() -> None:
     """Neighbors in a picture agree under any surface, so each is compared with other views only."""
     rays, view, left = directions(500), np.zeros(500, dtype=int), np.ones(500, dtype=bool)
     radiance = pattern(rays)
@@ -123,7 +131,7 @@ def test_a_bowl_of_reach_one_is_an_ellipsoid() -> None:
     chart = Chart.about(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.8)
     hollow = Hollow.bowl(0.0, np.zeros(4), 0.5)
     np.testing.assert_allclose(hollow.reach, 1)
-    mesh, _ = Relief(flat_block(), chart, ConcaveOptions(rounding_cells=0.3)).carved(hollow).mesh(1)
+    mesh, _ = Relief(flat_block(), chart).carved(hollow, 0.3).mesh(1)
     inside = mesh.vertices[(mesh.vertices[:, 2] < -0.1)]
     level = np.sqrt((inside[:, :2] ** 2).sum(1) / 0.8**2 + inside[:, 2] ** 2 / 0.4**2)
     assert len(inside) > 200
@@ -132,11 +140,7 @@ def test_a_bowl_of_reach_one_is_an_ellipsoid() -> None:
 
 def test_nothing_is_carved_beyond_the_rim() -> None:
     chart = Chart.about(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.6)
-    mesh, _ = (
-        Relief(flat_block(), chart, ConcaveOptions(rounding_cells=0.3))
-        .carved(Hollow.bowl(0.0, np.zeros(4), 0.5))
-        .mesh(1)
-    )
+    mesh, _ = Relief(flat_block(), chart).carved(Hollow.bowl(0.0, np.zeros(4), 0.5), 0.3).mesh(1)
     beyond = np.hypot(*mesh.vertices[:, :2].T) > 0.7
     np.testing.assert_allclose(mesh.vertices[beyond, 2], 0, atol=0.005)
 
@@ -145,7 +149,7 @@ def test_unexplained_points_are_gathered_by_where_they_are() -> None:
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.normal(size=(300, 3)) * 0.1 + middle for middle in ([0, 0, 0], [3, 0, 0], [6, 0, 0])])
     disagreed = np.repeat([1.1, 0.5, 1.2], 300)
-    parts = unexplained_parts(points, disagreed, replace(ConcaveOptions(), neighborhood=0.3))
+    parts = unexplained_parts(points, disagreed, 0.3)
     assert sorted(round(float(points[part, 0].mean())) for part in parts) == [0, 6]
 
 
@@ -173,11 +177,12 @@ def hollow_errors_deg(surface: LevelSet, body: Body, views: Views) -> np.ndarray
     return normal_errors_deg(surface, body, views, cameras_around(6, 50)[:3])
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_hollow_that_no_outline_shows_is_found(dish: tuple[Body, Views]) -> None:
     body, views = dish
     lidded = Body(lambda x: np.maximum(ellipsoid(OUTER).value(x), x[:, 0] - RIM))
     start = level_set_of(lidded, views)
-    found = concave_start(views, start, start, OPTIONS)
+    found = concave_start(views, start, start)
     assert found is not None
     before, after = (hollow_errors_deg(each, body, views) for each in (start, found))
     wrong = before > 10
@@ -186,43 +191,50 @@ def test_a_hollow_that_no_outline_shows_is_found(dish: tuple[Body, Views]) -> No
     assert np.median(after[wrong]) < np.median(before[wrong]) / 3
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_convex_body_is_left_alone() -> None:
     """Pixels agree all over it, so nothing is searched."""
     views = body_views(ellipsoid(), 14, 56)
     start = level_set_of(ellipsoid((0.97, 0.82, 0.65)), views)
-    assert concave_start(views, start, start, OPTIONS) is None
+    assert concave_start(views, start, start) is None
 
 
+@pytest.mark.usefixtures("quick")
 def test_what_steps_explain_is_not_searched(dish: tuple[Body, Views]) -> None:
     body, views = dish
     lidded = Body(lambda x: np.maximum(ellipsoid(OUTER).value(x), x[:, 0] - RIM))
-    assert concave_start(views, level_set_of(lidded, views), level_set_of(body, views), OPTIONS) is None
+    assert concave_start(views, level_set_of(lidded, views), level_set_of(body, views)) is None
 
 
-def test_a_patch_that_settled_steps_leave_unexplained_is_searched_as_a_whole(dish: tuple[Body, Views]) -> None:
+@pytest.mark.usefixtures("quick")
+def test_a_patch_that_settled_steps_leave_unexplained_is_searched_as_a_whole(
+    dish: tuple[Body, Views], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Though no part of it is unexplained by itself; not where steps explain it."""
     body, views = dish
     lid = level_set_of(Body(lambda x: np.maximum(ellipsoid(OUTER).value(x), x[:, 0] - RIM)), views)
-    lenient = replace(OPTIONS, least_disagreement=10.0, settled_disagreement=0.7)
-    pixels, chart = solid_pixels(views, lenient.rays), Chart.about(np.array([0.5, 0.0, 0.0]), np.eye(3)[0], 0.5)
+    monkeypatch.setattr(concave, "LEAST_DISAGREEMENT", 10.0)
+    monkeypatch.setattr(concave, "SETTLED_DISAGREEMENT", 0.7)
+    pixels, chart = solid_pixels(views, QUICK["RAYS"]), Chart.about(np.array([0.5, 0.0, 0.0]), np.eye(3)[0], 0.5)
     under_lid, under_body = (
-        list(unexplained_patches(chart, lid, settled, pixels, lenient))
-        for settled in (lid, level_set_of(body, views, 60))
+        list(unexplained_patches(chart, lid, settled, pixels)) for settled in (lid, level_set_of(body, views, 60))
     )
     assert len(under_lid) == 1
     assert not under_body
 
 
-def test_photographs_of_one_color_tell_no_hollow(dish: tuple[Body, Views]) -> None:
+@pytest.mark.usefixtures("quick")
+def test_photographs_of_one_color_show_no_hollow(dish: tuple[Body, Views]) -> None:
     body, views = dish
     plain = tuple(replace(view, radiance=0 * view.radiance + 0.5) for view in views.train)
     start = level_set_of(body, views)
-    assert concave_start(replace(views, train=plain), start, start, OPTIONS) is None
+    assert concave_start(replace(views, train=plain), start, start) is None
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_surface_that_no_pixel_meets_has_no_hollow(dish: tuple[Body, Views]) -> None:
     far = level_set_of(Body(lambda x: np.linalg.norm(x - [0, 0, 9.0], axis=1)), dish[1])
-    assert concave_start(dish[1], far, far, OPTIONS) is None
+    assert concave_start(dish[1], far, far) is None
 
 
 def test_hollows_are_looked_for_under_lids_where_the_start_has_none(
@@ -230,17 +242,16 @@ def test_hollows_are_looked_for_under_lids_where_the_start_has_none(
 ) -> None:
     """One after the other, until there is one."""
     start, lid, other = (level_set_of(ellipsoid(), dish[1], 20) for _ in range(3))
-    asked = []
+    searched = []
 
-    def looked_for(views: Views, surface: LevelSet, settled: LevelSet, options: ConcaveOptions) -> LevelSet | None:
-        asked.append(surface)
+    def looked_for(views: Views, surface: LevelSet, settled: LevelSet) -> LevelSet | None:
+        searched.append(surface)
         return None if surface is start else surface
 
     monkeypatch.setattr(fit, "concave_start", looked_for)
-    rounds = (replace(DEFAULTS.rounds[0], rays=2000, steps=1),)
-    short = replace(DEFAULTS, rounds=rounds, finer=(), mending=(), detailing=(), concave=ConcaveOptions(rounds=rounds))
-    fit_free_form(dish[1], start, short, lids=(lid, other))
-    assert [each is known for each, known in zip(asked, (start, lid), strict=True)] == [True, True]
+    rounds = (replace(COARSE[0], rays=2000, steps=1),)
+    fit_free_form(dish[1], start, Schedule((), rounds, (), rounds, (), ()), lids=(lid, other))
+    assert [each is known for each, known in zip(searched, (start, lid), strict=True)] == [True, True]
 
 
 @pytest.mark.slow
@@ -249,7 +260,7 @@ def test_a_dish_is_recovered_from_its_visual_hull(dish: tuple[Body, Views]) -> N
     views = body_views(body, 30, 80)
     proposal = FreeFormFamily().propose(views, FitConfig(), asked=True)
     assert proposal is not None
-    surface = fit_free_form(views, proposal.shape.surface, replace(DEFAULTS, finer=()))[0].surface
+    surface = fit_free_form(views, proposal.shape.surface, Schedule(finer=()))[0].surface
     errors = normal_errors_deg(surface, body, views, cameras_around(7, 60)[1::2])
     assert np.median(errors) < 0.3
     assert (errors < 5).mean() > 0.95

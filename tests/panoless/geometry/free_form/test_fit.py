@@ -1,6 +1,7 @@
 """Free-form surfaces from pictures of bodies that are traced by something else."""
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -15,24 +16,26 @@ from panoless.capture.views import Views, views_of
 from panoless.config import FitConfig
 from panoless.environment.surroundings import Surroundings
 from panoless.first_surface.options import FirstSurfaceOptions
-from panoless.geometry.free_form import steps
-from panoless.geometry.free_form.equations import silhouette_rows
+from panoless.geometry.free_form import fit, start, steps
+from panoless.geometry.free_form.equations import OUTLINE_SCALE_PX, silhouette_rows
 from panoless.geometry.free_form.fit import (
+    HELD_OUT_RAYS,
     FitStage,
     coarse_stage,
     distrusted_share,
     fit_free_form,
     held_out_error,
-    make_task,
-    mended_stages,
+    refitted_stages,
     take_round,
 )
 from panoless.geometry.free_form.kind import FreeFormFamily, FreeFormMirror
-from panoless.geometry.free_form.options import DEFAULTS, ConcaveOptions, DescentOptions, FreeFormOptions, FreeFormRound
-from panoless.geometry.free_form.photometric import Sights, Solution
+from panoless.geometry.free_form.options import FreeFormOptions
+from panoless.geometry.free_form.photometric import INNER_PX, LEAST_COSINE, Sights, Solution
+from panoless.geometry.free_form.schedule import COARSE, DESCENT, DETAILED, Round, Schedule
 from panoless.geometry.free_form.start import FirstSurfaces, first_surfaces, started
 from panoless.geometry.free_form.steps import Change, gauss_newton_step
 from panoless.geometry.free_form.surface import LevelSet
+from panoless.geometry.free_form.task import make_task
 from panoless.geometry.free_form.trust import full_trust
 from panoless.kernels.level_set import seen_with_slopes
 from panoless.kernels.reference.cubemap import padded_texels
@@ -54,34 +57,28 @@ from tests.support.mirror_body import (
     wavy_ball,
 )
 
-OPTIONS = FreeFormOptions(
-    rounds=tuple(replace(settings, rays=settings.rays // 2) for settings in DEFAULTS.rounds),
-    finer=(),
-    detailing=(),
-    concave=ConcaveOptions(search=False),
-    descent=DescentOptions(rounds=()),
-    start_tensions=DEFAULTS.start_tensions[::2],
+OPTIONS = FreeFormOptions(hollows=False, starts=False, finest_cells=28)
+SCHEDULE = replace(
+    Schedule.of(OPTIONS), coarse=tuple(replace(settings, rays=settings.rays // 2) for settings in COARSE)
 )
 FEW_PIXELS = replace(
-    OPTIONS,
-    rounds=tuple(replace(settings, rays=8_000) for settings in OPTIONS.rounds),
-    mending=tuple(replace(settings, rays=8_000) for settings in OPTIONS.mending),
-    most_mendings=1,
+    SCHEDULE,
+    coarse=tuple(replace(settings, rays=8_000) for settings in SCHEDULE.coarse),
+    refit=tuple(replace(settings, rays=8_000) for settings in SCHEDULE.refit),
 )
-COARSE = replace(OPTIONS.rounds[0], rays=5_000)
-SECOND = FreeFormRound(20, 32, 0.20, 1, 20_000, 100.0, 5)
+FIRST_ROUND = replace(COARSE[0], rays=5_000)
+SECOND = Round(20, 32, 0.20, 1, 20_000, 100.0, 5)
 """A round on the grid of the first, by pixels' centers."""
 FIRST = FirstSurfaceOptions(hull_resolution=56)
 CONFIG = replace(FitConfig(), free_form=OPTIONS, first_surface=FIRST)
+SEVERAL = replace(CONFIG, free_form=replace(OPTIONS, starts=True))
+"""With first surfaces of all tensions."""
 VIEWS, SIZE_PX = 20, 64
 
 
-def fitted(
-    views: Views, options: FreeFormOptions = OPTIONS, hull: FirstSurfaceOptions = CONFIG.first_surface
-) -> LevelSet:
-    proposal = FreeFormFamily().propose(views, replace(CONFIG, free_form=options, first_surface=hull), asked=True)
-    assert proposal is not None
-    return fit_free_form(views, started(views, proposal.shape, options)[0], options)[0].surface
+def fitted(views: Views, schedule: Schedule = SCHEDULE, hull: FirstSurfaceOptions = CONFIG.first_surface) -> LevelSet:
+    first = first_surfaces(views, replace(CONFIG, first_surface=hull))
+    return fit_free_form(views, started(views, first, schedule)[0], schedule)[0].surface
 
 
 def normal_errors_deg(surface: LevelSet, body: Body, views: Views, cameras: list[Camera]) -> np.ndarray:
@@ -144,59 +141,59 @@ def test_the_hole_of_a_ring_stays_open(ring: tuple[Views, FreeFormMirror]) -> No
 
 @pytest.fixture(scope="module")
 def dented() -> tuple[Body, Views, FitStage]:
-    """An ellipsoid with a dent where cameras face it, and what a step under a fine map believes of it."""
+    """An ellipsoid with a dent where cameras face it, and what it trusts after a step under a fine map."""
     body = ellipsoid()
     views = body_views(body, 12, 56)
-    right = coarse_stage(views, first_surfaces(views, CONFIG).plain, FEW_PIXELS.rounds, FEW_PIXELS).surface
+    right = coarse_stage(views, first_surfaces(views, CONFIG).plain, FEW_PIXELS.coarse).surface
     camera = cameras_around(VIEWS, SIZE_PX)[VIEWS // 2]
     origin, direction = (each.mean(0, keepdims=True) for each in camera_rays_world(camera, 1))
     hit = right.hits(in_frame(views.object_frame, origin), direction / np.linalg.norm(direction))
     away = right.spacing * np.linalg.norm(right.nodes() - hit.places, axis=3)
     dent = replace(right, coefficients=right.coefficients + 1.5 * np.exp(-0.5 * (away / 0.2) ** 2))
-    believed = FitStage(dent, full_trust(dent, OPTIONS.trust_cells), None, OPTIONS.damping)
-    return body, views, take_round(views, believed, replace(FEW_PIXELS.rounds[-1], steps=1), FEW_PIXELS)
+    return body, views, take_round(views, FitStage.begun(dent), replace(FEW_PIXELS.coarse[-1], steps=1))
 
 
-def test_parts_that_pixels_distrust_are_mended(dented: tuple[Body, Views, FitStage]) -> None:
+def test_parts_that_pixels_distrust_are_refitted(dented: tuple[Body, Views, FitStage]) -> None:
     body, views, stage = dented
     cameras = cameras_around(7, 60)[1::2]
-    *_, mended = mended_stages(views, stage, FEW_PIXELS)
-    before, after = (normal_errors_deg(each.surface, body, views, cameras) for each in (stage, mended))
+    _, refitted = islice(refitted_stages(views, stage, FEW_PIXELS.refit), 2)
+    before, after = (normal_errors_deg(each.surface, body, views, cameras) for each in (stage, refitted))
     assert after.mean() < before.mean() / 3
-    assert distrusted_share(views, mended, FEW_PIXELS) < distrusted_share(views, stage, FEW_PIXELS) / 3
+    assert distrusted_share(views, refitted) < distrusted_share(views, stage) / 3
 
 
 @pytest.mark.slow
 def test_waves_narrower_than_the_first_cells_are_found_under_coarse_maps() -> None:
     """Their normals turn by 15° and more. Measured: 0.3° in the median; 8.3° without the rounds that look for them."""
     body, cameras = wavy_ball(0.03, 9.0), cameras_around(16, 64)
-    short = tuple(replace(DEFAULTS.detailing[index], rays=8_000, steps=4) for index in (0, 2, 4, 5))
-    options = replace(FEW_PIXELS, mending=(), detailing=short)
+    short = tuple(replace(DETAILED[index], rays=8_000, steps=4) for index in (0, 2, 4, 5))
+    schedule = replace(FEW_PIXELS, refit=(), detailed=short)
     views = body_views(body, len(cameras), 64)
-    assert np.median(normal_errors_deg(fitted(views, options), body, views, cameras[::5])) < 0.6
+    assert np.median(normal_errors_deg(fitted(views, schedule), body, views, cameras[::5])) < 0.6
 
 
-def test_rounds_that_look_for_details_are_refused_where_held_out_views_gain_nothing() -> None:
+def test_rounds_that_look_for_details_are_refused_where_held_out_views_gain_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """On a ball that is explained already, and no finer round takes their cells away again."""
-    views, details = body_views(sphere(), 10, 40), FreeFormRound(24, 4, 0.8, 1, 2_000, 30.0, 1)
-    coarse = replace(FEW_PIXELS, rounds=(replace(COARSE, steps=2),), mending=(), detailing=(), detailed_error=-1.0)
-    start, _ = started(views, first_surfaces(views, replace(CONFIG, free_form=coarse)), coarse)
-    alone, refused, taken = (
-        fit_free_form(views, start, each)[0].surface
-        for each in (
-            coarse,
-            replace(coarse, detailing=(details,)),
-            replace(coarse, detailing=(details,), least_detailing_gain=-99.0, finer=(replace(details, cells=22),)),
-        )
+    views, details = body_views(sphere(), 10, 40), Round(24, 4, 0.8, 1, 2_000, 30.0, 1)
+    coarse = replace(FEW_PIXELS, coarse=(replace(FIRST_ROUND, steps=2),), refit=())
+    first = first_surfaces(views, CONFIG).plain
+    monkeypatch.setattr(fit, "DETAILED_ERROR", -1.0)
+    alone, refused = (
+        fit_free_form(views, first, each)[0].surface for each in (coarse, replace(coarse, detailed=(details,)))
     )
+    monkeypatch.setattr(fit, "LEAST_GAIN", -99.0)
+    finer = replace(coarse, detailed=(details,), finer=(replace(details, cells=22),))
+    taken = fit_free_form(views, first, finer)[0].surface
     np.testing.assert_array_equal(refused.coefficients, alone.coefficients)
-    assert (alone.cells, taken.cells) == (COARSE.cells, details.cells)
+    assert (alone.cells, taken.cells) == (FIRST_ROUND.cells, details.cells)
 
 
-def test_what_pixels_trust_is_not_mended(dented: tuple[Body, Views, FitStage]) -> None:
+def test_what_pixels_trust_is_not_refitted(dented: tuple[Body, Views, FitStage]) -> None:
     _, views, stage = dented
-    trusted = replace(stage, trust=full_trust(stage.surface, FEW_PIXELS.trust_cells))
-    assert list(mended_stages(views, trusted, FEW_PIXELS)) == [trusted]
+    trusted = replace(stage, trust=full_trust(stage.surface))
+    assert list(refitted_stages(views, trusted, FEW_PIXELS.refit)) == [trusted]
 
 
 @pytest.mark.slow
@@ -207,14 +204,13 @@ def test_held_out_pixels_that_miss_the_surface_are_unexplained() -> None:
     solved, tested = (replace(views, train=tuple(part)) for part in (train[:8], train[8:]))
     whole = first_surfaces(views, CONFIG).hull
     small = replace(whole, coefficients=whole.coefficients + 0.3 / whole.spacing)
-    pixels = solid_pixels(tested, OPTIONS.held_out_rays)
+    pixels = solid_pixels(tested, HELD_OUT_RAYS)
     for surface, bare in ((whole, False), (small, True)):
-        stage = FitStage(surface, full_trust(surface, OPTIONS.trust_cells), None, OPTIONS.damping)
-        sights = Sights.of(surface, pixels.rays, 1, OPTIONS.least_cosine)
-        inner = pixels.inner_px > OPTIONS.inner_px
+        sights, inner = Sights.of(surface, pixels.rays, 1, LEAST_COSINE), pixels.inner_px > INNER_PX
         missed, clear = (inner & ~sights.hits.met).sum(), (inner & sights.clear).sum()
         assert (missed > 0.2 * clear) == bare
-        assert held_out_error(solved, tested, stage, OPTIONS) == pytest.approx(missed / (missed + clear), abs=1e-3)
+        error = held_out_error(solved, tested, FitStage.begun(surface))
+        assert error == pytest.approx(missed / (missed + clear), abs=1e-3)
 
 
 @pytest.mark.slow
@@ -243,12 +239,11 @@ def test_a_world_that_is_turned_and_scaled_gives_the_same_surface() -> None:
 def solution() -> Solution:
     """A wavy ball between two rounds."""
     views = body_views(wavy_ball(), 12, 60)
-    options = replace(OPTIONS, rounds=OPTIONS.rounds[:1])
-    surface = fitted(views, options)
-    return Solution.at(make_task(views, SECOND, options), surface, full_trust(surface, 20), None, 2)
+    surface = fitted(views, replace(SCHEDULE, coarse=SCHEDULE.coarse[:1]))
+    return Solution.at(make_task(views, SECOND), surface, full_trust(surface, 20), None, 2)
 
 
-def test_a_step_with_the_map_made_anew_gains_what_its_equations_promise(solution: Solution) -> None:
+def test_a_step_with_the_map_solved_again_gains_what_its_equations_promise(solution: Solution) -> None:
     step = gauss_newton_step(solution, 1e-3).coefficients
     promised = -float((step * solution.gradient()[0]).sum()) - float((step * solution.product(step)[0]).sum()) / 2
     surface = replace(solution.surface, coefficients=solution.surface.coefficients + step)
@@ -270,16 +265,14 @@ def test_the_gradient_is_that_of_finite_differences(solution: Solution) -> None:
     assert (costs[1] - costs[0]) / 2 == pytest.approx(float((gradient * change).sum()), rel=0.02)
 
 
-def test_smoothness_of_an_anchored_round_is_asked_of_the_change_alone(solution: Solution) -> None:
+def test_a_prior_on_the_increment_smooths_the_change_alone(solution: Solution) -> None:
     coefficients = solution.surface.coefficients
-    anchored = replace(solution, task=replace(solution.task, anchor=coefficients))
-    assert np.abs(anchored.bent).max() == 0
-    np.testing.assert_allclose(
-        solution.gradient()[0] - anchored.gradient()[0], solution.bent * solution.active, atol=1e-9
-    )
-    free = replace(solution, task=replace(solution.task, anchor=np.zeros_like(coefficients)))
+    same = replace(solution, task=replace(solution.task, reference=coefficients))
+    assert np.abs(same.bent).max() == 0
+    np.testing.assert_allclose(solution.gradient()[0] - same.gradient()[0], solution.bent * solution.active, atol=1e-9)
+    free = replace(solution, task=replace(solution.task, reference=np.zeros_like(coefficients)))
     np.testing.assert_array_equal(free.bent, solution.bent)
-    assert anchored.cost(anchored) < solution.cost(solution) == free.cost(free)
+    assert same.cost(same) < solution.cost(solution) == free.cost(free)
 
 
 @pytest.mark.parametrize("cells", [-1.0, 1.0])
@@ -297,31 +290,30 @@ def with_waves(surface: LevelSet) -> LevelSet:
 
 
 @pytest.mark.slow
-def test_a_start_that_descended_is_taken_where_pixels_agree_better() -> None:
+def test_a_start_that_descended_is_taken_where_pixels_agree_better(monkeypatch: pytest.MonkeyPatch) -> None:
     """Not the plain surface with waves but what a plate or the hull leads to; the plain one where no gain is enough."""
     views = body_views(sphere(), 8, 32)
-    proposal = FreeFormFamily().propose(views, CONFIG, asked=True)
-    assert proposal is not None
-    right, one = proposal.shape.surface, FreeFormRound(12, 4, 0.5, 1, 500, 100.0, 1, anchored=True)
-    options = replace(OPTIONS, rounds=(replace(one, anchored=False),), descent=DescentOptions(rounds=(one,)))
+    right, one = first_surfaces(views, CONFIG).plain, Round(12, 4, 0.5, 1, 500, 100.0, 1, increment_prior=True)
+    schedule = replace(SCHEDULE, coarse=(replace(one, increment_prior=False),), descent=(one,))
     wrong = with_waves(right)
-    assert started(views, FirstSurfaces(wrong, wrong, (right,)), options)[0].cells == one.cells
-    assert started(views, FirstSurfaces(wrong, right, (wrong,)), options)[0].cells == one.cells
-    never = replace(options, descent=replace(options.descent, least_gain=1.0))
-    assert started(views, FirstSurfaces(right, right, (wrong,)), never)[0].cells == right.cells
+    assert started(views, FirstSurfaces(wrong, wrong, (right,)), schedule)[0].cells == one.cells
+    assert started(views, FirstSurfaces(wrong, right, (wrong,)), schedule)[0].cells == one.cells
+    monkeypatch.setattr(start, "LEAST_GAIN", 1.0)
+    assert started(views, FirstSurfaces(right, right, (wrong,)), schedule)[0].cells == right.cells
 
 
-def test_the_plain_surface_descends_alone_where_pixels_agree_on_it() -> None:
-    """Held by outlines; where any disagreement is little enough, a ball that is at hand is not asked."""
+def test_the_plain_surface_descends_alone_where_pixels_agree_on_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dominated by silhouettes; where any disagreement is little enough, a ball that is at hand is not tried."""
     views = body_views(sphere(), 8, 32)
     right = first_surfaces(views, CONFIG).plain
     wrong = with_waves(right)
-    one = FreeFormRound(12, 4, 0.5, 1, 500, 100.0, 1, anchored=True)
-    content = DescentOptions(rounds=(one,), least_disagreement=np.inf, least_gain=-np.inf)
-    options = replace(OPTIONS, rounds=(replace(one, anchored=False),), descent=content)
-    held = coarse_stage(views, wrong, [replace(one, held=True)], options).surface
-    found, _ = started(views, FirstSurfaces(wrong, right, (right,)), options)
-    np.testing.assert_array_equal(found.coefficients, held.coefficients)
+    one = Round(12, 4, 0.5, 1, 500, 100.0, 1, increment_prior=True)
+    monkeypatch.setattr(start, "LEAST_DISAGREEMENT", np.inf)
+    monkeypatch.setattr(start, "LEAST_GAIN", -np.inf)
+    schedule = replace(SCHEDULE, coarse=(replace(one, increment_prior=False),), descent=(one,))
+    dominated = coarse_stage(views, wrong, [replace(one, silhouette_dominated=True)]).surface
+    found, _ = started(views, FirstSurfaces(wrong, right, (right,)), schedule)
+    np.testing.assert_array_equal(found.coefficients, dominated.coefficients)
 
 
 def test_the_matrix_is_symmetric_and_positive(solution: Solution) -> None:
@@ -334,10 +326,9 @@ def test_the_matrix_is_symmetric_and_positive(solution: Solution) -> None:
 @pytest.mark.slow
 def test_held_out_views_refuse_cells_that_a_ball_does_not_need() -> None:
     """Two more rounds are offered, and the one with a rough surface is not taken."""
-    rough = FreeFormRound(34, 32, 0.15, 1, 10_000, 1e-6, 2)
-    options = replace(OPTIONS, rounds=(COARSE, replace(SECOND, rays=5_000)), finer=(rough,))
+    rough = Round(34, 32, 0.15, 1, 10_000, 1e-6, 2)
     views = body_views(sphere(), 10, 40)
-    surface = fitted(views, options)
+    surface = fitted(views, replace(SCHEDULE, coarse=(FIRST_ROUND, replace(SECOND, rays=5_000)), finer=(rough,)))
     assert max(surface.shape) < 34
 
 
@@ -345,11 +336,8 @@ def test_held_out_views_refuse_cells_that_a_ball_does_not_need() -> None:
 def test_the_same_views_give_the_same_surface() -> None:
     """A killed fit in closed form starts again, so it ends where the other would have."""
     views = body_views(sphere(), 8, 32)
-    options, hull = (
-        replace(OPTIONS, rounds=(replace(COARSE, cells=14, steps=2),)),
-        FirstSurfaceOptions(hull_resolution=28),
-    )
-    one, other = (fitted(views, options, hull) for _ in range(2))
+    schedule = replace(SCHEDULE, coarse=(replace(FIRST_ROUND, cells=14, steps=2),))
+    one, other = (fitted(views, schedule, FirstSurfaceOptions(hull_resolution=28)) for _ in range(2))
     np.testing.assert_array_equal(one.coefficients, other.coefficients)
 
 
@@ -359,7 +347,7 @@ def test_the_kind_keeps_the_protocol(ring: tuple[Views, FreeFormMirror]) -> None
     again = FreeFormMirror.from_state_dict(geometry.state_dict())
     np.testing.assert_array_equal(again.surface.coefficients, geometry.surface.coefficients)
     np.testing.assert_array_equal(again.trust.values, geometry.trust.values)
-    assert again.options == geometry.options
+    assert again.occlusion_test == geometry.occlusion_test
     assert 500 < geometry.num_parameters < geometry.surface.coefficients.size
 
     view = views.train[5]
@@ -393,11 +381,11 @@ def test_rows_of_a_block_are_those_of_finite_differences(solution: Solution, kin
     change -= change.mean(0) if kind.by_view and kind.size < 6 else 0
     sides = [replace(moved, nuisance=Nuisance((block.stepped(sign * change),))) for sign in (1, -1)]
     photographs, silhouettes = moved.beside[0].photographs, moved.beside[0].silhouettes
-    options, clear, left = solution.task.options, moved.sights.clear, []
+    clear, left = moved.sights.clear, []
     length = solution.environment.shape[-1] + 2
     padded = padded_texels(solution.environment).reshape(6, length, length, 3).double().numpy()
     for side in sides:
-        sights = Sights.of(solution.surface, side.rays, solution.task.settings.samples, options.least_cosine)
+        sights = Sights.of(solution.surface, side.rays, solution.task.settings.samples, LEAST_COSINE)
         clear = clear & sights.clear
         radiance = solution.task.pixels.radiance * np.exp(-side.nuisance.log_gains(side.rays.view))
         left.append(seen_with_slopes(padded, sights.outgoing)[0] - radiance)
@@ -443,8 +431,8 @@ def test_the_matrix_with_all_unknowns_is_symmetric(solution: Solution) -> None:
 def test_blocks_of_views_end_where_scipy_ends(solution: Solution) -> None:
     """Under a surface and a map that stay: the cost of exposures and masks is no higher than that of its minimum."""
     nuisance = nuisance_of(body_views(wavy_ball(), 12, 20), [Exposures, MaskOffsets])
-    settings = replace(solution.task.settings, steps=12, under_known_map=True)
-    task = replace(solution.task, settings=settings, options=replace(OPTIONS, map_rounds=0, least_gain=0.0))
+    settings = replace(solution.task.settings, steps=12, under_known_map=True, least_gain=0.0)
+    task = replace(solution.task, settings=settings)
     gains = np.linspace(-0.2, 0.2, 12)
     darker = replace(task.pixels, radiance=task.pixels.radiance * np.exp(gains)[task.pixels.rays.view, None])
     begun = Solution.at(
@@ -490,33 +478,29 @@ def test_flat_faces_that_no_outline_shows_are_found_by_a_descent() -> None:
     plain one by 22°.
     """
     views = body_views(block(), VIEWS, SIZE_PX)
-    proposal = FreeFormFamily().propose(views, CONFIG, asked=True)
-    assert proposal is not None
+    first = first_surfaces(views, SEVERAL)
 
-    def error_deg(options: FreeFormOptions) -> float:
-        start, _ = started(views, proposal.shape, options)
-        return float(np.median(normal_errors_deg(start, block(), views, cameras_around(7, 60)[1::2])))
+    def error_deg(schedule: Schedule) -> float:
+        surface, _ = started(views, first, schedule)
+        return float(np.median(normal_errors_deg(surface, block(), views, cameras_around(7, 60)[1::2])))
 
-    assert error_deg(replace(OPTIONS, descent=DescentOptions())) < 3.0 < 12.0 < error_deg(OPTIONS)
+    assert error_deg(replace(SCHEDULE, descent=DESCENT)) < 3.0 < 12.0 < error_deg(SCHEDULE)
 
 
 @pytest.mark.slow
-def test_outlines_hold_faces_that_maps_of_few_texels_would_turn() -> None:
-    """After two rounds of the descent from a rounded plate, by the mean of normals: 3.3° held, 17° by pixels alone."""
+def test_dominant_silhouettes_keep_faces_that_maps_of_few_texels_would_turn() -> None:
+    """After two rounds of the descent from a rounded plate, by the mean of normals: 3.3° so, 17° by pixels alone."""
     body = block(exponent=10.0)
     views = body_views(body, 16, 56)
-    config = replace(CONFIG, free_form=replace(OPTIONS, start_tensions=DEFAULTS.start_tensions))
-    proposal = FreeFormFamily().propose(views, config, asked=True)
-    assert proposal is not None
-    first = proposal.shape.plates[1]
+    first = first_surfaces(views, SEVERAL).plates[1]
 
-    def error_deg(*, held: bool) -> float:
-        rounds = [replace(each, held=held) for each in DescentOptions().rounds[:2]]
+    def error_deg(*, dominated: bool) -> float:
+        rounds = [replace(each, silhouette_dominated=dominated) for each in DESCENT[:2]]
         with torch.no_grad():
-            surface = coarse_stage(views, first, rounds, OPTIONS).surface
+            surface = coarse_stage(views, first, rounds).surface
         return float(np.mean(normal_errors_deg(surface, body, views, cameras_around(7, 60)[1::2])))
 
-    assert error_deg(held=True) < 4.0 < 12.0 < error_deg(held=False)
+    assert error_deg(dominated=True) < 4.0 < 12.0 < error_deg(dominated=False)
 
 
 def test_what_all_cameras_share_is_taken_back() -> None:
@@ -572,11 +556,11 @@ def test_rays_that_pass_the_box_of_a_surface_cost_as_outliers(ring: tuple[Views,
     away = turned_by(views, 60.0, 0)
     outlines = outline_rays(views)
     costs = [
-        silhouette_rows(geometry.surface, rays, rays.chosen(slice(0)), 1.0, 1.0, NO_NUISANCE, DEFAULTS)[0].cost
+        silhouette_rows(geometry.surface, rays, rays.chosen(slice(0)), 1.0, 1.0, NO_NUISANCE)[0].cost
         for rays in (outlines, outlines.moved(away))
     ]
     assert costs[1] > 10 * costs[0]
-    assert costs[1] > 0.49 * len(outlines.size) * DEFAULTS.outline_scale_px**2
+    assert costs[1] > 0.49 * len(outlines.size) * OUTLINE_SCALE_PX**2
 
 
 def wronged(views: Views) -> tuple[Views, dict[str, np.ndarray]]:
