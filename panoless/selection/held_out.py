@@ -11,7 +11,15 @@ from panoless.config import FitConfig
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, observe_views
-from panoless.selection.options import SelectionOptions
+
+LEAST_GAIN = 0.05
+"""Share by which what is preferred lowers the held-out error."""
+STANDARD_ERRORS = 2.0
+"""And by so many standard errors of the paired differences."""
+COMPARED_RAYS = 1_000_000
+"""Most rays that held-out errors are computed from."""
+COMPARED_RESOLUTION = 128
+"""Most texels along a face side of the maps by which they are computed."""
 
 
 def held_out_errors(views: Views, config: FitConfig, geometry: Geometry) -> Float[np.ndarray, "V"] | None:
@@ -19,8 +27,8 @@ def held_out_errors(views: Views, config: FitConfig, geometry: Geometry) -> Floa
 
     Every fifth view is held out from the map.
     """
-    parts, options = held_out_parts(views), config.selection
-    return None if parts is None else unexplained(*parts, geometry, options.compared_rays, options.trial_resolution)
+    parts, resolution = held_out_parts(views), config.environment.trial_resolution(COMPARED_RESOLUTION)
+    return None if parts is None else unexplained(*parts, geometry, COMPARED_RAYS, resolution)
 
 
 def held_out_parts(views: Views) -> tuple[Views, Views] | None:
@@ -38,8 +46,10 @@ def unexplained(solved: Views, tested: Views, geometry: Geometry, rays: int, res
         return np.array([prediction_error([batch], environment) for batch in observe_views(tested, geometry, rays)])
 
 
-def is_clearly_lower(errors: Float[np.ndarray, "V"], of: Float[np.ndarray, "V"], options: SelectionOptions) -> bool:
-    """Whether `errors` lie below those `of` another by the least gain and the standard errors of the options."""
+def is_clearly_lower(
+    errors: Float[np.ndarray, "V"], of: Float[np.ndarray, "V"], least_gain: float = LEAST_GAIN
+) -> bool:
+    """Whether `errors` lie below those `of` another by the least gain, and by two standard errors."""
     gain = of - errors
-    noise = options.standard_errors * float(gain.std(ddof=1)) / len(gain) ** 0.5 if len(gain) > 1 else np.inf
-    return bool(gain.mean() > max(noise, options.least_gain * of.mean()))
+    noise = STANDARD_ERRORS * float(gain.std(ddof=1)) / len(gain) ** 0.5 if len(gain) > 1 else np.inf
+    return bool(gain.mean() > max(noise, least_gain * of.mean()))

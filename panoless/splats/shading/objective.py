@@ -58,8 +58,8 @@ class ShadedObjective:
         surface = seen.surface
         everywhere = torch.arange(view.mask.numel(), device=view.mask.device)
         color = (seen.diffuse + seen.specular).flatten(1)
-        image, target = composited(color, surface.alpha.flatten(), everywhere, view, self._config, iteration)
-        total = photometric = photometric_paper(image, target, loss.lambda_ssim)
+        image, target = composited(color, surface.alpha.flatten(), everywhere, view, view.radiance.new_ones(3, 1))
+        total = photometric = photometric_paper(image, target)
         consistency = outline = photometric.new_zeros(())
         if loss.lambda_normal_consistency > 0:
             consistency = consistency_with_depth(surface, view.camera, torch.ones_like(view.mask))
