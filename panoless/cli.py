@@ -12,7 +12,7 @@ import tyro
 
 from panoless.config import FitConfig, renamed_arguments, with_overrides
 from panoless.export.extension import Extension
-from panoless.photographs.options import CaptureOptions
+from panoless.photographs.options import LEAST_VIEWS, CaptureOptions
 from panoless.presets import PRESETS
 from shinypartial.core.command_line import command_line
 from shinypartial.core.errors import InputError
@@ -283,7 +283,7 @@ class Capture(LongCommand):
         named = self.colmap or self.masks or self.segmenter or self.board not in (None, "none")
         if named or any(file.suffix.lower() in VIDEO_SUFFIXES for file in files):
             return None
-        few, balls = len(files) < self.options.least_views, {}
+        few, balls = len(files) < LEAST_VIEWS, {}
         if few and hints:
             return {}
         try:
@@ -293,7 +293,7 @@ class Capture(LongCommand):
             if not few:
                 return None
             raise InputError(
-                expected=f"a mirror ball, or at least {self.options.least_views} photographs of another object",
+                expected=f"a mirror ball, or at least {LEAST_VIEWS} photographs of another object",
                 found=f"{len(files)} photographs; {error.found} in {file.name}",
                 remedy=f"Take more photographs. If it is a ball: {error.remedy}",
             ) from None

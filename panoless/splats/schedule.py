@@ -51,9 +51,7 @@ class Schedule:
         return self.begun(iteration, self.config.environment.warmup)
 
     def rate_factor(self, iteration: int) -> float:
-        """1 until the drop begins, then a geometric fall that ends at the drop factor with the last iteration. Published
-        rates do not drop.
-        """
+        """1, then a geometric fall to `DROP_FACTOR` at the last iteration; published rates do not fall."""
         begin, end = self._iteration(DROP_AT), self.config.splats.iterations
         if self.config.splats.rates == "published" or iteration < begin:
             return 1.0
