@@ -23,7 +23,7 @@ from panoless.splats.kernels.reference.rasterize import rotation_matrices
 from panoless.splats.kernels.splats import blend_splats, project_gaussians
 from panoless.splats.model import ShadedSurfels, Surfels
 from panoless.splats.rendering import ALPHA_FLOOR
-from panoless.splats.shading.occlusion import Occluder, OccluderOptions
+from panoless.splats.shading.occlusion import Occluder
 from panoless.splats.split_sum import LEVELS, Prefiltered, look_up_rough, specular_share
 from shinypartial.core.harmonics import harmonic_polynomials
 
@@ -67,8 +67,8 @@ class Shading(Protocol):
         ...
 
     @property
-    def occlusion(self) -> OccluderOptions | None:
-        """When and how it traces what the object hides of its surroundings; None: it does not."""
+    def traces(self) -> bool:
+        """Whether it traces what the object hides of its surroundings."""
         ...
 
     def begun(self, surfels: Surfels, *, random: bool) -> ShadedSurfels:
