@@ -45,7 +45,6 @@ def command(dataset: Dataset, output: str) -> list[str]:
         "first_surface.hull_resolution=24",
         "surroundings.mode=off",
         "material.reflectance=off",
-        "trust.resolution=16",
     ]
     options += ["corrections.masks=off", "corrections.exposure=off", "corrections.lens=off"]
     return ["fit", str(dataset.root), "--output", output, *options]
@@ -128,16 +127,8 @@ SHORT = {
         'free_form.rounds=[{"cells": 16, "resolution": 8, "robust_scale": 0.3, "samples": 1, "rays": 3000, '
         '"smoothing": 100, "steps": 2}]',
     ),
-    "revolution": (
-        "revolution.photometric.pixels=10000",
-        "revolution.mouth.judged_pixels=5000",
-        "revolution.lip.length_px=5",
-        "revolution.map.pixels=100000",
-        "revolution.footprints.pixels=5000",
-    ),
 }
-SHORT["auto"] = SHORT["revolution"]
-BELIEVED = "corrections.masks=off", "corrections.exposure=off", "corrections.lens=off", "poses.mode=off"
+BELIEVED = "corrections.masks=off", "corrections.exposure=off", "corrections.lens=off", "corrections.poses=off"
 
 
 def short_config(kind: str) -> FitConfig:

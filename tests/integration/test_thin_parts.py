@@ -27,8 +27,7 @@ CONFIG = replace(
         descent=replace(SURFELS.free_form.descent, rounds=()),
         concave=replace(SURFELS.free_form.concave, rounds=SHORT),
     ),
-    poses=replace(SURFELS.poses, mode="off"),
-    corrections=replace(SURFELS.corrections, masks="off", exposure="off", lens="off"),
+    corrections=replace(SURFELS.corrections, poses="off", masks="off", exposure="off", lens="off"),
 )
 
 

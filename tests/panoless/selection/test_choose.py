@@ -30,6 +30,7 @@ from panoless.selection.options import CorrectionOptions
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.perturb.masks import wobbling
 from shinypartial.dataset.schema import Dataset
+from tests.support.few_rounds import take_few_rounds
 from tests.support.mirror_plane import NORMAL, RECTANGLE, arc, make_plane_dataset, plane_of, reflecting_views
 from tests.support.mirror_revolution import around, goblet, pillar_views, revolution_views
 from tests.support.mirror_sphere import tiny_config
@@ -44,12 +45,10 @@ def coarse_config() -> FitConfig:
     return replace(
         config,
         model="auto",
-        selection=replace(config.selection, trial_resolution=32),
+        environment=replace(config.environment, solve_resolution=32),
         # The traced dome has flat edges, so it looks like a flat mirror in a near room.
         surroundings=replace(config.surroundings, mode="off"),
         corrections=CorrectionOptions(masks="off", exposure="off", lens="off"),
-        height_field=replace(config.height_field, rounds=3),
-        revolution=replace(config.revolution, rounds=1),
         free_form=replace(
             config.free_form,
             rounds=(coarsest, replace(coarsest, resolution=32, robust_scale=0.2, steps=4)),
@@ -63,6 +62,12 @@ def coarse_config() -> FitConfig:
 
 
 CONFIG = coarse_config()
+
+
+@pytest.fixture(autouse=True)
+def few_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Enough to tell kinds apart."""
+    take_few_rounds(monkeypatch, heights=3, revolutions=1)
 
 
 def framed(frame_height: float, bend: float = 0.0) -> Views:
@@ -216,7 +221,7 @@ def test_a_goblet_takes_the_surface_of_revolution() -> None:
 
 def test_the_configuration_overrides_both_ways(views: Views) -> None:
     """Surfels for a flat mirror, a plane for a bent one and even for a sphere; nothing is compared."""
-    stated = replace(CONFIG, poses=replace(CONFIG.poses, mode="off"))
+    stated = replace(CONFIG, corrections=replace(CONFIG.corrections, poses="off"))
     chosen = {model: replace(stated, model=model) for model in ("plane", "surfels")}
     state = begin(framed(0.0), chosen["surfels"])
     assert state.geometry.kind == "surfels"
