@@ -33,7 +33,8 @@ class Fit(LongCommand):
     """Fit a dataset: its surface, an environment map and a visibility map; then export the prediction."""
 
     FIRST: ClassVar = (
-        "dataset preset output viewer device set config.model config.tint config.downscale config.environment.range"
+        "dataset preset output viewer device set config.model config.seed config.tint config.exposure config.downscale "
+        "config.environment.range config.environment.solve_resolution"
     )
     dataset: Annotated[Path | None, tyro.conf.Positional] = None
     """Dataset folder, also plain NeRF-synthetic, or a bundled one: tiny-vase; else the newest in ./datasets."""
@@ -53,7 +54,7 @@ class Fit(LongCommand):
     set: Annotated[
         tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="OPTION=VALUE [OPTION=VALUE ...]")
     ] = ()
-    """Change options of a stage, such as plane.max_vertices=64; docs/reference/fit-options.md lists them."""
+    """Change options of a stage, such as surroundings.degree=2; docs/reference/fit-options.md lists them."""
     config: FitConfig = field(default_factory=FitConfig)
 
     def work(self) -> None:
