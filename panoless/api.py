@@ -136,7 +136,7 @@ def fit(
 
     `dataset` is a folder, also a plain NeRF-synthetic one, or the name of a bundled dataset such as `tiny-vase`;
     without it the newest below ./datasets is taken. `config` replaces the preset's values, `model` and `set`, such
-    as `("plane.max_vertices=64",)`, change some of them.
+    as `("surroundings.degree=2",)`, change some of them.
     `output` is the prediction folder, predictions/DATASET-PRESET by default; checkpoints lie in the run folder of the
     same name below ./runs. After `time_limit` minutes the fit ends at its next checkpoint with what it has; the same
     call with more time goes on from there. A call that was interrupted continues after its last finished stage, and one

@@ -12,7 +12,7 @@ import tyro
 
 from panoless.config import FitConfig, renamed_arguments, with_overrides
 from panoless.export.extension import Extension
-from panoless.photographs.options import CaptureOptions
+from panoless.photographs.options import LEAST_VIEWS, CaptureOptions
 from panoless.presets import PRESETS
 from shinypartial.core.command_line import command_line
 from shinypartial.core.errors import InputError
@@ -33,8 +33,8 @@ class Fit(LongCommand):
     """Fit a dataset: its surface, an environment map and a visibility map; then export the prediction."""
 
     FIRST: ClassVar = (
-        "dataset preset output time_limit viewer device set config.model config.tint config.downscale "
-        "config.environment.range"
+        "dataset preset output time_limit viewer device set config.model config.seed config.tint "
+        "config.exposure config.downscale config.environment.range config.environment.solve_resolution"
     )
     dataset: Annotated[Path | None, tyro.conf.Positional] = None
     """Dataset folder, also plain NeRF-synthetic, or a bundled one: tiny-vase; else the newest in ./datasets."""
@@ -56,7 +56,7 @@ class Fit(LongCommand):
     set: Annotated[
         tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="OPTION=VALUE [OPTION=VALUE ...]")
     ] = ()
-    """Change options of a stage, such as plane.max_vertices=64; docs/reference/fit-options.md lists them."""
+    """Change options of a stage, such as surroundings.degree=2; docs/reference/fit-options.md lists them."""
     config: FitConfig = field(default_factory=FitConfig)
 
     def work(self) -> None:
@@ -287,7 +287,7 @@ class Capture(LongCommand):
         named = self.colmap or self.masks or self.segmenter or self.board not in (None, "none")
         if named or any(file.suffix.lower() in VIDEO_SUFFIXES for file in files):
             return None
-        few, balls = len(files) < self.options.least_views, {}
+        few, balls = len(files) < LEAST_VIEWS, {}
         if few and hints:
             return {}
         try:
@@ -297,7 +297,7 @@ class Capture(LongCommand):
             if not few:
                 return None
             raise InputError(
-                expected=f"a mirror ball, or at least {self.options.least_views} photographs of another object",
+                expected=f"a mirror ball, or at least {LEAST_VIEWS} photographs of another object",
                 found=f"{len(files)} photographs; {error.found} in {file.name}",
                 remedy=f"Take more photographs. If it is a ball: {error.remedy}",
             ) from None

@@ -13,7 +13,6 @@ from typing import Annotated, Any, Literal, TypeVar
 import tyro
 from msgspec import Meta
 
-from panoless.capture.options import ContrastOptions, MaskRepairOptions
 from panoless.environment.options import (
     COARSEST,
     MaterialOptions,
@@ -22,16 +21,11 @@ from panoless.environment.options import (
 )
 from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.geometry.free_form.options import FreeFormOptions
-from panoless.geometry.height_field.options import HeightFieldOptions
-from panoless.geometry.plane.options import PlaneOptions
-from panoless.geometry.revolution.options import RevolutionOptions
 from panoless.geometry.sphere.options import SphereOptions
-from panoless.selection.options import CorrectionOptions, PoseOptions, SelectionOptions
+from panoless.selection.options import CorrectionOptions
 from panoless.splats.options import SplatConfig
-from panoless.trust.options import TrustOptions
 from shinypartial.core.errors import InputError
 from shinypartial.io.records import (
-    Count,
     Natural,
     NonNegative,
     Positive,
@@ -59,10 +53,6 @@ class EnvironmentConfig:
     """Texels along a face side during the optimization; 2ⁿ or 3 · 2ⁿ where a shading blurs the map for rough parts."""
     activation: Literal["clamp", "sigmoid"] = "clamp"
     """`sigmoid`: Eq. 7 of the paper, started at random logits; `clamp`: radiance itself, kept in [0, 1]."""
-    gray: Share = 0.5
-    """Radiance that it starts with."""
-    noise: NonNegative = 5.0
-    """How far its logits start from `gray` at random; read for `sigmoid`."""
     range: Literal["ldr", "hdr"] = "ldr"
     """`ldr`: views are clipped to [0, 1], as photographs are; `hdr`: radiance above 1 is fitted, too (EXR, HDR)."""
     warmup: Share = 0.06
@@ -81,6 +71,10 @@ class EnvironmentConfig:
     for surfels, held-out pixels for kinds whose pixels are areas, and the density of rays for others. Where the mirror
     may be rough, 2ⁿ or 3 · 2ⁿ."""
 
+    def trial_resolution(self, most: int) -> int:
+        """Texels along a face side of a map that only judges: no more than the exported map has, where that is set."""
+        return min(most, self.solve_resolution or most)
+
 
 @dataclass(frozen=True)
 class FitConfig:
@@ -98,29 +92,19 @@ class FitConfig:
     """Known reflectance of the mirror in red, green and blue (linear): what it shows is tint · environment."""
     exposure: NonNegative = 0.0
     """Factor of all photographs by which a shape is chosen, fitted and judged; the map is solved from them as they are.
-    0: that which gives a dark object the mean brightness `contrast.brightness`."""
-    downscale: Count = 1
-    """Average the training images over blocks of this many pixels a side."""
-    least_object_px: NonNegative = 0.0
-    """Smaller blocks, where the object (the root of its area) would have fewer pixels across."""
+    0: that which gives a dark object a mean brightness of 0.35."""
+    downscale: Natural = 1
+    """Average the training images over blocks of this many pixels a side; 0: 2, but 1 for a small object."""
     crop_margin_px: Annotated[int, Meta(ge=-1)] = 12
     """Work on the mask's bounding box with this margin; −1 works on whole images."""
     splats: Annotated[SplatConfig, tyro.conf.arg(name="")] = field(default_factory=SplatConfig)
     environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
-    mask_repair: Tuned[MaskRepairOptions] = field(default_factory=MaskRepairOptions)
     first_surface: Tuned[FirstSurfaceOptions] = field(default_factory=FirstSurfaceOptions)
-    contrast: Tuned[ContrastOptions] = field(default_factory=ContrastOptions)
     sphere: Tuned[SphereOptions] = field(default_factory=SphereOptions)
-    plane: Tuned[PlaneOptions] = field(default_factory=PlaneOptions)
-    height_field: Tuned[HeightFieldOptions] = field(default_factory=HeightFieldOptions)
-    revolution: Tuned[RevolutionOptions] = field(default_factory=RevolutionOptions)
     free_form: Tuned[FreeFormOptions] = field(default_factory=FreeFormOptions)
-    poses: Tuned[PoseOptions] = field(default_factory=PoseOptions)
     surroundings: Tuned[SurroundingsOptions] = field(default_factory=SurroundingsOptions)
     material: Tuned[MaterialOptions] = field(default_factory=MaterialOptions)
-    selection: Tuned[SelectionOptions] = field(default_factory=SelectionOptions)
     corrections: Tuned[CorrectionOptions] = field(default_factory=CorrectionOptions)
-    trust: Tuned[TrustOptions] = field(default_factory=TrustOptions)
 
 
 def renamed_arguments(arguments: list[str]) -> list[str]:
@@ -144,7 +128,7 @@ def renamed_arguments(arguments: list[str]) -> list[str]:
 
 
 def with_overrides(config: FitConfig, overrides: Sequence[str]) -> FitConfig:
-    """The configuration with values set by `path=value`, such as `plane.max_vertices=64`; values are JSON or words.
+    """The configuration with values set by `path=value`, such as `surroundings.degree=2`; values are JSON or words.
 
     Raises InputError for a path that is no option, and for a value out of its range.
     """
@@ -159,7 +143,7 @@ def with_overrides(config: FitConfig, overrides: Sequence[str]) -> FitConfig:
             place = place.get(section, {}) if isinstance(place, dict) else {}
         if not equals or not isinstance(place, dict) or name not in place:
             raise InputError(
-                expected="--set OPTION=VALUE with an option of the configuration, such as plane.max_vertices=64",
+                expected="--set OPTION=VALUE with an option of the configuration, such as surroundings.degree=2",
                 found=override,
                 remedy="The reference of options lists them all; any other number is a constant beside its formula.",
             )
@@ -207,11 +191,10 @@ def _check_blurred_maps(config: FitConfig) -> None:
     """InputError for maps that don't halve whole where a lobe may blur them: of rough mirrors and of the split sum."""
     environment, material = config.environment, config.material
     exact = environment.range == "ldr" and config.model != "surfels"
-    rough, soft = exact and material.roughness == "auto", exact and "auto" in (material.roughness, material.blur)
+    soft = exact and "auto" in (material.roughness, material.blur)
     for option, resolution, blurred in (
         ("--config.environment.resolution", environment.resolution, config.splats.surfels.shading in SPLIT_SUM),
-        ("--config.environment.solve-resolution", environment.solve_resolution, rough),
-        ("--set material.resolution", material.resolution, soft),
+        ("--config.environment.solve-resolution", environment.solve_resolution, soft),
     ):
         if blurred and not halves_whole(resolution):
             raise InputError(

@@ -1,6 +1,6 @@
 """A time limit of a fit: what improves a state ends there, what completes it does not.
 
-Every checkpoint (see `panoless.journal`) of a block that `improves` a state looks at the clock. Past the limit it
+Every checkpoint (see `panoless.journal`) of a block that is `improving` a state looks at the clock. Past the limit it
 leaves that block, and the state before it is the result. Nothing that was computed after that is remembered, so the
 same command without a limit goes on from the last whole checkpoint.
 """

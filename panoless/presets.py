@@ -9,8 +9,7 @@ from panoless.splats.presets import METHODS
 PRESETS: dict[str, FitConfig] = {
     "fast": FitConfig(
         preset="fast",
-        downscale=2,
-        least_object_px=96.0,
+        downscale=0,
         splats=SplatConfig(iterations=300, surfels=SurfelConfig(count=3000)),
         first_surface=FirstSurfaceOptions(hull_resolution=64),
         environment=EnvironmentConfig(resolution=64, rays=2_000_000),

@@ -13,13 +13,17 @@ from shinypartial.dataset.schema import BallEvidence, Dataset
 
 PHOTOGRAPHER_DEG = 30.0
 """About each camera, seen from a ball: who holds it reaches so far, legs included, in 37 photographs of a lobby."""
+COARSE_DOWNSCALE = 2
+"""Side of the blocks of pixels where none is configured…"""
+LEAST_OBJECT_PX = 96.0
+"""…and fewest blocks across the object, the root of its area, for which they are that large."""
 FEW_VIEWS = 5
 """Of a ball, from which one can be spared to judge how near the surroundings are."""
 
 
 def of_ball(config: FitConfig, ball: BallEvidence, views: int) -> FitConfig:
     """The configuration of a fit to a capture of a polished ball from so many views."""
-    corrections = replace(config.corrections, masks="off", lens="off")
+    corrections = replace(config.corrections, poses="off", masks="off", lens="off")
     if ball.exposures_known:
         corrections = replace(corrections, exposure="off")
     surroundings = config.surroundings
@@ -28,7 +32,6 @@ def of_ball(config: FitConfig, ball: BallEvidence, views: int) -> FitConfig:
     return replace(
         config,
         model="sphere",
-        poses=replace(config.poses, mode="off"),
         corrections=corrections,
         surroundings=surroundings,
         material=replace(config.material, roughness="off", blur="off", scattering="off"),
@@ -49,15 +52,16 @@ def configured_views(dataset: Dataset, config: FitConfig) -> tuple[Views, FitCon
     views = load_views(
         dataset,
         config.crop_margin_px,
-        config.downscale,
+        config.downscale or COARSE_DOWNSCALE,
         encoding_of(config),
-        least_object_px=config.least_object_px,
+        least_object_px=0.0 if config.downscale else LEAST_OBJECT_PX,
         known_radius=config.sphere.radius,
     )
     if ball is not None and ball.background:
         views = replace(views, background=load_background(dataset, encoding_of(config)))
     exposure = config.exposure
     if exposure == 0:
-        exposure = exposure_of(views, config.contrast) if can_be_exposed(config) else 1.0
+        exposure = exposure_of(views) if can_be_exposed(config) else 1.0
     config = replace(config, exposure=exposure)
-    return with_repaired_masks(exposed(views, exposure), config.mask_repair), config
+    views = exposed(views, exposure)
+    return (views if config.corrections.repair == "off" else with_repaired_masks(views)), config

@@ -7,9 +7,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from panoless.capture.options import ContrastOptions
 from panoless.capture.views import Views
 
+DARK = 0.2
+"""Mean radiance of the object's pixels (linear) below which photographs are dark."""
+BRIGHTNESS = 0.35
+"""Mean radiance to which dark ones are exposed, all together."""
+DARK_SHARE = 0.5
+"""Share of the mean brightness below which a median one is dark."""
 LARGEST_EXPOSURE = 100.0
 """More than so many times brighter nothing is made: darker photographs show noise."""
 MEDIANS = 6.0
@@ -29,14 +34,14 @@ class Contrast:
     knee: float | None = None
 
     @classmethod
-    def of(cls, views: Views, options: ContrastOptions, *, least_knee: float = LEAST_KNEE) -> "Contrast":
+    def of(cls, views: Views, *, least_knee: float = LEAST_KNEE) -> "Contrast":
         """What views ask for: logarithms where the median brightness of the object's pixels is far below the mean.
 
         The share of the two does not depend on the exposure, but for what that saturates.
         """
         brightness = _brightness(views)
         median = float(brightness.median()) if len(brightness) else 0.0
-        if not len(brightness) or median >= options.dark_share * float(brightness.mean()):
+        if not len(brightness) or median >= DARK_SHARE * float(brightness.mean()):
             return cls()
         return cls(max(median / MEDIANS, least_knee))
 
@@ -59,14 +64,14 @@ def _brightness(views: Views) -> Float[Tensor, "P"]:
     return torch.cat([view.radiance_at(view.solid).mean(1) for view in views.train])
 
 
-def exposure_of(views: Views, options: ContrastOptions) -> float:
-    """The factor that gives the object of dark photographs the brightness of the options in the mean; 1 for others.
+def exposure_of(views: Views, dark: float = DARK, brightness: float = BRIGHTNESS) -> float:
+    """The factor that gives the object of dark photographs a mean brightness; 1 for others.
 
     These have a scale: the radiance at which they are saturated.
     """
-    brightness = _brightness(views)
-    mean = float(brightness.mean()) if len(brightness) else 0.0
-    return min(max(options.brightness / mean, 1.0), LARGEST_EXPOSURE) if 0 < mean < options.dark else 1.0
+    shown = _brightness(views)
+    mean = float(shown.mean()) if len(shown) else 0.0
+    return min(max(brightness / mean, 1.0), LARGEST_EXPOSURE) if 0 < mean < dark else 1.0
 
 
 def exposed(views: Views, exposure: float) -> Views:

@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from panoless.capture.masks import MASK_LEVEL
-from panoless.capture.options import MaskRepairOptions
 from panoless.capture.rays import in_camera, project
 from panoless.capture.silhouettes import mask_distance
 from panoless.capture.views import MaskRepairs, TrainView, Views
@@ -51,7 +50,7 @@ SPARE = 1.1
 SQUARE = np.ones((3, 3), bool)
 
 
-def with_repaired_masks(views: Views, options: MaskRepairOptions, *, grids: tuple[int, int] = GRIDS) -> Views:
+def with_repaired_masks(views: Views, *, grids: tuple[int, int] = GRIDS) -> Views:
     """The views with masks from which nothing as large as a blob is missing, and nothing stands out, by what the others
     say.
 
@@ -60,7 +59,7 @@ def with_repaired_masks(views: Views, options: MaskRepairOptions, *, grids: tupl
     mended. What is missing is filled first: holes in other masks look as if a view showed too much. In each round the
     mended masks vote on the masks as they were, in the last rounds on a finer grid.
     """
-    if options.mode == "off" or len(views.train) < LEAST_VIEWS:
+    if len(views.train) < LEAST_VIEWS:
         return views
     said, inside = views, [view.mask.cpu().numpy() >= MASK_LEVEL for view in views.train]
     margin = MARGIN * _Grid.of(views, grids[0]).spacing

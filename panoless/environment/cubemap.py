@@ -9,17 +9,23 @@ from panoless.config import EnvironmentConfig
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap
 from shinypartial.core.sphere import directions_to_cube
 
+GRAY = 0.5
+"""Radiance of the first map."""
+NOISE = 5.0
+"""Half the width of the uniform noise on its logits."""
 LEAST_GRAY = 1e-6
 """Of a map that starts through the sigmoid, so that its logits are finite."""
 
 
-def initial_environment(config: EnvironmentConfig, generator: torch.Generator) -> Float[Tensor, "6 3 L L"]:
+def initial_environment(
+    config: EnvironmentConfig, generator: torch.Generator, gray: float = GRAY, noise: float = NOISE
+) -> Float[Tensor, "6 3 L L"]:
     """Gray radiance for `clamp`; its logits and noise for `sigmoid`."""
     shape = (6, 3, config.resolution, config.resolution)
     if config.activation == "sigmoid":
-        middle = torch.logit(torch.tensor(config.gray), eps=LEAST_GRAY)
-        return (torch.rand(shape, generator=generator) * 2 - 1) * config.noise + middle
-    return torch.full(shape, config.gray)
+        middle = torch.logit(torch.tensor(gray), eps=LEAST_GRAY)
+        return (torch.rand(shape, generator=generator) * 2 - 1) * noise + middle
+    return torch.full(shape, gray)
 
 
 def look_up(

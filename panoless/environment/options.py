@@ -5,8 +5,6 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from shinypartial.io.records import Count
-
 COARSEST = 4
 """Texels along a face side on which the widest blur of a lobe works."""
 
@@ -29,8 +27,6 @@ class SurroundingsOptions:
     differ."""
     floor: Literal["auto", "off"] = "auto"
     """Whether what the object stands on is taken for a level disk before the walls, where held-out views gain by it."""
-    rays: Count = 60_000
-    """About so many pixels of all views tell how near they are."""
 
 
 @dataclass(frozen=True)
@@ -50,5 +46,3 @@ class MaterialOptions:
     better, too, the one that does so more is taken."""
     known_roughness: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.0
     """Where it is known, in units of Blender's principled shader; 0: held-out views tell it."""
-    resolution: Count = 64
-    """Texels along a face side of the maps under which reflectance, roughness and blur are judged."""

@@ -12,7 +12,7 @@ from panoless.photographs.certainty import SeenPoints
 from panoless.photographs.corners import Sighting, corners_of, locate_corners
 from panoless.photographs.frames import Frames
 from panoless.photographs.lens import Lens, opencv
-from panoless.photographs.options import CaptureOptions
+from panoless.photographs.options import LEAST_VIEWS
 from panoless.photographs.posed import LEVEL, PosedView, Poses, as_rows, with_covariances
 from panoless.photographs.video import luminance
 from shinypartial.core.board import BOARDS, CELLS_OF_MARKER, CELLS_OF_SQUARE, MM, Board
@@ -22,6 +22,10 @@ from shinypartial.io.images import read_png
 
 BOARD_FRAMES = 8
 """Frames in which a board that nobody named is looked for: half of them must show it."""
+LEAST_CORNERS = 8
+"""Corners of the board that a frame must show; a pose needs four, and more make it certain."""
+MOST_FOCAL_ERROR = 0.02
+"""Standard deviation of the focal length, as a share of it, above which the frames do not determine it."""
 CORNER_BLURS_PX = (1.5, 0.7, 0.7)
 """Rounds in which corners are located by the print around them, each with a blur of both (px)."""
 
@@ -103,7 +107,7 @@ def _write_pdf(board: Board, path: Path) -> None:
         temporary.write_bytes(file.encode("ascii"))
 
 
-def recognized_board(frames: Frames, folder: Path, options: CaptureOptions) -> Board | None:
+def recognized_board(frames: Frames, folder: Path) -> Board | None:
     """The board of which most corners are seen, if half of some frames show enough of them; None: there is none.
 
     A board on Letter is found as one on A4: that has all of its markers in the same places and one row more, so their
@@ -114,7 +118,7 @@ def recognized_board(frames: Frames, folder: Path, options: CaptureOptions) -> B
     best, most = None, 0
     for board in (BOARDS["A4"], BOARDS["A3"]):
         seen = [len(each.corners) for each in find_board(board, some, folder)]
-        enough = [count for count in seen if count >= options.least_corners]
+        enough = [count for count in seen if count >= LEAST_CORNERS]
         if 2 * len(enough) >= len(some.photographs) and sum(enough) > most:
             best, most = board, sum(enough)
     return best
@@ -143,7 +147,6 @@ def poses_from_board(
     board: Board,
     frames: Frames,
     folder: Path,
-    options: CaptureOptions,
     *,
     corner_blurs_px: Sequence[float] = CORNER_BLURS_PX,
 ) -> Poses:
@@ -162,30 +165,30 @@ def poses_from_board(
         )
     size = sizes.pop()
     seen = find_board(board, frames, folder)
-    sightings = [sighting for sighting in seen if len(sighting.corners) >= options.least_corners]
+    sightings = [sighting for sighting in seen if len(sighting.corners) >= LEAST_CORNERS]
     origin = f"the board of {board.columns}×{board.rows} squares"
-    if len(sightings) < options.least_views:
+    if len(sightings) < LEAST_VIEWS:
         raise InputError(
-            expected=f"at least {options.least_views} frames that show {options.least_corners} corners of {origin}",
+            expected=f"at least {LEAST_VIEWS} frames that show {LEAST_CORNERS} corners of {origin}",
             found=f"{len(sightings)} of {len(frames.photographs)}",
             remedy="Let the whole board be in the picture, flat, sharp and larger than the object; check --board.",
         )
     start = cv2.initCameraMatrix2D(*_points_and_places(board, sightings), size, 1.0)[0, 0]
     lens = Lens(float(start), float(start), size[0] / 2, size[1] / 2, *size)
-    sightings, adjusted = _robust(board, sightings, lens, options, OUTLIER_ROUNDS)
+    sightings, adjusted = _robust(board, sightings, lens, OUTLIER_ROUNDS)
     pictures = {one.name: folder / f"{one.name}.png" for one in frames.photographs}
     for blur_px in corner_blurs_px:
         known = dict(zip((sighting.name for sighting in sightings), adjusted.poses, strict=True))
         near = {
             sighting.name: known.get(sighting.name, _rough_pose(board, sighting, adjusted.lens)) for sighting in seen
         }
-        located = _located(board, near, adjusted.lens, pictures, blur_px, options)
-        if len(located) < options.least_views:
+        located = _located(board, near, adjusted.lens, pictures, blur_px)
+        if len(located) < LEAST_VIEWS:
             break
-        sightings, adjusted = _robust(board, located, adjusted.lens, options, 1)
-    if not adjusted.focal_error < options.most_focal_error:
+        sightings, adjusted = _robust(board, located, adjusted.lens, 1)
+    if not adjusted.focal_error < MOST_FOCAL_ERROR:
         raise InputError(
-            expected=f"frames that tell the focal length to {options.most_focal_error:.0%}",
+            expected=f"frames that tell the focal length to {MOST_FOCAL_ERROR:.0%}",
             found=f"an uncertainty of {adjusted.focal_error:.1%}",
             remedy="Add frames that see the board at a slant, from different sides.",
         )
@@ -238,13 +241,11 @@ def _adjust(board: Board, sightings: list[Sighting], lens: Lens) -> _Adjusted:
     return _Adjusted(found_lens, float(deviations[:2].max()) / focal, tuple(poses), tuple(residuals))
 
 
-def _robust(
-    board: Board, sightings: list[Sighting], lens: Lens, options: CaptureOptions, rounds: int
-) -> tuple[list[Sighting], _Adjusted]:
+def _robust(board: Board, sightings: list[Sighting], lens: Lens, rounds: int) -> tuple[list[Sighting], _Adjusted]:
     """The adjustment of what is left when outliers are gone."""
     adjusted = _adjust(board, sightings, lens)
     for _ in range(rounds):
-        sightings = _without_outliers(sightings, adjusted.residuals_px, options)
+        sightings = _without_outliers(sightings, adjusted.residuals_px)
         adjusted = _adjust(board, sightings, lens)
     return sightings, adjusted
 
@@ -270,26 +271,23 @@ def _located(
     lens: Lens,
     pictures: dict[str, Path],
     blur_px: float,
-    options: CaptureOptions,
 ) -> list[Sighting]:
     """The corners by all of the print around them, near where poses have them, in the frames that show enough."""
     found = []
     for name, pose in poses.items():
         light = luminance(read_png(pictures[name])[..., :3])
-        located = locate_corners(board, name, light, lens, pose, blur_px, options)
-        if len(located.corners) >= options.least_corners:
+        located = locate_corners(board, name, light, lens, pose, blur_px)
+        if len(located.corners) >= LEAST_CORNERS:
             found.append(located)
     return found
 
 
-def _without_outliers(
-    sightings: list[Sighting], residuals_px: tuple[Float[np.ndarray, "_"], ...], options: CaptureOptions
-) -> list[Sighting]:
+def _without_outliers(sightings: list[Sighting], residuals_px: tuple[Float[np.ndarray, "_"], ...]) -> list[Sighting]:
     """Corners within three deviations, by the median of all; frames that keep enough of them."""
     limit = 3 * 1.4826 * float(np.median(np.concatenate(residuals_px)))
     kept = []
     for sighting, residuals in zip(sightings, residuals_px, strict=True):
         near = residuals <= limit
-        if near.sum() >= options.least_corners:
+        if near.sum() >= LEAST_CORNERS:
             kept.append(Sighting(sighting.name, sighting.corners[near], sighting.places_px[near]))
     return kept

@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from panoless.photographs.lens import Lens, opencv
-from panoless.photographs.options import CaptureOptions
 from shinypartial.core.board import CELLS_OF_SQUARE, MM, Board
 
+LEAST_MATCH = 0.8
+"""Share of the variance around a corner that the print must explain; what something hides is not explained."""
 CORNER_WINDOW = 0.7
 """Half side of the window around a corner, in squares of the board."""
 CORNER_REACH = 0.15
@@ -53,7 +54,6 @@ def locate_corners(
     lens: Lens,
     camera_to_board: Float[np.ndarray, "4 4"],
     blur_px: float,
-    options: CaptureOptions,
 ) -> Sighting:
     """Corners near where a pose has them, from the luminance of a frame; both are blurred by `blur_px` before."""
     cv2 = opencv()
@@ -73,7 +73,7 @@ def locate_corners(
     shifts, match = _shifts(_blurred(part, blur_px), _blurred(picture, blur_px), known, expected - low, half)
     inside = (expected > half).all(1) & (expected < np.array([lens.width, lens.height]) - 1 - half).all(1)
     near = np.linalg.norm(shifts, axis=1) < CORNER_REACH * square_px
-    kept: Bool[np.ndarray, "P"] = inside & near & (match > options.least_match)
+    kept: Bool[np.ndarray, "P"] = inside & near & (match > LEAST_MATCH)
     return Sighting(name, np.flatnonzero(kept), (expected + shifts)[kept])
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from panoless.photographs.lens import opencv
-from panoless.photographs.options import CaptureOptions
+from panoless.photographs.options import LEAST_VIEWS, CaptureOptions
 from panoless.photographs.shot import RAW_SUFFIXES
 from panoless.photographs.standstill import StillCheck
 from panoless.photographs.video import VIDEO_SUFFIXES, decoded_video, luminance
@@ -18,6 +18,10 @@ from shinypartial.dataset.bundled import bundled_photographs
 from shinypartial.io.images import EXR, PICTURE_SUFFIXES, read_as_stored, read_upright, to_bytes, write_png
 from shinypartial.io.progress import Progress
 from shinypartial.io.threads import in_threads
+
+MOST_BLUR = 0.75
+"""Blur (Crete et al. 2007, 0 to 1) of the median frame above which a capture is refused: 0.67 after a Gaussian blur
+of 2 pixels, 0.78 after 3."""
 
 #: What programs write beside a picture; no photograph of its own.
 COMPANIONS = ("_alpha", "_mask", "_normal", "_self", "_depth")
@@ -105,20 +109,20 @@ def make_frames(files: list[Path], folder: Path, upright: bool, options: Capture
     for photograph in in_threads(made, sources):
         photographs.append(photograph)
         progress.advance()
-    if len(photographs) < options.least_views:
+    if len(photographs) < LEAST_VIEWS:
         raise InputError(
-            expected=f"at least {options.least_views} photographs",
+            expected=f"at least {LEAST_VIEWS} photographs",
             found=f"{len(photographs)} in {files[0].parent}",
             remedy="Take more of them, 50 to 100 from an arc as wide as you can.",
         )
     blur = float(np.median([photograph.blur for photograph in photographs]))
-    if blur > options.most_blur:
+    if blur > MOST_BLUR:
         raise InputError(
-            expected=f"sharp photographs: blur of at most {options.most_blur:.2f} in the median frame",
+            expected=f"sharp photographs: blur of at most {MOST_BLUR:.2f} in the median frame",
             found=f"{blur:.2f}",
             remedy="Lock the focus on the object, take more light or a tripod, and move slowly.",
         )
-    borders.require_motion(options)
+    borders.require_motion()
     return Frames(tuple(photographs))
 
 

@@ -17,8 +17,7 @@ from scipy import ndimage
 from panoless.capture.masks import MAIN_SHARE, largest_pieces
 from panoless.photographs.hull import carve, cube, nearest_point, outline, pixels_of
 from panoless.photographs.lens import opencv
-from panoless.photographs.masks import EDGE_PX, HULL_SPARE, TOLERATED, averaged, enlarged
-from panoless.photographs.options import CaptureOptions
+from panoless.photographs.masks import EDGE_PX, HULL_SPARE, HULL_VOXELS, TOLERATED, averaged, enlarged
 from panoless.photographs.posed import GroundPlane
 from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
@@ -28,6 +27,8 @@ from shinypartial.io.progress import Progress
 
 SIDE_PX = 640
 """Masks by the ground are found in pictures averaged to no more than this."""
+TEXELS = 640
+"""Texels along a side of the square of ground."""
 REACH = 0.5
 """Half side of the square of ground that is looked at, as a share of the distance of the cameras."""
 CANDIDATES = 8
@@ -103,16 +104,16 @@ class Evidence:
     """By how much each pixel differs from the ground that it would show, in codes of 1."""
 
 
-def sheet_about(cameras: Sequence[Camera], ground: GroundPlane, options: CaptureOptions) -> Sheet:
+def sheet_about(cameras: Sequence[Camera], ground: GroundPlane) -> Sheet:
     """A square about the point below the one that all cameras look at."""
     normal = np.array(ground.normal)
     target = nearest_point(cameras)
     foot = target - (normal @ target - ground.offset) * normal
     half = REACH * float(np.median([np.linalg.norm(each.position_world - foot) for each in cameras]))
     right, down = tangents(normal)
-    step = 2 * half / options.ground_texels
+    step = 2 * half / TEXELS
     first = foot - (half - step / 2) * (right + down)
-    return Sheet(first, step * right, step * down, options.ground_texels)
+    return Sheet(first, step * right, step * down, TEXELS)
 
 
 def laid_out(
@@ -223,13 +224,13 @@ def cleared(seen: Sequence[Evidence], points: Float[np.ndarray, "P 3"]) -> Float
 
 
 def ground_masks(
-    whole: Mapping[str, Camera], folder: Path, ground: GroundPlane, picture: Path, options: CaptureOptions
+    whole: Mapping[str, Camera], folder: Path, ground: GroundPlane, picture: Path
 ) -> dict[str, UInt8[np.ndarray, "_ _"]]:
     """Masks of all views, and the ground as a `picture`. Raises InputError where nothing stands on it."""
     side, downscaled, blocks = averaged(whole, folder, SIDE_PX)
     cameras, pictures = list(downscaled.values()), list(blocks.values())
     progress = Progress("masks by the ground", len(whole))
-    sheet = sheet_about(cameras, ground, options)
+    sheet = sheet_about(cameras, ground)
     colors, reached = laid_out(pictures, cameras, sheet)
     sparse = (slice(None), slice(None, None, SPARSE), slice(None, None, SPARSE))
     gains = gains_of(colors[sparse], reached[sparse])
@@ -240,11 +241,11 @@ def ground_masks(
     for each, camera, gain in zip(pictures, cameras, gains, strict=True):
         seen.append(evidence_of(each, camera, gain, sheet, pattern, known))
         progress.advance()
-    found = _object_points(seen, ground, sheet, options)
+    found = _object_points(seen, ground, sheet)
     outlines = [[outline(view.camera, points, found.spacing) for points in found.sets] for view in seen]
     odds = odds_of(seen, outlines)
     masks = [_mask(view, of_view, odds) for view, of_view in zip(seen, outlines, strict=True)]
-    masks = _agreed(seen, masks, found, options)
+    masks = _agreed(seen, masks, found)
     return {name: _at_full_size(mask, whole[name], side) for name, mask in zip(whole, masks, strict=True)}
 
 
@@ -258,9 +259,9 @@ class _Points:
     half_side: float
 
 
-def _object_points(seen: Sequence[Evidence], ground: GroundPlane, sheet: Sheet, options: CaptureOptions) -> _Points:
+def _object_points(seen: Sequence[Evidence], ground: GroundPlane, sheet: Sheet) -> _Points:
     """What stands on the ground and is not cleared away: the largest piece, on a grid about it."""
-    normal, count, half = np.array(ground.normal), options.hull_voxels, sheet.half_side / 2
+    normal, count, half = np.array(ground.normal), HULL_VOXELS, sheet.half_side / 2
     center = sheet.center + half * normal
     for last in (False, True):
         points = cube(center, half, count)
@@ -319,12 +320,12 @@ def _mask(
 
 
 def _agreed(
-    seen: Sequence[Evidence], masks: Sequence[Bool[np.ndarray, "_ _"]], found: _Points, options: CaptureOptions
+    seen: Sequence[Evidence], masks: Sequence[Bool[np.ndarray, "_ _"]], found: _Points
 ) -> list[Bool[np.ndarray, "_ _"]]:
     """Masks by the hull of these where the view itself cannot tell, as before the far end of the room."""
     views = [(view.camera, mask) for view, mask in zip(seen, masks, strict=True)]
     allowed = int(TOLERATED * len(views))
-    points = carve(views, found.center, found.half_side, options.hull_voxels, allowed)
+    points = carve(views, found.center, found.half_side, HULL_VOXELS, allowed)
     agreed = []
     for view, mask in zip(seen, masks, strict=True):
         hull = outline(view.camera, points, found.spacing)

@@ -174,7 +174,7 @@ def _poses(request: Request, frames: Frames, pictures: Path, work: Path) -> tupl
     model = request.colmap or (None if drawn else find_model(request.source))
     transforms = None if drawn or model else find_transforms(request.source)
     if not (request.board or model or transforms):
-        drawn = recognized_board(frames, pictures, request.options)
+        drawn = recognized_board(frames, pictures)
     board = drawn and replace(drawn, square_mm=drawn.square_mm if request.square_mm is None else request.square_mm)
     read, named = read_transforms(transforms, frames) if transforms else (None, {})
     names = [one.name for one in frames.photographs]
@@ -196,7 +196,7 @@ def _poses(request: Request, frames: Frames, pictures: Path, work: Path) -> tupl
 
     def work_on() -> Poses:
         if board:
-            found, remedy = poses_from_board(board, frames, pictures, request.options), "Show the board in each frame."
+            found, remedy = poses_from_board(board, frames, pictures), "Show the board in each frame."
         elif model:
             found = read_colmap(model, frames)
             remedy = "Names of pictures must be those that the model knows."
@@ -204,7 +204,7 @@ def _poses(request: Request, frames: Frames, pictures: Path, work: Path) -> tupl
             found, remedy = read, "Names of pictures must be those of file_path."
         else:
             found, remedy = poses_from_structure(frames, pictures, masks, work / "structure"), REMEDY
-        poses = without_the_rest(found, frames, request.options, remedy)
+        poses = without_the_rest(found, frames, remedy)
         cameras = tuple(view.camera for view in poses.views)
         target = nearest_point(cameras)
         side = np.mean([camera.position_world for camera in cameras], axis=0) - target
@@ -287,18 +287,18 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
             origin, remedy = f"hints in {', '.join(request.hints)}", MORE_HINTS
             sides = {one.name: one.side for one in frames.photographs}
             hints = {name: hint.scaled(sides.get(name, 1)) for name, hint in request.hints.items()}
-            for name, mask in find_masks(cameras, train, hints, request.options).items():
+            for name, mask in find_masks(cameras, train, hints).items():
                 write_png(train / f"{name}_alpha.png", mask)
         elif own or poses.ground is None:
             origin = "alpha channels"
         else:
             origin, remedy = "what moves against the ground", GIVE_MASKS
-            found = ground_masks(cameras, train, poses.ground, work / "ground.png", request.options)
+            found = ground_masks(cameras, train, poses.ground, work / "ground.png")
             for name, mask in found.items():
                 write_png(train / f"{name}_alpha.png", mask)
         masks = {view.name: _written_mask(train, view) for view in poses.views}
         judged = {name: (cameras[name], mask) for name, mask in masks.items()}
-        overlaps = overlaps_of(judged, request.options, remedy)
+        overlaps = overlaps_of(judged, remedy)
         _write_mask_sheet(work / "masks.jpg", train, masks, dict(zip(masks, overlaps, strict=True)))
         return Masks(origin, tuple(masks), overlaps)
 

@@ -17,7 +17,6 @@ from panoless.capture.masks import MAIN_SHARE, MASK_LEVEL, cut_sides, estimate_o
 from panoless.photographs.frames import block_means
 from panoless.photographs.hull import carve, outline, overlap, sighted_ball
 from panoless.photographs.lens import opencv
-from panoless.photographs.options import CaptureOptions
 from shinypartial.core.camera import Camera, project
 from shinypartial.core.errors import InputError
 from shinypartial.io.files import read_json
@@ -25,6 +24,16 @@ from shinypartial.io.images import read_png
 from shinypartial.io.progress import Progress
 from shinypartial.io.records import read_record
 
+MASK_SIDE_PX = 240
+"""Masks are found in pictures averaged to no more than this, and only their edges in larger ones: GrabCut takes seconds
+for a picture of 800 pixels."""
+ROUNDS = 3
+"""Rounds of votes of views on masks, and of edges."""
+LEAST_OVERLAP = 0.7
+"""Overlap (intersection over union) of a view's mask and the hull's outline, in the median, below which poses and masks
+contradict each other."""
+HULL_VOXELS = 96
+"""Voxels of the visual hull along a side."""
 HULL_SPARE = 1.3
 """Half side of the hull's cube over the radius that rectangles or masks suggest."""
 TOLERATED = 0.1
@@ -98,16 +107,14 @@ class Masks:
     """Of each mask with the outline of the hull of all."""
 
 
-def hull_of(
-    views: Sequence[tuple[Camera, Float[np.ndarray, "_ _"]]], options: CaptureOptions
-) -> tuple[Float[np.ndarray, "P 3"], float]:
+def hull_of(views: Sequence[tuple[Camera, Float[np.ndarray, "_ _"]]]) -> tuple[Float[np.ndarray, "P 3"], float]:
     """Points of the hull of masks, and their spacing; as few masks are left out as let it fill the others."""
     frame = estimate_object_frame(views)
     half_side = HULL_SPARE * frame.radius
     inside = [(camera, mask >= MASK_LEVEL) for camera, mask in views]
-    spacing = 2 * half_side / options.hull_voxels
+    spacing = 2 * half_side / HULL_VOXELS
     for wrong in range(int(TOLERATED * len(views)) + 1):
-        points = carve(inside, frame.center, half_side, options.hull_voxels, wrong)
+        points = carve(inside, frame.center, half_side, HULL_VOXELS, wrong)
         filled = [
             np.count_nonzero(outline(camera, points, spacing) & mask) / np.count_nonzero(mask)
             for camera, mask in inside
@@ -119,7 +126,6 @@ def hull_of(
 
 def overlaps_of(
     views: Mapping[str, tuple[Camera, Float[np.ndarray, "_ _"]]],
-    options: CaptureOptions,
     remedy: str = CHECK_MASKS,
 ) -> tuple[float, ...]:
     """Overlap of each mask with the hull of all. Raises InputError for masks of the background, for empty ones, and
@@ -135,11 +141,11 @@ def overlaps_of(
             remedy=remedy.format(wrong[0]),
         )
     seen = tuple(views.values())
-    points, spacing = hull_of(seen, options)
+    points, spacing = hull_of(seen)
     found = tuple(overlap(mask >= MASK_LEVEL, outline(camera, points, spacing)) for camera, mask in seen)
-    if np.median(found) < options.least_overlap:
+    if np.median(found) < LEAST_OVERLAP:
         raise InputError(
-            expected=f"masks and poses that agree on an object: overlap of at least {options.least_overlap:.0%}",
+            expected=f"masks and poses that agree on an object: overlap of at least {LEAST_OVERLAP:.0%}",
             found=f"{np.median(found):.0%} in the median view",
             remedy=remedy.format(list(views)[int(np.argmin(found))]),
         )
@@ -183,7 +189,7 @@ def read_clicks(path: Path) -> dict[str, Hint]:
 
 
 def find_masks(
-    whole: Mapping[str, Camera], folder: Path, hints: Mapping[str, Hint], options: CaptureOptions
+    whole: Mapping[str, Camera], folder: Path, hints: Mapping[str, Hint]
 ) -> dict[str, UInt8[np.ndarray, "_ _"]]:
     """Masks of all views from hints in some. Raises InputError for names of no view and for hints that tell nothing."""
     unknown = [name for name in hints if name not in whole]
@@ -194,8 +200,8 @@ def find_masks(
             remedy="Take names of photographs without their suffix.",
         )
     names = list(whole)
-    side, cameras, pictures = averaged(whole, folder, options.mask_side_px)
-    progress = Progress("masks", len(names) * (2 + options.rounds))
+    side, cameras, pictures = averaged(whole, folder, MASK_SIDE_PX)
+    progress = Progress("masks", len(names) * (2 + ROUNDS))
     masks: dict[str, Bool[np.ndarray, "_ _"]] = {}
     known = {name: hint.scaled(side) for name, hint in hints.items()}
     for name, hint in known.items():
@@ -209,7 +215,7 @@ def find_masks(
             )
         progress.advance()
     _spread(names, cameras, pictures, masks, progress)
-    for _ in range(options.rounds):
+    for _ in range(ROUNDS):
         ball = _ball(cameras, masks)
         voted = {name: _voted(name, cameras, masks, ball) for name in names}
         bands = {name: _band(voted[name], BAND) for name in names}

@@ -9,10 +9,12 @@ from jaxtyping import Float
 from panoless.photographs.certainty import SeenPoints, pose_covariances
 from panoless.photographs.frames import Frames, Photograph
 from panoless.photographs.lens import Lens
-from panoless.photographs.options import CaptureOptions
+from panoless.photographs.options import LEAST_VIEWS
 from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
 
+LEAST_POSED = 0.5
+"""Share of the frames that must get a pose: with fewer, those that do are likely to be wrong."""
 GROUND_THICKNESS = 0.005
 """Points so near to a plane lie on it, as a share of the distance of the cameras."""
 GROUND_POINTS = 0.3
@@ -126,14 +128,14 @@ def with_covariances(poses: Poses, seen: Sequence[SeenPoints], *, known_points: 
     return replace(poses, views=tuple(views))
 
 
-def without_the_rest(poses: Poses, frames: Frames, options: CaptureOptions, remedy: str) -> Poses:
+def without_the_rest(poses: Poses, frames: Frames, remedy: str) -> Poses:
     """The same with the frames that have none named; InputError when these are too many."""
     named = {view.name for view in poses.views}
     left_out = tuple(photograph.name for photograph in frames.photographs if photograph.name not in named)
     count, total = len(poses.views), len(frames.photographs)
-    if count < max(options.least_views, options.least_posed * total):
+    if count < max(LEAST_VIEWS, LEAST_POSED * total):
         raise InputError(
-            expected=f"poses for at least {options.least_views} frames and {options.least_posed:.0%} of them",
+            expected=f"poses for at least {LEAST_VIEWS} frames and {LEAST_POSED:.0%} of them",
             found=f"{count} of {total} by {poses.origin}",
             remedy=remedy,
         )

@@ -5,10 +5,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from panoless.photographs.options import CaptureOptions
+from panoless.photographs.options import LEAST_VIEWS
 from panoless.photographs.video import luminance
 from shinypartial.core.errors import InputError
 
+LEAST_CHANGE = 0.25
+"""By which share of its contrast the border of frames changes at least where the camera moves."""
 LEAST_CONTRAST = 0.1
 """Standard deviation of light at the border of the median frame, as a share of its mean, that shows whether the camera
 moved."""
@@ -36,20 +38,20 @@ class StillCheck:
         border[BORDER_CELLS:-BORDER_CELLS, BORDER_CELLS:-BORDER_CELLS] = False
         self.borders.append(cells[border] / max(float(cells[border].mean()), TINY))
 
-    def require_motion(self, options: CaptureOptions) -> None:
+    def require_motion(self) -> None:
         """Raise InputError where borders show something, and the same in all frames.
 
         With b the border of a frame and m the median of all, that is: the median of |b − m|² stays below a share of the
         variance of m.
         """
         sizes = {len(border) for border in self.borders}
-        if len(self.borders) < options.least_views or len(sizes) > 1:
+        if len(self.borders) < LEAST_VIEWS or len(sizes) > 1:
             return
         borders = np.stack(self.borders)
         middle = np.median(borders, axis=0)
         contrast = float(middle.std())
         change = float(np.sqrt(np.median(np.mean((borders - middle) ** 2, axis=1))))
-        if contrast > LEAST_CONTRAST and change < options.least_change * contrast:
+        if contrast > LEAST_CONTRAST and change < LEAST_CHANGE * contrast:
             raise InputError(
                 expected="a camera that moves around the object, before surroundings at rest",
                 found=f"borders that change by {change / contrast:.0%} of their contrast: the camera stood still",

@@ -24,7 +24,7 @@ from panoless.journal import remembered
 from panoless.problem.nuisance import SHIFT, STATED_FLOOR, TURN_DEG
 from panoless.selection.candidates import Candidate, Selection, Verdict, describe
 from panoless.selection.fitted import Fitted, is_refined, missed_share
-from panoless.selection.held_out import held_out_errors, held_out_parts, is_matte
+from panoless.selection.held_out import LEAST_GAIN, held_out_errors, held_out_parts, is_matte
 from panoless.selection.joint import fit_jointly, followed, nuisance_kinds, proposed
 from panoless.selection.surroundings import explains_clearly_more
 from shinypartial.core.errors import InputError
@@ -37,6 +37,22 @@ OTHER = "another kind is preferred"
 TOO_MUCH = "leaves too much unexplained"
 MATTE = "one color a place explains the views, as of a matte object: no mirror was fitted"
 NONE_HELD_OUT = "too few views to hold one out"
+LARGEST_SILHOUETTE_PX = 0.5
+"""A candidate's silhouette lies at most this far from the masks' contours: median over views of the median."""
+LEAST_NEAR_OVERLAP = 0.98
+"""Its silhouette and the masks share at least this part of their union: median over views. Both are for outlines
+that agree with each other. Where they contradict each other a candidate may be farther from them by as much."""
+FARTHEST = 4.0
+"""What is farther off than so many times either is not near, however much outlines contradict each other: wrong
+cameras make them do so, too, and are turned."""
+BENT_EDGE = 2.0
+"""What a kind refines may be farther from the masks by this factor: its edge bends, too."""
+LARGEST_ERROR = 0.3
+"""A candidate that leaves more of the held-out views unexplained is refused, unless no later kind explains more."""
+DOUBTED_ERROR = 0.15
+"""Where a candidate leaves more, later ones are examined, too, unless outlines determine its whole shape."""
+DOUBTED_SHARE = 0.5
+"""One of those is preferred where it leaves less than this share of that."""
 LEAST_OVERLAP = 0.75
 """No turns are looked for where a shape overlaps less with the masks: mirror and vase do by 0.86 and 0.83 with turns of
 2°, and a plane by 0.70 with sculpture."""
@@ -81,7 +97,7 @@ def choose_geometry(views: Views, config: FitConfig) -> tuple[Geometry, Selectio
         fitted.append((candidate, geometry))
         if candidate.reason == MATTE:
             break
-        if explains and (family.told_by_outlines or error_of(fitted[-1]) <= config.selection.doubted_error):
+        if explains and (family.told_by_outlines or error_of(fitted[-1]) <= DOUBTED_ERROR):
             break
     chosen = [each for each in fitted if each[0].verdict == Verdict.CHOSEN]
     if chosen:
@@ -115,7 +131,7 @@ def much_less_unexplained(
     """The simplest, unless one after it leaves a share of its error only, what it misses of the object included."""
     chosen = fitted[0]
     for each in fitted[1:]:
-        enough = config.selection.doubted_share * error_of(chosen)
+        enough = DOUBTED_SHARE * error_of(chosen)
         if error_of(each) < enough and _with_missed(each, views, config) < enough:
             chosen = each
     return chosen
@@ -135,7 +151,7 @@ def least_unexplained(fitted: Sequence[tuple[Candidate, Geometry]], config: FitC
     another takes on counts only where no other was fitted.
     """
     waiting = [each for each in fitted if not is_refined(each[0].kind)] or fitted
-    enough = min(map(error_of, waiting)) / (1 - config.selection.least_gain)
+    enough = min(map(error_of, waiting)) / (1 - LEAST_GAIN)
     return next(each for each in waiting if error_of(each) <= enough)
 
 
@@ -162,7 +178,7 @@ def begun(source: Family, views: Views, config: FitConfig, *, asked: bool) -> St
         return None
     start = Start(first)
     is_off = np.isfinite(first.silhouette_px) and first.overlap >= LEAST_OVERLAP
-    if config.poses.mode == "off" or not is_off or is_near(start, views, config, bent=False):
+    if config.corrections.poses == "off" or not is_off or is_near(start, views, config, bent=False):
         return start
     stride = len(views.train) // TRIAL_VIEWS
     if stride >= 2 and not asked:
@@ -188,13 +204,12 @@ def is_near(start: Start, views: Views, config: FitConfig, *, bent: bool) -> boo
     Outlines that contradict each other miss any shape. By d pixels, they leave the share d · length / area of the
     object to one side alone.
     """
-    options, proposal = config.selection, start.proposal
-    farther = options.bent_edge if bent else 1.0
-    outside, missed = farther * options.largest_silhouette_px, farther * (1 - options.least_overlap)
+    proposal, farther = start.proposal, BENT_EDGE if bent else 1.0
+    outside, missed = farther * LARGEST_SILHOUETTE_PX, farther * (1 - LEAST_NEAR_OVERLAP)
     away, apart = proposal.silhouette_px, 1 - proposal.overlap
     if away <= outside and apart <= missed:
         return True
-    if away > options.farthest * outside or apart > options.farthest * missed:
+    if away > FARTHEST * outside or apart > FARTHEST * missed:
         return False
     error_px = contradiction_px(views if start.poses is None else start.poses.moved(views))
     return away <= outside + error_px and apart <= missed + error_px * _outline_share(views)
@@ -225,7 +240,7 @@ def _bends_rather(family: Family, geometry: Geometry, start: Start | None, views
     if start is None or not is_near(start, views, config, bent=True):
         return False
     fitted = (fit_jointly(other, _source(other), views, start.proposal, far) for other in others)
-    return any(explains_clearly_more(views, each.geometry, geometry, config) for each in fitted)
+    return any(explains_clearly_more(views, each.geometry, geometry) for each in fitted)
 
 
 @remembered()
@@ -237,7 +252,7 @@ def _bends_in_few_steps(other: Family, geometry: Geometry, views: Views, config:
         return False
     start = other.before_steps(posed, proposal, config)
     bent = followed(other, posed, proposal, start, start.surroundings, config)
-    return explains_clearly_more(posed, bent, geometry.with_poses(None), config)
+    return explains_clearly_more(posed, bent, geometry.with_poses(None))
 
 
 @remembered(lambda _, config: f"Stage 1 of 1: {FAMILIES[config.model].label}")
@@ -301,7 +316,7 @@ def _examine(family: Family, start: Start | None, views: Views, config: FitConfi
     if errors is None:
         return Candidate(family.kind, Verdict.CHOSEN, NONE_HELD_OUT, *evidence, **found), geometry
     error = float(errors.mean())
-    unexplained = error > config.selection.largest_error
+    unexplained = error > LARGEST_ERROR
     verdict, reason = (Verdict.LEFT_TOO_MUCH, TOO_MUCH) if unexplained else (Verdict.CHOSEN, EXPLAINS)
     return Candidate(family.kind, verdict, reason, *evidence, error, **found), geometry
 

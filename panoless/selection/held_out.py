@@ -13,7 +13,15 @@ from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, observe_views, usable_views
 from panoless.geometry.places import WithoutMirror, surfaces_of
-from panoless.selection.options import SelectionOptions
+
+LEAST_GAIN = 0.05
+"""Share by which what is preferred lowers the held-out error."""
+STANDARD_ERRORS = 2.0
+"""And by so many standard errors of the paired differences."""
+COMPARED_RAYS = 1_000_000
+"""Most rays that held-out errors are computed from."""
+COMPARED_RESOLUTION = 128
+"""Most texels along a face side of the maps by which they are computed."""
 
 MATTE_SHARE = 0.6
 """Error under one color a place, in that under other models, below which an object is matte."""
@@ -28,8 +36,8 @@ def held_out_errors(views: Views, config: FitConfig, geometry: Geometry) -> Floa
 
     Every fifth view is held out from the map.
     """
-    parts, options = held_out_parts(views), config.selection
-    return None if parts is None else unexplained(*parts, geometry, options.compared_rays, options.trial_resolution)
+    parts, resolution = held_out_parts(views), config.environment.trial_resolution(COMPARED_RESOLUTION)
+    return None if parts is None else unexplained(*parts, geometry, COMPARED_RAYS, resolution)
 
 
 def held_out_parts(views: Views) -> tuple[Views, Views] | None:
@@ -58,15 +66,17 @@ def is_matte(views: Views, geometry: Geometry, config: FitConfig) -> bool:
         parts = surfaces_of(usable, geometry, MATTE_VIEWS)
         if not all(parts):
             return False
-        plain = WithoutMirror.of(usable, *parts, Contrast.of(usable, config.contrast), config.selection.compared_rays)
+        plain = WithoutMirror.of(usable, *parts, Contrast.of(usable), COMPARED_RAYS)
     if plain.one_color < LEAST_COLORS or plain.matte > MATTE_SHARE * plain.one_color:
         return False
     errors = held_out_errors(usable, config, geometry)
     return errors is not None and plain.matte < MATTE_SHARE * float(errors.mean())
 
 
-def is_clearly_lower(errors: Float[np.ndarray, "V"], of: Float[np.ndarray, "V"], options: SelectionOptions) -> bool:
-    """Whether `errors` lie below those `of` another by the least gain and the standard errors of the options."""
+def is_clearly_lower(
+    errors: Float[np.ndarray, "V"], of: Float[np.ndarray, "V"], least_gain: float = LEAST_GAIN
+) -> bool:
+    """Whether `errors` lie below those `of` another by the least gain, and by two standard errors."""
     gain = of - errors
-    noise = options.standard_errors * float(gain.std(ddof=1)) / len(gain) ** 0.5 if len(gain) > 1 else np.inf
-    return bool(gain.mean() > max(noise, options.least_gain * of.mean()))
+    noise = STANDARD_ERRORS * float(gain.std(ddof=1)) / len(gain) ** 0.5 if len(gain) > 1 else np.inf
+    return bool(gain.mean() > max(noise, least_gain * of.mean()))

@@ -29,7 +29,7 @@ def nuisance_kinds(config: FitConfig) -> tuple[list[type[Block]], list[str]]:
     """
     corrections = config.corrections
     kinds: list[type[Block]] = []
-    if config.poses.mode != "off":
+    if corrections.poses != "off":
         kinds.append(CameraPoses)
     if corrections.lens != "off":
         kinds += [FocalLength, Distortion]
@@ -39,7 +39,7 @@ def nuisance_kinds(config: FitConfig) -> tuple[list[type[Block]], list[str]]:
         kinds.append(Walls)
     if corrections.masks != "off":
         kinds += [MaskOffset, MaskOffsets]
-    required = [CameraPoses.name] if config.poses.mode == "on" else []
+    required = [CameraPoses.name] if corrections.poses == "on" else []
     return kinds, [*required, *([FocalLength.name, Distortion.name] if corrections.lens == "on" else [])]
 
 
@@ -86,6 +86,6 @@ def fit_jointly(family: Family, source: Family, views: Views, start: Proposal, c
     if config.surroundings.mode == "on":
         return found.with_geometry(near)
     far = follow(near, FAR)
-    if far is None or explains_clearly_more(corrected, near, far, config):
+    if far is None or explains_clearly_more(corrected, near, far):
         return found.with_geometry(near)
     return solved(FAR)

@@ -31,6 +31,8 @@ from panoless.selection.held_out import held_out_parts, is_clearly_lower
 
 RAYS = 100_000
 """About so many pixels of all views tell the reflectance."""
+RESOLUTION = 64
+"""Most texels along a face side of the maps under which reflectance, roughness and blur are judged."""
 LARGEST_REFLECTANCE = 0.97
 """Of the channel that is mirrored least, above which held-out views do not decide."""
 LEAST_GAIN = 0.02
@@ -70,6 +72,7 @@ def earned_reflectance(views: Views, geometry: Geometry, config: FitConfig) -> R
     asks where a tint is given, or in a high dynamic range.
     """
     options, encoding = config.material, encoding_of(config)
+    resolution = config.environment.trial_resolution(RESOLUTION)
     if options.reflectance == "off" or encoding.high_dynamic_range or config.tint != NO_TINT:
         return None
     with torch.no_grad():
@@ -78,20 +81,20 @@ def earned_reflectance(views: Views, geometry: Geometry, config: FitConfig) -> R
         kept, held_out = split_held_out(seen)
         if not held_out or not any(len(each.radiance) for each in kept):
             return None
-        lamps = lamp_light(joined_rays(rays), encoding.saturation, options.resolution)
+        lamps = lamp_light(joined_rays(rays), encoding.saturation, resolution)
         known, perfect = joined_rays(kept), Reflectance(np.ones(3))
-        metal = find_reflectance(known, options.resolution)
-        matte = find_reflectance(known, options.resolution, lamps, metal)
+        metal = find_reflectance(known, resolution)
+        matte = find_reflectance(known, resolution, lamps, metal)
         earned = perfect
         for found, least in ((metal, LEAST_GAIN), (matte, LEAST_SCATTERING_GAIN)):
             if min(found.tint) > LARGEST_REFLECTANCE and found.albedo.max() < LEAST_ALBEDO:
                 continue
-            other, best = (_errors(kept, held_out, each, options.resolution) for each in (found, earned))
-            if is_clearly_lower(other, best, replace(config.selection, least_gain=least)):
+            other, best = (_errors(kept, held_out, each, resolution) for each in (found, earned))
+            if is_clearly_lower(other, best, least):
                 earned = found
         if earned is perfect:
             return None
-        return find_reflectance(joined_rays(seen), options.resolution, lamps if earned is matte else None)
+        return find_reflectance(joined_rays(seen), resolution, lamps if earned is matte else None)
 
 
 def _errors(
@@ -196,7 +199,7 @@ def earned_softness(
         trial = _SoftnessTrial.of(views, geometry, config)
         if trial is None:
             return Softness()
-        rounds, clearly = JUDGED_ROUNDS, replace(config.selection, least_gain=LEAST_ROUGHNESS_GAIN)
+        rounds = JUDGED_ROUNDS
         sharp = trial.errors(Softness(), rounds)
         if sharp.mean() < LEAST_UNEXPLAINED:
             return Softness()
@@ -210,7 +213,7 @@ def earned_softness(
         errors = [trial.errors(each, rounds) for each in asked]
         best = int(np.argmin([each.mean() for each in errors]))
         is_more_than_smooth = errors[best].mean() < (1 - LEAST_ROUGHNESS_GAIN) * smoothed.mean()
-        if not is_more_than_smooth or not is_clearly_lower(errors[best], sharp, clearly):
+        if not is_more_than_smooth or not is_clearly_lower(errors[best], sharp, LEAST_ROUGHNESS_GAIN):
             return Softness()
         if asked[best].roughness is None:
             return Softness(blur_px=trial.searched(lambda value: Softness(blur_px=value), BLURS_PX, trials))
@@ -238,7 +241,7 @@ class _SoftnessTrial:
         )
         if not known:
             return None
-        start = solve_environment([each.rays() for each in known], config.material.resolution)
+        start = solve_environment([each.rays() for each in known], config.environment.trial_resolution(RESOLUTION))
         return cls(known, held_out, start, encoding_of(config).saturation)
 
     @remembered()

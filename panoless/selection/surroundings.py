@@ -19,8 +19,10 @@ from panoless.environment.solve import solve_environment
 from panoless.environment.surroundings import FAR, SHARPEST, Surroundings
 from panoless.geometry.base import Family, Geometry, Proposal, usable_views
 from panoless.journal import remembered
-from panoless.selection.held_out import is_clearly_lower
+from panoless.selection.held_out import LEAST_GAIN, is_clearly_lower
 
+RAYS = 60_000
+"""About so many pixels of all views determine how near they are."""
 CHECKED_VIEWS = 10
 """So many views tell whether to look closer…"""
 CHECKED_RAYS = 20_000
@@ -51,7 +53,9 @@ NEARER = 1e-2
 
 
 @remembered()
-def proposed_surroundings(family: Family, views: Views, proposal: Proposal, config: FitConfig) -> Surroundings:
+def proposed_surroundings(
+    family: Family, views: Views, proposal: Proposal, config: FitConfig, *, rays_taken: int = RAYS
+) -> Surroundings:
     """A sphere around the proposed shape, or a floor below it before a sphere, if held-out views ask for one clearly;
     else a far world.
 
@@ -65,7 +69,7 @@ def proposed_surroundings(family: Family, views: Views, proposal: Proposal, conf
         geometry = family.before_steps(views, proposal, config)
         if options.mode == "auto" and not _asks_for_near(views, geometry, floor=options.floor == "auto"):
             return FAR
-        seen = leaving_rays(views, geometry, options.rays)
+        seen = leaving_rays(views, geometry, rays_taken)
         kept, held_out = split_held_out(seen)
         if not kept or not held_out:
             return FAR
@@ -81,8 +85,8 @@ def proposed_surroundings(family: Family, views: Views, proposal: Proposal, conf
         for each in tried:
             errors = _errors(kept, held_out, each)
             always = options.mode == "on" and best.is_far
-            least = config.selection.least_gain if each.floor is None else LEAST_FLOOR_GAIN
-            if always or is_clearly_lower(errors, of_best, replace(config.selection, least_gain=least)):
+            least = LEAST_GAIN if each.floor is None else LEAST_FLOOR_GAIN
+            if always or is_clearly_lower(errors, of_best, least):
                 best, of_best = each, errors
     return best
 
@@ -100,7 +104,6 @@ def on_floor(
     """
     if near.surroundings.floor is None:
         return near
-    selection = replace(config.selection, least_gain=LEAST_REFINED_FLOOR_GAIN)
     with torch.no_grad():
         posed = views if near.poses is None else near.poses.moved(views)
         kept, held_out = split_held_out(leaving_rays(posed, near, REFINED_FLOOR_RAYS))
@@ -108,10 +111,10 @@ def on_floor(
             return near
         found = found_surroundings(joined(kept), near.surroundings, resolutions, tilts=True)
         of_found, before = (_errors(kept, held_out, each) for each in (found, near.surroundings))
-    if not is_clearly_lower(of_found, before, selection):
+    if not is_clearly_lower(of_found, before, LEAST_REFINED_FLOOR_GAIN):
         return near
     again = follow(near, found)
-    better = again is not None and explains_clearly_more(views, again, near, replace(config, selection=selection))
+    better = again is not None and explains_clearly_more(views, again, near, LEAST_REFINED_FLOOR_GAIN)
     return again if again is not None and better else near
 
 
@@ -139,7 +142,7 @@ def brought_near(
             return far
     while inverse < SHARPEST:
         near = follow(best, Surroundings(np.array([inverse])))
-        if near is None or near.surroundings.is_far or not explains_clearly_more(views, near, best, config):
+        if near is None or near.surroundings.is_far or not explains_clearly_more(views, near, best):
             break
         best, inverse = near, 2 * inverse
     return best
@@ -165,7 +168,7 @@ def _asks_for_near(views: Views, geometry: Geometry, *, floor: bool) -> bool:
     return floor and with_floor(rays, _up(views))[1] < LARGEST_FLOOR_COST
 
 
-def explains_clearly_more(views: Views, near: Geometry, far: Geometry, config: FitConfig) -> bool:
+def explains_clearly_more(views: Views, near: Geometry, far: Geometry, least_gain: float = LEAST_GAIN) -> bool:
     """Whether held-out views, under the map of the others, are explained clearly better by one fit than by another.
 
     Both have seen all views, one of them with one number more.
@@ -180,7 +183,7 @@ def explains_clearly_more(views: Views, near: Geometry, far: Geometry, config: F
                 return False
             environment = solve_environment(kept, JUDGED_RESOLUTION)
         errors.append(np.array([prediction_error([batch], environment) for batch in held_out]))
-    return is_clearly_lower(errors[0], errors[1], config.selection)
+    return is_clearly_lower(errors[0], errors[1], least_gain)
 
 
 def leaving_rays(views: Views, geometry: Geometry, count: int) -> list[LeavingRays]:

@@ -9,8 +9,13 @@ from torch import Tensor
 
 from panoless.splats.kernels.reference.rasterize import rotation_matrices
 from panoless.splats.model import Surfels
-from panoless.splats.options import DensityConfig
 
+GRADIENT_THRESHOLD = 2e-4
+"""Mean screen-space gradient (per half image width) above which a surfel is cloned or split."""
+DENSE_SHARE = 0.01
+"""Surfels larger than this share of the scene's radius are split, smaller ones cloned."""
+PRUNE_SHARE = 0.1
+"""Surfels larger than this share of the scene's radius are removed."""
 SPLIT_INTO = 2
 SPLIT_SHRINK = 0.8 * SPLIT_INTO
 RESET_OPACITY = 0.01
@@ -53,22 +58,25 @@ class Edit:
 def grow_and_prune(
     surfels: Surfels,
     statistics: DensityStatistics,
-    config: DensityConfig,
     generator: torch.Generator,
     *,
-    prune_faint: bool = True,
+    max_surfels: int,
+    least_opacity: float,
+    unit: float = 1.0,
+    threshold: float = GRADIENT_THRESHOLD,
 ) -> Edit:
     """Clone small and split large surfels whose mean gradient is above threshold; prune faint and huge ones.
 
-    A split replaces a surfel by two drawn from its own Gaussian, scales divided by 1.6. Without `prune_faint` only
-    huge surfels go: right after an opacity reset all are faint.
+    A split replaces a surfel by two drawn from its own Gaussian, scales divided by 1.6. Where no opacity is required
+    only huge surfels go: right after an opacity reset all are faint. `unit` is the scene's radius in radii of the
+    object. Growth stops at `max_surfels`.
     """
     surfels = surfels.detached()
     largest = surfels.scales.amax(1)
-    grows = (statistics.mean >= config.gradient_threshold) & (surfels.count < config.max_surfels)
-    clones = torch.nonzero(grows & (largest <= config.dense_share))[:, 0]
-    splits = torch.nonzero(grows & (largest > config.dense_share))[:, 0]
-    room = max(config.max_surfels - surfels.count, 0)
+    grows = (statistics.mean >= threshold) & (surfels.count < max_surfels)
+    clones = torch.nonzero(grows & (largest <= DENSE_SHARE * unit))[:, 0]
+    splits = torch.nonzero(grows & (largest > DENSE_SHARE * unit))[:, 0]
+    room = max(max_surfels - surfels.count, 0)
     clones, splits = clones[:room], splits[: max(room - len(clones), 0)]
     stays = torch.ones_like(grows)
     stays[splits] = False
@@ -78,9 +86,9 @@ def grow_and_prune(
     merged = type(surfels)(**{name: torch.cat([part.named()[name] for part in parts]) for name in surfels.named()})
     source = torch.cat([kept, clones, children])
     unchanged = torch.arange(len(source), device=source.device) < len(kept)
-    alive = merged.scales.amax(1) < config.prune_share
-    if prune_faint:
-        alive &= merged.opacities >= config.prune_opacity
+    alive = merged.scales.amax(1) < PRUNE_SHARE * unit
+    if least_opacity > 0:
+        alive &= merged.opacities >= least_opacity
     if not alive.any():
         alive[merged.opacities.argmax()] = True
     return Edit(merged.select(alive), source[alive], unchanged[alive])

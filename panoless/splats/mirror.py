@@ -27,11 +27,24 @@ from panoless.numeric.robust import robust_weight
 from panoless.splats.kernels.rasterize import Channels, RasterBuffers
 from panoless.splats.model import ShadedSurfels, Surfels
 from panoless.splats.objective import MirrorObjective, StepObjective
-from panoless.splats.options import SurfelOptions
 from panoless.splats.rendering import ALPHA_FLOOR, rasterize_surfels, surface_buffers, tiles_of
 from shinypartial.core.conventions import SOLID_ALPHA
 
 SH_DEGREE_0 = 0.28209479177387814
+TRIAL_SHARE = 1 / 8
+"""Share of the rays that decides which surfels to trust and how fine a map is worth it."""
+TRIAL_RESOLUTION = 128
+"""Texels along a face side of the map by which that is decided."""
+TRUST_VIEWS = 40
+"""Most views by which surfels are judged."""
+TRUST_SCALE = 0.15
+"""Residual (linear radiance) beyond which a pixel lowers the trust in its surfels."""
+PRIOR_PIXELS = 1.0
+"""Weight of the prior of each surfel, in pixels, so that one that is hardly seen is hardly trusted…"""
+PRIOR_TRUST = 0.2
+"""…and its value."""
+TRUST_POWER = 4.0
+"""The power of the blended trust by which a ray counts."""
 
 
 @dataclass(frozen=True)
@@ -43,16 +56,12 @@ class SurfelMirror:
     curved: bool = True
     albedo: bool = False
     roughness: bool = False
-    depth_blend: float = 0.5
-    """λ_d of Eq. 3."""
 
     @classmethod
     def of(cls, surfels: Surfels, config: FitConfig) -> "SurfelMirror":
         """Surfels as a configuration takes them."""
-        loss = config.splats.loss
-        return cls(
-            surfels, config.splats.surfels.curved, config.splats.albedo, loss.roughness_weighted, loss.depth_blend
-        )
+        splats = config.splats
+        return cls(surfels, splats.surfels.curved, splats.albedo, splats.loss.roughness_weighted)
 
     @property
     def num_parameters(self) -> int:
@@ -119,15 +128,14 @@ class SurfelMirror:
         A trial map says which surfels to trust, and held-out views how fine the map should be, unless the
         configuration does; then all rays are solved.
         """
-        most, own = config.environment.rays, config.splats.surfels.tuned
+        most = config.environment.rays
         observed = [(view, *self.observe_covered(view, pixels)) for view, pixels in at_most_pixels(views, most)]
-        resolution, few = config.environment.solve_resolution, most * own.trial_share
-        trial_resolution = resolution or own.trial_resolution
+        resolution, few = config.environment.solve_resolution, most * TRIAL_SHARE
+        trial_resolution = resolution or TRIAL_RESOLUTION
         coarse = solve_environment(thinned([rays for _, rays, _ in observed], few), trial_resolution)
-        trust = surfel_trust(views, self, coarse, own)
+        trust = surfel_trust(views, self, coarse)
         rays = [
-            replace(rays, trust=self._trust_of(view, trust, pixels) ** own.trust_power)
-            for view, rays, pixels in observed
+            replace(rays, trust=self._trust_of(view, trust, pixels) ** TRUST_POWER) for view, rays, pixels in observed
         ]
         trial = thinned(rays, few)
         coarse = solve_environment(trial, trial_resolution)
@@ -141,7 +149,7 @@ class SurfelMirror:
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
         """Blended over the surfels."""
-        return surface_buffers(self.surfels, camera, curved=self.curved, depth_blend=self.depth_blend)
+        return surface_buffers(self.surfels, camera, curved=self.curved)
 
     def shade(
         self,
@@ -203,9 +211,7 @@ def _columns(names: Sequence[str], matrix: Tensor) -> dict[str, Tensor]:
     return dict(zip(names, matrix.unbind(1), strict=False))
 
 
-def surfel_trust(
-    views: Views, mirror: SurfelMirror, environment: Float[Tensor, "6 3 L L"], options: SurfelOptions
-) -> Float[Tensor, "K"]:
+def surfel_trust(views: Views, mirror: SurfelMirror, environment: Float[Tensor, "6 3 L L"]) -> Float[Tensor, "K"]:
     """Share of the pixels that a surfel makes up, over some views, whose radiance agrees with a map; in [0, 1].
 
     A surfel whose normal is wrong disagrees in most views although its rays agree with each other in one; a pixel alone
@@ -214,20 +220,20 @@ def surfel_trust(
     """
     surfels = mirror.surfels
     agreeing, total = torch.zeros_like(surfels.means[:, 0]), torch.zeros_like(surfels.means[:, 0])
-    for view in views.train[:: math.ceil(len(views.train) / options.trust_views)]:
+    for view in views.train[:: math.ceil(len(views.train) / TRUST_VIEWS)]:
         rays, pixels = mirror.observe_covered(view, view.solid)
         error = sample_cubemap(environment, rays.directions) - rays.radiance
         shares = torch.zeros(surfels.count, 3, device=surfels.means.device, requires_grad=True)
         with torch.enable_grad():
             buffers = rasterize_attribute(view, surfels.detached(), shares)
             votes = torch.zeros_like(buffers.colors).flatten(1)
-            votes[0, pixels], votes[1, pixels] = robust_weight(error, options.trust_scale), 1.0
+            votes[0, pixels], votes[1, pixels] = robust_weight(error, TRUST_SCALE), 1.0
             # A scalar, because torch loads much code to check the shapes of other cotangents.
             voted = (buffers.colors * votes.view_as(buffers.colors)).sum()
         (gradient,) = torch.autograd.grad(voted, shares)
         agreeing += gradient[:, 0]
         total += gradient[:, 1]
-    return (agreeing + options.prior_trust * options.prior_pixels) / (total + options.prior_pixels)
+    return (agreeing + PRIOR_TRUST * PRIOR_PIXELS) / (total + PRIOR_PIXELS)
 
 
 def rasterize_attribute(view: TrainView, surfels: Surfels, attribute: Float[Tensor, "K 3"]) -> RasterBuffers:

@@ -98,13 +98,9 @@ def composited(
     alpha: Float[Tensor, "P"],
     pixels: Tensor,
     view: TrainView,
-    config: FitConfig,
-    iteration: int,
+    background: Float[Tensor, "3 1"],
 ) -> tuple[Float[Tensor, "3 H W"], Float[Tensor, "3 H W"]]:
     """A picture, premultiplied at the given pixels and empty elsewhere, and the photograph, both over a background."""
-    background = view.radiance.new_full((3, 1), float(config.splats.loss.white_background))
-    if config.splats.loss.random_background:
-        background = torch.rand(3, 1, generator=generator_of(config.seed, iteration, 1)).to(view.radiance)
     image = background.expand(3, view.mask.numel()).clone()
     image[:, pixels] = color + (1 - alpha) * background
     target = view.radiance + (1 - view.mask) * background[:, :, None]
@@ -162,8 +158,6 @@ class MirrorObjective:
             pixels = torch.nonzero(raster.alpha.detach().flatten() > ALPHA_FLOOR)[:, 0]
             error = self._composited_error(view, raster, surfels, environment, pixels, iteration)
             total, photometric = total + error, float(error.detach())
-        if phase.channels.distortion:
-            total = total + self.config.splats.loss.lambda_distortion * raster.distortion.mean()
         observed = None
         if self.config.splats.visibility == "online":
             with torch.no_grad():
@@ -208,15 +202,15 @@ class MirrorObjective:
         pixels: Tensor,
         iteration: int,
     ) -> Tensor:
-        """Eq. 9 over the whole image, to which the given pixels add more than the background."""
+        """Eq. 9 over the whole image, to which the given pixels add more than the background, a random color a step."""
         alpha = buffers.alpha.flatten()[pixels]
         directions = mirrored_directions(view.camera, pixels, buffers.normals_camera.flatten(1)[:, pixels])
         specular = look_up(environment, directions, self.config.environment.activation).T
         if self.config.splats.loss.roughness_weighted:
             specular = specular * (1 - self._roughness(view, surfels).flatten()[pixels]).square()
         color = compose(buffers.colors.flatten(1)[:, pixels], specular, alpha, self.config.splats.alpha_applied)
-        image, target = composited(color, alpha, pixels, view, self.config, iteration)
-        return photometric_paper(image, target, self.config.splats.loss.lambda_ssim)
+        background = torch.rand(3, 1, generator=generator_of(self.config.seed, iteration, 1)).to(view.radiance)
+        return photometric_paper(*composited(color, alpha, pixels, view, background))
 
     def _roughness(self, view: TrainView, surfels: Surfels) -> Float[Tensor, "H W"]:
         roughness = torch.sigmoid(surfels.roughness_logits)[:, None].expand(-1, 3).contiguous()

@@ -1,15 +1,14 @@
 """Adam over named parameters whose surfel rows can be edited during the fit."""
 
 import math
-from dataclasses import asdict
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from panoless.splats.descent import Rates
 from panoless.splats.kernels.adam import UNBOUNDED, AdamTensor, adam_step
 from panoless.splats.model import Surfels
-from panoless.splats.options import RateConfig
 
 MOMENTUM = 0.9
 EPSILON = 1e-12
@@ -21,10 +20,10 @@ ENVIRONMENT = "environment"
 class SurfelOptimizer:
     """A rate and moments for each name. `torch.optim` is not used: it loads a compiler, which takes seconds."""
 
-    def __init__(self, surfels: Surfels, environment: Tensor, rates: RateConfig) -> None:
+    def __init__(self, surfels: Surfels, environment: Tensor, rates: Rates) -> None:
         """Make leaves of all tensors; rates are looked up by the parameters' names."""
         self._betas = MOMENTUM, rates.square_memory
-        self._rates = {"opacity_logits": rates.opacity_logits, **asdict(rates)}
+        self._rates = rates.by_name
         self._state: dict[str, dict[str, Tensor]] = {}
         self.surfels = surfels.mapped(_leaf)
         """The surfel parameters, leaves of the graph."""

@@ -19,6 +19,20 @@ TIE_TOLERANCE = 1e-6
 INITIAL_OPACITY_LOGIT = 2.2
 INITIAL_ROUGHNESS_LOGIT = -2.2
 RANDOM_OPACITY = 0.1
+OVERLAP = 0.8
+"""Radius of surfels over the side of the square that is there for one of them."""
+SAG_PX = 1.0
+"""A surfel's disk may leave the first surface, or the hull, by so much at twice its radius."""
+LEAST_RADIUS_PX = 1.5
+"""Strong curvature makes no smaller surfels than these."""
+SHRINKING_STEPS = 6
+"""Times that a surfel which sticks out of the hull is shrunk at most…"""
+SHRINKAGE = 0.75
+"""…and the factor each time."""
+CANDIDATES = 8
+"""Points drawn for each surfel, to be spread."""
+RELAXATION_ROUNDS = 3
+"""Rounds of Lloyd's relaxation by which surfels spread."""
 
 
 def hull_surfels(views: Views, config: SurfelConfig, seed: int, options: FirstSurfaceOptions) -> Surfels:
@@ -45,43 +59,43 @@ def surfels_on_mesh(
     areas = np.linalg.norm(surface.area_vectors(), axis=1) / 2 * facing
     face_normals = unit(vertex_normals[surface.triangles].sum(1))
     bends, _ = _principal(tensors[surface.triangles].mean(1), _tangent_frames(face_normals))
-    radii, largest = _radii(areas, bends, hull.pixel, config)
+    radii, largest = _radii(areas, bends, hull.pixel, config.count)
     rng = np.random.default_rng(seed)
     expected = np.cumsum(areas / radii.prod(1))
     # Stratified over the cumulative number, and more than are needed, so that they can be spread.
-    candidates = config.tuned.candidates * config.count
+    candidates = CANDIDATES * config.count
     picks = np.searchsorted(expected, (np.arange(candidates) + rng.random(candidates)) * expected[-1] / candidates)
     faces = surface.triangles[np.minimum(picks, len(surface.triangles) - 1)]
     shares = rng.dirichlet([1.0, 1.0, 1.0], candidates)
     points = np.einsum("kv,kvi->ki", shares, surface.vertices[faces])
-    chosen = _spread(points, config)
+    chosen = _spread(points, config.count)
     points, faces, shares = points[chosen], faces[chosen], shares[chosen]
     normals, tensors = (np.einsum("kv,kv...->k...", shares, values[faces]) for values in (vertex_normals, tensors))
     bends, frames = _principal(tensors, _tangent_frames(unit(normals)))
-    scales = _within_hull(hull, points, frames, np.minimum(_reach(bends, hull.pixel, config), largest), config)
+    scales = _within_hull(hull, points, frames, np.minimum(_reach(bends, hull.pixel), largest))
     return surfels_at(points, frames, scales, _shape_operators(tensors, frames))
 
 
 def _radii(
-    areas: Float[np.ndarray, "T"], bends: Float[np.ndarray, "T 2"], pixel: float, config: SurfelConfig
+    areas: Float[np.ndarray, "T"], bends: Float[np.ndarray, "T 2"], pixel: float, count: int
 ) -> tuple[Float[np.ndarray, "T 2"], float]:
-    """Radii of as many overlapping surfels as configured on faces of these principal curvatures, and the largest.
+    """Radii of so many overlapping surfels on faces of these principal curvatures, and the largest.
 
-    The largest radius r solves Σ A/(min(r, l_u) min(r, l_v)) = n/`overlap`², l the limit by curvature.
+    The largest radius r solves Σ A/(min(r, l_u) min(r, l_v)) = n/`OVERLAP`², l the limit by curvature.
     """
-    limits = _reach(bends, pixel, config)
-    low, high = 1e-6, config.tuned.overlap * math.sqrt(areas.sum() / config.count) * 100
+    limits = _reach(bends, pixel)
+    low, high = 1e-6, OVERLAP * math.sqrt(areas.sum() / count) * 100
     for _ in range(60):
         middle = math.sqrt(low * high)
-        needed = (areas / np.minimum(limits, middle).prod(1)).sum() * config.tuned.overlap**2
-        low, high = (middle, high) if needed > config.count else (low, middle)
+        needed = (areas / np.minimum(limits, middle).prod(1)).sum() * OVERLAP**2
+        low, high = (middle, high) if needed > count else (low, middle)
     return np.minimum(limits, high), high
 
 
-def _reach(bends: Float[np.ndarray, "K 2"], pixel: float, config: SurfelConfig) -> Float[np.ndarray, "K 2"]:
-    """The radius s at which a disk leaves a surface of curvature κ by `sag_px` at 2 s, at least `least_radius_px`."""
-    limit = np.sqrt(config.tuned.sag_px * pixel / 2 / np.maximum(np.abs(bends), 1e-9))
-    return np.maximum(limit, config.tuned.least_radius_px * pixel)
+def _reach(bends: Float[np.ndarray, "K 2"], pixel: float) -> Float[np.ndarray, "K 2"]:
+    """The radius s at which a disk leaves a surface of curvature κ by `SAG_PX` at 2 s, at least `LEAST_RADIUS_PX`."""
+    limit = np.sqrt(SAG_PX * pixel / 2 / np.maximum(np.abs(bends), 1e-9))
+    return np.maximum(limit, LEAST_RADIUS_PX * pixel)
 
 
 def _within_hull(
@@ -89,28 +103,26 @@ def _within_hull(
     points: Float[np.ndarray, "K 3"],
     frames: Float[np.ndarray, "K 3 3"],
     radii: Float[np.ndarray, "K 2"],
-    config: SurfelConfig,
 ) -> Float[np.ndarray, "K 2"]:
-    """Radii, shrunk until the disk at twice the radius leaves the hull by no more than `sag_px`, along either axis.
+    """Radii, shrunk until the disk at twice the radius leaves the hull by no more than `SAG_PX`, along either axis.
 
     What lies outside the hull is seen outside the masks, where it would be a halo.
     """
     radii = radii.copy()
-    for _ in range(config.tuned.shrinking_steps):
+    for _ in range(SHRINKING_STEPS):
         tips = 2 * radii[:, :, None] * frames[:, :, :2].transpose(0, 2, 1)
         excess = np.maximum(hull.at(points[:, None] + tips), hull.at(points[:, None] - tips))
-        shrunk = np.maximum(config.tuned.shrinkage * radii, config.tuned.least_radius_px * hull.pixel)
-        radii = np.where(excess > config.tuned.sag_px * hull.pixel, shrunk, radii)
+        shrunk = np.maximum(SHRINKAGE * radii, LEAST_RADIUS_PX * hull.pixel)
+        radii = np.where(excess > SAG_PX * hull.pixel, shrunk, radii)
     return radii
 
 
-def _spread(points: Float[np.ndarray, "C 3"], config: SurfelConfig) -> Int[np.ndarray, "K"]:
-    """Indices of as many points as configured, spread evenly among all: Lloyd's relaxation of a regular choice."""
+def _spread(points: Float[np.ndarray, "C 3"], count: int) -> Int[np.ndarray, "K"]:
+    """Indices of so many points, spread evenly among all: Lloyd's relaxation of a regular choice."""
     from scipy.spatial import cKDTree
 
-    count = config.count
     centers = points[:: max(len(points) // count, 1)][:count]
-    for _ in range(config.tuned.relaxation_rounds):
+    for _ in range(RELAXATION_ROUNDS):
         _, owner = cKDTree(centers).query(points)
         total = np.bincount(owner, minlength=count)
         sums = np.stack([np.bincount(owner, column, minlength=count) for column in points.T], 1)

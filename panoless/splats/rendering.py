@@ -12,12 +12,17 @@ from panoless.splats.model import Surfels
 
 __all__ = [
     "ALPHA_FLOOR",
+    "DEPTH_BLEND",
     "compose",
     "rasterize_surfels",
     "reflection_directions_world",
     "surface_buffers",
     "tiles_of",
 ]
+
+
+DEPTH_BLEND = 0.5
+"""λ_d of Eq. 3: 0 takes the expected depth, 1 the median depth."""
 
 
 def rasterize_surfels(
@@ -45,7 +50,9 @@ def rasterize_surfels(
     )
 
 
-def surface_buffers(surfels: Surfels, camera: RasterCamera, *, curved: bool, depth_blend: float) -> SurfaceBuffers:
+def surface_buffers(
+    surfels: Surfels, camera: RasterCamera, *, curved: bool, depth_blend: float = DEPTH_BLEND
+) -> SurfaceBuffers:
     """Rasterize, and blend the depths to D_surf (Eqs. 1–3)."""
     raster = rasterize_surfels(surfels, camera, curved=curved)
     depth = surface_depth(raster.accumulated_depth, raster.median_depth, raster.alpha, depth_blend)

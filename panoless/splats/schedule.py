@@ -3,11 +3,17 @@
 from dataclasses import dataclass
 
 from panoless.config import FitConfig
+from panoless.splats.descent import PUBLISHED, Published
 from panoless.splats.kernels.objective import ObjectiveTerms
 from panoless.splats.kernels.rasterize import Channels
+from panoless.splats.rendering import DEPTH_BLEND
 
 RECOVERY_STEPS = 100
 MEANS_FALL = 0.01
+DROP_AT = 0.4
+"""Share of our iterations after which every rate falls geometrically…"""
+DROP_FACTOR = 0.01
+"""…to this factor at the last iteration, which improves the normals."""
 
 
 @dataclass(frozen=True)
@@ -18,6 +24,14 @@ class Schedule:
 
     def _iteration(self, share: float) -> int:
         return round(share * self.config.splats.iterations)
+
+    @property
+    def _published(self) -> Published:
+        return PUBLISHED[self.config.splats.surfels.shading]
+
+    def _share(self, step: float) -> float:
+        """Of a step of the published schedule."""
+        return step / self._published.steps
 
     def begun(self, iteration: int, share: float) -> bool:
         """Whether that share of the iterations is over."""
@@ -37,17 +51,20 @@ class Schedule:
         return self.begun(iteration, self.config.environment.warmup)
 
     def rate_factor(self, iteration: int) -> float:
-        """1 until the drop begins, then a geometric fall that ends at the drop factor with the last iteration."""
-        rates = self.config.splats.rates
-        begin, end = self._iteration(rates.drop_at), self.config.splats.iterations
-        if iteration < begin:
+        """1, then a geometric fall to `DROP_FACTOR` at the last iteration; published rates do not fall."""
+        begin, end = self._iteration(DROP_AT), self.config.splats.iterations
+        if self.config.splats.rates == "published" or iteration < begin:
             return 1.0
-        return rates.drop_factor ** ((iteration + 1 - begin) / max(end - begin, 1))
+        return DROP_FACTOR ** ((iteration + 1 - begin) / max(end - begin, 1))
 
     def means_factor(self, iteration: int) -> float:
-        """What the rate of the means is multiplied by besides: a geometric fall to MEANS_FALL, where it stays."""
-        share = self.config.splats.rates.means_fall_until
-        return MEANS_FALL ** min(iteration / max(self._iteration(share), 1), 1.0) if share > 0 else 1.0
+        """What the rate of the means is multiplied by besides: in published rates, a geometric fall to
+        MEANS_FALL, where it stays.
+        """
+        if self.config.splats.rates == "ours":
+            return 1.0
+        fall = self._iteration(self._share(self._published.means_fall_until))
+        return MEANS_FALL ** min(iteration / max(fall, 1), 1.0)
 
     def lambda_silhouette(self, iteration: int) -> float:
         """The weight of Eq. 13, zero when its time is over ([t < 3000] in Eq. 14)."""
@@ -55,37 +72,39 @@ class Schedule:
         return 0.0 if self.begun(iteration, loss.silhouette_until) else loss.lambda_silhouette
 
     def _density_active(self, iteration: int) -> bool:
-        density = self.config.splats.density
-        within = self.begun(iteration, density.start) and not self.begun(iteration, density.stop)
-        return density.enabled and within
+        first, last = (self._share(step) for step in (self._published.grows_from, self._published.grows_until))
+        within = self.begun(iteration, first) and not self.begun(iteration, last)
+        return self.config.splats.density.enabled and within
 
     def density_round(self, iteration: int) -> bool:
         """Whether surfels are cloned, split and pruned after this iteration."""
-        return self._density_active(iteration) and self.due(iteration, self.config.splats.density.every)
+        return self._density_active(iteration) and self.due(iteration, self._share(self._published.grows_every))
 
     def opacity_reset(self, iteration: int) -> bool:
         """Whether opacities are reset after this iteration."""
-        return self._density_active(iteration) and self.due(iteration, self.config.splats.density.reset_every)
+        return self._density_active(iteration) and self.due(iteration, self._share(self._published.resets_every))
 
     def opacities_recovered(self, iteration: int) -> bool:
         """Whether surfels had time to earn their opacity back since the last reset, so that pruning is fair.
 
         Recovery takes steps, not a share of the fit: a hundred, or half the time between resets if that is less.
         """
-        period = max(self._iteration(self.config.splats.density.reset_every), 1)
+        period = max(self._iteration(self._share(self._published.resets_every)), 1)
         return iteration < period or iteration % period >= min(RECOVERY_STEPS, period // 2)
 
     def propagation(self, iteration: int) -> bool:
         """Whether normals are propagated after this iteration; an opacity reset has precedence."""
-        density = self.config.splats.density
-        within = self.begun(iteration, density.propagate_from) and not self.begun(iteration, density.propagate_until)
-        active = self._density_active(iteration) and within
-        return active and self.due(iteration, density.propagate_every) and not self.opacity_reset(iteration)
+        first, last = (
+            self._share(step) for step in (self._published.propagates_from, self._published.propagates_until)
+        )
+        within = self.begun(iteration, first) and not self.begun(iteration, last)
+        due = self.due(iteration, self._share(self._published.propagates_every))
+        return self._density_active(iteration) and within and due and not self.opacity_reset(iteration)
 
     def resting(self, iteration: int) -> frozenset[str]:
         """The parameters that hold still in this iteration: opacities for a while after a propagation."""
-        rest = self._iteration(self.config.splats.density.opacities_rest)
-        since = iteration % max(self._iteration(self.config.splats.density.propagate_every), 1)
+        rest = self._iteration(self._share(self._published.opacities_rest))
+        since = iteration % max(self._iteration(self._share(self._published.propagates_every)), 1)
         rests = 0 < since <= rest and self.propagation(iteration - since)
         return frozenset({"opacity_logits"}) if rests else frozenset()
 
@@ -110,14 +129,10 @@ def phase_of(config: FitConfig, geometry_moves: bool, lambda_silhouette: float) 
         lambda_normal_consistency=loss.lambda_normal_consistency * geometry_moves,
         consistency_everywhere=not masked,
         lambda_silhouette=lambda_silhouette * geometry_moves,
-        depth_blend=loss.depth_blend,
+        depth_blend=DEPTH_BLEND,
         activation=config.environment.activation,
         alpha_applied=config.splats.alpha_applied,
     )
-    channels = Channels(
-        colors=config.splats.albedo,
-        depth=terms.lambda_normal_consistency > 0,
-        distortion=loss.lambda_distortion > 0 and geometry_moves,
-    )
-    everywhere = not masked or terms.lambda_silhouette > 0 or channels.distortion
+    channels = Channels(colors=config.splats.albedo, depth=terms.lambda_normal_consistency > 0, distortion=False)
+    everywhere = not masked or terms.lambda_silhouette > 0
     return Phase(geometry_moves, terms, channels, everywhere)

@@ -2,15 +2,14 @@
 
 import math
 import time
-from dataclasses import replace
 
 import torch
 
 from panoless.capture.views import Views
 from panoless.config import FitConfig
-from panoless.environment.cubemap import initial_environment
 from panoless.environment.visibility import accumulate
 from panoless.splats.density import DensityStatistics, grow_and_prune, reset_opacities
+from panoless.splats.descent import PUBLISHED, Rates, first_map
 from panoless.splats.kernels.adam import UNBOUNDED
 from panoless.splats.mirror import SurfelMirror
 from panoless.splats.objective import LossTerms, generator_of
@@ -21,6 +20,8 @@ from shinypartial.core.errors import InputError
 from shinypartial.io.progress import Progress
 
 CURVE_EVERY = 10
+OBSERVED_ALPHA = 0.5
+"""τ: only pixels with alpha above it count as observations."""
 
 
 def train_surfels(
@@ -49,11 +50,8 @@ class SurfelTrainer:
         self.schedule = Schedule(config)
         self._epoch, self._order = -1, list[int]()
         self._brightest = max(1.0, *(float(view.radiance.max()) for view in views.train))
-        unit = views.camera_extent if config.splats.scene_radius == "cameras" else 1.0
-        rates = replace(config.splats.rates, means=config.splats.rates.means * unit)
-        shares = config.splats.density.dense_share * unit, config.splats.density.prune_share * unit
-        self._density = replace(config.splats.density, dense_share=shares[0], prune_share=shares[1])
-        self.optimizer = SurfelOptimizer(mirror.surfels, training.environment, rates)
+        self._unit = 1.0 if config.splats.rates == "ours" else views.camera_extent
+        self.optimizer = SurfelOptimizer(mirror.surfels, training.environment, Rates.of(config, self._unit))
         self.statistics = DensityStatistics.empty(mirror.surfels.count, mirror.surfels.means.device)
         if training.optimizer:
             self.optimizer.load_state_dict(training.optimizer["adam"])
@@ -93,7 +91,7 @@ class SurfelTrainer:
             raise InputError(
                 expected="a finite loss",
                 found=f"{total} at iteration {iteration}",
-                remedy="Check the images for extreme values, or lower the rates (--config.rates.…).",
+                remedy="Check the images for extreme values, or take --preset default.",
             )
         if offsets is not None and offsets.grad is not None:
             self.statistics.observe(offsets.grad, step.in_frustum, view.camera.width)
@@ -105,9 +103,7 @@ class SurfelTrainer:
             environment_bounds=(0, self._brightest) if self.config.environment.activation == "clamp" else UNBOUNDED,
         )
         if step.observed is not None:
-            accumulate(
-                self.evidence, step.observed.directions, step.observed.alpha, self.config.splats.visibility_alpha
-            )
+            accumulate(self.evidence, step.observed.directions, step.observed.alpha, OBSERVED_ALPHA)
         self._control_density(iteration)
         if iteration % CURVE_EVERY == 0:
             self._record(iteration, step.terms)
@@ -118,8 +114,7 @@ class SurfelTrainer:
         if self._objective.restarts(iteration):
             self.optimizer.set_values(self._objective.restarted(self.optimizer.surfels.detached()))
             generator = generator_of(self.config.seed, iteration, 3)
-            first = initial_environment(self.config.environment, generator)
-            self.optimizer.set_environment(first.to(self.optimizer.environment.device))
+            self.optimizer.set_environment(first_map(self.config, generator).to(self.optimizer.environment.device))
 
     def _view_index(self, iteration: int) -> int:
         """Every epoch visits all views once, in an order that depends on seed and epoch only."""
@@ -135,7 +130,14 @@ class SurfelTrainer:
         if self.schedule.density_round(iteration):
             generator = generator_of(self.config.seed, iteration, 2)
             prune_faint = self.schedule.opacities_recovered(iteration)
-            edit = grow_and_prune(surfels, self.statistics, self._density, generator, prune_faint=prune_faint)
+            edit = grow_and_prune(
+                surfels,
+                self.statistics,
+                generator,
+                max_surfels=self.config.splats.density.max_surfels,
+                least_opacity=PUBLISHED[self.config.splats.surfels.shading].least_opacity if prune_faint else 0.0,
+                unit=self._unit,
+            )
             self.optimizer.edit_surfels(edit.surfels, edit.source, edit.unchanged)
             self.statistics = DensityStatistics.empty(self.optimizer.surfels.count, surfels.means.device)
         if self.schedule.opacity_reset(iteration):

@@ -57,6 +57,12 @@ LIGHT_FIGURES = ("unexplained", "one_color", "matte", "unexplained_part", "noise
 """What comes from held-out light."""
 
 
+VIEWS = 20
+"""Most views of either part, kept and held out, whose silhouettes and places count."""
+RAYS = 300_000
+"""Most rays that the map without held-out views is solved from, and most that test it."""
+RESOLUTION = 128
+"""Most texels along a face side of that map."""
 RANKED = 100_000
 """Rays at most whose ranks are compared: their correlation is then known to 0.003."""
 SURE = 0.5
@@ -147,7 +153,7 @@ def gather_evidence(
     seen = tuple(views.train[index] for index in used)
     views, usable = replace(views, train=seen), replace(views, train=tuple(found[index] for index in used))
     solid, kept = (max(each.num_solid, 1) for each in (views, usable))
-    surfaces = surfaces_of(usable, geometry, config.trust.views)
+    surfaces = surfaces_of(usable, geometry, VIEWS)
     light = _light(usable, surfaces, geometry, visibility, config, by_confidence=ball is not None)
     silhouettes = [_silhouette(*each) for part in surfaces for each in part]
     distance, shift, overlap, missed, surplus = np.array(silhouettes).reshape(-1, 5).T
@@ -228,9 +234,9 @@ def _light(
     solved = replace(views, train=tuple(split_held_out(views.train)[0]))
     tested = replace(views, train=tuple(view for view, _ in held_out))
     environment = _predicting_map(_seen_areas(solved, geometry, config), config)
-    contrast = Contrast.of(views, config.contrast)
+    contrast = Contrast.of(views)
     parts = Cells.empty(PART_CELLS, 1, views.train[0].mask.device)
-    plain = WithoutMirror.of(views, kept, held_out, contrast, config.trust.rays)
+    plain = WithoutMirror.of(views, kept, held_out, contrast, RAYS)
     errors, confidence, explained = [], [], Mean()
     saturation = encoding_of(config).saturation.to(environment)
     for areas in _seen_areas(tested, geometry, config):
@@ -240,7 +246,7 @@ def _light(
         weight = rays.initial_weight() * (confidence[-1] > SURE if by_confidence else 1)
         explained.add(bounded_error(error, SCALE), weight)
         errors.append(error)
-    for (view, surface), (_, pixels) in zip(held_out, at_most_pixels(tested, config.trust.rays), strict=True):
+    for (view, surface), (_, pixels) in zip(held_out, at_most_pixels(tested, RAYS), strict=True):
         radiance = contrast.shown(view.radiance_at(pixels))
         normals = surface.normals_camera.flatten(1)[:, pixels]
         shaded = geometry.shade(environment, view.camera, pixels, normals).minimum(saturation)
@@ -263,7 +269,7 @@ def _light(
 
 def _seen_areas(views: Views, geometry: Geometry, config: FitConfig) -> list[PixelFootprints]:
     """What pixels saw as means over their areas; encoded radiance, which has no such means, at their centers."""
-    most = config.trust.rays
+    most = RAYS
     if encoding_of(config).high_dynamic_range:
         return [PixelFootprints.centers(rays) for rays in observe_views(views, geometry, most)]
     return thinned(pixel_areas(views, geometry, most), most)
@@ -274,7 +280,9 @@ def _predicting_map(areas: Sequence[PixelFootprints], config: FitConfig) -> Floa
     explained as much, and scales are narrow, because many may be wrong.
     """
     rays = [each.rays() for each in areas]
-    environment = solve_environment(rays, min(config.trust.resolution, densest_resolution(rays)))
+    environment = solve_environment(
+        rays, min(config.environment.trial_resolution(RESOLUTION), densest_resolution(rays))
+    )
     saturation, lamps = encoding_of(config).saturation, replace(HARD, saturated_weight=1.0)
     return deblur_map(Footprints(list(areas)), environment, saturation, SMOOTHNESS[MIDDLE], lamps, steps=TRIAL_STEPS)
 

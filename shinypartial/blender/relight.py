@@ -38,7 +38,6 @@ class PictureOptions:
     """Pixels along the width."""
     samples: Count = 64
     """Paths a pixel."""
-    seed: int = 0
     threads: int | None = None
     """Of the CPU; all cores where it is not given."""
 
@@ -132,7 +131,7 @@ def _sample(bpy: Any, scene: Any, options: PictureOptions) -> None:
     choose_device(bpy)
     set_threads(bpy, options.threads)
     cycles, render = scene.cycles, scene.render
-    cycles.samples, cycles.seed = options.samples, options.seed
+    cycles.samples, cycles.seed = options.samples, 0
     cycles.use_adaptive_sampling = cycles.use_denoising = False
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0
     render.resolution_y = max(round(render.resolution_y * options.resolution / render.resolution_x), 1)

@@ -40,13 +40,21 @@ class Convert(LongCommand):
 
     def work(self) -> None:
         """Write and say what."""
-        from shinypartial.conversion.convert import ConversionOptions, convert
+        from shinypartial.conversion.convert import convert
         from shinypartial.prediction.format import newest_prediction
 
         prediction = self.prediction or announce_newest("prediction", newest_prediction())
         output = self.output or prediction.resolve().with_name(f"{prediction.resolve().name}-converted")
-        options = ConversionOptions(self.confidence, self.layout, self.degree, self.lobes, self.feather_deg)
-        written = convert(prediction, self.to, output, options)
+        written = convert(
+            prediction,
+            self.to,
+            output,
+            confidence=self.confidence,
+            layout=self.layout,
+            degree=self.degree,
+            lobes=self.lobes,
+            feather_deg=self.feather_deg,
+        )
         for path in written:
             print(f"Wrote {path}")
         report_result({"folder": output} | {path.name: path for path in written})

@@ -12,14 +12,12 @@ from shinypartial.io.events import LongCommand, report_result
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """The camera path, in the keys of the recipe's [camera]; what is not given is the recipe's."""
+    """The camera path, in keys of the recipe's [camera]; what is not given is the recipe's."""
 
     path: Literal["arc", "plus", "golden_spiral", "zigzag", "diamond", "around"] | None = None
     """Kind of path."""
     radius: float | None = None
     """Distance from the target in scene units; for a plus, that of its middle."""
-    target: tuple[float, float, float] | None = None
-    """World point that every camera looks at."""
     facing_azimuth_deg: float | None = None
     """Azimuth of the hemisphere's axis, from +X toward +Y: the side of the object that is photographed."""
     azimuth_deg: tuple[float, float] | None = None
@@ -30,20 +28,12 @@ class CameraOptions:
     """Number of arcs, strokes of the zigzag or nested diamonds."""
     lens_mm: float | None = None
     """Focal length."""
-    sensor_mm: float | None = None
-    """Width of the square sensor."""
     train: int | None = None
     """Number of training views."""
     test: int | None = None
     """Number of test views."""
-    placement: Literal["interleaved", "random"] | None = None
-    """Training views evenly along the path, or drawn by chance."""
-    seed: int | None = None
-    """Seed of the placement."""
     f_number: float | None = None
     """Focal length over the diameter of the aperture, for a scene unit of one meter; blurs what is out of focus."""
-    focus_distance: float | None = None
-    """Depth of the plane that is sharp, in scene units; that of the target when not given."""
     motion_deg: float | None = None
     """Angle around the vertical through the target by which the camera moves during the exposure."""
 
@@ -54,18 +44,13 @@ class SceneOptions:
 
     world: str | None = None
     """What lights the scene: city, courtyard, forest, interior, night, studio, sunrise, sunset, or an EXR file."""
-    surroundings_distance: float | None = None
-    """From the origin to the nearest wall of a room that carries the world; infinitely far when not given."""
     surroundings_radii: float | None = None
-    """The same in object radii."""
+    """From the origin to the nearest wall of a room that carries the world, in object radii; infinitely far when not
+    given."""
     surroundings_room: Literal["sphere", "box"] | None = None
     """Shape of that room about the origin."""
-    surroundings_proportions: tuple[float, float, float] | None = None
-    """Of a box along X, Y and Z; the nearest walls are those of the shortest side."""
     operator_height: float | None = None
     """Height in scene units of a figure at each camera that only reflections show; nobody is there when not given."""
-    operator_radiance: float | None = None
-    """Gray light that this figure gives off."""
     exposure: float | None = None
     """Photographic stops: multiplies the light by 2^exposure."""
     roughness: float | None = None

@@ -2,7 +2,6 @@
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -36,28 +35,22 @@ WITH_SURFACE = {"blender", "glb", "mitsuba", "usd", "threejs"}
 WITH_WORLD = {"blender", "mitsuba", "usd"}
 
 
-@dataclass(frozen=True)
-class ConversionOptions:
-    """How light is written."""
-
-    confidence: Confidence = "keep"
-    """Directions that were not seen: `keep` what the prediction has there; `darken`: light times visibility; `fill`:
-    smoothly from around where the visibility is 0."""
-    layout: Layout = "three"
-    """Of cube maps: `three` for three.js, whose lookups mirror x; `opengl` for lookups in the direction itself."""
-    degree: int = 4
-    """Of spherical harmonics, at most 4."""
-    lobes: int = 24
-    """Number of spherical Gaussians."""
-    feather_deg: float = 5.0
-    """Width over which the mask of what was seen falls to zero, inward."""
-
-
 def convert(
-    prediction: Path, targets: Sequence[Target], output: Path, options: ConversionOptions = ConversionOptions()
+    prediction: Path,
+    targets: Sequence[Target],
+    output: Path,
+    *,
+    confidence: Confidence = "keep",
+    layout: Layout = "three",
+    degree: int = 4,
+    lobes: int = 24,
+    feather_deg: float = 5.0,
 ) -> list[Path]:
     """Write what each target needs into the folder `output`; return the files.
 
+    In directions that were not seen, `confidence` keeps what the prediction has there, darkens it by the visibility, or
+    fills it from around. `layout` is that of cube maps, `degree` that of spherical harmonics, `lobes` the number of
+    spherical Gaussians; over `feather_deg` the mask of what was seen falls to zero, inward.
     Raises InputError when the prediction lacks what a target needs, or when Blender can't be loaded.
     """
     info, written = read_info(prediction), []
@@ -73,7 +66,7 @@ def convert(
         write_glb(output / GLB, surface, reflectance)
         written.append(output / GLB)
     if "mask" in targets:
-        write_png(output / MASK, np.rint(255 * seen_mask(prediction, options.feather_deg)).astype(np.uint8))
+        write_png(output / MASK, np.rint(255 * seen_mask(prediction, feather_deg)).astype(np.uint8))
         written.append(output / MASK)
     if "room" in targets:
         write_json(output / ROOM, room_of(prediction))
@@ -82,15 +75,15 @@ def convert(
         written += write_for_extension(prediction, output)
     if set(targets) <= {"glb", "mask", "room", "extension"}:
         return written
-    light = np.maximum(light_of(prediction, options.confidence), 0)
+    light = np.maximum(light_of(prediction, confidence), 0)
     if "sh" in targets:
-        write_json(output / HARMONICS, harmonics_of(light, options.degree))
+        write_json(output / HARMONICS, harmonics_of(light, degree))
         written.append(output / HARMONICS)
     if "sg" in targets:
-        write_json(output / LOBES, lobes_of(light, options.lobes))
+        write_json(output / LOBES, lobes_of(light, lobes))
         written.append(output / LOBES)
     if "cubemap" in targets:
-        for name, face in zip(FACES, cube_faces(light, options.layout), strict=True):
+        for name, face in zip(FACES, cube_faces(light, layout), strict=True):
             write_hdr(output / f"{name}.hdr", face.astype(np.float32))
             written.append(output / f"{name}.hdr")
     if WITH_WORLD & set(targets):

@@ -61,10 +61,10 @@ def recorded_picture(
     """The frame that a phone makes of what a pinhole of the same size sees."""
     shaken = smeared(radiance, moment.shake_px)
     focused = blur(shaken, moment.focus_px) if moment.focus_px else shaken
-    bent = warp(focused, undistorted_pixels(camera, phone.k1, 0.0))
+    bent = warp(focused, undistorted_pixels(camera, phone.k1))
     gain = moment.gain * vignette_gain(camera.height, camera.width, phone.vignette_stops)
     random = np.random.default_rng(moment.seed)
-    light = add_noise(bent * gain[..., None].astype(np.float32), phone.shot_noise, phone.read_noise, 1.0, random)
+    light = add_noise(bent * gain[..., None].astype(np.float32), phone.shot_noise, phone.read_noise, random)
     return to_display(light)
 
 
@@ -94,7 +94,7 @@ def exif_tags(camera: Camera, photographs: Photographs, moment: Moment) -> dict[
 
 def recorded_mask(alpha: Float[np.ndarray, "H W"], camera: Camera, phone: Phone) -> UInt8[np.ndarray, "H W"]:
     """Where the object is in the frame, as 8-bit code of the share of each pixel."""
-    return encode_unit(warp(alpha[..., None], undistorted_pixels(camera, phone.k1, 0.0))[..., 0])
+    return encode_unit(warp(alpha[..., None], undistorted_pixels(camera, phone.k1))[..., 0])
 
 
 def smeared(image: Float[np.ndarray, "H W C"], way_px: tuple[float, float]) -> Float[np.ndarray, "H W C"]:

@@ -52,28 +52,18 @@ BRIGHTNESS_REACH = 5.0
 """By so many stops the brightness may be another than the one with the highest correlation."""
 MOST_VIEWS = 40
 """Views that tell the light, evenly spread over those that have normals."""
-
-
-@dataclass(frozen=True)
-class LightOptions:
-    """How a light is recognized.
-
-    What was chosen was chosen on *Vase*, *Mirror* and *Sculpture* under eight lights each: there details of the right
-    map correlate by 0.71 to 0.95 and those of the next best by 0.50 at most; under a roughness of 0.3 by 0.35 at most.
-    """
-
-    height: int = 64
-    """Rows of the maps in which all turns are compared."""
-    detail_rad: float = 0.1
-    """Details are what a Gaussian of this standard deviation takes away: broad light is alike in many worlds."""
-    stops: tuple[float, ...] = tuple(range(-4, 5))
-    """Brightness of a map that is tried, as powers of 2."""
-    rays: int = 30_000
-    """Mirrored rays that tell the exact turn and brightness."""
-    least_correlation: float = 0.6
-    """Of the details that a map has and those that were photographed; below it no map is taken."""
-    least_lead: float = 0.2
-    """By which the correlation of the best map is above that of every other."""
+HEIGHT = 64
+"""Rows of the maps in which all turns are compared."""
+DETAIL_RAD = 0.1
+"""Details are what a Gaussian of this standard deviation takes away: broad light is alike in many worlds."""
+STOPS = tuple(range(-4, 5))
+"""Brightness of a map that is tried, as powers of 2."""
+RAYS = 30_000
+"""Mirrored rays that determine the exact turn and brightness."""
+LEAST_CORRELATION = 0.6
+"""Of the details that a map has and those that were photographed; below it no map is taken."""
+LEAST_LEAD = 0.2
+"""By which the correlation of the best map is above that of every other."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +99,6 @@ def find_light(
     source: Path,
     root: Path,
     worlds: Mapping[str, Path],
-    options: LightOptions = LightOptions(),
     *,
     strength: float = 1.0,
     link: bool = False,
@@ -136,8 +125,8 @@ def find_light(
     copies = [*files, *transforms, *([plot] if plot.exists() else [])]
     jobs = [Job.copy(old, place_of(old, dataset, root), link) for old in dict.fromkeys(copies)]
     maps = {name: read_light(path) for name, path in worlds.items()}
-    matches = match_worlds(mirrored_rays(dataset), maps, options)
-    match = clear_winner(matches, options)
+    matches = match_worlds(mirrored_rays(dataset), maps)
+    match = clear_winner(matches)
     world = turned_latlong(maps[match.name], _about_z(match.turn_deg)) * np.float32(strength)
     jobs.append(Job(tuple(root / each for each in ENVIRONMENT_FILES), lambda: write_environment(root, world)))
     recipe = {
@@ -178,32 +167,30 @@ def _normals_known(frame: Frame) -> bool:
     return frame.normal_png.exists() or frame.exr.exists()
 
 
-def match_worlds(
-    seen: Seen, worlds: Mapping[str, Float[np.ndarray, "H W 3"]], options: LightOptions = LightOptions()
-) -> tuple[Match, ...]:
+def match_worlds(seen: Seen, worlds: Mapping[str, Float[np.ndarray, "H W 3"]]) -> tuple[Match, ...]:
     """How well the details of each map are those that were seen, best first; the best one's turn is made exact.
 
     All turns by whole columns are compared at once, as circular correlations of rows.
     """
-    weight, details = _seen_details(seen, options)
+    weight, details = _seen_details(seen)
     progress, found = Progress("comparing lights", len(worlds)), []
     for name, world in worlds.items():
-        turns = _best_turns(name, weight, details, _shrunk(world, options.height), options)
+        turns = _best_turns(name, weight, details, _shrunk(world, HEIGHT))
         found.append(max(turns, key=lambda each: each.correlation))
         progress.advance()
     best, *others = sorted(found, key=lambda each: -each.correlation)
-    return _exact(best, _evenly(seen, options.rays), worlds[best.name], 360 / (2 * options.height)), *others
+    return _exact(best, _evenly(seen, RAYS), worlds[best.name], 360 / (2 * HEIGHT)), *others
 
 
-def clear_winner(matches: Iterable[Match], options: LightOptions = LightOptions()) -> Match:
+def clear_winner(matches: Iterable[Match]) -> Match:
     """The best match; InputError where it is not good enough, or not clearly better than the others."""
     best, *others = matches
     lead = best.correlation - max((each.correlation for each in others), default=0.0)
-    if best.correlation < options.least_correlation or lead < options.least_lead:
+    if best.correlation < LEAST_CORRELATION or lead < LEAST_LEAD:
         near = ", ".join(f"{each.name} {each.correlation:.2f}" for each in (best, *others[:2]))
         raise InputError(
-            expected=f"one map whose details correlate with what is mirrored by {options.least_correlation:g} or more, "
-            f"and by {options.least_lead:g} more than those of any other",
+            expected=f"one map whose details correlate with what is mirrored by {LEAST_CORRELATION:g} or more, "
+            f"and by {LEAST_LEAD:g} more than those of any other",
             found=near,
             remedy="Name more maps by --worlds: the object is lit by none of these, or it is too rough to tell.",
         )
@@ -217,9 +204,9 @@ def _about_z(turn_deg: float) -> Turn:
     return Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
 
 
-def _seen_details(seen: Seen, options: LightOptions) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]:
+def _seen_details(seen: Seen) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]:
     """The solid angle of texels that rays fall into, 0 of the others, and the details of their mean codes."""
-    height, width = options.height, 2 * options.height
+    height, width = HEIGHT, 2 * HEIGHT
     uv = directions_to_latlong(seen.directions)
     row = np.minimum((uv[:, 1] * height).astype(int), height - 1)
     flat = row * width + (uv[:, 0] * width).astype(int) % width
@@ -227,7 +214,7 @@ def _seen_details(seen: Seen, options: LightOptions) -> tuple[Float[np.ndarray, 
     sums = np.stack([np.bincount(flat, channel, minlength=height * width) for channel in seen.codes.T], -1)
     codes = (sums / np.maximum(count, 1)[:, None]).reshape(height, width, 3)
     known = (count > 0).reshape(height, width, 1).astype(float)
-    blurred = blur_latlong(np.concatenate([codes, known], -1), options.detail_rad)
+    blurred = blur_latlong(np.concatenate([codes, known], -1), DETAIL_RAD)
     details = known * (codes - blurred[..., :3] / np.maximum(blurred[..., 3:], 1e-6))
     return latlong_solid_angles(height) * known[..., 0], details
 
@@ -244,16 +231,15 @@ def _best_turns(
     weight: Float[np.ndarray, "H W"],
     details: Float[np.ndarray, "H W 3"],
     world: Float[np.ndarray, "H W 3"],
-    options: LightOptions,
 ) -> Iterator[Match]:
     """For each brightness the turn with the highest correlation."""
     width = weight.shape[1]
     of_weight = np.fft.rfft(weight, axis=1)[..., None]
     of_seen = np.fft.rfft(weight[..., None] * details, axis=1)
     power = float((weight[..., None] * details**2).sum())
-    for stops in options.stops:
+    for stops in STOPS:
         codes = linear_to_srgb(np.clip(world * 2.0**stops, 0, 1))
-        own = codes - blur_latlong(codes, options.detail_rad)
+        own = codes - blur_latlong(codes, DETAIL_RAD)
         both = _over_turns(of_seen, np.fft.rfft(own, axis=1), width)
         powers = power * _over_turns(of_weight, np.fft.rfft(own**2, axis=1), width)
         correlation = both / np.sqrt(np.maximum(powers, 1e-12))

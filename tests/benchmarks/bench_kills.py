@@ -45,11 +45,8 @@ recorder.CHECKPOINT_INTERVAL_S = 0.2; sys.exit(panoless.cli.main(sys.argv[1:]))
 SMALL = shlex.split("""
     --preset fast --config.iterations 400 --config.surfels.count 500 --config.environment.rays 100000
     --config.environment.resolution 32 --config.environment.solve-resolution 32
-    --set corrections.masks=off corrections.exposure=off corrections.lens=off poses.mode=off surroundings.mode=off
-""")
-REVOLUTION = shlex.split("""
-    --set revolution.photometric.pixels=10000 revolution.mouth.judged_pixels=5000
-    revolution.lip.length_px=5 revolution.map.pixels=100000 revolution.footprints.pixels=5000
+    --set corrections.masks=off corrections.exposure=off corrections.lens=off corrections.poses=off
+    surroundings.mode=off
 """)
 FREE_FORM = shlex.split("--set free_form.hollows=false free_form.starts=false free_form.finest_cells=20")
 
@@ -80,10 +77,10 @@ COMMANDS = {
     "fit: sphere": _fit("ball", "sphere", 15),
     "fit: plane": _fit("ball", "plane", 15),
     "fit: height field": _fit("ball", "height_field", 15),
-    "fit: revolution": _fit("fewer", "revolution", 15, *REVOLUTION),
+    "fit: revolution": _fit("fewer", "revolution", 15),
     "fit: free form": _fit("fewer", "free_form", 15, *FREE_FORM),
     "fit: surfels": _fit("fewer", "surfels", 20),
-    "fit: auto": _fit("fewer", "auto", 15, *REVOLUTION),
+    "fit: auto": _fit("fewer", "auto", 15),
     "stability": Command(
         [
             *_program("shinypartial", "stability", "--plan", "tiny", "--seeds", "0", "--cores", "2"),

@@ -15,6 +15,7 @@ import numpy as np
 from panoless.capture.configured import configured_views
 from panoless.config import FitConfig
 from panoless.presets import PRESETS
+from panoless.splats.descent import PUBLISHED
 from panoless.splats.start import first_mirror, first_training
 from panoless.splats.train import train_surfels
 from shinypartial.dataset.bundled import bundled_dataset
@@ -56,16 +57,17 @@ class _MemoryWatch(Unobserved):
 def watch(preset: str, steps: int, count: int) -> Flatness:
     """Train that many surfels for so many steps; density control, where the preset has it, goes on to the end."""
     config: FitConfig = PRESETS[preset]
+    method = config.splats.surfels.shading
+    PUBLISHED[method] = replace(PUBLISHED[method], grows_until=PUBLISHED[method].steps)
     config = replace(
         config,
         splats=replace(
             config.splats,
             iterations=steps,
             surfels=replace(config.splats.surfels, count=count),
-            density=replace(config.splats.density, stop=1.0, max_surfels=2 * count),
+            density=replace(config.splats.density, max_surfels=2 * count),
         ),
         downscale=2,
-        least_object_px=0.0,
         first_surface=replace(config.first_surface, hull_resolution=40),
         environment=replace(config.environment, resolution=32, rays=100_000),
     )

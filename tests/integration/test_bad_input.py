@@ -33,7 +33,6 @@ TINY = [
     "first_surface.hull_resolution=24",
     "surroundings.mode=off",
     "material.reflectance=off",
-    "trust.resolution=16",
 ]
 TINY += ["corrections.masks=off", "corrections.exposure=off", "corrections.lens=off"]
 
@@ -262,7 +261,7 @@ def test_export_of_what_is_no_run(damage: str, workplace: Path, finished: Path, 
         (run / "fit.json").write_text("[1, 2]")
     if damage == "old options":
         content = json.loads((run / "fit.json").read_text())
-        del content["config"]["splats"]["loss"]["lambda_ssim"]
+        del content["config"]["splats"]["loss"]["robust_scale"]
         (run / "fit.json").write_text(json.dumps(content))
     capsys.readouterr()
     assert_refused(capsys, main(["export", "runs/out", "--output", "again"]))

@@ -15,7 +15,7 @@ import pytest
 from jaxtyping import Bool, UInt8
 
 from panoless.viewer.server import Address, open_prediction
-from shinypartial.conversion.convert import ConversionOptions, convert
+from shinypartial.conversion.convert import convert
 from shinypartial.conversion.light import Layout
 from shinypartial.conversion.scenes import THREE
 from shinypartial.core.color import to_display
@@ -149,7 +149,7 @@ def by_cube_map(
     browser: Page, three: Path, prediction: Path, folder: Path, layout: Layout
 ) -> UInt8[np.ndarray, "H W 3"]:
     """What `OWN_PAGE` shows of a prediction's cube map and GLB."""
-    convert(prediction, ("cubemap", "glb"), folder / "web", ConversionOptions(layout=layout))
+    convert(prediction, ("cubemap", "glb"), folder / "web", layout=layout)
     (folder / "index.html").write_text(OWN_PAGE)
     (folder / "three").symlink_to(three)
     with served(folder) as address:

@@ -18,9 +18,7 @@ from shinypartial.dataset.write import write_view
 from tests.support.mirror_sphere import tiny_config
 from tests.support.synthetic_dataset import make_sphere_dataset
 
-CONFIG: FitConfig = replace(
-    tiny_config("fast", iterations=20, count=150), material=PRESETS["fast"].material, trust=PRESETS["fast"].trust
-)
+CONFIG: FitConfig = replace(tiny_config("fast", iterations=20, count=150), material=PRESETS["fast"].material)
 Change = Callable[[Path], None]
 
 

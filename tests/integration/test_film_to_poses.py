@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from panoless.photographs.make import Request, capture
-from panoless.photographs.options import CaptureOptions
 from shinypartial.dataset.same_world import align
 from shinypartial.generate.film import TRUTH, film
 from shinypartial.scene import load_film, override
@@ -23,7 +22,7 @@ def test_a_film_on_a_board_is_captured(tmp_path: Path) -> None:
     spec = load_film("chrome-ball-board")
     small = replace(spec, scene=override(spec.scene, resolution=320, samples=8, train=24, test=1))
     made = film(small, tmp_path / "film").root
-    request = Request(made, tmp_path / "captured", options=CaptureOptions(hull_voxels=48))
+    request = Request(made, tmp_path / "captured")
     captured = capture(request)
     assert len(captured.poses.views) >= 18
     found = align(request.output, made / TRUTH, tmp_path / "aligned")

@@ -45,7 +45,6 @@ def command(dataset: Dataset, output: str) -> list[str]:
         "first_surface.hull_resolution=24",
         "surroundings.mode=off",
         "material.reflectance=off",
-        "trust.resolution=16",
     ]
     options += ["corrections.masks=off", "corrections.exposure=off", "corrections.lens=off"]
     return ["fit", str(dataset.root), "--output", output, *options]
@@ -117,18 +116,8 @@ def test_kinds_that_were_examined_before_a_kill_are_not_fitted_again(
         assert (first / name).read_bytes() == (second / name).read_bytes(), name
 
 
-SHORT = {
-    "free_form": ("free_form.hollows=false", "free_form.starts=false", "free_form.finest_cells=20"),
-    "revolution": (
-        "revolution.photometric.pixels=10000",
-        "revolution.mouth.judged_pixels=5000",
-        "revolution.lip.length_px=5",
-        "revolution.map.pixels=100000",
-        "revolution.footprints.pixels=5000",
-    ),
-}
-SHORT["auto"] = SHORT["revolution"]
-BELIEVED = "corrections.masks=off", "corrections.exposure=off", "corrections.lens=off", "poses.mode=off"
+SHORT = {"free_form": ("free_form.hollows=false", "free_form.starts=false", "free_form.finest_cells=20")}
+BELIEVED = "corrections.masks=off", "corrections.exposure=off", "corrections.lens=off", "corrections.poses=off"
 
 
 def short_config(kind: str) -> FitConfig:

@@ -17,8 +17,7 @@ SURFELS: FitConfig = tiny_config("fast", iterations=2, count=60)
 CONFIG = replace(
     SURFELS,
     free_form=FreeFormOptions(starts=False, finest_cells=20),
-    poses=replace(SURFELS.poses, mode="off"),
-    corrections=replace(SURFELS.corrections, masks="off", exposure="off", lens="off"),
+    corrections=replace(SURFELS.corrections, poses="off", masks="off", exposure="off", lens="off"),
 )
 
 

@@ -45,3 +45,11 @@ def finished(many_views_dataset: Dataset, tmp_path_factory: pytest.TempPathFacto
 
     config, folder = tiny_config(), tmp_path_factory.mktemp("runs") / "sphere"
     return FinishedFit(many_views_dataset, config, folder, fit(many_views_dataset, config, folder))
+
+
+@pytest.fixture
+def often(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Density control acts within a short fit."""
+    from tests.support.mirror_sphere import control_density_often
+
+    control_density_often(monkeypatch)

@@ -19,21 +19,12 @@ from shinypartial.io.records import write_record
 from shinypartial.prediction.format import read_info
 
 TUNED = (
-    "mask_repair",
     "first_surface",
-    "contrast",
     "sphere",
-    "plane",
-    "height_field",
-    "revolution",
     "free_form",
-    "poses",
     "surroundings",
     "material",
     "corrections",
-    "selection",
-    "trust",
-    "surfels.tuned",
 )
 TINY = ["--config.iterations", "4", "--config.surfels.count", "40"]
 AS_TOLD = [
@@ -90,9 +81,9 @@ def test_every_tuned_number_can_be_set(section: str) -> None:
 
 
 def test_a_tuned_number_may_be_written_with_dashes() -> None:
-    config = with_overrides(FitConfig(), ["revolution.max-bounces=3", "selection.least_gain=0.1"])
-    assert config.revolution.max_bounces == 3
-    assert config.selection.least_gain == 0.1
+    config = with_overrides(FitConfig(), ["sphere.operator-deg=3", "material.known_roughness=0.1"])
+    assert config.sphere.operator_deg == 3
+    assert config.material.known_roughness == 0.1
 
 
 @pytest.mark.parametrize(("preset", "form"), [("fast", "{} {}"), ("paper", "{} {}"), ("paper", "{}={}")])
@@ -169,15 +160,15 @@ def test_options_reach_the_fit_and_are_saved(
     tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    options = [*TINY, "--preset", "paper", "--config.density.no-enabled", "--config.loss.lambda-ssim", "0.25"]
-    options += ["--set", "selection.least_gain=0.1", "trust.views=21", "--set", "plane.max_vertices=9"]
+    options = [*TINY, "--preset", "paper", "--config.density.no-enabled", "--config.loss.robust-scale", "0.25"]
+    options += ["--set", "surroundings.degree=1", "corrections.lens=off", "--set", "sphere.radius=9"]
     assert main(["fit", str(sphere_dataset.root), *options]) == 0
     folder = tmp_path / "predictions" / f"{sphere_dataset.name}-paper"
     saved = json.loads((folder / "prediction.json").read_text())["config"]
     assert saved == json.loads((tmp_path / "runs" / folder.name / "fit.json").read_text())["config"]
     assert saved["splats"]["iterations"] == 4
-    assert saved["splats"]["loss"]["lambda_ssim"] == 0.25
-    assert (saved["selection"]["least_gain"], saved["plane"]["max_vertices"]) == (0.1, 9)
+    assert saved["splats"]["loss"]["robust_scale"] == 0.25
+    assert (saved["surroundings"]["degree"], saved["sphere"]["radius"]) == (1, 9)
     assert saved["splats"]["density"]["enabled"] is False
     assert saved["environment"]["activation"] == "sigmoid"
     lines = capsys.readouterr().out.splitlines()

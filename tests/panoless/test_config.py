@@ -16,8 +16,9 @@ from panoless.cli import main
 from panoless.config import FitConfig, check_config, config_from_dict, renamed_arguments, with_overrides
 from panoless.photographs.options import CaptureOptions
 from panoless.presets import PRESETS
+from panoless.splats.descent import Rates
 from panoless.splats.model import ShadedSurfels
-from panoless.splats.options import RateConfig, SplatConfig
+from panoless.splats.options import SplatConfig
 from shinypartial.core.errors import InputError
 from shinypartial.io.records import write_record
 
@@ -45,10 +46,10 @@ def test_presets_differ_beyond_their_name() -> None:
 def test_a_configuration_of_another_version_is_named(damage: str) -> None:
     content = asdict(PRESETS["default"])
     if damage == "missing":
-        del content["splats"]["loss"]["lambda_ssim"]
+        del content["splats"]["loss"]["robust_scale"]
     else:
         content["splats"]["loss"]["lambda_of_the_future"] = 1.0
-    with pytest.raises(InputError, match=r"lambda_ssim|lambda_of_the_future"):
+    with pytest.raises(InputError, match=r"robust_scale|lambda_of_the_future"):
         config_from_dict(content)
 
 
@@ -80,15 +81,14 @@ def reads() -> set[tuple[str, str]]:
 def test_every_option_is_read(section: str) -> None:
     kind = SECTIONS[section] if section else FitConfig
     owners = {"config", "splats", section, "options"} if section else {"config"}
-    looked_up_by_name = {item.name for item in fields(ShadedSurfels)} | {"environment"} if kind is RateConfig else set()
     seen = {name for owner, name in reads() if owner in owners}
-    assert {item.name for item in fields(kind)} - looked_up_by_name - seen == set()  # type: ignore[arg-type]
+    assert {item.name for item in fields(kind)} - seen == set()  # type: ignore[arg-type]
 
 
-def test_every_parameter_has_a_rate() -> None:
-    rates = {item.name for item in fields(RateConfig)}
-    others = {"drop_at", "drop_factor", "means_fall_until", "square_memory"}
-    assert rates - others == {item.name for item in fields(ShadedSurfels)} | {"environment"}
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_parameter_has_a_rate(preset: str) -> None:
+    rates = Rates.of(PRESETS[preset], unit=1.0)
+    assert set(rates.by_name) == {item.name for item in fields(ShadedSurfels)} | {"environment"}
 
 
 def with_value(config: Any, name: str, value: Any) -> Any:
@@ -113,15 +113,12 @@ def test_presets_are_in_range(preset: str) -> None:
         ("first_surface.hull_votes", 1.01),
         ("environment.resolution", 1),
         ("environment.warmup", -0.1),
-        ("loss.depth_blend", 2.0),
-        ("loss.lambda_ssim", 1.5),
+        ("loss.silhouette_until", 1.5),
         ("loss.lambda_silhouette", -1.0),
-        ("rates.means", float("nan")),
-        ("rates.environment", float("inf")),
+        ("loss.lambda_normal_consistency", float("nan")),
+        ("exposure", float("inf")),
         ("crop_margin_px", -2),
-        ("visibility_alpha", 1.5),
         ("loss.robust_scale", -0.1),
-        ("rates.square_memory", 1.0),
         ("environment.rays", 7),
         ("seed", -1),
         ("seed", 2**63),
@@ -155,7 +152,8 @@ def test_every_number_has_a_range_at_its_field(options: type) -> None:
 
 
 @pytest.mark.parametrize(
-    "override", ["surroundings.rays=0", "material.resolution=0", "plane.max_vertices=2", "height_field.cells=-1"]
+    "override",
+    ["surroundings.degree=3", "material.known_roughness=0.6", "sphere.radius=-1", "sphere.operator_deg=-1"],
 )
 def test_a_tuned_number_out_of_range_is_refused(override: str) -> None:
     with pytest.raises(InputError, match=override.partition("=")[0]):
@@ -166,7 +164,6 @@ def test_a_tuned_number_out_of_range_is_refused(override: str) -> None:
     ("preset", "name"),
     [
         ("default", "environment.solve_resolution"),
-        ("default", "material.resolution"),
         ("gaussian-shader", "environment.resolution"),
         ("material-refgs", "environment.resolution"),
         ("ref-gaussian", "environment.resolution"),
@@ -182,7 +179,7 @@ def test_maps_that_are_blurred_halve_whole(preset: str, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("loss.lambda_distortion", 1000.0), ("crop_margin_px", -1), ("seed", 2**63 - 1)]
+    ("name", "value"), [("loss.lambda_silhouette", 1000.0), ("crop_margin_px", -1), ("seed", 2**63 - 1)]
 )
 def test_unusual_values_are_allowed(name: str, value: float) -> None:
     check_config(with_value(PRESETS["default"], name, value))

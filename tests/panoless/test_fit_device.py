@@ -1,6 +1,7 @@
 """A fit places its data on a device once and keeps them there, proved with a device that is not there."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -13,31 +14,32 @@ from panoless.geometry.plane.model import plane_buffers, unoccluded_share
 from panoless.kernels import backend
 from panoless.reconstruct import fit as fit_module
 from panoless.reconstruct.fit import find_device, fit
+from panoless.splats import train
+from panoless.splats.density import grow_and_prune
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import Dataset
+from tests.support.few_rounds import take_few_rounds
 from tests.support.mirror_plane import RECTANGLE, arc, make_plane_dataset, plane_of
 from tests.support.mirror_sphere import tiny_config
 from tests.support.second_device import second_device
 
 
 @pytest.fixture
-def definition_only(monkeypatch: pytest.MonkeyPatch) -> None:
+def definition_only(monkeypatch: pytest.MonkeyPatch, often: None) -> None:
     """Both devices compute by the definition, in few rounds and sweeps."""
     monkeypatch.setattr(backend, "_fastest", lambda dtype, device: "reference")
     monkeypatch.setattr(cubemap, "ROBUST_SCALES", (None,))
     monkeypatch.setattr(cubemap, "REFINING_SCALES", (0.05,))
     monkeypatch.setattr(fill, "RELAXED_TEXELS", 16)
+    monkeypatch.setattr(train, "grow_and_prune", partial(grow_and_prune, threshold=0.0))
+    take_few_rounds(monkeypatch, heights=1, revolutions=1)
 
 
 def shortest_config(preset: str) -> FitConfig:
     """Every path of a preset in a few steps."""
     config = tiny_config(preset, iterations=5, count=20)
-    density = replace(
-        config.splats.density, start=0.0, every=0.2, reset_every=0.5, propagate_every=0.34, gradient_threshold=0
-    )
     return replace(
         config,
-        splats=replace(config.splats, density=density),
         first_surface=replace(config.first_surface, hull_resolution=16),
         model="surfels",
         downscale=2,
@@ -71,8 +73,6 @@ def test_the_same_kind_is_chosen_on_another_device(tmp_path: Path, definition_on
     config = replace(
         config,
         model="auto",
-        selection=replace(config.selection, trial_resolution=8),
-        height_field=replace(config.height_field, cells=8, rounds=1),
         corrections=replace(config.corrections, masks="off", exposure="off", lens="off"),
         surroundings=replace(config.surroundings, mode="off"),
     )

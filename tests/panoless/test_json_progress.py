@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SCHEMA = ROOT / "docs" / "reference" / "json-progress.schema.json"
 SHORT = ["--model", "surfels", "--config.iterations", "30", "--config.surfels.count", "100"]
 SHORT += ["--config.environment.resolution", "16", "--config.environment.solve-resolution", "16", "--set"]
-SHORT += ["surroundings.mode=off", "material.reflectance=off", "corrections.masks=off", "trust.resolution=16"]
+SHORT += ["surroundings.mode=off", "material.reflectance=off", "corrections.masks=off"]
 SHORT += ["corrections.exposure=off", "corrections.lens=off", "first_surface.hull_resolution=24"]
 
 

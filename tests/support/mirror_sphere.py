@@ -3,12 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from panoless.config import FitConfig
 from panoless.presets import PRESETS
+from panoless.splats.descent import PUBLISHED
 from panoless.splats.model import Surfels
 from tests.support.synthetic_dataset import environment_radiance
 
@@ -32,30 +34,41 @@ def sphere_surfels(count: int, radius: float = 1.0, opacity_logit: float = 6.0) 
     )
 
 
+def control_density_often(patch: pytest.MonkeyPatch) -> None:
+    """Density control of all methods keeps a rhythm in a fit of some ten iterations."""
+    for name, each in PUBLISHED.items():
+        first, last, every, reset, propagation = (share * each.steps for share in (0.1, 0.9, 0.2, 0.4, 0.3))
+        often = replace(
+            each,
+            grows_from=first,
+            grows_until=last,
+            grows_every=every,
+            resets_every=reset,
+            propagates_every=propagation,
+        )
+        patch.setitem(PUBLISHED, name, often)
+
+
 def clipped_environment(directions: Float[Tensor, "*S 3"]) -> Float[Tensor, "*S 3"]:
     """The environment of the synthetic dataset in given directions, clipped to [0, 1] as training views are."""
     return torch.from_numpy(environment_radiance(directions.double().numpy())).clamp(0, 1).float()
 
 
 def tiny_config(preset: str = "default", iterations: int = 80, count: int = 300) -> FitConfig:
-    """A preset of surfels, few, with few texels and iterations; density control keeps a rhythm at this length. The
-    surroundings are far and the mirror is perfect, as those of the synthetic sphere are, without fits that ask whether
-    they are; trust is judged under a coarse map.
+    """A preset of surfels, few, with few texels and iterations. The surroundings are far and the mirror is perfect, as
+    those of the synthetic sphere are, without fits that ask whether they are.
     """
     config = PRESETS[preset]
-    density = replace(config.splats.density, start=0.1, stop=0.9, every=0.2, reset_every=0.4, propagate_every=0.3)
     return replace(
         config,
         splats=replace(
             config.splats,
             iterations=iterations,
             surfels=replace(config.splats.surfels, count=count),
-            density=density,
         ),
         model="surfels",
         first_surface=replace(config.first_surface, hull_resolution=40),
         environment=replace(config.environment, resolution=24, solve_resolution=24),
         surroundings=replace(config.surroundings, mode="off"),
         material=replace(config.material, reflectance="off", roughness="off", blur="off"),
-        trust=replace(config.trust, resolution=32),
     )

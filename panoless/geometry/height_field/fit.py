@@ -2,7 +2,7 @@
 fine as held-out views ask for.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,6 @@ from panoless.capture.silhouettes import MaskContours, mask_contours
 from panoless.capture.views import Views, split_held_out
 from panoless.environment.solve import solve_environment
 from panoless.geometry.height_field.model import HeightField, flat_height_field
-from panoless.geometry.height_field.options import DEFAULTS, HeightFieldOptions
 from panoless.geometry.height_field.photometric import Photographs, observe
 from panoless.geometry.height_field.silhouette import edge_equations, edge_residuals
 from panoless.geometry.plane.model import Plane
@@ -38,6 +37,10 @@ class HeightFieldRound:
     """Most steps."""
 
 
+CELLS = 16
+"""Cells of the spline along the longer side of the boundary, to begin with."""
+HALVINGS = 1
+"""How often they may be halved, where held-out views gain by it."""
 JUDGED_STEPS = 2
 """Steps on a finer grid after which it is judged."""
 MAX_POINTS = 20_000
@@ -75,8 +78,11 @@ LEAST_CLEARED = 0.1
 def fit_height_field(
     views: Views,
     plane: Plane,
-    options: HeightFieldOptions = DEFAULTS,
     fitted: HeightField | None = None,
+    *,
+    cells: int = CELLS,
+    halvings: int = HALVINGS,
+    rounds: Sequence[HeightFieldRound] = ROUNDS,
 ) -> HeightField:
     """The heights over a plane, and the plane itself, that explain silhouettes and photographs best.
 
@@ -85,10 +91,10 @@ def fit_height_field(
     One that was `fitted` to almost the same views goes on in the last round, on its grid.
     """
     with torch.no_grad():
-        contours, rounds = _contours(views), ROUNDS[: options.rounds]
+        contours = _contours(views)
         if fitted is not None:
             return _refine(views, contours, fitted, rounds[-1], rounds[-1])
-        height_field = flat_height_field(plane, options.cells)
+        height_field = flat_height_field(plane, cells)
         for scale_px in EDGE_SCALES_PX:
             height_field = step_height_field(contours, height_field, scale_px, EDGE_BENDING)[0]
         progress = Progress("fitting a bent mirror", len(rounds) + 3)
@@ -103,7 +109,7 @@ def fit_height_field(
             return _unexplained(kept, held_out, each, rounds[-1])
 
         if held_out.train:
-            height_field = _refine_grid(views, kept, contours, height_field, error, options.halvings, rounds[-1])
+            height_field = _refine_grid(views, kept, contours, height_field, error, halvings, rounds[-1])
         progress.advance()
         if held_out.train:
             cleared = _cleared(height_field, error)

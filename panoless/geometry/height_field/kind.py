@@ -13,7 +13,7 @@ from panoless.config import FitConfig
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, poses_from_plain, to_plain
 from panoless.geometry.exact import ExactFamily, SeenByCenters
-from panoless.geometry.height_field.fit import best_dome, fit_height_field
+from panoless.geometry.height_field.fit import CELLS, best_dome, fit_height_field
 from panoless.geometry.height_field.model import (
     HeightField,
     flat_height_field,
@@ -95,16 +95,16 @@ class HeightFieldFamily(ExactFamily):
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The plane that it bends, flat as yet."""
-        return HeightFieldMirror(flat_height_field(proposal.shape, config.height_field.cells))
+        return HeightFieldMirror(flat_height_field(proposal.shape, CELLS))
 
     def before_steps(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """The dome or bowl over the plane that photographs agree on best, or the plane."""
-        flat = flat_height_field(proposal.shape, config.height_field.cells)
+        flat = flat_height_field(proposal.shape, CELLS)
         return HeightFieldMirror(best_dome(views, flat))
 
     def unknowns(self, views: Views, proposal: Proposal, config: FitConfig) -> HeightFieldUnknowns:
         """See there."""
-        return HeightFieldUnknowns(flat_height_field(proposal.shape, config.height_field.cells))
+        return HeightFieldUnknowns(flat_height_field(proposal.shape, CELLS))
 
     def begun(self, views: Views, surface: HeightFieldUnknowns, config: FitConfig) -> HeightFieldUnknowns:
         """With the dome or bowl more that photographs agree on best."""
@@ -112,5 +112,5 @@ class HeightFieldFamily(ExactFamily):
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """Heights, plane and boundary by silhouettes and photographs together."""
-        options, fitted = config.height_field, None if proposal.fitted is None else proposal.fitted.height_field
-        return HeightFieldMirror(fit_height_field(views, proposal.shape, options, fitted))
+        fitted = None if proposal.fitted is None else proposal.fitted.height_field
+        return HeightFieldMirror(fit_height_field(views, proposal.shape, fitted))

@@ -19,7 +19,6 @@ from panoless.capture.silhouettes import MaskContours, mask_contours
 from panoless.capture.views import TrainView, Views
 from panoless.geometry.base import overlap
 from panoless.geometry.plane.model import Plane, plane_buffers
-from panoless.geometry.plane.options import PlaneOptions
 from panoless.geometry.plane.silhouette import (
     CORNER_DEG,
     BoundaryResiduals,
@@ -66,6 +65,8 @@ START_HALF_SIDE = 1.2
 """Half a side of that grid, in radii of the object."""
 STARTS = 3
 """So many of the best starts go through the first round."""
+MAX_VERTICES = 128
+"""Most vertices of the boundary."""
 MAX_POINTS = 40_000
 """Most contour points of all views."""
 VOTING_VIEWS = 32
@@ -114,7 +115,7 @@ class PlaneFit:
     """Σ min(alpha, mask) / Σ max(alpha, mask), with the frame."""
 
 
-def fit_plane(views: Views, *, thorough: bool = True, options: PlaneOptions = PlaneOptions()) -> PlaneFit:
+def fit_plane(views: Views, *, thorough: bool = True) -> PlaneFit:
     """The plane and boundary that explain the masks best, from several starts; never a failure because none is good.
 
     Unless `thorough`, a plane that the first round leaves hopelessly far from the contours is returned as it is then,
@@ -125,15 +126,15 @@ def fit_plane(views: Views, *, thorough: bool = True, options: PlaneOptions = Pl
     contours = mask_contours(views)
     _require_distinct_views(contours)
     sparse = contours.every(max(1, len(contours.view) // MAX_POINTS))
-    starts = [_refine(views, sparse, start, FIRST_ROUND, options) for start in _starts(views)]
+    starts = [_refine(views, sparse, start, FIRST_ROUND) for start in _starts(views)]
     plane = min(starts, key=lambda start: _cost(sparse, start))
     if not thorough and _hopeless(sparse, plane):
         return _score(views, contours, plane, math.inf)
     for settings in LATER_ROUNDS:
-        plane = _refine(views, sparse, plane, settings, options)
+        plane = _refine(views, sparse, plane, settings)
     final_scales = (FINAL_SCALE_PX,) * FINAL_STEPS
     for _ in range(SIMPLIFICATIONS):
-        plane = _descend(sparse, _simplify_boundary(plane, sparse, options), final_scales)
+        plane = _descend(sparse, _simplify_boundary(plane, sparse), final_scales)
     sigma = float(np.sqrt(max(_covariance(sparse, plane, frame=True)[2, 2], 0.0)))
     frame = plane.frame_height > FRAME_SIGMAS * sigma
     if not frame:
@@ -205,15 +206,13 @@ def _votes(
     return result
 
 
-def _refine(
-    views: Views, contours: MaskContours, plane: Plane, settings: BoundaryRound, options: PlaneOptions
-) -> Plane:
-    plane = replace(plane, boundary=_vote_boundary(views, contours, plane, settings, options))
+def _refine(views: Views, contours: MaskContours, plane: Plane, settings: BoundaryRound) -> Plane:
+    plane = replace(plane, boundary=_vote_boundary(views, contours, plane, settings))
     return _descend(contours, plane, settings.scales_px)
 
 
 def _vote_boundary(
-    views: Views, contours: MaskContours, plane: Plane, settings: BoundaryRound, options: PlaneOptions
+    views: Views, contours: MaskContours, plane: Plane, settings: BoundaryRound
 ) -> Float[np.ndarray, "N 2"]:
     """The level set of the mean of all masks on the plane, simplified; a box where they have no point in common."""
     from skimage.measure import find_contours
@@ -227,11 +226,11 @@ def _vote_boundary(
     curves = find_contours(votes, settings.level * votes.max()) if votes.max() > 0 else []
     if not curves:
         return np.array([low, (high[0], low[1]), high, (low[0], high[1])])
-    cells = _simplify(max(curves, key=len)[:-1], settings.tolerance_cells, options.max_vertices)
+    cells = _simplify(max(curves, key=len)[:-1], settings.tolerance_cells)
     return _counterclockwise(low + cells / (settings.grid - 1) * (high - low))
 
 
-def _simplify(boundary: Float[np.ndarray, "N 2"], tolerance: float, max_vertices: int) -> Float[np.ndarray, "M 2"]:
+def _simplify(boundary: Float[np.ndarray, "N 2"], tolerance: float) -> Float[np.ndarray, "M 2"]:
     """Fewer vertices, at most `tolerance` from the boundary, or more where that many would not do."""
     from skimage.measure import approximate_polygon
 
@@ -240,7 +239,7 @@ def _simplify(boundary: Float[np.ndarray, "N 2"], tolerance: float, max_vertices
     closed = np.roll(boundary, -start, 0)
     closed = np.concatenate([closed, closed[:1]])
     simple = approximate_polygon(closed, tolerance)[:-1]
-    while len(simple) > max_vertices:
+    while len(simple) > MAX_VERTICES:
         tolerance *= 1.5
         simple = approximate_polygon(closed, tolerance)[:-1]
     return simple if len(simple) >= 3 else boundary
@@ -316,10 +315,10 @@ def _equations(
     return (by_view @ jacobian).toarray(), matrix
 
 
-def _simplify_boundary(plane: Plane, contours: MaskContours, options: PlaneOptions) -> Plane:
+def _simplify_boundary(plane: Plane, contours: MaskContours) -> Plane:
     """The plane with sharp corners and as few vertices as a quarter of a pixel allows."""
     pixel = 1 / max(float(np.median(boundary_residuals(contours, plane).pixels_per_unit)), 1e-9)
-    simple = _simplify(plane.boundary, SIMPLE_PX * pixel, options.max_vertices)
+    simple = _simplify(plane.boundary, SIMPLE_PX * pixel)
     return replace(plane, boundary=_sharpen(simple, CHAMFER_PX * pixel, CORNER_DEG))
 
 

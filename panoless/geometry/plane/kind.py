@@ -79,7 +79,7 @@ class PlaneFamily(ExactFamily):
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """Plane, boundary and frame by silhouettes."""
         try:
-            found = fit_plane(views, thorough=asked, options=config.plane)
+            found = fit_plane(views, thorough=asked)
         except InputError:
             if asked:
                 raise

@@ -8,8 +8,7 @@ from jaxtyping import Int
 
 from panoless.capture.views import TrainView, Views
 from panoless.environment.footprints import Footprints, PixelFootprints, batched
-from panoless.geometry.revolution.model import SurfaceOfRevolution
-from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
+from panoless.geometry.revolution.model import FITTED_BOUNCES, SurfaceOfRevolution
 from panoless.geometry.revolution.pixels import PixelBundles
 from panoless.geometry.revolution.render import LARGEST_BEND, smooth_pixels
 
@@ -25,7 +24,6 @@ OFFSETS = (-0.25, 0.25)
 def pixel_footprints(
     views: Views,
     surface: SurfaceOfRevolution,
-    options: RevolutionOptions = DEFAULTS,
     *,
     max_bounces: int = 1,
     occlusion_test: bool = True,
@@ -46,20 +44,19 @@ def pixel_footprints(
             directions = torch.stack(list(at.within(OFFSETS)), 1).to(view.radiance.device)
             yield PixelFootprints(directions, view.radiance_at(pixels))
 
-    return Footprints(batched(seen()), lambda: [_trace(chosen, surface, others, options)])
+    return Footprints(batched(seen()), lambda: [_trace(chosen, surface, others)])
 
 
 def _trace(
     views: Sequence[TrainView],
     surface: SurfaceOfRevolution,
     pixels: Sequence[Int[np.ndarray, "_"]],
-    options: RevolutionOptions,
 ) -> PixelFootprints:
     """About `TRACED` of the pixels, as far as all of their rays leave."""
     stride = max(1, -(-sum(map(len, pixels)) // TRACED))
     chosen = [each[index % stride :: stride] for index, each in enumerate(pixels)]
     bundles = PixelBundles.of(zip(views, chosen, strict=True))
-    paths, device = bundles.trace(surface, options.max_bounces), views[0].radiance.device
+    paths, device = bundles.trace(surface, FITTED_BOUNCES), views[0].radiance.device
     whole = (paths.bounces > 0).reshape(-1, bundles.rays_per_pixel).all(1)
     directions = paths.directions.reshape(-1, bundles.rays_per_pixel, 3)[whole]
     radiance = torch.from_numpy(bundles.radiance[whole])

@@ -20,8 +20,7 @@ from panoless.geometry.revolution.floor import fit_floor, floor_pixels
 from panoless.geometry.revolution.footprints import ROUNDS, has_edges, informative_pixels, refine_by_footprints
 from panoless.geometry.revolution.interior import end_pixels, search_interior
 from panoless.geometry.revolution.lip import LENGTH_PX, clear_of_lip, lip_pixels, open_at_lip, place_lip, refine_lip
-from panoless.geometry.revolution.model import MAX_BOUNCES, SurfaceOfRevolution, revolution_buffers
-from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
+from panoless.geometry.revolution.model import FITTED_BOUNCES, MAX_BOUNCES, SurfaceOfRevolution, revolution_buffers
 from panoless.geometry.revolution.photometric import Round, refine_round, solve_map
 from panoless.geometry.revolution.pixels import CENTER, JUDGED_SCALE, PixelBundles, evenly
 from panoless.geometry.revolution.profile import resample_profile
@@ -53,6 +52,12 @@ COARSE = (Round(64, 0.3, 3.0, 2), Round(128, 0.3, 2.0, 2))
 """Rounds on single rays before the mouth is opened."""
 FINE = (Round(128, 0.2, 1.5, 2), Round(256, 0.2, 1.5, 2), Round(256, 0.1, 1.0, 2), Round(256, 0.1, 1.0, 2))
 """Rounds after."""
+MOST_ROUNDS = 4
+"""Rounds of each series, which goes from coarse to fine."""
+PIXELS = 120_000
+"""Pixels of a step on single rays; half as many are taken as areas, a quarter under the coarsest maps."""
+MAP_RAYS = 600_000
+"""Rays that a round's map is solved from; a quarter of them under the coarsest."""
 CONTOUR_POINTS = 20_000
 """Contour points of a step."""
 END_PIXELS = 100_000
@@ -148,24 +153,20 @@ def _count(chosen: list[tuple[TrainView, Int[np.ndarray, "_"]]]) -> int:
     return sum(len(pixels) for _, pixels in chosen)
 
 
-def refine_revolution(
-    views: Views, start: SurfaceOfRevolution, options: RevolutionOptions = DEFAULTS
-) -> SurfaceOfRevolution:
+def refine_revolution(views: Views, start: SurfaceOfRevolution, *, rounds: int = MOST_ROUNDS) -> SurfaceOfRevolution:
     """Profile and axis by what is mirrored, from the closed surface of the silhouettes.
 
     The outside gives a map, under which the mouth is opened. Rounds on single rays follow, and after them the
     refinements for which pixels are found: areas of pixels, the interior anew, the floor and the lip.
     """
     with torch.no_grad():
-        return Refinement(views, start, options).run()
+        return Refinement(views, start, rounds=rounds).run()
 
 
-def follow_views(
-    views: Views, fitted: SurfaceOfRevolution, options: RevolutionOptions = DEFAULTS
-) -> SurfaceOfRevolution:
+def follow_views(views: Views, fitted: SurfaceOfRevolution) -> SurfaceOfRevolution:
     """A fitted surface after one more round on single rays, to views that changed a little."""
     with torch.no_grad():
-        return Refinement(views, fitted, options).refine_by_centers(fitted, FINE[: options.rounds][-1], None)[0]
+        return Refinement(views, fitted).refine_by_centers(fitted, FINE[-1], None)[0]
 
 
 @dataclass(frozen=True)
@@ -182,8 +183,17 @@ class _Judged:
 class Refinement:
     """The data of a fit, and its steps."""
 
-    def __init__(self, views: Views, start: SurfaceOfRevolution, options: RevolutionOptions) -> None:
-        self.views, self.start, self.options = views, start, options
+    def __init__(
+        self,
+        views: Views,
+        start: SurfaceOfRevolution,
+        *,
+        rounds: int = MOST_ROUNDS,
+        pixels: int = PIXELS,
+        map_rays: int = MAP_RAYS,
+    ) -> None:
+        self.views, self.start = views, start
+        self.rounds, self.pixels, self.map_rays = rounds, pixels, map_rays
         kept, held_out = split_held_out(views.train)
         self.kept, self.held_out = (replace(views, train=tuple(part)) for part in (kept, held_out))
         self.contours = contour_rays(views).at_most(CONTOUR_POINTS)
@@ -191,7 +201,7 @@ class Refinement:
 
     def run(self) -> SurfaceOfRevolution:
         """All of them, in order."""
-        fine = FINE[: self.options.rounds]
+        fine = FINE[: self.rounds]
         progress = Progress("fitting a surface of revolution", 5 + len(fine))
         surface, environment = self.open_mouth()
         progress.advance()
@@ -233,7 +243,7 @@ class Refinement:
         opened = []
         for surface in starts:
             environment = None
-            for each in COARSE[: self.options.rounds]:
+            for each in COARSE[: self.rounds]:
                 surface, environment = self.refine_by_centers(surface, each, environment)
             assert environment is not None, "there is a coarse round"
             flat = self._judged(surface, seen, environment)
@@ -253,7 +263,7 @@ class Refinement:
         and under that of such a wall if it explains more than the flat lid.
         """
         maps = [environment]
-        if self.options.thin_walls and (opened := open_at_lip(self.contours, closed)) is not None:
+        if (opened := open_at_lip(self.contours, closed)) is not None:
             thin = self._judged(opened, seen)
             yield thin
             if self._best(flat, thin) is thin:
@@ -265,7 +275,7 @@ class Refinement:
     def _descended(self, start: _Judged, seen: PixelBundles) -> _Judged:
         """A surface after steps under maps so coarse that its inside may be wrong by many degrees."""
         surface = start.surface
-        for each in DESCENT[: self.options.rounds]:
+        for each in DESCENT[: self.rounds]:
             surface, _ = self.refine_by_centers(surface, each, None, share=4)
         return self._judged(surface, seen)
 
@@ -274,8 +284,8 @@ class Refinement:
         """A surface under its own map of the views that are not held out, from nothing, since others' leave traces;
         with rays that are mirrored often, since some directions are seen by way of the walls only.
         """
-        rays, resolution = self.options.map_rays, COARSE[: self.options.rounds][-1].resolution
-        environment = solve_map(self.kept, surface, rays, resolution, max_bounces=self.options.max_bounces)
+        rays, resolution = self.map_rays, COARSE[: self.rounds][-1].resolution
+        environment = solve_map(self.kept, surface, rays, resolution, max_bounces=FITTED_BOUNCES)
         return _Judged(surface, environment, self._error(seen, surface, environment), going_on)
 
     def _best(self, *candidates: _Judged) -> _Judged:
@@ -300,9 +310,9 @@ class Refinement:
     ) -> tuple[SurfaceOfRevolution, Tensor]:
         """The surface after one round on single rays, and the map before it; of one in `share` pixels and rays."""
         views = clear_of_lip(self.views, surface)
-        environment = solve_map(views, surface, self.options.map_rays // share, each.resolution, environment)
+        environment = solve_map(views, surface, self.map_rays // share, each.resolution, environment)
         surface = refine_round(
-            PixelBundles.of(evenly(views, self.options.pixels // share), CENTER),
+            PixelBundles.of(evenly(views, self.pixels // share), CENTER),
             self.contours,
             surface,
             environment,
@@ -315,7 +325,7 @@ class Refinement:
     def solve_finest_map(self, surface: SurfaceOfRevolution, environment: Tensor) -> Float[Tensor, "6 3 L L"]:
         """The map of many rays in the resolution of the last round on areas."""
         views = clear_of_lip(self.views, surface)
-        return solve_map(views, surface, FINEST_MAP_RAYS, ROUNDS[: self.options.rounds][-1].resolution, environment)
+        return solve_map(views, surface, FINEST_MAP_RAYS, ROUNDS[: self.rounds][-1].resolution, environment)
 
     def refine_areas(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
         """Grooves and edges, by pixels as areas, where there are any."""
@@ -328,8 +338,15 @@ class Refinement:
         views = clear_of_lip(self.kept, start)
         if not has_edges(views, start, self.pixel):
             return start
-        candidate = refine_by_footprints(views.train, self.contours, start, environment, self.options)
-        held_out = informative_pixels(self.held_out.train, start, self.options.pixels // 8, self.pixel)
+        candidate = refine_by_footprints(
+            views.train,
+            self.contours,
+            start,
+            environment,
+            pixels=self.pixels // 2,
+            rounds=ROUNDS[: self.rounds],
+        )
+        held_out = informative_pixels(self.held_out.train, start, self.pixels // 8, self.pixel)
         return self.keep_if_better(surface, candidate, PixelBundles.of(held_out), environment)
 
     def refine_interior(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:

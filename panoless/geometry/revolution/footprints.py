@@ -16,8 +16,7 @@ from torch.nn.functional import avg_pool2d
 from panoless.capture.rays import pixel_rays
 from panoless.capture.views import TrainView, Views, every_kth_pixel
 from panoless.geometry.revolution.lip import place_lip
-from panoless.geometry.revolution.model import SurfaceOfRevolution
-from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
+from panoless.geometry.revolution.model import FITTED_BOUNCES, SurfaceOfRevolution
 from panoless.geometry.revolution.photometric import Round, refine_round
 from panoless.geometry.revolution.pixels import PixelBundles
 from panoless.geometry.revolution.profile import resample_profile
@@ -92,23 +91,27 @@ def refine_by_footprints(
     contours: ContourRays,
     surface: SurfaceOfRevolution,
     environment: Float[Tensor, "6 3 L L"],
-    options: RevolutionOptions = DEFAULTS,
+    *,
+    pixels: int,
+    rounds: Sequence[Round] = ROUNDS,
 ) -> SurfaceOfRevolution:
-    """The surface with vertices a third of a pixel apart, after rounds of Gauss–Newton on pixels as areas."""
+    """The surface with vertices a third of a pixel apart, after rounds of Gauss–Newton on at most so many
+    pixels as areas.
+    """
     pixel = contours.pixel
-    count = min(options.pixels // 2, int(LARGEST_SHARE * sum(len(view.solid) for view in views)))
-    pixels = PixelBundles.of(informative_pixels(views, surface, count, pixel))
+    count = min(pixels, int(LARGEST_SHARE * sum(len(view.solid) for view in views)))
+    bundles = PixelBundles.of(informative_pixels(views, surface, count, pixel))
     spacing = SPACING_PX * pixel
     surface = resample_profile(surface, spacing)
-    for each in ROUNDS[: options.rounds]:
+    for each in rounds:
         blurred = avg_pool2d(environment, max(environment.shape[-1] // each.resolution, 1))
         surface = refine_round(
-            pixels,
+            bundles,
             contours,
             surface,
             blurred,
             each,
             lambda moved: resample_profile(place_lip(contours, moved, spacing), spacing),
-            options.max_bounces,
+            FITTED_BOUNCES,
         )
     return surface

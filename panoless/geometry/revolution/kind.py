@@ -20,13 +20,11 @@ from panoless.geometry.revolution.deblurred_map import pixel_footprints
 from panoless.geometry.revolution.fit import follow_views, propose_revolution, refine_revolution
 from panoless.geometry.revolution.lip import CLEARANCE_PX, beside_lip
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_buffers, revolution_rays
-from panoless.geometry.revolution.options import DEFAULTS, RevolutionOptions
 from panoless.geometry.revolution.render import SAMPLES, mean_light
 from panoless.geometry.revolution.silhouette import contour_rays
 from panoless.geometry.revolution.unknowns import STIFF_PX, RevolutionUnknowns
 from panoless.kernels.camera import RasterCamera
 from shinypartial.core.errors import InputError
-from shinypartial.io.records import read_record, write_record
 
 MERIDIANS = 128
 
@@ -39,7 +37,6 @@ class RevolutionMirror(ExactGeometry):
     surface: SurfaceOfRevolution
     occlusion_test: bool = True
     """Whether pixels that see the object again are left out."""
-    options: RevolutionOptions = DEFAULTS
 
     @property
     def surroundings(self) -> Surroundings:
@@ -74,7 +71,7 @@ class RevolutionMirror(ExactGeometry):
 
     def footprints(self, views: Views, max_pixels: int) -> Footprints:
         """Of all pixels that see the environment at once, and of a sample of the others."""
-        return pixel_footprints(views, self.surface, self.options, occlusion_test=self.occlusion_test)
+        return pixel_footprints(views, self.surface, occlusion_test=self.occlusion_test)
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
         """By intersection; alpha by 4×4 rays where neighbors disagree."""
@@ -92,15 +89,14 @@ class RevolutionMirror(ExactGeometry):
 
     def state_dict(self) -> dict[str, Any]:
         """All numbers as lists and plain values."""
-        surface, options, poses = to_plain(self.surface), write_record(self.options), to_plain(self.poses)
-        return {"surface": surface, "occlusion_test": self.occlusion_test, "options": options, "poses": poses}
+        surface, poses = to_plain(self.surface), to_plain(self.poses)
+        return {"surface": surface, "occlusion_test": self.occlusion_test, "poses": poses}
 
     @classmethod
     def from_state_dict(cls, content: dict[str, Any]) -> "RevolutionMirror":
         """The geometry that `state_dict` was taken from."""
-        options = read_record(RevolutionOptions, content["options"], "the options of a surface of revolution")
         surface = from_plain(SurfaceOfRevolution, content["surface"])
-        return cls(surface, content["occlusion_test"], options, poses=poses_from_plain(content))
+        return cls(surface, content["occlusion_test"], poses=poses_from_plain(content))
 
     def mesh(self, frame: ObjectFrame) -> Mesh:
         """Quadrilaterals between 128 meridians, with the normals of the surface; a crease has a ring for each side."""
@@ -133,7 +129,7 @@ class RevolutionFamily(ExactFamily):
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The outside, closed flat at both ends."""
-        return RevolutionMirror(proposal.shape, config.environment.trace, config.revolution)
+        return RevolutionMirror(proposal.shape, config.environment.trace)
 
     def unknowns(self, views: Views, proposal: Proposal, config: FitConfig) -> RevolutionUnknowns:
         """See there."""
@@ -146,7 +142,7 @@ class RevolutionFamily(ExactFamily):
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """Profile and axis by what is reflected."""
         if proposal.fitted is None:
-            surface = refine_revolution(views, proposal.shape, config.revolution)
+            surface = refine_revolution(views, proposal.shape)
         else:
-            surface = follow_views(views, proposal.fitted.surface, config.revolution)
-        return RevolutionMirror(surface, config.environment.trace, config.revolution)
+            surface = follow_views(views, proposal.fitted.surface)
+        return RevolutionMirror(surface, config.environment.trace)

@@ -24,6 +24,8 @@ from shinypartial.core.sphere import pixel_footprint_sr
 CONFIDENCE_TEXEL_RAD = math.pi / 2 / 128
 """A pixel that spans a wider angle says little about any texel: confidence 1/(1 + a/t) with t its square."""
 MAX_BOUNCES = 16
+FITTED_BOUNCES = 6
+"""Reflections of a ray in a fit; more bounces only count in pictures."""
 """Reflections after which a ray is black: as many as the renderer of the data sets follows."""
 
 CREASE_RAD = math.radians(35.0)

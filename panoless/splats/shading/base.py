@@ -23,7 +23,7 @@ from panoless.splats.kernels.reference.rasterize import rotation_matrices
 from panoless.splats.kernels.splats import blend_splats, project_gaussians
 from panoless.splats.model import ShadedSurfels, Surfels
 from panoless.splats.rendering import ALPHA_FLOOR
-from panoless.splats.shading.occlusion import Occluder, OccluderOptions
+from panoless.splats.shading.occlusion import Occluder
 from panoless.splats.split_sum import LEVELS, Prefiltered, look_up_rough, specular_share
 from shinypartial.core.harmonics import harmonic_polynomials
 
@@ -67,8 +67,8 @@ class Shading(Protocol):
         ...
 
     @property
-    def occlusion(self) -> OccluderOptions | None:
-        """When and how it traces what the object hides of its surroundings; None: it does not."""
+    def traces(self) -> bool:
+        """Whether it traces what the object hides of its surroundings."""
         ...
 
     def begun(self, surfels: Surfels, *, random: bool) -> ShadedSurfels:
@@ -162,9 +162,8 @@ def blend_surfels(
     camera: RasterCamera,
     attributes: Float[Tensor, "K C"],
     offsets: Float[Tensor, "K 2"] | None,
-    depth_blend: float = 0.0,
 ) -> Blended:
-    """Flat surfels by the rasterizer, three attributes at a time; the depth is that of Eq. 3."""
+    """Flat surfels by the rasterizer, three attributes at a time, with the expected depth."""
     missing = -attributes.shape[1] % 3
     padded = torch.nn.functional.pad(attributes, (0, missing))
     shapes = surfels.means, surfels.quats, surfels.scales, surfels.opacities
@@ -176,7 +175,7 @@ def blend_surfels(
         torch.cat([each.colors for each in rasters])[: attributes.shape[1]],
         first.normals_camera,
         first.alpha,
-        surface_depth(first.accumulated_depth, first.median_depth, first.alpha, depth_blend),
+        surface_depth(first.accumulated_depth, first.median_depth, first.alpha, depth_blend=0.0),
         first.in_frustum,
     )
 

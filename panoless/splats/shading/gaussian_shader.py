@@ -39,7 +39,7 @@ class GaussianShader(Unchanging):
     )
     restarts_at: float = 0.0
     """Never."""
-    occlusion: None = None
+    traces: bool = False
     tint: float = 0.5
     roughness: float = 0.65
     predicted_normal: float = 0.2

@@ -27,7 +27,7 @@ class MaterialRefGS(RefGaussian):
     """The published constants; shares are of its 50,000 steps."""
 
     learned: ClassVar[frozenset[str]] = RefGaussian.learned - {"indirect_harmonics"}
-    occlusion: None = None
+    traces: bool = False
     """Surroundings of Gaussians would tell it."""
     restarts_at: float = 0.0
     """Pixels are shaded from the first step on."""

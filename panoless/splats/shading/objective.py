@@ -19,7 +19,7 @@ from panoless.splats.model import ShadedSurfels, Surfels
 from panoless.splats.objective import LossTerms, Step, composited, generator_of
 from panoless.splats.schedule import Schedule
 from panoless.splats.shading.base import Shading, blend_surfels, consistency_with_depth
-from panoless.splats.shading.occlusion import DepthMap, Occluder, OccluderOptions
+from panoless.splats.shading.occlusion import BEGINS, EVERY, MOST_VIEWS, DepthMap, Occluder
 
 SHAPES = frozenset({"means", "quats", "log_scales", "opacity_logits"})
 
@@ -58,8 +58,8 @@ class ShadedObjective:
         surface = seen.surface
         everywhere = torch.arange(view.mask.numel(), device=view.mask.device)
         color = (seen.diffuse + seen.specular).flatten(1)
-        image, target = composited(color, surface.alpha.flatten(), everywhere, view, self._config, iteration)
-        total = photometric = photometric_paper(image, target, loss.lambda_ssim)
+        image, target = composited(color, surface.alpha.flatten(), everywhere, view, view.radiance.new_ones(3, 1))
+        total = photometric = photometric_paper(image, target)
         consistency = outline = photometric.new_zeros(())
         if loss.lambda_normal_consistency > 0:
             consistency = consistency_with_depth(surface, view.camera, torch.ones_like(view.mask))
@@ -90,11 +90,10 @@ class ShadedObjective:
         return replace(surfels, **{name: fresh[name] for name in self._shading.learned})
 
     def _renew_occluder(self, primitives: ShadedSurfels, iteration: int) -> None:
-        options = self._shading.occlusion
-        if options is None or not self._schedule.begun(iteration, options.begins):
+        if not self._shading.traces or not self._schedule.begun(iteration, BEGINS):
             return
-        if self.occluder is None or self._schedule.due(iteration, options.every):
-            self.occluder = occluder_of(primitives.detached(), self._cameras, options)
+        if self.occluder is None or self._schedule.due(iteration, EVERY):
+            self.occluder = occluder_of(primitives.detached(), self._cameras)
 
     def revived(self, surfels: Surfels) -> Surfels:
         """After opacities were reset."""
@@ -102,12 +101,12 @@ class ShadedObjective:
 
 
 @torch.no_grad()
-def occluder_of(surfels: ShadedSurfels, cameras: Sequence[RasterCamera], options: OccluderOptions) -> Occluder:
+def occluder_of(surfels: ShadedSurfels, cameras: Sequence[RasterCamera]) -> Occluder:
     """Distances to the surface that cameras see of surfels."""
-    chosen = cameras[:: math.ceil(len(cameras) / options.most_views)]
+    chosen = cameras[:: math.ceil(len(cameras) / MOST_VIEWS)]
     seen = ((camera, blend_surfels(surfels, camera, surfels.base_color_logits, None)) for camera in chosen)
     maps = (DepthMap(camera, each.depth, each.alpha) for camera, each in seen)
-    return Occluder.fused(maps, options, surfels.means.device)
+    return Occluder.fused(maps, surfels.means.device)
 
 
 def nearest_views(views: Views) -> dict[int, RasterCamera]:

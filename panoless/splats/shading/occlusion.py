@@ -17,31 +17,22 @@ SOLID = 0.5
 OUTSIDE = 0.25
 """A ray has left the surface that it starts on where the distance exceeds this share of the truncation."""
 RAYS_AT_ONCE = 8192
-
-
-@dataclass(frozen=True)
-class OccluderOptions:
-    """When a grid of distances is made of a surface, and how fine it is."""
-
-    begins: float = 20_000 / 50_000
-    """Share of the steps after which rays are traced (Yao et al. 2024)."""
-    every: float = 2_000 / 50_000
-    """Share of the steps between two grids (Yao et al. 2024)."""
-    cells: int = 96
-    """Grid points along an edge of the cube."""
-    half_edge: float = 1.2
-    """Half the edge of the cube, in radii of the object."""
-    truncation_cells: float = 5.0
-    """Distances are known to so many cells before and behind the surface (Yao et al. 2024)."""
-    stride_cells: float = 2.0
-    """Length of a ray's steps; what lies behind the surface is thicker."""
-    most_views: int = 32
-    """Depths of so many views, evenly spread, are joined."""
-
-    @property
-    def cell(self) -> float:
-        """Edge of a cell in radii of the object."""
-        return 2 * self.half_edge / (self.cells - 1)
+BEGINS = 20_000 / 50_000
+"""Share of the steps after which rays are traced (Yao et al. 2024)."""
+EVERY = 2_000 / 50_000
+"""Share of the steps between two grids (Yao et al. 2024)."""
+MOST_VIEWS = 32
+"""Depths of so many views, evenly spread, are joined."""
+CELLS = 96
+"""Grid points along an edge of the cube."""
+HALF_EDGE = 1.2
+"""Half the edge of the cube, in radii of the object."""
+CELL = 2 * HALF_EDGE / (CELLS - 1)
+"""Edge of a cell in radii of the object."""
+TRUNCATION = 5.0 * CELL
+"""Distances are known so far before and behind the surface: five cells (Yao et al. 2024)."""
+STRIDE = 2.0 * CELL
+"""Length of a ray's steps; what lies behind the surface is thicker."""
 
 
 class DepthMap(NamedTuple):
@@ -59,30 +50,27 @@ class Occluder:
     """
 
     distances: Float[Tensor, "N N N"]
-    options: OccluderOptions
 
     @classmethod
-    def fused(
-        cls, maps: Iterable[DepthMap], options: OccluderOptions, device: torch.device | None = None
-    ) -> "Occluder":
+    def fused(cls, maps: Iterable[DepthMap], device: torch.device | None = None) -> "Occluder":
         """The mean over the views of how far each grid point lies before the surface (Curless and Levoy 1996).
 
         A view says nothing of points that lie deeper behind its surface than the truncation. Of what is behind, the
         largest connected part is kept, so that nothing that floats beside the object hides anything.
         """
-        axis = torch.linspace(-options.half_edge, options.half_edge, options.cells, device=device)
+        axis = torch.linspace(-HALF_EDGE, HALF_EDGE, CELLS, device=device)
         z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
         points = torch.stack([x, y, z], -1).view(-1, 3)
         total = count = torch.zeros_like(points[:, 0])
         for seen in maps:
-            signed, known = _signed_distances(points, seen, options)
+            signed, known = _signed_distances(points, seen)
             total, count = total + signed * known, count + known
         mean = torch.where(count > 0, total / count.clamp(min=1), 1.0)
-        return cls(_largest_part(mean.view(3 * (options.cells,))), options)
+        return cls(_largest_part(mean.view(3 * (CELLS,))))
 
     def to(self, device: torch.device) -> "Occluder":
         """The same on a device."""
-        return Occluder(self.distances.to(device), self.options)
+        return Occluder(self.distances.to(device))
 
     @torch.no_grad()
     def hides(self, origins: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
@@ -96,7 +84,7 @@ class Occluder:
         return torch.cat(found) if found else torch.zeros(0, dtype=torch.bool, device=origins.device)
 
     def _hides(self, origins: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
-        grid = (origins[:, None] + directions[:, None] * self._reaches[:, None]) / self.options.half_edge
+        grid = (origins[:, None] + directions[:, None] * self._reaches[:, None]) / HALF_EDGE
         values = grid_sample(self.distances[None, None], grid[None, None], align_corners=True)[0, 0, 0]
         left = (values > OUTSIDE).cummax(1).values
         return (left & (values < 0)).any(1)
@@ -104,14 +92,11 @@ class Occluder:
     @cached_property
     def _reaches(self) -> Float[Tensor, "S"]:
         """Distances along a ray: steps of the stride to the cube's longest diagonal."""
-        stride = self.options.stride_cells * self.options.cell
-        steps = int(2 * 3**0.5 * self.options.half_edge / stride)
-        return stride * torch.arange(1, steps + 1, device=self.distances.device)
+        steps = int(2 * 3**0.5 * HALF_EDGE / STRIDE)
+        return STRIDE * torch.arange(1, steps + 1, device=self.distances.device)
 
 
-def _signed_distances(
-    points: Float[Tensor, "M 3"], seen: DepthMap, options: OccluderOptions
-) -> tuple[Float[Tensor, "M"], Bool[Tensor, "M"]]:
+def _signed_distances(points: Float[Tensor, "M 3"], seen: DepthMap) -> tuple[Float[Tensor, "M"], Bool[Tensor, "M"]]:
     """Depth of the surface less that of points, over the truncation and at most 1; and of which points it is known."""
     camera = seen.camera
     pose = camera.world_to_camera.to(points)
@@ -122,7 +107,7 @@ def _signed_distances(
     row = (camera.fy * y / depth + camera.cy).floor().long()
     inside = front & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     pixels = torch.where(inside, row * camera.width + column, 0)
-    signed = (seen.depth.flatten()[pixels] - z) / (options.truncation_cells * options.cell)
+    signed = (seen.depth.flatten()[pixels] - z) / TRUNCATION
     signed = torch.where(seen.alpha.flatten()[pixels] >= SOLID, signed, 1.0).clamp(max=1)
     return signed, inside & (signed > -1)
 

@@ -32,7 +32,7 @@ from panoless.splats.shading.base import (
     shaded,
     split_sum_light,
 )
-from panoless.splats.shading.occlusion import Occluder, OccluderOptions
+from panoless.splats.shading.occlusion import Occluder
 from panoless.splats.split_sum import look_up_rough, prefiltered, specular_share
 
 DIELECTRIC = 0.04
@@ -59,12 +59,12 @@ class RefGaussian(Unchanging):
     """…and at most this roughness are enlarged to spread their normals."""
     disturbance: float = 0.4
     """Diffuse color of the others changes at random by up to so much, once pixels are shaded."""
-    occlusion: OccluderOptions | None = OccluderOptions()
+    traces: bool = True
 
     def begun(self, surfels: Surfels, *, random: bool) -> ShadedSurfels:
         """Gray, hardly metallic, rather smooth."""
         materials = self.metalness, self.roughness, self.base_color
-        return shaded(surfels, surfels.log_scales, *materials, indirect=self.occlusion is not None)
+        return shaded(surfels, surfels.log_scales, *materials, indirect=self.traces)
 
     def seen(
         self,

@@ -35,7 +35,7 @@ class ReflectionStrength(Unchanging):
     learned: ClassVar[frozenset[str]] = frozenset({"harmonics", "strength_logits"})
     restarts_at: float = 0.0
     """Never."""
-    occlusion: None = None
+    traces: bool = False
     reflects_from: float = 3_000 / 61_000
     """Share of the steps before which nothing is reflected."""
     harmonics_from: tuple[float, ...] = (10_000 / 61_000, 11_000 / 61_000, 12_000 / 61_000)

@@ -2,13 +2,11 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from msgspec import Meta
 
 from shinypartial.io.records import Count, NonNegative, Positive, Share, check_record, write_record
-
-Side = Literal["left", "right", "top", "bottom"]
 
 
 @dataclass(frozen=True)
@@ -57,10 +55,8 @@ class SensorErrors:
     """Standard deviation of a Gaussian blur in pixels."""
     k1: float = 0.0
     """Radial distortion in r², in OpenCV's model: the pictures are warped."""
-    k2: float = 0.0
-    """Radial distortion in r⁴."""
     record_distortion: bool = False
-    """State k1 and k2 in the transforms; panoless and `shinypartial evaluate` refuse a folder that states them."""
+    """State k1 in the transforms; panoless and `shinypartial evaluate` refuse a folder that states them."""
     vignette_stops: NonNegative = 0.0
     """Light lost in the corners in stops; the loss grows with the square of the distance from the middle."""
     exposure_sigma_stops: NonNegative = 0.0
@@ -71,8 +67,6 @@ class SensorErrors:
     """Standard deviation of shot noise at radiance 1; its variance is proportional to radiance."""
     read_noise: NonNegative = 0.0
     """Standard deviation of read noise, the same at every radiance."""
-    gain: Positive = 1.0
-    """Amplification as by ISO: multiplies the variance of shot noise by this, that of read noise by its square."""
     srgb8: bool = False
     """Store 8-bit sRGB clipped to [0, 1] in place of unbounded radiance."""
     jpeg_quality: Annotated[int, Meta(ge=1, le=100)] | None = None
@@ -84,18 +78,14 @@ class ViewChoice:
     """Fewer training views, or less of the object in each."""
 
     keep: Count | None = None
-    """Number of training views that remain."""
-    order: Literal["even", "random"] = "even"
-    """Keep views evenly along their order, or drawn by chance."""
+    """Number of training views that remain, evenly along their order."""
     arc_deg: Annotated[float, Meta(gt=0, le=360)] | None = None
     """Keep the views within half of this angle in azimuth about the middle of the training cameras, seen from the
     point that they look at."""
     object_scale: Annotated[float, Meta(gt=0, le=1)] = 1.0
     """Shrink each picture by this factor about its middle, within a frame of the same size."""
     cut: Annotated[float, Meta(ge=0, lt=1)] = 0.0
-    """Crop all pictures equally, so that on average this share of the object's bounding box is cut off."""
-    cut_side: Side = "left"
-    """Side on which the pictures are cropped."""
+    """Crop all pictures equally on the left, so that on average this share of the object's bounding box is cut off."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +113,7 @@ class Perturbation:
     def changes_pictures(self) -> bool:
         """Whether pictures or masks of the training views are made anew; else they are copied."""
         views = self.views
-        lens = dataclasses.replace(self.sensor, record_distortion=False, gain=1.0)
+        lens = dataclasses.replace(self.sensor, record_distortion=False)
         return self.masks != MaskErrors() or lens != SensorErrors() or views.object_scale < 1 or views.cut > 0
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from shinypartial.core.camera import Camera
 from shinypartial.dataset.perturb import masks, sensor
-from shinypartial.dataset.perturb.options import MaskErrors, SensorErrors, Side
+from shinypartial.dataset.perturb.options import MaskErrors, SensorErrors
 from shinypartial.dataset.read import read_whole_view
 from shinypartial.dataset.schema import Frame, View
 
@@ -97,28 +97,23 @@ def _mixed(picture: Picture, sample: Resampling) -> Picture:
     return replace(picture, straight=straight, shown=shown[..., 0], alpha=alpha[..., 0].clip(0, 1))
 
 
-def cropped(picture: Picture, side: Side, margin_px: int) -> Picture:
-    """Without that many pixels on one side."""
-    start, stop = (margin_px, None) if side in ("left", "top") else (0, -margin_px or None)
-    part = (slice(start, stop), slice(None)) if side in ("top", "bottom") else (slice(None), slice(start, stop))
-    return replace(picture, **{name: array[part] for name, array in vars(picture).items() if array is not None})
+def cropped(picture: Picture, margin_px: int) -> Picture:
+    """Without that many pixels on the left."""
+    arrays = {name: array for name, array in vars(picture).items() if array is not None}
+    return replace(picture, **{name: array[:, margin_px:] for name, array in arrays.items()})
 
 
-def cropped_camera(camera: Camera, side: Side, margin_px: int) -> Camera:
+def cropped_camera(camera: Camera, margin_px: int) -> Camera:
     """The camera of a cropped picture."""
-    if side in ("left", "right"):
-        center = camera.cx - (margin_px if side == "left" else 0)
-        return replace(camera, cx=center, width=camera.width - margin_px)
-    center = camera.cy - (margin_px if side == "top" else 0)
-    return replace(camera, cy=center, height=camera.height - margin_px)
+    return replace(camera, cx=camera.cx - margin_px, width=camera.width - margin_px)
 
 
 def through_lens(picture: Picture, camera: Camera, options: SensorErrors) -> Picture:
     """Blurred, distorted and vignetted; `camera` is the true one."""
     if options.blur_px:
         picture = _mixed(picture, lambda image: sensor.blur(image, options.blur_px))
-    if options.k1 or options.k2:
-        places = sensor.undistorted_pixels(camera, options.k1, options.k2)
+    if options.k1:
+        places = sensor.undistorted_pixels(camera, options.k1)
         picture = _resampled(picture, lambda image: sensor.warp(image, places))
     gain = sensor.vignette_gain(camera.height, camera.width, options.vignette_stops)
     return replace(picture, straight=(picture.straight * gain[..., None]).astype(np.float32))
@@ -130,7 +125,7 @@ def recorded(
     """Exposed by so many stops in each channel, with the sensor's noise."""
     straight = (picture.straight * 2.0**stops).astype(np.float32)
     if options.shot_noise or options.read_noise:
-        straight = sensor.add_noise(straight, options.shot_noise, options.read_noise, options.gain, random)
+        straight = sensor.add_noise(straight, options.shot_noise, options.read_noise, random)
     return replace(picture, straight=straight)
 
 

@@ -48,7 +48,7 @@ class Plan:
     turn: Float[np.ndarray, "3 3"] | None
     """Rotation of the world; None when it stays."""
     crop_px: int
-    """What is cut off every picture on the side `views.cut_side`."""
+    """What is cut off every picture on the left."""
 
 
 def generator(seed: int, what: str, index: int = 0) -> np.random.Generator:
@@ -64,8 +64,8 @@ def make_plan(dataset: Dataset, options: Perturbation) -> Plan:
     """
     check_options(options)
     frames = dataset.train
-    chosen = choose_views(frames, options.views, generator(options.seed, "views"))
-    scale, side = options.views.object_scale, options.views.cut_side
+    chosen = choose_views(frames, options.views)
+    scale = options.views.object_scale
     extents = [_extent(frames[i], options.views) for i in chosen] if options.views.cut else []
     crop_px = _crop_px([frames[i] for i in chosen], extents, options.views) if extents else 0
     turn = _world_turn(options)
@@ -74,9 +74,9 @@ def make_plan(dataset: Dataset, options: Perturbation) -> Plan:
     views = []
     for place, index in enumerate(chosen):
         camera = shrunk_camera(frames[index].camera, scale)
-        if options.sensor.k1 or options.sensor.k2:
-            undistorted_pixels(camera, options.sensor.k1, options.sensor.k2)
-        camera = cropped_camera(camera, side, crop_px) if crop_px else camera
+        if options.sensor.k1:
+            undistorted_pixels(camera, options.sensor.k1)
+        camera = cropped_camera(camera, crop_px) if crop_px else camera
         stops, drawn_stops = _stops(options, index)
         drawn = drawn_poses[index] | drawn_stops | ({"mask": "empty"} if index in empty else {})
         extent = extents[place] if extents else None
@@ -88,7 +88,7 @@ def make_plan(dataset: Dataset, options: Perturbation) -> Plan:
     return Plan(options, tuple(views), turn, crop_px)
 
 
-def choose_views(frames: Sequence[Frame], options: ViewChoice, random: np.random.Generator) -> list[int]:
+def choose_views(frames: Sequence[Frame], options: ViewChoice) -> list[int]:
     """Places of the views that remain: first those within the arc, then as many of them as are kept, in their order."""
     places = np.arange(len(frames))
     if options.arc_deg is not None:
@@ -110,8 +110,6 @@ def choose_views(frames: Sequence[Frame], options: ViewChoice, random: np.random
             found=str(keep),
             remedy="Lower it, or leave it out.",
         )
-    if options.order == "random":
-        return sorted(random.permutation(places)[:keep].tolist())
     return places[((np.arange(keep) + 0.5) * len(places) / keep).astype(int)].tolist()
 
 
@@ -181,22 +179,18 @@ def _stops(options: Perturbation, index: int) -> tuple[Float[np.ndarray, "3"], d
 
 
 def _extent(frame: Frame, options: ViewChoice) -> tuple[float, float] | None:
-    """Pixels from the side of the cut to the object, and the object's size from there on; None for an empty mask."""
+    """Pixels from the left side to the object, and the object's size from there on; None for an empty mask."""
     inside = read_view(frame).alpha >= 0.5
-    lines = np.flatnonzero(inside.any(0 if options.cut_side in ("left", "right") else 1))
-    if not len(lines):
+    columns, width = np.flatnonzero(inside.any(0)), inside.shape[1]
+    if not len(columns):
         return None
-    width = inside.shape[1] if options.cut_side in ("left", "right") else inside.shape[0]
-    ends = (np.array([lines[0], lines[-1] + 1]) - width / 2) * options.object_scale + width / 2
-    margin = ends[0] if options.cut_side in ("left", "top") else width - ends[1]
-    return float(margin), float(ends[1] - ends[0])
+    ends = (np.array([columns[0], columns[-1] + 1]) - width / 2) * options.object_scale + width / 2
+    return float(ends[0]), float(ends[1] - ends[0])
 
 
 def _crop_px(frames: Sequence[Frame], extents: Sequence[tuple[float, float] | None], options: ViewChoice) -> int:
     lines = [margin + options.cut * size for margin, size in filter(None, extents)]
-    smallest = min(
-        frame.camera.width if options.cut_side in ("left", "right") else frame.camera.height for frame in frames
-    )
+    smallest = min(frame.camera.width for frame in frames)
     if not lines or round(np.mean(lines)) >= smallest:
         raise InputError(
             expected="masks and pictures that --views.cut leaves something of",

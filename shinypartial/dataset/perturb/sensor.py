@@ -23,24 +23,24 @@ def blur(image: Float[np.ndarray, "H W C"], sigma_px: float) -> Float[np.ndarray
     return gaussian_filter(image, (sigma_px, sigma_px, 0), mode="nearest")
 
 
-def undistorted_pixels(camera: Camera, k1: float, k2: float) -> Float[np.ndarray, "2 H W"]:
+def undistorted_pixels(camera: Camera, k1: float) -> Float[np.ndarray, "2 H W"]:
     """Where (row, column) in a pinhole picture each pixel of the distorted one looks, in array indices.
 
-    OpenCV's radial model: a point at (x, y) in front of the pinhole camera appears at (x, y)·(1 + k1 r² + k2 r⁴),
+    OpenCV's radial model: a point at (x, y) in front of the pinhole camera appears at (x, y)·(1 + k1 r²),
     r² = x² + y². Raises InputError when some of the picture has no such point: the distortion folds it.
     """
     y, x = np.indices((camera.height, camera.width)) + PIXEL_CENTER
     x, y = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
     distorted = np.hypot(x, y)
     radius = np.linspace(0, TABLE_REACH * distorted.max(), TABLE_SIZE)
-    image = radius * (1 + k1 * radius**2 + k2 * radius**4)
+    image = radius * (1 + k1 * radius**2)
     beyond = np.flatnonzero(image > distorted.max())
     end = beyond[0] + 1 if beyond.size else 0
     if end == 0 or (np.diff(image[:end]) <= 0).any():
         raise InputError(
             expected="a distortion whose radius grows out to the corners of the picture",
-            found=f"k1 = {k1:g} and k2 = {k2:g}, which fold it",
-            remedy="Lower --sensor.k1 and --sensor.k2.",
+            found=f"k1 = {k1:g}, which folds it",
+            remedy="Lower --sensor.k1.",
         )
     scale = np.interp(distorted, image[:end], radius[:end]) / np.maximum(distorted, 1e-12)
     column, row = x * scale * camera.fx + camera.cx, y * scale * camera.fy + camera.cy
@@ -62,14 +62,14 @@ def vignette_gain(height: int, width: int, corner_stops: float) -> Float[np.ndar
     return 2.0 ** (-corner_stops * squared / ((width / 2) ** 2 + (height / 2) ** 2))
 
 
-def noise_std(radiance: Float[np.ndarray, "..."], shot: float, read: float, gain: float) -> Float[np.ndarray, "..."]:
-    """Standard deviation at each radiance x: √(g σ_shot² max(x, 0) + g² σ_read²), photon and read noise at gain g."""
-    return np.sqrt(gain * shot**2 * np.maximum(radiance, 0) + (gain * read) ** 2)
+def noise_std(radiance: Float[np.ndarray, "..."], shot: float, read: float) -> Float[np.ndarray, "..."]:
+    """Standard deviation at each radiance x: √(σ_shot² max(x, 0) + σ_read²), photon and read noise."""
+    return np.sqrt(shot**2 * np.maximum(radiance, 0) + read**2)
 
 
 def add_noise(
-    radiance: Float[np.ndarray, "..."], shot: float, read: float, gain: float, random: np.random.Generator
+    radiance: Float[np.ndarray, "..."], shot: float, read: float, random: np.random.Generator
 ) -> Float[np.ndarray, "..."]:
     """Gaussian noise of `noise_std`, clipped below at zero, where a sensor records black."""
-    noise = random.standard_normal(radiance.shape) * noise_std(radiance, shot, read, gain)
+    noise = random.standard_normal(radiance.shape) * noise_std(radiance, shot, read)
     return np.maximum(radiance + noise, 0).astype(radiance.dtype)

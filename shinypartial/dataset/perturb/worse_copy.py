@@ -138,7 +138,7 @@ def _rewritten(copy: _Copy, view: PlannedView) -> Iterator[Job]:
     """
     options, frame = copy.plan.options, view.source
     sensor, views = options.sensor, options.views
-    moved = bool(views.object_scale < 1 or views.cut or sensor.k1 or sensor.k2 or copy.plan.turn is not None)
+    moved = bool(views.object_scale < 1 or views.cut or sensor.k1 or copy.plan.turn is not None)
     beside = [
         path for path in files_of(frame) if path.name.startswith(f"{frame.stem.name}_") and path != frame.alpha_png
     ]
@@ -165,7 +165,7 @@ def _write_frame(plan: Plan, planned: PlannedView, files: tuple[Path, ...]) -> N
     picture = pictures.through_lens(picture, true_camera, options.sensor)
     picture = pictures.recorded(picture, planned.stops, options.sensor, generator(seed, "noise", index))
     if plan.crop_px:
-        picture = pictures.cropped(picture, options.views.cut_side, plan.crop_px)
+        picture = pictures.cropped(picture, plan.crop_px)
     picture = pictures.masked_wrongly(picture, options.masks, planned.empty_mask, generator(seed, "masks", index))
     view = picture.view
     if plan.turn is not None and view.normals_world is not None:
@@ -213,7 +213,7 @@ def _transforms(plan: Plan, dataset: Dataset) -> dict[str, Any]:
             entry["file_path"] = entry["file_path"].removesuffix(frame.suffix) + suffix
         entries.append(entry)
     sensor = plan.options.sensor
-    lens = {"k1": sensor.k1, "k2": sensor.k2} if sensor.record_distortion else {}
+    lens = {"k1": sensor.k1} if sensor.record_distortion else {}
     return {**content, **({} if as_before or not alike else intrinsics[0]), **lens, "frames": entries}
 
 

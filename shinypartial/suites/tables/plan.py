@@ -207,7 +207,7 @@ TABLES: dict[TableName, Table] = {
         "Cameras that are turned",
         "Each training camera is turned by an angle about a random axis; the truth stays.",
         ("vase",),
-        (PAPERS, Method("ours, poses believed", _fit("default", "--set poses.mode=off")), DEFAULT),
+        (PAPERS, Method("ours, poses believed", _fit("default", "--set corrections.poses=off")), DEFAULT),
         (*ENVIRONMENT, *NORMALS[:2], *COST),
         published.JITTER,
         (

@@ -6,14 +6,16 @@ from pathlib import Path
 import pytest
 import torch
 
+from panoless.capture import configured
 from panoless.capture.configured import configured_views
+from panoless.capture.contrast import BRIGHTNESS, DARK
 from panoless.capture.encoding import encoding_of
-from panoless.capture.options import ContrastOptions
 from panoless.capture.views import load_views
 from panoless.config import FitConfig
 from panoless.presets import PRESETS
 from panoless.reconstruct.fit import fit
 from panoless.reconstruct.state import FitState
+from panoless.selection.options import CorrectionOptions
 from panoless.splats.mirror import SurfelMirror
 from shinypartial.dataset.read import open_dataset, read_view
 from shinypartial.dataset.schema import BallEvidence, Dataset
@@ -22,7 +24,7 @@ from tests.support.mirror_sphere import tiny_config
 from tests.support.synthetic_dataset import make_sphere_dataset
 
 UNSATURATED = 0.2
-"""So exposed, the sun of the synthetic world is below 1."""
+"""So exposed, the sun of the synthetic world is below 1, and photographs are dark."""
 
 
 def exposed_dataset(root: Path, factor: float, train: int = 6) -> Dataset:
@@ -36,10 +38,9 @@ def exposed_dataset(root: Path, factor: float, train: int = 6) -> Dataset:
 
 def test_views_are_as_bright_as_asked_however_they_were_exposed(tmp_path: Path) -> None:
     bright, dark = (exposed_dataset(tmp_path / str(factor), factor) for factor in (UNSATURATED, UNSATURATED / 16))
-    config = FitConfig(contrast=ContrastOptions(dark=1.0, brightness=0.3))
-    (views, told), (others, of_others) = (configured_views(each, config) for each in (bright, dark))
+    (views, told), (others, of_others) = (configured_views(each, FitConfig()) for each in (bright, dark))
     mean = torch.cat([view.radiance_at(view.solid) for view in views.train]).mean()
-    assert float(mean) == pytest.approx(0.3, rel=1e-5)
+    assert float(mean) == pytest.approx(BRIGHTNESS, rel=1e-5)
     assert of_others.exposure == pytest.approx(16 * told.exposure, rel=1e-3)
     for view, other in zip(views.train, others.train, strict=True):
         # Half floats in the files keep three digits.
@@ -53,6 +54,11 @@ def test_photographs_that_are_not_dark_stay_as_they_are(sphere_dataset: Dataset)
         assert torch.equal(view.radiance, other.radiance)
 
 
+def test_masks_stay_as_they_are_where_repairs_are_off(sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(configured, "with_repaired_masks", lambda _: pytest.fail("a mask may be mended"))
+    configured_views(sphere_dataset, FitConfig(corrections=CorrectionOptions(repair="off")))
+
+
 def test_black_photographs_stay_black(tmp_path: Path) -> None:
     views, config = configured_views(exposed_dataset(tmp_path / "black", 0.0), FitConfig())
     assert config.exposure == 1
@@ -60,12 +66,11 @@ def test_black_photographs_stay_black(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("preset", ["paper", "3dgs-dr"])
-def test_methods_that_work_between_zero_and_one_take_photographs_as_they_are(
-    preset: str, sphere_dataset: Dataset
-) -> None:
-    config = replace(PRESETS[preset], crop_margin_px=2, contrast=ContrastOptions(dark=1.0, brightness=0.9))
-    views, told = configured_views(sphere_dataset, config)
-    plain = load_views(sphere_dataset, 2, encoding=encoding_of(config))
+def test_methods_that_work_between_zero_and_one_take_photographs_as_they_are(preset: str, tmp_path: Path) -> None:
+    dataset, config = exposed_dataset(tmp_path / "dark", UNSATURATED), replace(PRESETS[preset], crop_margin_px=2)
+    views, told = configured_views(dataset, config)
+    plain = load_views(dataset, 2, encoding=encoding_of(config))
+    assert float(torch.cat([view.radiance_at(view.solid) for view in load_views(dataset, 2).train]).mean()) < DARK
     assert torch.equal(views.train[0].radiance, plain.train[0].radiance)
     assert told.exposure == 1
 
@@ -74,8 +79,7 @@ def test_methods_that_work_between_zero_and_one_take_photographs_as_they_are(
 def test_a_darker_exposure_gives_the_same_surface_and_a_darker_map(tmp_path: Path) -> None:
     def fitted(factor: float) -> FitState:
         dataset = exposed_dataset(tmp_path / f"data-{factor}", factor, train=14)
-        config = replace(tiny_config(), contrast=ContrastOptions(dark=1.0, brightness=0.5))
-        return fit(dataset, config, tmp_path / f"run-{factor}")
+        return fit(dataset, tiny_config(), tmp_path / f"run-{factor}")
 
     bright, dark = fitted(UNSATURATED), fitted(UNSATURATED / 16)
     assert isinstance(bright.geometry, SurfelMirror)
@@ -100,7 +104,7 @@ def test_a_capture_of_a_ball_knows_its_shape_and_cameras(sphere_dataset: Dataset
     captured = open_dataset(damaged_dataset)
     _, config = configured_views(captured, FitConfig())
     assert config.model == "sphere"
-    assert config.poses.mode == "off"
+    assert config.corrections.poses == "off"
     assert (config.corrections.masks, config.corrections.lens) == ("off", "off")
     assert (config.material.roughness, config.material.blur) == ("off", "off")
     assert config.material.reflectance == FitConfig().material.reflectance
@@ -108,4 +112,4 @@ def test_a_capture_of_a_ball_knows_its_shape_and_cameras(sphere_dataset: Dataset
     for dataset, model in ((captured, "surfels"), (sphere_dataset, "auto")):
         _, config = configured_views(dataset, FitConfig(model=model))
         assert config.model == model
-        assert config.poses == FitConfig().poses
+        assert config.corrections == FitConfig().corrections

@@ -6,16 +6,13 @@ import pytest
 import torch
 
 from panoless.capture.contrast import LEAST_KNEE, Contrast
-from panoless.capture.options import ContrastOptions
 from panoless.capture.views import Views
 from tests.support.mirror_body import body_views, sphere
-
-OPTIONS = ContrastOptions()
 
 
 def knee_of(views: Views) -> float | None:
     """Down to any darkness."""
-    return Contrast.of(views, OPTIONS, least_knee=1e-9).knee
+    return Contrast.of(views, least_knee=1e-9).knee
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +26,7 @@ def exposed(views: Views, power: float, gain: float = 1.0) -> Views:
 
 
 def test_views_of_usual_brightness_stay_as_they_are(bright: Views) -> None:
-    assert Contrast.of(bright, OPTIONS).applied(bright) is bright
+    assert Contrast.of(bright).applied(bright) is bright
 
 
 def test_dark_views_keep_black_white_and_the_order_between() -> None:
@@ -54,9 +51,5 @@ def test_whether_a_world_is_dark_does_not_depend_on_its_exposure(bright: Views, 
     assert knee_of(exposed(bright, 1.0, gain)) is None
 
 
-def test_no_view_is_dark_where_none_is_to_be(bright: Views) -> None:
-    assert Contrast.of(exposed(bright, 16.0), ContrastOptions(dark_share=0.0)).knee is None
-
-
 def test_the_knee_stays_above_noise(bright: Views) -> None:
-    assert Contrast.of(exposed(bright, 16.0, 1e-3), OPTIONS).knee == LEAST_KNEE
+    assert Contrast.of(exposed(bright, 16.0, 1e-3)).knee == LEAST_KNEE

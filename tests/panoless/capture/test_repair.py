@@ -7,14 +7,11 @@ import pytest
 import torch
 
 from panoless.capture.masks import MASK_LEVEL
-from panoless.capture.options import MaskRepairOptions
 from panoless.capture.poses import Poses
 from panoless.capture.repair import with_repaired_masks
 from panoless.capture.views import MaskRepairs, TrainView, Views
 from shinypartial.core.conventions import SOLID_ALPHA
 from tests.support.mirror_body import body_views, torus
-
-OPTIONS = MaskRepairOptions()
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +41,7 @@ def solid_middle(view: TrainView) -> tuple[int, int]:
 
 def test_a_gap_of_the_object_stays(ring: Views) -> None:
     assert any(_has_hole(view) for view in ring.train)
-    assert with_repaired_masks(ring, OPTIONS).repairs == MaskRepairs()
+    assert with_repaired_masks(ring).repairs == MaskRepairs()
 
 
 def _has_hole(view: TrainView) -> bool:
@@ -56,7 +53,7 @@ def _has_hole(view: TrainView) -> bool:
 def test_a_hole_in_one_mask_is_filled_and_tells_no_color(ring: Views) -> None:
     row, column = solid_middle(ring.train[5])
     wrong = painted(ring, 5, row, column, 4, 0.0)
-    mended = with_repaired_masks(wrong, OPTIONS)
+    mended = with_repaired_masks(wrong)
     assert mended.repairs == MaskRepairs(holes=1, pieces=0, views=1)
     assert (mended.train[5].mask >= MASK_LEVEL).equal(ring.train[5].mask >= MASK_LEVEL)
     assert mended.train[5].solid.equal(wrong.train[5].solid)
@@ -72,7 +69,7 @@ def test_a_stray_piece_is_left_out(ring: Views, attached: bool) -> None:
     rows, columns = np.nonzero(before.numpy() >= MASK_LEVEL)
     row, column = (int(rows[columns.argmin()]), int(columns.min()) - 6) if attached else (7, 7)
     wrong = painted(ring, 9, row, column, 6, 1.0)
-    mended = with_repaired_masks(wrong, OPTIONS)
+    mended = with_repaired_masks(wrong)
     assert mended.repairs == MaskRepairs(holes=0, pieces=1, views=1)
     added = int((wrong.train[9].mask - before > 0.5).sum())
     left = int((mended.train[9].mask - before > 0.5).sum())
@@ -85,19 +82,13 @@ def test_masks_of_turned_cameras_stay(ring: Views, turn_deg: float) -> None:
     """They contradict each other along whole outlines."""
     turns = np.random.default_rng(1).normal(size=(len(ring.train), 3))
     turns *= np.radians(turn_deg) / np.linalg.norm(turns, axis=1, keepdims=True)
-    assert with_repaired_masks(Poses(turns, 0 * turns).moved(ring), OPTIONS).repairs == MaskRepairs()
+    assert with_repaired_masks(Poses(turns, 0 * turns).moved(ring)).repairs == MaskRepairs()
 
 
 def test_few_views_contradict_nothing(ring: Views) -> None:
     row, column = solid_middle(ring.train[5])
     few = replace(painted(ring, 5, row, column, 4, 0.0), train=ring.train[:6])
-    assert with_repaired_masks(few, OPTIONS) is few
-
-
-def test_off_means_off(ring: Views) -> None:
-    row, column = solid_middle(ring.train[5])
-    wrong = painted(ring, 5, row, column, 4, 0.0)
-    assert with_repaired_masks(wrong, replace(OPTIONS, mode="off")) is wrong
+    assert with_repaired_masks(few) is few
 
 
 def test_a_finer_grid_fills_a_dent_up_to_the_outline(ring: Views) -> None:
@@ -109,5 +100,5 @@ def test_a_finer_grid_fills_a_dent_up_to_the_outline(ring: Views) -> None:
     def lacking(views: Views) -> int:
         return int((before & (views.train[5].mask < MASK_LEVEL)).sum())
 
-    coarse, fine = (with_repaired_masks(dented, OPTIONS, grids=(20, cells)) for cells in (20, 40))
+    coarse, fine = (with_repaired_masks(dented, grids=(20, cells)) for cells in (20, 40))
     assert lacking(fine) < 0.05 * lacking(dented) < 0.2 * lacking(dented) < lacking(coarse)

@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from panoless.photographs import board as board_module
+from panoless.photographs import corners
 from panoless.photographs.board import (
     BOARD_TO_WORLD,
     drawn_by_opencv,
@@ -18,7 +20,6 @@ from panoless.photographs.board import (
 from panoless.photographs.corners import corners_of, locate_corners
 from panoless.photographs.frames import Frames, Photograph
 from panoless.photographs.lens import Lens
-from panoless.photographs.options import CaptureOptions
 from panoless.photographs.video import luminance
 from shinypartial.core.board import BOARDS, Board
 from shinypartial.core.camera import Camera, project
@@ -111,18 +112,17 @@ def photographed(tmp_path_factory: pytest.TempPathFactory):
 def test_a_board_is_known_by_its_markers(paper: str, found: str, tmp_path: Path) -> None:
     """Letter is A4 without its last row, so both define one world. Where most frames show none, there is none."""
     frames, _ = photographs_of(BOARDS[paper], tmp_path, 0.9)
-    options = CaptureOptions()
-    assert recognized_board(frames, tmp_path, options) == BOARDS[found]
+    assert recognized_board(frames, tmp_path) == BOARDS[found]
     gray = np.full((*SIZE[::-1], 3), 90, np.uint8)
     for one in frames.photographs[:6]:
         write_png(tmp_path / f"{one.name}.png", gray)
-    assert recognized_board(frames, tmp_path, options) is None
+    assert recognized_board(frames, tmp_path) is None
 
 
 def test_cameras_are_found_from_the_board(photographed) -> None:
     """Poses within 0.03°, distances within 0.1 %: 0.012° and 0.04 % were measured; a pixel is 0.06°."""
     folder, frames, cameras = photographed
-    found = poses_from_board(BOARD, frames, folder, CaptureOptions())
+    found = poses_from_board(BOARD, frames, folder)
     assert [view.name for view in found.views] == [one.name for one in frames.photographs]
     for view, camera in zip(found.views, cameras, strict=True):
         pose = np.array(view.camera_to_world)
@@ -146,7 +146,7 @@ def test_corners_are_found_by_all_print_around_them_and_not_where_something_hide
     light = luminance(read_png(folder / f"{frames.photographs[4].name}.png"))
     hidden = slice(270, 330), slice(370, 430)
     light[hidden] = 0.5
-    found = locate_corners(BOARD, "4", light, lens, wrong, 1.5, CaptureOptions())
+    found = locate_corners(BOARD, "4", light, lens, wrong, 1.5)
     assert len(found.corners) > 0.7 * len(points)
     assert np.abs(found.places_px - points[found.corners]).max() < 0.15
     behind = ((points > [375, 275]) & (points < [425, 325])).all(1)
@@ -157,31 +157,35 @@ def test_corners_are_found_by_all_print_around_them_and_not_where_something_hide
 def test_the_measured_square_scales_the_world(photographed) -> None:
     folder, frames, cameras = photographed
     board = replace(BOARD, square_mm=2 * BOARD.square_mm)
-    found = poses_from_board(board, frames, folder, CaptureOptions(), corner_blurs_px=())
+    found = poses_from_board(board, frames, folder, corner_blurs_px=())
     position = np.array(found.views[0].camera_to_world)[:3, 3]
     np.testing.assert_allclose(position, 2 * cameras[0].position_world, atol=0.004 * DISTANCE_M)
 
 
-def test_corners_that_no_print_explains_stay_as_they_were_detected(photographed) -> None:
+def test_corners_that_no_print_explains_stay_as_they_were_detected(
+    photographed, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """No window has all of its variance explained: a refinement that keeps too few frames changes nothing."""
     folder, frames, _ = photographed
-    detected = poses_from_board(BOARD, frames, folder, CaptureOptions(), corner_blurs_px=())
-    assert poses_from_board(BOARD, frames, folder, CaptureOptions(least_match=1.0)) == detected
+    detected = poses_from_board(BOARD, frames, folder, corner_blurs_px=())
+    monkeypatch.setattr(corners, "LEAST_MATCH", 1.0)
+    assert poses_from_board(BOARD, frames, folder) == detected
 
 
-def test_a_board_that_is_hardly_seen_is_refused(photographed, tmp_path: Path) -> None:
+def test_a_board_that_is_hardly_seen_is_refused(photographed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, frames, _ = photographed
     for one in frames.photographs:
         image = read_png(folder / f"{one.name}.png").copy()
         image[:, : SIZE[0] // 2 + 60] = 90
         image[: SIZE[1] // 2] = 90
         write_png(tmp_path / f"{one.name}.png", image)
+    monkeypatch.setattr(board_module, "LEAST_CORNERS", 15)
     with pytest.raises(InputError, match="whole board"):
-        poses_from_board(BOARD, frames, tmp_path, CaptureOptions(least_corners=15))
+        poses_from_board(BOARD, frames, tmp_path)
 
 
 def test_another_size_among_the_frames_is_refused(photographed) -> None:
     folder, frames, _ = photographed
     turned = replace(frames.photographs[0], width=SIZE[1], height=SIZE[0])
     with pytest.raises(InputError, match="one size"):
-        poses_from_board(BOARD, Frames((turned, *frames.photographs[1:])), folder, CaptureOptions())
+        poses_from_board(BOARD, Frames((turned, *frames.photographs[1:])), folder)

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from panoless.photographs import ground
 from panoless.photographs.ground import evidence_of, gains_of, ground_masks, laid_out, odds_of, pattern_of, sheet_about
 from panoless.photographs.hull import overlap
 from panoless.photographs.lens import Lens
-from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import GroundPlane, PosedView, Poses, as_rows, find_ground
 from panoless.photographs.structure import upright_world
 from shinypartial.core.camera import Camera, ray_directions_world
@@ -19,7 +19,6 @@ from tests.support.photographed_planes import arc
 GROUND = GroundPlane((0.0, 0.0, 1.0), 0.0)
 RADIUS, CENTER = 0.3, np.array([0.05, 0.0, 0.3])
 CAMERAS = arc(14, 3.0, (160, 120), 260.0, (0.0, 0.0, 0.2))
-OPTIONS = CaptureOptions(hull_voxels=48, ground_texels=200)
 TILES = np.random.default_rng(5).integers(20, 236, (400, 400, 3))
 TILE = 0.09
 
@@ -59,9 +58,16 @@ def photographed(tmp_path: Path) -> tuple[dict[str, Camera], list[np.ndarray], P
     return {f"p{number}": camera for number, camera in enumerate(CAMERAS)}, masks, tmp_path
 
 
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures are small."""
+    monkeypatch.setattr(ground, "TEXELS", 200)
+    monkeypatch.setattr(ground, "HULL_VOXELS", 48)
+
+
 def test_a_mirror_ball_is_found_without_a_hint(photographed) -> None:
     cameras, truth, folder = photographed
-    found = ground_masks(cameras, folder, GROUND, folder / "ground.png", OPTIONS)
+    found = ground_masks(cameras, folder, GROUND, folder / "ground.png")
     overlaps = [overlap(found[name] >= 128, mask) for name, mask in zip(cameras, truth, strict=True)]
     # The ball is 56 pixels wide: a pixel of its outline is 7 % of it.
     assert np.median(overlaps) > 0.88
@@ -71,7 +77,7 @@ def test_a_mirror_ball_is_found_without_a_hint(photographed) -> None:
 
 def test_the_sheet_is_known_below_the_ball_from_views_that_look_past_it() -> None:
     pictures = [seen_by(camera)[0] for camera in CAMERAS]
-    sheet = sheet_about(CAMERAS, GROUND, OPTIONS)
+    sheet = sheet_about(CAMERAS, GROUND)
     foot = np.linalg.norm([camera.position_world for camera in CAMERAS], axis=1)
     assert sheet.half_side == pytest.approx(0.5 * np.median(foot), rel=0.01)
     pattern, known = pattern_of(*laid_out(pictures, CAMERAS, sheet))
@@ -94,7 +100,7 @@ def test_the_sheet_is_known_below_the_ball_from_views_that_look_past_it() -> Non
 def test_gains_even_out_exposure_and_white_balance() -> None:
     factors = np.random.default_rng(2).uniform(0.85, 1.1, (len(CAMERAS), 3))
     pictures = [(seen_by(c)[0] * f).clip(0, 255).astype(np.uint8) for c, f in zip(CAMERAS, factors, strict=True)]
-    sheet = sheet_about(CAMERAS, GROUND, OPTIONS)
+    sheet = sheet_about(CAMERAS, GROUND)
     even = factors * gains_of(*laid_out(pictures, CAMERAS, sheet))
     assert (even.std(0) / even.mean(0)).max() < 0.03
     assert (factors.std(0) / factors.mean(0)).min() > 0.05
@@ -102,7 +108,7 @@ def test_gains_even_out_exposure_and_white_balance() -> None:
 
 def test_a_view_tells_ground_from_mirror() -> None:
     pictures = [seen_by(camera)[0] for camera in CAMERAS]
-    sheet = sheet_about(CAMERAS, GROUND, OPTIONS)
+    sheet = sheet_about(CAMERAS, GROUND)
     pattern, known = pattern_of(*laid_out(pictures, CAMERAS, sheet))
     mask = seen_by(CAMERAS[4])[1]
     view = evidence_of(pictures[4], CAMERAS[4], np.ones(3, np.float32), sheet, pattern, known)
@@ -121,7 +127,7 @@ def test_a_sheet_with_nothing_on_it_is_refused(tmp_path: Path) -> None:
         write_png(tmp_path / f"p{number}.png", seen_by(camera, ball=False)[0])
     cameras = {f"p{number}": camera for number, camera in enumerate(CAMERAS)}
     with pytest.raises(InputError, match=r"stands before the ground.*--masks"):
-        ground_masks(cameras, tmp_path, GROUND, tmp_path / "ground.png", OPTIONS)
+        ground_masks(cameras, tmp_path, GROUND, tmp_path / "ground.png")
 
 
 def scattered(share: float, tilt: np.ndarray) -> np.ndarray:

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from panoless.cli import main
+from panoless.photographs import frames, masks
 from panoless.photographs.frames import Frames, Photograph
 from panoless.photographs.make import Request, capture
 from panoless.photographs.masks import Hint
-from panoless.photographs.options import CaptureOptions
 from panoless.photographs.structure import poses_from_structure, turned_up
 from shinypartial.core.camera import opencv_to_opengl
 from shinypartial.core.errors import InputError
@@ -24,7 +24,13 @@ from shinypartial.io.images import write_png
 from tests.panoless.photographs.test_masks import CAMERAS, TRUTH, box_of, write_pictures
 from tests.support.photographed_planes import arc, photograph
 
-OPTIONS = CaptureOptions(hull_voxels=32, rounds=1, most_blur=1.0)
+
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures are small and smooth."""
+    monkeypatch.setattr(frames, "MOST_BLUR", 1.0)
+    monkeypatch.setattr(masks, "HULL_VOXELS", 32)
+    monkeypatch.setattr(masks, "ROUNDS", 1)
 
 
 @pytest.fixture
@@ -45,7 +51,7 @@ def photographs(tmp_path: Path) -> Path:
 
 def test_photographs_with_masks_become_a_dataset(photographs: Path, tmp_path: Path) -> None:
     output = tmp_path / "dataset"
-    made = capture(Request(photographs, output, masks=photographs / "masks", options=OPTIONS))
+    made = capture(Request(photographs, output, masks=photographs / "masks"))
     assert "Poses: 9 by transforms.json" in "\n".join(made.summary())
     dataset = open_dataset(output)
     for frame, camera, truth in zip(dataset.train, CAMERAS, TRUTH, strict=True):
@@ -61,20 +67,20 @@ def test_stages_that_are_done_are_not_done_again(photographs: Path, tmp_path: Pa
     def times() -> list[int]:
         return [path.stat().st_mtime_ns for path in records]
 
-    given = Request(photographs, output, masks=photographs / "masks", options=OPTIONS)
+    given = Request(photographs, output, masks=photographs / "masks")
     first = capture(given)
     before = times()
     assert capture(given) == first
     assert times() == before
     left, top, right, bottom = box_of(TRUTH[4])
-    capture(Request(photographs, output, hints={"p_4": Hint((left, top, right, bottom))}, options=OPTIONS))
+    capture(Request(photographs, output, hints={"p_4": Hint((left, top, right, bottom))}))
     # Given masks take part in structure from motion, so that poses depend on them; frames do not.
     assert [new == old for new, old in zip(times(), before, strict=True)] == [True, False, False]
     assert "hints in p_4" in records[2].read_text()
 
 
 def test_other_masks_of_the_same_names_ask_for_poses_anew(photographs: Path, tmp_path: Path) -> None:
-    given = Request(photographs, tmp_path / "dataset", masks=photographs / "masks", options=OPTIONS)
+    given = Request(photographs, tmp_path / "dataset", masks=photographs / "masks")
     capture(given)
     found = tmp_path / "dataset" / "capture" / "poses.json"
     before = found.stat().st_mtime_ns
@@ -84,8 +90,8 @@ def test_other_masks_of_the_same_names_ask_for_poses_anew(photographs: Path, tmp
 
 
 def test_masks_beside_pictures_are_found_where_a_file_of_cameras_names_none(photographs: Path, tmp_path: Path) -> None:
-    found = capture(Request(photographs, tmp_path / "found", options=OPTIONS))
-    named = capture(Request(photographs, tmp_path / "named", masks=photographs / "masks", options=OPTIONS))
+    found = capture(Request(photographs, tmp_path / "found"))
+    named = capture(Request(photographs, tmp_path / "named", masks=photographs / "masks"))
     assert found.masks == named.masks
 
 
@@ -108,12 +114,12 @@ def test_options_that_exclude_each_other_are_named(
 def test_pictures_without_any_mask_are_refused(photographs: Path, tmp_path: Path) -> None:
     shutil.rmtree(photographs / "masks")
     with pytest.raises(InputError, match="--box"):
-        capture(Request(photographs, tmp_path / "dataset", options=OPTIONS))
+        capture(Request(photographs, tmp_path / "dataset"))
 
 
 def test_a_folder_of_other_things_is_not_written_to(photographs: Path) -> None:
     with pytest.raises(InputError, match="other files"):
-        capture(Request(photographs, photographs, options=OPTIONS))
+        capture(Request(photographs, photographs))
 
 
 def test_rectangles_and_their_photographs_come_in_pairs(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -222,7 +228,7 @@ def test_the_newest_dataset_is_the_one_that_was_captured(
     with pytest.raises(InputError, match=r"panoless capture photos") as error:
         open_dataset(Path("photos"))
     assert "transforms.json" in error.value.found
-    command = ["capture", "photos", "--options.most-blur", "1", "--options.hull-voxels", "32"]
+    command = ["capture", "photos"]
     assert main(command) == 0
     assert "Next: panoless fit datasets/photos" in capsys.readouterr().out
     assert resolve_dataset() == Path("datasets/photos")
@@ -236,6 +242,6 @@ def test_listed_frames_without_a_photograph_are_named(
     write_png(tmp_path / "bad" / "outside.png", np.zeros((96, 96, 3), np.uint8))
     content["frames"].append(content["frames"][0] | {"file_path": "../bad/outside.png"})
     path.write_text(json.dumps(content))
-    made = capture(Request(photographs, tmp_path / "dataset", options=OPTIONS))
+    made = capture(Request(photographs, tmp_path / "dataset"))
     assert len(made.poses.views) == 9
     assert "no photograph is read for ../bad/outside.png" in capsys.readouterr().err

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from panoless.photographs import masks as masks_module
 from panoless.photographs.hull import carve, nearest_point, outline, overlap
 from panoless.photographs.masks import (
     MORE_HINTS,
@@ -16,7 +17,6 @@ from panoless.photographs.masks import (
     overlaps_of,
     read_clicks,
 )
-from panoless.photographs.options import CaptureOptions
 from shinypartial.core.camera import Camera, ray_directions_world
 from shinypartial.core.errors import InputError
 from shinypartial.io.files import write_json
@@ -25,7 +25,6 @@ from tests.support.photographed_planes import arc
 
 CENTER, RADIUS = np.array([0.1, -0.05, 0.2]), 0.4
 CAMERAS = arc(9, 3.0, (96, 96), 200.0)
-OPTIONS = CaptureOptions(hull_voxels=48)
 
 
 def ball(camera: Camera, center=CENTER, radius: float = RADIUS) -> np.ndarray:
@@ -43,7 +42,7 @@ def named(cameras: Sequence[Camera], masks: Sequence[np.ndarray]) -> dict[str, t
 
 
 def test_the_hull_of_true_masks_has_their_outline() -> None:
-    overlaps = overlaps_of(named(CAMERAS, TRUTH), OPTIONS)
+    overlaps = overlaps_of(named(CAMERAS, TRUTH))
     assert min(overlaps) > 0.95  # A voxel is 1.5 pixels.
 
 
@@ -51,7 +50,7 @@ def test_one_wrong_mask_of_many_is_left_out() -> None:
     cameras = arc(12, 3.0, (96, 96), 200.0)
     masks = [ball(camera) for camera in cameras]
     masks[4] = np.roll(masks[4], 30, 1)
-    overlaps = overlaps_of(named(cameras, masks), OPTIONS)
+    overlaps = overlaps_of(named(cameras, masks))
     assert np.argmin(overlaps) == 4
     assert np.median(overlaps) > 0.9
 
@@ -87,7 +86,7 @@ def test_a_mask_moves_to_a_neighboring_view() -> None:
 )
 def test_masks_of_the_background_and_empty_ones_are_refused(change, message: str) -> None:
     with pytest.raises(InputError, match=message) as error:
-        overlaps_of(named(CAMERAS, [change(mask) for mask in TRUTH]), OPTIONS)
+        overlaps_of(named(CAMERAS, [change(mask) for mask in TRUTH]))
     assert "v_0, v_1" in error.value.found
     assert "invert them" in error.value.remedy
 
@@ -96,7 +95,7 @@ def test_masks_that_were_found_are_not_blamed_on_the_user() -> None:
     """The view whose mask is empty is named, and where a rectangle would help."""
     masks = [mask & (index != 3) for index, mask in enumerate(TRUTH)]
     with pytest.raises(InputError, match="1 of 9 that are empty: v_3") as error:
-        overlaps_of(named(CAMERAS, masks), OPTIONS, MORE_HINTS)
+        overlaps_of(named(CAMERAS, masks), MORE_HINTS)
     assert "--box-in v_3" in error.value.remedy
     assert "nvert" not in error.value.remedy
 
@@ -104,7 +103,7 @@ def test_masks_that_were_found_are_not_blamed_on_the_user() -> None:
 def test_masks_that_contradict_the_poses_are_refused() -> None:
     masks = [np.roll(mask, (17 * i % 48 - 24, 29 * i % 48 - 24), (0, 1)) for i, mask in enumerate(TRUTH)]
     with pytest.raises(InputError, match="agree on an object"):
-        overlaps_of(named(CAMERAS, masks), OPTIONS)
+        overlaps_of(named(CAMERAS, masks))
 
 
 def write_pictures(folder: Path) -> None:
@@ -126,7 +125,7 @@ def test_one_rectangle_gives_all_masks(tmp_path: Path) -> None:
     """Where the object stands out. An overlap of 0.98 is a quarter of a pixel along the edge."""
     write_pictures(tmp_path)
     cameras = {f"p_{index}": camera for index, camera in enumerate(CAMERAS)}
-    masks = find_masks(cameras, tmp_path, {"p_4": Hint(box_of(TRUTH[4]))}, OPTIONS)
+    masks = find_masks(cameras, tmp_path, {"p_4": Hint(box_of(TRUTH[4]))})
     assert list(masks) == list(cameras)
     for mask, truth in zip(masks.values(), TRUTH, strict=True):
         assert overlap(mask > 127, truth) > 0.98
@@ -134,13 +133,13 @@ def test_one_rectangle_gives_all_masks(tmp_path: Path) -> None:
 
 def test_rectangles_without_a_view_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--box-in"):
-        find_masks({"p_0": CAMERAS[0]}, tmp_path, {"other": Hint((0.0, 0.0, 9.0, 9.0))}, OPTIONS)
+        find_masks({"p_0": CAMERAS[0]}, tmp_path, {"other": Hint((0.0, 0.0, 9.0, 9.0))})
 
 
 def test_masks_of_large_pictures_are_found_in_small_ones(tmp_path: Path) -> None:
     write_pictures(tmp_path)
     cameras = {f"p_{index}": camera for index, camera in enumerate(CAMERAS)}
-    masks = find_masks(cameras, tmp_path, {"p_4": Hint(box_of(TRUTH[4]))}, CaptureOptions(mask_side_px=40, rounds=1))
+    masks = find_masks(cameras, tmp_path, {"p_4": Hint(box_of(TRUTH[4]))})
     for mask, truth in zip(masks.values(), TRUTH, strict=True):
         assert overlap(mask > 127, truth) > 0.97
 
@@ -153,12 +152,12 @@ def test_five_clicks_give_all_masks(tmp_path: Path) -> None:
     x, y, (left, top, right, bottom) = float(columns.mean()), float(rows.mean()), box_of(TRUTH[4], 6)
     clicks = {"p_4": {"on": [[x, y]], "off": [[left, y], [right, y], [x, top], [x, bottom]]}}
     write_json(tmp_path / "clicks.json", clicks)
-    masks = find_masks(cameras, tmp_path, read_clicks(tmp_path / "clicks.json"), OPTIONS)
+    masks = find_masks(cameras, tmp_path, read_clicks(tmp_path / "clicks.json"))
     for mask, truth in zip(masks.values(), TRUTH, strict=True):
         assert overlap(mask > 127, truth) > 0.98
 
 
-def test_clicks_are_believed(tmp_path: Path) -> None:
+def test_clicks_are_believed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A patch of the ground's colors in the middle of the ball: what is clicked stays as it was clicked."""
     write_pictures(tmp_path)
     rows, columns = np.nonzero(TRUTH[4])
@@ -167,9 +166,10 @@ def test_clicks_are_believed(tmp_path: Path) -> None:
     image[y - 6 : y + 6, x - 6 : x + 6] = image[:12, :12]
     write_png(tmp_path / "p_4.png", image)
     cameras = {f"p_{index}": CAMERAS[index] for index in (3, 4, 5)}
-    middle, once = ((float(x), float(y)),), CaptureOptions(hull_voxels=48, rounds=1)
+    middle = ((float(x), float(y)),)
+    monkeypatch.setattr(masks_module, "ROUNDS", 1)
     for hint, covered in ((Hint(box_of(TRUTH[4]), on=middle), True), (Hint(box_of(TRUTH[4]), off=middle), False)):
-        mask = find_masks(cameras, tmp_path, {"p_4": hint}, once)["p_4"] > 127
+        mask = find_masks(cameras, tmp_path, {"p_4": hint})["p_4"] > 127
         assert mask[y - 1 : y + 1, x - 1 : x + 1].all() == covered
         assert mask[y - 1 : y + 1, x - 1 : x + 1].any() == covered
         assert mask[y, x - 12]
@@ -189,7 +189,7 @@ def test_clicks_that_tell_nothing_are_refused(tmp_path: Path, content: object, m
     write_pictures(tmp_path)
     write_json(tmp_path / "clicks.json", content)
     with pytest.raises(InputError, match=message):
-        find_masks({"p_0": CAMERAS[0]}, tmp_path, read_clicks(tmp_path / "clicks.json"), OPTIONS)
+        find_masks({"p_0": CAMERAS[0]}, tmp_path, read_clicks(tmp_path / "clicks.json"))
 
 
 def test_masks_beside_photographs_or_a_video_are_found_where_all_are_there(tmp_path: Path) -> None:

@@ -7,9 +7,9 @@ import numpy as np
 import pycolmap
 import pytest
 
+from panoless.photographs import posed
 from panoless.photographs.frames import Frames, Photograph
 from panoless.photographs.models import find_model, read_colmap, read_rotations, read_transforms
-from panoless.photographs.options import CaptureOptions
 from panoless.photographs.posed import without_the_rest
 from shinypartial.core.camera import look_at, opencv_to_opengl
 from shinypartial.core.errors import InputError
@@ -107,13 +107,16 @@ def test_a_damaged_or_missing_model_is_refused(tmp_path: Path) -> None:
         read_colmap(model, frames_of_size())
 
 
-def test_too_few_poses_are_refused_and_frames_without_one_named(tmp_path: Path) -> None:
+def test_too_few_poses_are_refused_and_frames_without_one_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     poses = read_colmap(write_model(tmp_path, False), frames_of_size())
     with pytest.raises(InputError, match="3 of 3"):
-        without_the_rest(poses, frames_of_size(), CaptureOptions(), "Add more.")
+        without_the_rest(poses, frames_of_size(), "Add more.")
+    monkeypatch.setattr(posed, "LEAST_VIEWS", 3)
     more = frames_of_size().photographs
     extra = Photograph("stray", Path("stray.jpg"), *SIZE, 1, *SIZE, 0.0, 0.5)
-    assert without_the_rest(poses, Frames((*more, extra)), CaptureOptions(least_views=3), "").left_out == ("stray",)
+    assert without_the_rest(poses, Frames((*more, extra)), "").left_out == ("stray",)
 
 
 def write_transforms_json(folder: Path, **changes: object) -> Path:

@@ -1,6 +1,6 @@
 """Snapshots lie on the path of the fit: the last one is its result, and a kill neither loses nor doubles any."""
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from panoless.reconstruct.snapshots import (
 )
 from panoless.reconstruct.state import FitState, load_state
 from panoless.selection.candidates import Selection
+from panoless.splats import train
 from panoless.splats.mirror import SurfelMirror
 from panoless.splats.objective import LossTerms
 from panoless.splats.train import SurfelTrainer
@@ -34,6 +35,7 @@ from shinypartial.prediction.format import SNAPSHOTS, prediction_folders, read_i
 from shinypartial.prediction.format import snapshot_folders as exported_snapshots
 from tests.support.mirror_sphere import sphere_surfels, tiny_config
 
+pytestmark = pytest.mark.usefixtures("often")
 CONFIG = tiny_config(iterations=24, count=120)
 MARKS = snapshot_schedule(4, (), CONFIG.splats.iterations)
 
@@ -115,12 +117,12 @@ def test_the_last_snapshot_is_the_result(prediction: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["default", "paper"])
-def test_completing_the_last_snapshot_completes_the_fit(preset: str, tmp_path: Path, sphere_dataset: Dataset) -> None:
+def test_completing_the_last_snapshot_completes_the_fit(
+    preset: str, tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Also where the environment is what gradient descent left, and visibility what all iterations saw."""
-    config = replace(
-        tiny_config(preset, iterations=6, count=120),
-        splats=replace(tiny_config(preset, iterations=6, count=120).splats, visibility_alpha=0.0),
-    )
+    monkeypatch.setattr(train, "OBSERVED_ALPHA", 0.0)
+    config = tiny_config(preset, iterations=6, count=120)
     final = fit(sphere_dataset, config, tmp_path, snapshot_schedule(2, (), 6))
     views = load_views(sphere_dataset, config.crop_margin_px)
     early, late = (read_snapshot(folder) for folder in snapshot_folders(tmp_path))

@@ -31,6 +31,7 @@ from panoless.selection.options import CorrectionOptions
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.perturb.masks import wobbling
 from shinypartial.dataset.schema import Dataset
+from tests.support.few_rounds import take_few_rounds
 from tests.support.mirror_plane import NORMAL, RECTANGLE, arc, make_plane_dataset, plane_of, reflecting_views
 from tests.support.mirror_revolution import around, goblet, pillar_views, revolution_views
 from tests.support.mirror_sphere import tiny_config
@@ -44,17 +45,21 @@ def coarse_config() -> FitConfig:
     return replace(
         config,
         model="auto",
-        selection=replace(config.selection, trial_resolution=32),
+        environment=replace(config.environment, solve_resolution=32),
         # The traced dome has flat edges, so it looks like a flat mirror in a near room.
         surroundings=replace(config.surroundings, mode="off"),
-        corrections=CorrectionOptions(masks="off", exposure="off", lens="off"),
-        height_field=replace(config.height_field, rounds=3),
-        revolution=replace(config.revolution, rounds=1),
+        corrections=CorrectionOptions(poses="off", masks="off", exposure="off", lens="off"),
         free_form=FreeFormOptions(hollows=False, starts=False, finest_cells=20),
     )
 
 
 CONFIG = coarse_config()
+
+
+@pytest.fixture(autouse=True)
+def few_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Enough to tell kinds apart."""
+    take_few_rounds(monkeypatch, heights=3, revolutions=1)
 
 
 def framed(frame_height: float, bend: float = 0.0) -> Views:
@@ -105,7 +110,10 @@ def test_turned_cameras_change_no_choice_between_flat_and_bent(bend: float) -> N
     views, rng = reflecting_views(plane_of(RECTANGLE), arc(15), bend), np.random.default_rng(3)
     wrong = rng.normal(size=(15, 3))
     wrong *= np.radians(0.5) / np.linalg.norm(wrong, axis=1, keepdims=True)
-    geometry, selection = choose_geometry(Poses(wrong, np.zeros((15, 3))).moved(views), CONFIG)
+    geometry, selection = choose_geometry(
+        Poses(wrong, np.zeros((15, 3))).moved(views),
+        replace(CONFIG, corrections=replace(CONFIG.corrections, poses="auto")),
+    )
     assert geometry.kind == ("height_field" if bend else "plane")
     turned = selection.candidates[-1].camera_turn_deg
     assert turned is not None
@@ -208,7 +216,7 @@ def test_a_goblet_takes_the_surface_of_revolution() -> None:
 
 def test_the_configuration_overrides_both_ways(views: Views) -> None:
     """Surfels for a flat mirror, a plane for a bent one and even for a sphere; nothing is compared."""
-    stated = replace(CONFIG, poses=replace(CONFIG.poses, mode="off"))
+    stated = replace(CONFIG, corrections=replace(CONFIG.corrections, poses="off"))
     chosen = {model: replace(stated, model=model) for model in ("plane", "surfels")}
     state = begin(framed(0.0), chosen["surfels"])
     assert state.geometry.kind == "surfels"

@@ -8,7 +8,7 @@ import torch
 
 from panoless.capture.encoding import LDR
 from panoless.capture.views import TrainView, Views
-from panoless.config import FitConfig
+from panoless.config import EnvironmentConfig, FitConfig
 from panoless.environment.options import MaterialOptions
 from panoless.environment.reflectance import Reflectance
 from panoless.geometry.plane.kind import PlaneMirror
@@ -21,7 +21,7 @@ from tests.support.synthetic_dataset import environment_radiance
 
 GOLD = np.array([1.0, 0.77, 0.34])
 MIRROR = RevolutionMirror(goblet(), occlusion_test=False)
-CONFIG = FitConfig(material=MaterialOptions(resolution=16))
+CONFIG = FitConfig(environment=EnvironmentConfig(solve_resolution=16))
 """With texels as wide as the views are coarse."""
 PERFECT = revolution_views(MIRROR.surface, around(15, size=48))
 

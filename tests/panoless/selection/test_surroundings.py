@@ -10,7 +10,6 @@ from jaxtyping import Float
 from panoless.capture.rays import pixel_rays, reflect
 from panoless.capture.views import TrainView
 from panoless.config import FitConfig
-from panoless.environment.options import SurroundingsOptions
 from panoless.environment.surroundings import Floor, Surroundings
 from panoless.geometry.base import Geometry, Proposal
 from panoless.geometry.height_field.kind import HeightFieldFamily
@@ -23,7 +22,7 @@ from tests.support.mirror_height_field import height_field_views
 from tests.support.mirror_plane import RECTANGLE, arc, camera_at, disc, plane_of, reflecting_views
 from tests.support.synthetic_dataset import environment_radiance
 
-CONFIG = FitConfig(surroundings=SurroundingsOptions(rays=10_000))
+CONFIG, RAYS = FitConfig(), 10_000
 FAR_VIEWS = reflecting_views(plane_of(RECTANGLE), arc(10, size=48))
 
 
@@ -55,15 +54,15 @@ def test_a_flat_mirror_in_a_room_tells_how_near_it_is() -> None:
     views = replace(FAR_VIEWS, train=tuple(in_room(view, plane, 4.0) for view in FAR_VIEWS.train))
     family = PlaneFamily()
     proposal = Proposal(plane_of(RECTANGLE), 0.1, 1.0)
-    found = proposed_surroundings(family, views, proposal, CONFIG)
+    found = proposed_surroundings(family, views, proposal, CONFIG, rays_taken=RAYS)
     assert found.coefficients == pytest.approx([0.25], rel=0.05)
     near, far = (family.fit(views, each, CONFIG) for each in (proposal.in_surroundings(found), proposal))
     assert near.surroundings is found
-    assert explains_clearly_more(views, near, far, CONFIG)
-    assert not explains_clearly_more(views, far, near, CONFIG)
-    assert proposed_surroundings(HeightFieldFamily(), views, proposal, CONFIG).coefficients == pytest.approx(
-        found.coefficients, rel=0.02
-    )
+    assert explains_clearly_more(views, near, far)
+    assert not explains_clearly_more(views, far, near)
+    assert proposed_surroundings(
+        HeightFieldFamily(), views, proposal, CONFIG, rays_taken=RAYS
+    ).coefficients == pytest.approx(found.coefficients, rel=0.02)
 
 
 @pytest.mark.slow
@@ -72,8 +71,8 @@ def test_a_convex_mirror_in_a_far_world_is_not_put_into_a_room() -> None:
     plane = plane_of(disc(24))
     views = height_field_views(flat_height_field(plane, 6).domed(0.45), arc(16, size=64))
     proposal = Proposal(plane, 0.0, 1.0)
-    assert not proposed_surroundings(PlaneFamily(), views, proposal, CONFIG).is_far
-    assert proposed_surroundings(HeightFieldFamily(), views, proposal, CONFIG).is_far
+    assert not proposed_surroundings(PlaneFamily(), views, proposal, CONFIG, rays_taken=RAYS).is_far
+    assert proposed_surroundings(HeightFieldFamily(), views, proposal, CONFIG, rays_taken=RAYS).is_far
 
 
 def above() -> list[RasterCamera]:
@@ -94,7 +93,7 @@ def test_a_flat_mirror_on_a_table_tells_how_high_it_stands() -> None:
     views = reflecting_views(plane, above())
     views = replace(views, train=tuple(in_room(view, plane, 6.0, 0.7) for view in views.train))
     proposal = Proposal(plane, 0.1, 1.0)
-    found = proposed_surroundings(PlaneFamily(), views, proposal, CONFIG)
+    found = proposed_surroundings(PlaneFamily(), views, proposal, CONFIG, rays_taken=RAYS)
     assert found.floor is not None
     assert found.floor.depth == pytest.approx(0.7, rel=0.05)
     fitted = PlaneFamily().as_proposed(proposal, CONFIG)
@@ -113,7 +112,7 @@ def test_a_flat_mirror_on_a_table_tells_how_high_it_stands() -> None:
 def test_a_far_world_stays_far() -> None:
     family = PlaneFamily()
     proposal = Proposal(plane_of(RECTANGLE), 0.1, 1.0)
-    assert proposed_surroundings(family, FAR_VIEWS, proposal, CONFIG).is_far
+    assert proposed_surroundings(family, FAR_VIEWS, proposal, CONFIG, rays_taken=RAYS).is_far
 
 
 def test_a_fit_in_a_far_world_is_brought_into_ever_nearer_walls() -> None:

@@ -16,20 +16,30 @@ from panoless.splats.density import (
     propagate_normals,
     reset_opacities,
 )
+from panoless.splats.descent import Rates
 from panoless.splats.kernels.reference.rasterize import rotation_matrices
 from panoless.splats.model import Surfels
 from panoless.splats.optimizer import SurfelOptimizer
-from panoless.splats.options import DensityConfig, RateConfig
 from tests.support.mirror_sphere import sphere_surfels
 
-CONFIG = DensityConfig(enabled=True, gradient_threshold=1e-3, dense_share=0.05)
-COUNT = 10
+COUNT, LEAST_OPACITY = 10, 0.1
+UNIT = 5.0
+"""Surfels larger than 0.05 are dense in a scene of this radius, and those larger than 0.5 too large."""
 
 
-def grow(surfels: Surfels, means: list[float], config: DensityConfig = CONFIG, seed: int = 0) -> Edit:
+def grow(surfels: Surfels, means: list[float], most: int = 100_000, seed: int = 0) -> Edit:
     """One round, given the mean gradient of each surfel."""
     statistics = DensityStatistics(torch.tensor(means) * 4, torch.full((len(means),), 4.0))
-    return grow_and_prune(surfels, statistics, config, torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(seed)
+    return grow_and_prune(
+        surfels,
+        statistics,
+        generator,
+        max_surfels=most,
+        least_opacity=LEAST_OPACITY,
+        unit=UNIT,
+        threshold=1e-3,
+    )
 
 
 def sized(scales: list[float]) -> Surfels:
@@ -75,7 +85,7 @@ def test_faint_and_huge_surfels_are_removed() -> None:
 
 
 def test_only_what_is_below_the_threshold_is_faint() -> None:
-    logit = math.log(CONFIG.prune_opacity / (1 - CONFIG.prune_opacity))
+    logit = math.log(LEAST_OPACITY / (1 - LEAST_OPACITY))
     surfels = sized([0.01] * 2)
     logits = torch.tensor([logit, logit - 1e-3])
     assert grow(replace(surfels, opacity_logits=logits), [LOW] * 2).source.tolist() == [0]
@@ -89,7 +99,7 @@ def test_the_set_never_becomes_empty() -> None:
 @pytest.mark.parametrize("limit", [3, 8, 10, 11, 13, 100])
 @pytest.mark.parametrize("size", [0.01, 0.2])
 def test_growth_stops_at_the_limit(limit: int, size: float) -> None:
-    edit = grow(sized([size] * COUNT), [HIGH] * COUNT, replace(CONFIG, max_surfels=limit))
+    edit = grow(sized([size] * COUNT), [HIGH] * COUNT, limit)
     assert edit.surfels.count == min(2 * COUNT, max(limit, COUNT))
 
 
@@ -129,7 +139,7 @@ def test_propagation_only_raises_opacity_and_size() -> None:
 
 def stepped(count: int) -> SurfelOptimizer:
     """An optimizer whose moments differ in every row."""
-    optimizer = SurfelOptimizer(sphere_surfels(count), torch.rand(6, 3, 4, 4), RateConfig())
+    optimizer = SurfelOptimizer(sphere_surfels(count), torch.rand(6, 3, 4, 4), Rates())
     for _ in range(3):
         loss = sum(
             (value * torch.arange(1.0, count + 1).view(-1, *[1] * (value.dim() - 1))).square().sum()
@@ -161,7 +171,7 @@ def test_kept_rows_keep_their_moments_and_new_rows_start_from_zero() -> None:
 
 
 def test_an_edit_before_the_first_step_is_an_edit() -> None:
-    optimizer = SurfelOptimizer(sphere_surfels(5), torch.rand(6, 3, 4, 4), RateConfig())
+    optimizer = SurfelOptimizer(sphere_surfels(5), torch.rand(6, 3, 4, 4), Rates())
     index = torch.tensor([1, 1])
     optimizer.edit_surfels(optimizer.surfels.select(index), index, torch.tensor([True, False]))
     assert optimizer.surfels.count == 2
@@ -171,5 +181,5 @@ def test_an_edit_before_the_first_step_is_an_edit() -> None:
 def test_faint_surfels_survive_a_round_that_does_not_prune_them() -> None:
     surfels = replace(sized([0.01, 0.6]), opacity_logits=torch.tensor([-8.0, 4.0]))
     statistics = DensityStatistics.empty(2)
-    edit = grow_and_prune(surfels, statistics, CONFIG, torch.Generator().manual_seed(0), prune_faint=False)
+    edit = grow_and_prune(surfels, statistics, torch.Generator(), max_surfels=COUNT, least_opacity=0.0, unit=UNIT)
     assert edit.source.tolist() == [0]

@@ -18,9 +18,8 @@ from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.revolution.kind import RevolutionMirror
 from panoless.geometry.revolution.model import trace_reflections
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap
-from panoless.splats.mirror import SurfelMirror, surfel_trust
+from panoless.splats.mirror import PRIOR_TRUST, SurfelMirror, surfel_trust
 from panoless.splats.model import Surfels
-from panoless.splats.options import SurfelOptions
 from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
 from tests.support.mirror_revolution import around, funnel, revolution_views
 from tests.support.mirror_sphere import clipped_environment, sphere_surfels, tiny_config
@@ -76,11 +75,11 @@ def test_surfels_with_wrong_normals_are_not_trusted(
     """By a map that is right, and by one that all surfels together made."""
     with torch.no_grad():
         own = solve_environment(list(observe_views(views, mirror(partly_wrong), 10**6)), 24)
-        seen = surfel_trust(views, mirror(right), truth, SurfelOptions()) > 0.8
+        seen = surfel_trust(views, mirror(right), truth) > 0.8
         assert (seen & patch).sum() > 20
         assert (seen & ~patch).sum() > 200
         for environment, least_gap in ((truth, 0.5), (own, 0.2)):
-            trust = surfel_trust(views, mirror(partly_wrong), environment, SurfelOptions())
+            trust = surfel_trust(views, mirror(partly_wrong), environment)
             assert float(trust[seen & patch].median()) < float(trust[seen & ~patch].median()) - least_gap
 
 
@@ -89,9 +88,9 @@ def test_trust_is_a_share_and_what_is_not_seen_has_that_of_the_start(
 ) -> None:
     """The first ten surfels stand behind every camera."""
     hidden = replace(right, means=torch.cat([right.means[:10] + torch.tensor([50.0, 0, 0]), right.means[10:]]))
-    trust = surfel_trust(views, mirror(hidden), truth, SurfelOptions())
+    trust = surfel_trust(views, mirror(hidden), truth)
     assert 0 <= float(trust.min()) <= float(trust.max()) <= 1
-    torch.testing.assert_close(trust[:10], torch.full((10,), SurfelOptions().prior_trust))
+    torch.testing.assert_close(trust[:10], torch.full((10,), PRIOR_TRUST))
 
 
 def test_a_map_solved_with_trust_is_nearer_to_the_truth(

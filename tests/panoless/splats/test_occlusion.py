@@ -16,7 +16,7 @@ from panoless.splats.mirror import SurfelMirror
 from panoless.splats.shading.base import points_at
 from panoless.splats.shading.geometry import ShadedMirror
 from panoless.splats.shading.objective import ShadedObjective, occluder_of
-from panoless.splats.shading.occlusion import DepthMap, Occluder, OccluderOptions
+from panoless.splats.shading.occlusion import CELL, DepthMap, Occluder
 from panoless.splats.train import SurfelTrainer
 from tests.panoless.splats.test_shading import method_config, mirrors, shell, sphere, world
 from tests.support.surfel_training import Unobserved, new_trainer
@@ -91,13 +91,13 @@ def test_rays_meet_the_surface_where_closed_form_says_so() -> None:
     it within six cells, in the crease.
     """
     balls = torch.cat([BALLS, JOINED[None]])
-    occluder = Occluder.fused((seen(camera, balls) for camera in around()), OccluderOptions())
+    occluder = Occluder.fused(seen(camera, balls) for camera in around())
     points, directions = mirrored_rays(balls)
     distance = first_hits(points, directions, balls)
     truth = distance.isfinite()
     thinner, thicker = (torch.cat([balls[:, :3], balls[:, 3:] + change], 1) for change in (-0.04, 0.04))
     deep = first_hits(points, directions, thinner).isfinite()
-    surely_hidden = truth & deep & (distance > 6 * occluder.options.cell)
+    surely_hidden = truth & deep & (distance > 6 * CELL)
     surely_free = ~truth & ~first_hits(points + 0.1 * directions, directions, thicker).isfinite()
     found = occluder.hides(points, directions).float()
     assert float(surely_hidden.float().mean()) > 0.02
@@ -108,14 +108,14 @@ def test_rays_meet_the_surface_where_closed_form_says_so() -> None:
 
 def test_a_convex_object_hides_nothing() -> None:
     ball = torch.tensor([[0.1, 0.0, -0.1, 0.8]])
-    occluder = Occluder.fused((seen(camera, ball) for camera in around()), OccluderOptions())
+    occluder = Occluder.fused(seen(camera, ball) for camera in around())
     assert float(occluder.hides(*mirrored_rays(ball)).float().mean()) < 0.002
 
 
 def test_what_floats_beside_the_object_hides_nothing() -> None:
     """A small ball apart from a large one, in the way of rays that the large one mirrors."""
     balls = torch.tensor([[-0.2, 0.0, 0.0, 0.6], [0.75, -0.5, 0.0, 0.15]])
-    occluder = Occluder.fused((seen(camera, balls) for camera in around()), OccluderOptions())
+    occluder = Occluder.fused(seen(camera, balls) for camera in around())
     points, directions = mirrored_rays(balls)
     large = (points - balls[0, :3]).norm(dim=1) < 0.61
     points, directions = points[large], directions[large]
@@ -124,7 +124,7 @@ def test_what_floats_beside_the_object_hides_nothing() -> None:
 
 
 def test_no_rays_are_hidden_by_none() -> None:
-    occluder = Occluder(torch.ones(4, 4, 4), OccluderOptions(cells=4))
+    occluder = Occluder(torch.ones(4, 4, 4))
     assert occluder.hides(torch.zeros(0, 3), torch.zeros(0, 3)).shape == (0,)
 
 
@@ -146,13 +146,13 @@ def mirror(views: Views) -> ShadedMirror:
 def test_hidden_pixels_show_the_light_of_the_object(mirror: ShadedMirror, views: Views) -> None:
     """Where all is hidden no map is seen, and what primitives hold is: c Y₀ for a coefficient of degree 0."""
     camera, pixels = views.train[0].camera, views.train[0].solid
-    options, surfels = OccluderOptions(), mirror.surfels
+    surfels = mirror.surfels
     light = torch.zeros_like(surfels.indirect_harmonics)  # type: ignore[attr-defined]
     light[:, 0] = torch.tensor([0.2, 0.4, 0.8])
     hidden = replace(mirror, surfels=replace(surfels, indirect_harmonics=light), occluder=shell())  # type: ignore[call-arg]
     shown = hidden.shade(world(), camera, pixels, torch.zeros(3, len(pixels)))
     assert torch.allclose(shown, light[0, 0] / (4 * torch.pi) ** 0.5, atol=2e-3)
-    open_air = replace(hidden, occluder=Occluder(torch.ones(8, 8, 8), options))
+    open_air = replace(hidden, occluder=Occluder(torch.ones(8, 8, 8)))
     unknown = replace(hidden, occluder=None)
     first, second = (each.shade(world(), camera, pixels, torch.zeros(3, len(pixels))) for each in (open_air, unknown))
     assert torch.equal(first, second)
@@ -167,7 +167,7 @@ def test_hidden_rays_are_no_evidence_of_the_map(mirror: ShadedMirror, views: Vie
 def test_surfels_that_make_a_ball_hide_nothing_of_it(mirror: ShadedMirror, views: Views) -> None:
     """The occluder that is made of their own depth, over the rays that they mirror."""
     cameras = [view.camera for view in views.train]
-    own = occluder_of(mirror.surfels, cameras, OccluderOptions())  # type: ignore[arg-type]
+    own = occluder_of(mirror.surfels, cameras)  # type: ignore[arg-type]
     view = views.train[0]
     free, kept = (len(each.observe(view, view.solid).directions) for each in (mirror, replace(mirror, occluder=own)))
     assert kept > 0.97 * free

@@ -7,12 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from panoless.splats.descent import Rates
 from panoless.splats.kernels.adam import AdamTensor, adam_step
 from panoless.splats.optimizer import EPSILON, MOMENTUM, SurfelOptimizer
-from panoless.splats.options import RateConfig
 from tests.support.mirror_sphere import sphere_surfels
 
-RATES = RateConfig()
+RATES = Rates()
 BETAS = (MOMENTUM, RATES.square_memory)
 
 
@@ -62,7 +62,7 @@ def test_the_first_step_is_the_rate_times_the_factor(factor: float) -> None:
     optimizer.step(factor, geometry=True, frozen=frozenset())
     for name, value in snapshot(optimizer).items():
         step = value - before[name]
-        torch.testing.assert_close(step, torch.full_like(step, factor * getattr(RATES, name)), rtol=0.02, atol=1e-6)
+        torch.testing.assert_close(step, torch.full_like(step, factor * RATES.by_name[name]), rtol=0.02, atol=1e-6)
 
 
 @pytest.mark.parametrize("square_memory", [0.9, 0.99, 0.999])
@@ -83,7 +83,7 @@ def test_a_restarted_moment_steps_farther_the_longer_squares_are_remembered(squa
     pull(optimizer)
     optimizer.step(1.0, geometry=True, frozen=frozenset())
     step = optimizer.surfels.opacity_logits - reset.opacity_logits
-    expected = rates.opacity_logits * (1 - MOMENTUM) / math.sqrt(1 - square_memory)
+    expected = rates.by_name["opacity_logits"] * (1 - MOMENTUM) / math.sqrt(1 - square_memory)
     torch.testing.assert_close(step, torch.full_like(step, expected), rtol=1e-3, atol=1e-6)
 
 
@@ -95,7 +95,7 @@ def test_only_the_means_take_the_factor_of_the_means() -> None:
     for name, value in snapshot(optimizer).items():
         factor = 0.25 if name == "means" else 1.0
         step = value - before[name]
-        torch.testing.assert_close(step, torch.full_like(step, factor * getattr(RATES, name)), rtol=0.02, atol=1e-6)
+        torch.testing.assert_close(step, torch.full_like(step, factor * RATES.by_name[name]), rtol=0.02, atol=1e-6)
 
 
 def test_values_that_stay_keep_their_moments_and_others_restart() -> None:

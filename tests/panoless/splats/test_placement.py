@@ -14,13 +14,15 @@ from panoless.splats.kernels.reference.rasterize import rotation_matrices
 from panoless.splats.model import Surfels
 from panoless.splats.options import SurfelConfig
 from panoless.splats.placement import (
+    LEAST_RADIUS_PX,
+    OVERLAP,
+    SAG_PX,
     _radii,
     _reach,
     initial_surfels,
 )
 
 CONFIG, FIRST = SurfelConfig(count=800), FirstSurfaceOptions(hull_resolution=48)
-SAG_PX, LEAST_RADIUS_PX = CONFIG.tuned.sag_px, CONFIG.tuned.least_radius_px
 
 
 def config_of(count: int, seed: int) -> FitConfig:
@@ -137,7 +139,7 @@ def test_select_and_named_keep_rows_together(hull: Surfels) -> None:
 def test_a_disk_leaves_a_curved_surface_by_a_pixel_at_twice_its_radius(bend: float) -> None:
     """A parabola of curvature κ falls by κ (2 s)²/2 there; radii below a pixel and a half are not made."""
     pixel = 0.005
-    radius = float(_reach(np.array([[bend, bend]]), pixel, CONFIG)[0, 0])
+    radius = float(_reach(np.array([[bend, bend]]), pixel)[0, 0])
     assert bend * (2 * radius) ** 2 / 2 == pytest.approx(pixel) or radius == pytest.approx(LEAST_RADIUS_PX * pixel)
     assert radius >= LEAST_RADIUS_PX * pixel
 
@@ -148,14 +150,14 @@ def test_strong_curvature_gets_smaller_surfels_and_more_of_them_across_it_only()
     areas = np.full(100, 0.01)
     bends = np.zeros((100, 2))
     bends[50:, 1] = bend
-    radii, largest = _radii(areas, bends, pixel, SurfelConfig(count=count))
+    radii, largest = _radii(areas, bends, pixel, count)
     limit = np.sqrt(pixel / (2 * bend))
     np.testing.assert_allclose(radii[:50], largest)
     np.testing.assert_allclose(radii[50:, 0], largest)
     np.testing.assert_allclose(radii[50:, 1], limit)
     assert limit < largest
     density = areas / radii.prod(1)
-    assert density.sum() * CONFIG.tuned.overlap**2 == pytest.approx(count)
+    assert density.sum() * OVERLAP**2 == pytest.approx(count)
     assert density[-1] / density[0] == pytest.approx(largest / limit)
 
 

@@ -8,7 +8,8 @@ import pytest
 
 from panoless.config import FitConfig
 from panoless.presets import PRESETS
-from panoless.splats.schedule import Schedule
+from panoless.splats.descent import PUBLISHED, Rates
+from panoless.splats.schedule import DROP_AT, DROP_FACTOR, Schedule
 
 PERIODIC = ("density_round", "opacity_reset", "propagation")
 
@@ -50,7 +51,8 @@ def test_the_paper_preset_has_the_published_schedule() -> None:
     assert events(config, "opacity_reset") == [3000, 6000, 9000]
     assert (schedule.lambda_silhouette(2999), schedule.lambda_silhouette(3000)) == (1.0, 0.0)
     assert schedule.geometry_moves(0)
-    assert (config.splats.rates.square_memory, config.splats.scene_radius) == (0.999, "cameras")
+    rates = Rates.of(config, unit=3.0)
+    assert (rates.square_memory, rates.by_name["means"]) == (0.999, pytest.approx(3 * 1.6e-4))
     assert {schedule.rate_factor(iteration) for iteration in (0, 20_000, 44_999)} == {1.0}
 
 
@@ -67,12 +69,12 @@ def test_the_means_slow_down_to_a_hundredth_as_in_the_papers_code() -> None:
     assert {default.means_factor(iteration) for iteration in (0, 500, 999)} == {1.0}
 
 
-def test_propagation_never_meets_a_reset() -> None:
+def test_propagation_never_meets_a_reset(monkeypatch: pytest.MonkeyPatch) -> None:
     config = PRESETS["paper"]
-    propagations = events(config, "propagation")
-    assert propagations == [1000, 2000]
-    longer = replace(config, splats=replace(config.splats, density=replace(config.splats.density, propagate_until=1.0)))
-    propagations = events(longer, "propagation")
+    assert events(config, "propagation") == [1000, 2000]
+    monkeypatch.setitem(PUBLISHED, "mirror", replace(PUBLISHED["mirror"], propagates_until=45_000))
+    schedule = Schedule(config)
+    propagations = [iteration for iteration in range(0, 45_000, 500) if schedule.propagation(iteration)]
     assert propagations == [1000, 2000, 4000, 5000, 7000, 8000, 10_000, 11_000]
     assert not set(propagations) & set(events(config, "opacity_reset"))
 
@@ -87,25 +89,13 @@ def test_nothing_happens_without_density_control() -> None:
     assert [events(config, name) for name in PERIODIC] == [[], [], []]
 
 
-def test_propagation_can_be_turned_off() -> None:
-    config = replace(
-        PRESETS["paper"],
-        splats=replace(
-            PRESETS["paper"].splats,
-            iterations=4500,
-            density=replace(PRESETS["paper"].splats.density, propagate_every=0.0),
-        ),
-    )
-    assert events(config, "propagation") == []
-
-
 def test_the_rates_are_constant_and_then_fall_to_the_drop_factor() -> None:
     config = replace(PRESETS["default"], splats=replace(PRESETS["default"].splats, iterations=1000))
     factors = [Schedule(config).rate_factor(iteration) for iteration in range(1000)]
-    drop = round(config.splats.rates.drop_at * 1000)
+    drop = round(DROP_AT * 1000)
     assert set(factors[:drop]) == {1.0}
     assert all(after <= before for before, after in pairwise(factors))
-    assert factors[-1] == pytest.approx(config.splats.rates.drop_factor)
+    assert factors[-1] == pytest.approx(DROP_FACTOR)
 
 
 def test_even_the_shortest_fit_has_a_schedule() -> None:

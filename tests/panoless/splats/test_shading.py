@@ -20,7 +20,7 @@ from panoless.splats.shading.base import harmonic_color, logit, propagated
 from panoless.splats.shading.geometry import ShadedMirror
 from panoless.splats.shading.material_refgs import MaterialRefGS, flatness, seen_at
 from panoless.splats.shading.objective import ShadedObjective
-from panoless.splats.shading.occlusion import Occluder, OccluderOptions
+from panoless.splats.shading.occlusion import CELLS, HALF_EDGE, Occluder
 from panoless.splats.shading.registry import SHADINGS
 from panoless.splats.train import SurfelTrainer
 from tests.support.mirror_sphere import sphere_surfels, tiny_config
@@ -59,11 +59,10 @@ def sphere(name: str, views: Views) -> ShadedSurfels:
 
 def shell(*, half: bool = False) -> Occluder:
     """Hides the map from what lies about the origin, or half of it: solid beyond a radius of 1.1."""
-    options = OccluderOptions()
-    axis = torch.linspace(-options.half_edge, options.half_edge, options.cells)
+    axis = torch.linspace(-HALF_EDGE, HALF_EDGE, CELLS)
     z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     solid = (torch.stack([z, y, x]).norm(dim=0) > 1.1) & ((x > 0) if half else True)
-    return Occluder(1 - 2 * solid.float(), options)
+    return Occluder(1 - 2 * solid.float())
 
 
 def mirrors(primitives: ShadedSurfels) -> ShadedSurfels:
@@ -229,7 +228,7 @@ def trained(preset: str, views: Views) -> tuple[SurfelMirror, SurfelTrainer]:
 
 
 @pytest.mark.parametrize("preset", ["3dgs-dr", *(pytest.param(m, marks=pytest.mark.slow) for m in METHODS[1:])])
-def test_a_method_takes_its_steps_and_survives_its_file(preset: str, views: Views) -> None:
+def test_a_method_takes_its_steps_and_survives_its_file(preset: str, views: Views, often: None) -> None:
     """Growth, pruning, resets, propagation; shading learns what it should, and a copy renders as the original."""
     mirror, trainer = trained(preset, views)
     learned = ShadedObjective(SHADINGS[mirror.shading], views, trainer.config).learned  # type: ignore[attr-defined]

@@ -9,16 +9,15 @@ from scipy.spatial.transform import Rotation
 from torch.nn.functional import max_pool2d, normalize
 
 from panoless.capture.views import TrainView, Views
-from panoless.config import FitConfig
+from panoless.config import EnvironmentConfig, FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.geometry.plane.kind import PlaneMirror
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.trust.evidence import VIEWED_WITHIN_RAD, Evidence, gather_evidence
-from panoless.trust.options import TrustOptions
 from panoless.trust.verdict import AROUND, LARGEST_MISSED, LARGEST_SURPLUS, MASKS, MATTER, POSES, SHINE, TEXTURE, judge
 from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
 
-CONFIG = FitConfig(trust=TrustOptions(resolution=32))
+CONFIG = FitConfig(environment=EnvironmentConfig(solve_resolution=32))
 MIRROR = PlaneMirror(plane_of(RECTANGLE))
 VISIBILITY = torch.linspace(0.1, 1.0, 6 * 32 * 32).reshape(6, 32, 32)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shinypartial.conversion.convert import ConversionOptions, convert
+from shinypartial.conversion.convert import convert
 from shinypartial.conversion.light import filled, harmonics_of, light_of
 from shinypartial.core.errors import InputError
 from shinypartial.core.harmonics import real_harmonics
@@ -54,7 +54,7 @@ def sampler_cube(faces: dict[str, np.ndarray], directions: np.ndarray) -> np.nda
 @pytest.mark.parametrize(("layout", "mirrored"), [("opengl", 1.0), ("three", -1.0)])
 def test_lookups_find_the_light_of_their_direction(prediction: Path, layout, mirrored: float) -> None:
     """three.js flips x before it looks up; the Y-up direction (x, y, z) is (x, −z, y) in the world."""
-    convert(prediction, ("cubemap",), prediction / "out", ConversionOptions(layout=layout))
+    convert(prediction, ("cubemap",), prediction / "out", layout=layout)
     faces = {name: read_picture(prediction / "out" / f"{name}.hdr") for name in FACES}
     random = np.random.default_rng(0).normal(size=(200, 3))
     y_up = np.concatenate([np.eye(3), -np.eye(3), random / np.linalg.norm(random, axis=1, keepdims=True)])

@@ -72,19 +72,17 @@ def test_blobs_on_empty_and_on_full_masks_end() -> None:
 
 
 @pytest.mark.parametrize("radiance", [0.2, 0.6, 1.0, 7.0])
-@pytest.mark.parametrize(("shot", "read", "gain"), [(0.03, 0.0, 1.0), (0.0, 0.02, 1.0), (0.02, 0.01, 4.0)])
-def test_noise_has_the_variance_of_photons_and_of_reading(
-    radiance: float, shot: float, read: float, gain: float
-) -> None:
-    noisy = sensor.add_noise(np.full((150, 150, 3), radiance), shot, read, gain, np.random.default_rng(2))
-    expected = gain * shot**2 * radiance + gain**2 * read**2
+@pytest.mark.parametrize(("shot", "read"), [(0.03, 0.0), (0.0, 0.02), (0.04, 0.04)])
+def test_noise_has_the_variance_of_photons_and_of_reading(radiance: float, shot: float, read: float) -> None:
+    noisy = sensor.add_noise(np.full((150, 150, 3), radiance), shot, read, np.random.default_rng(2))
+    expected = shot**2 * radiance + read**2
     count = noisy.size
     assert abs(noisy.mean() - radiance) < 5 * math.sqrt(expected / count)
     assert abs(noisy.var() / expected - 1) < 5 * math.sqrt(2 / count)
 
 
 def test_a_sensor_records_no_light_below_black() -> None:
-    noisy = sensor.add_noise(np.zeros((50, 50, 3)), 0.1, 0.1, 1.0, np.random.default_rng(0))
+    noisy = sensor.add_noise(np.zeros((50, 50, 3)), 0.1, 0.1, np.random.default_rng(0))
     assert noisy.min() == 0
     assert 0.4 < (noisy > 0).mean() < 0.6
 
@@ -107,14 +105,14 @@ def test_a_blur_keeps_light_and_has_its_variance(sigma_px: float) -> None:
     assert (blurred.sum(0) * offsets**2).sum() / 3 == pytest.approx(sigma_px**2, rel=0.01)
 
 
-@pytest.mark.parametrize(("k1", "k2"), [(-0.25, 0.06), (0.15, 0.0), (0.0, 0.3)])
-def test_a_point_appears_where_opencv_puts_it(k1: float, k2: float) -> None:
+@pytest.mark.parametrize("k1", [-0.25, 0.15, 0.3])
+def test_a_point_appears_where_opencv_puts_it(k1: float) -> None:
     camera = Camera(np.eye(4), 60.0, 64.0, 51.0, 46.0, 100, 90)
     rows, columns = np.indices((90, 100)) + 0.5
     for x, y in ((0.4, 0.2), (-0.5, 0.3), (0.1, -0.45)):
         spot = np.exp(-((columns - (60 * x + 51)) ** 2 + (rows - (64 * y + 46)) ** 2) / (2 * 2.0**2))
-        warped = sensor.warp(spot[..., None], sensor.undistorted_pixels(camera, k1, k2))[..., 0]
-        radial = 1 + k1 * (x**2 + y**2) + k2 * (x**2 + y**2) ** 2
+        warped = sensor.warp(spot[..., None], sensor.undistorted_pixels(camera, k1))[..., 0]
+        radial = 1 + k1 * (x**2 + y**2)
         row, column = np.unravel_index(warped.argmax(), warped.shape)
         assert abs(column + 0.5 - (60 * x * radial + 51)) <= 0.75
         assert abs(row + 0.5 - (64 * y * radial + 46)) <= 0.75
@@ -122,4 +120,4 @@ def test_a_point_appears_where_opencv_puts_it(k1: float, k2: float) -> None:
 
 def test_a_distortion_that_folds_the_picture_is_refused() -> None:
     with pytest.raises(InputError, match="fold"):
-        sensor.undistorted_pixels(Camera(np.eye(4), 30.0, 30.0, 32.0, 32.0, 64, 64), -0.6, 0.0)
+        sensor.undistorted_pixels(Camera(np.eye(4), 30.0, 30.0, 32.0, 32.0, 64, 64), -0.6)

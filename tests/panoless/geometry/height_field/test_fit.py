@@ -11,12 +11,12 @@ from panoless.capture.views import Views
 from panoless.geometry.height_field.fit import (
     EDGE_BENDING,
     EDGE_SCALES_PX,
+    ROUNDS,
     apply_height_field_step,
     fit_height_field,
     step_height_field,
 )
 from panoless.geometry.height_field.model import HeightField, flat_height_field, visible_reflections
-from panoless.geometry.height_field.options import HeightFieldOptions
 from panoless.geometry.height_field.photometric import Observations, Photographs, observe
 from panoless.geometry.height_field.silhouette import edge_jacobian, edge_residuals
 from panoless.geometry.plane.silhouette import apply_plane_step
@@ -146,7 +146,7 @@ def test_no_photograph_tells_the_tilt_of_a_flat_mirror() -> None:
 def test_a_bent_and_tilted_mirror_is_recovered(truth: HeightField) -> None:
     """From the flat, tilted plane, by 16 views of 64 px."""
     views, camera = height_field_views(truth, arc(16, size=64)), arc(16)[8]
-    found = fit_height_field(views, TILTED, HeightFieldOptions(halvings=0))
+    found = fit_height_field(views, TILTED, halvings=0)
     assert (
         np.mean(normal_errors_deg(found, truth, camera))
         < np.mean(normal_errors_deg(flat_height_field(TILTED, 4), truth, camera)) / 10
@@ -160,7 +160,7 @@ def test_a_dome_and_a_bowl_are_found_from_a_flat_start(slope: float) -> None:
     plane = plane_of(disc(24))
     truth = flat_height_field(plane, 6).domed(slope)
     views, camera = height_field_views(truth, arc(16, size=64)), arc(16)[8]
-    found = fit_height_field(views, plane, HeightFieldOptions(cells=6, halvings=0))
+    found = fit_height_field(views, plane, cells=6, halvings=0)
     assert np.mean(normal_errors_deg(flat_height_field(plane, 6), truth, camera)) > 9
     assert np.mean(normal_errors_deg(found, truth, camera)) < 0.5
 
@@ -183,7 +183,7 @@ def test_what_a_rim_hides_of_the_surroundings_is_left_out(rim: float) -> None:
     """
     truth = replace(flat_height_field(plane_of(RECTANGLE), 6).domed(0.3), clearance=rim)
     views, camera = height_field_views(truth, arc(16, size=64)), arc(16)[8]
-    found = fit_height_field(views, plane_of(RECTANGLE), HeightFieldOptions(cells=6, halvings=0))
+    found = fit_height_field(views, plane_of(RECTANGLE), cells=6, halvings=0)
     assert found.clearance in ((0.06, 0.12) if rim else (0.0,))
     assert np.mean(normal_errors_deg(found, truth, camera)) < 0.5
 
@@ -205,10 +205,9 @@ def test_a_tilt_that_photographs_do_not_tell_changes_nothing_for_them(truth: Hei
 @pytest.mark.slow
 def test_bumps_too_short_for_the_grid_are_recovered_on_a_finer_one() -> None:
     """Held-out views ask for halved cells, and for none where the mirror is flat."""
-    options = HeightFieldOptions(cells=5, rounds=3)
     for height, cells in ((0.0, 5), (0.004, 10)):
         truth = bumpy(PLANE, height, cells=10)
-        found = fit_height_field(height_field_views(truth, arc(12, size=48)), PLANE, options)
+        found = fit_height_field(height_field_views(truth, arc(12, size=48)), PLANE, cells=5, rounds=ROUNDS[:3])
         assert found.spacing == pytest.approx(flat_height_field(PLANE, cells).spacing, rel=0.02)
 
 

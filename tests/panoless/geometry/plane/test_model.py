@@ -12,9 +12,8 @@ from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import pose_of, unit_rays_camera
 from panoless.capture.silhouettes import mask_contours
 from panoless.capture.views import Views
-from panoless.geometry.plane.fit import PlaneFit, _descend, fit_plane
+from panoless.geometry.plane.fit import MAX_VERTICES, PlaneFit, _descend, fit_plane
 from panoless.geometry.plane.model import Plane, plane_buffers, unoccluded_share
-from panoless.geometry.plane.options import PlaneOptions
 from panoless.geometry.plane.silhouette import apply_plane_step, boundary_residuals
 from shinypartial.core.errors import InputError
 from tests.support.mirror_plane import (
@@ -174,7 +173,7 @@ def test_wrong_poses_do_not_bias_the_normal() -> None:
 def test_a_round_mirror_needs_only_so_many_vertices() -> None:
     angles = np.linspace(0, 2 * np.pi, 90, endpoint=False)
     fit = fit_plane(mirror_views(plane_of(np.stack([0.6 * np.cos(angles), 0.5 * np.sin(angles)], 1)), arc(12)))
-    assert len(fit.plane.boundary) <= PlaneOptions().max_vertices
+    assert len(fit.plane.boundary) <= MAX_VERTICES
     assert angle_deg(fit.plane.normal, NORMAL) < 0.2
     assert float(fit.iou.min()) > 0.99
 

@@ -12,7 +12,6 @@ from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
 from panoless.geometry.revolution.fit import Refinement, propose_revolution, refine_revolution
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_rays
-from panoless.geometry.revolution.options import RevolutionOptions
 from panoless.kernels.cubemap import sample_cubemap
 from tests.support.traced_vessel import Photographs, Vessel, cut_bowl, deep_cup, dished_jar, photograph, plate, stripes
 
@@ -97,7 +96,7 @@ def test_a_deep_cup_is_open_though_no_ray_leaves_it_at_once() -> None:
     proposal = propose_revolution(views)
     assert proposal is not None
     with torch.no_grad():
-        opened, _ = Refinement(views, proposal.surface, RevolutionOptions(map_rays=100_000)).open_mouth()
+        opened, _ = Refinement(views, proposal.surface, map_rays=100_000).open_mouth()
     assert opened.is_open
 
 
@@ -107,9 +106,8 @@ def test_the_inside_of_a_plate_is_found_by_steps_under_coarse_maps() -> None:
     photographs = photograph(plate(), VIEWS, 96, elevations_deg=(20.0, 35.0, 50.0, 60.0))
     proposal = propose_revolution(photographs.views)
     assert proposal is not None
-    options = RevolutionOptions(map_rays=240_000, pixels=60_000)
     with torch.no_grad():
-        opened, _ = Refinement(photographs.views, proposal.surface, options).open_mouth()
+        opened, _ = Refinement(photographs.views, proposal.surface, map_rays=240_000, pixels=60_000).open_mouth()
     assert np.median(normal_errors_deg(photographs, opened)) < 2
 
 
@@ -151,9 +149,8 @@ def test_both_ends_are_tried_where_cameras_see_both() -> None:
     photographs = photograph(cut_bowl(), VIEWS, SIZE, elevations_deg=(-40.0, 8.0, 25.0, 45.0))
     proposal = propose_revolution(photographs.views)
     assert proposal is not None
-    # The first rounds decide; those that follow refine what they found.
-    options = RevolutionOptions(rounds=1)
     for start in (proposal.surface, proposal.surface.turned_over()):
-        surface = refine_revolution(photographs.views, start, options)
+        # The first rounds decide; those that follow refine what they found.
+        surface = refine_revolution(photographs.views, start, rounds=1)
         assert surface.is_open
         assert surface.axis[2] > 0.99

@@ -11,7 +11,6 @@ from panoless.capture.views import Views
 from panoless.geometry.revolution.fit import Refinement
 from panoless.geometry.revolution.footprints import informative_pixels
 from panoless.geometry.revolution.model import SurfaceOfRevolution
-from panoless.geometry.revolution.options import RevolutionOptions
 from panoless.geometry.revolution.photometric import RADIANCE_SIGMA, Photometry, photometric_equations, solve_map
 from panoless.geometry.revolution.pixels import PixelBundles
 from panoless.geometry.revolution.profile import ProfileSplines, apply_step, resample_profile
@@ -60,14 +59,11 @@ def error_deg(surface: SurfaceOfRevolution, truth: SurfaceOfRevolution, size: in
     return float(np.degrees(np.arccos(cosine)).mean())
 
 
-COARSE = RevolutionOptions(rounds=2, pixels=24_000)
-"""The two coarse rounds, which take a tenth of the time."""
-
-
 def refine_areas(views: Views, start: SurfaceOfRevolution) -> SurfaceOfRevolution:
     """What held-out views leave of the refinement by areas."""
     with torch.no_grad():
-        fit = Refinement(views, start, COARSE)
+        # The two coarse rounds take a tenth of the time.
+        fit = Refinement(views, start, rounds=2, pixels=24_000)
         return fit.refine_areas(start, solve_map(views, start, 1_000_000, 64))
 
 

@@ -19,8 +19,8 @@ from panoless.geometry.sphere.kind import SphereFamily, SphereMirror
 from panoless.geometry.sphere.options import SphereOptions
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.selection.candidates import Verdict
-from panoless.selection.choose import choose_geometry
-from panoless.selection.options import CorrectionOptions, SelectionOptions
+from panoless.selection.choose import DOUBTED_ERROR, LARGEST_ERROR, choose_geometry
+from panoless.selection.options import CorrectionOptions
 from shinypartial.core.camera import Camera, ray_directions_world, reflect
 from shinypartial.core.errors import InputError
 from tests.support.mirror_revolution import around, goblet, revolution_views
@@ -33,7 +33,7 @@ CONFIG = replace(
     model="auto",
     corrections=CorrectionOptions(masks="off", exposure="off", lens="off"),
     surroundings=SurroundingsOptions(mode="off"),
-    selection=SelectionOptions(trial_resolution=16),
+    environment=replace(tiny_config().environment, solve_resolution=16),
 )
 
 
@@ -214,7 +214,7 @@ def test_noise_raises_no_doubt_of_a_sphere() -> None:
     mirror, selection = choose_geometry(replace(views, train=tuple(noisy)), CONFIG)
     (candidate,) = selection.candidates
     assert mirror.kind == candidate.kind == "sphere"
-    assert CONFIG.selection.doubted_error < candidate.held_out_error < CONFIG.selection.largest_error
+    assert DOUBTED_ERROR < candidate.held_out_error < LARGEST_ERROR
 
 
 @pytest.mark.parametrize("count", [2, 9])

@@ -206,8 +206,7 @@ def test_a_fit_of_the_capture_is_not_distrusted(
 
     monkeypatch.chdir(tmp_path)
     small = ("environment.resolution=32", "environment.solve_resolution=32", "environment.rays=100000")
-    options = (*small, "trust.resolution=32")
-    found = fit(captures[count][1].root, preset="fast", output=tmp_path / "prediction", set=options)
+    found = fit(captures[count][1].root, preset="fast", output=tmp_path / "prediction", set=small)
     assert found.info.model.startswith("sphere")
     assert found.info.verdict is not None
     assert found.info.verdict.verdict != "do not trust"
