@@ -106,12 +106,10 @@ class WithoutMirror:
         return cls(plain.value, matte.value)
 
 
-def evenly(views: Sequence[TrainView], count: int) -> list[TrainView]:
-    """About `count` of the views."""
-    return list(views[:: -(-len(views) // count) or 1])
-
-
-def surfaces_of(views: Views, geometry: Geometry, count: int) -> list[list[tuple[TrainView, SurfaceBuffers]]]:
+def surfaces_of(views: Views, geometry: Geometry, count: int) -> tuple[Seen, Seen]:
     """About so many of the kept and of the held-out views, with the surface in each."""
-    parts = [evenly(part, count) for part in split_held_out(views.train)]
-    return [[(view, geometry.buffers(view.camera)) for view in part] for part in parts]
+    kept, held_out = (
+        [(view, geometry.buffers(view.camera)) for view in part[:: -(-len(part) // count) or 1]]
+        for part in split_held_out(views.train)
+    )
+    return kept, held_out

@@ -63,10 +63,10 @@ def is_matte(views: Views, geometry: Geometry, config: FitConfig) -> bool:
     """
     usable = usable_views(views, geometry)
     with torch.no_grad():
-        parts = surfaces_of(usable, geometry, MATTE_VIEWS)
-        if not all(parts):
+        kept, held_out = surfaces_of(usable, geometry, MATTE_VIEWS)
+        if not kept or not held_out:
             return False
-        plain = WithoutMirror.of(usable, *parts, Contrast.of(usable), COMPARED_RAYS)
+        plain = WithoutMirror.of(usable, kept, held_out, Contrast.of(usable), COMPARED_RAYS)
     if plain.one_color < LEAST_COLORS or plain.matte > MATTE_SHARE * plain.one_color:
         return False
     errors = held_out_errors(usable, config, geometry)
