@@ -26,10 +26,9 @@ from shinypartial.dataset.read import open_dataset
 from shinypartial.dataset.schema import Frame
 from shinypartial.dataset.subset import files_of
 from shinypartial.evaluation.direct_views import DIRECT_SCORES
-from shinypartial.io.files import link_or_copy, read_json, write_json
+from shinypartial.io.files import link_or_copy, read_json, write_between, write_json
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-BEGIN, END = "<!-- mirror-ball:begin -->", "<!-- mirror-ball:end -->"
 LEVEL_DEG = 15.0
 """Cameras below this elevation look at walls and ceiling, the others at the floor and the table."""
 
@@ -98,12 +97,10 @@ def main() -> None:
         print(json.dumps(asdict(results[-1])), file=sys.stderr)
     if options.json:
         write_json(options.json, {"held_out": held_out, "results": [asdict(each) for each in results]})
-    lines = "\n".join(table(results))
-    print(lines)
+    lines = table(results)
+    print("\n".join(lines))
     if options.page:
-        text = options.page.read_text(encoding="utf-8")
-        before, after = text.split(BEGIN)[0], text.split(END)[1]
-        options.page.write_text(f"{before}{BEGIN}\n\n{lines}\n\n{END}{after}", encoding="utf-8")
+        write_between(options.page, "mirror-ball", lines)
 
 
 class CommandError(Exception):
@@ -190,9 +187,8 @@ def _result(
 def table(results: Sequence[Result]) -> list[str]:
     """Rows of Markdown: medians over all held-out cameras, with those of level ones behind the stroke."""
     lines = [
-        "| Poses by | Training cameras | Features off by | … across | Correlation in the band | Correlation | "
-        "PSNR, sRGB | PSNR, linear | Brightest lamp off by |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| Poses by | Cameras | Features off by | … across | Correlation | PSNR, sRGB | Brightest lamp off by |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
     ]
 
     def row(title: str, count: str, median: dict[str, Any], level: dict[str, Any] | None, lamp: str) -> str:
@@ -201,15 +197,14 @@ def table(results: Sequence[Result]) -> list[str]:
             return " / ".join("–" if each is None else f"{each:{spec}}" for each in shown) + unit
 
         cells = [both("offset_deg", ".2f", "°"), both("across_deg", ".2f", "°"), both("correlation", ".2f", "")]
-        cells += [both("correlation_unfiltered", ".2f", "")]
-        cells += [both("psnr_srgb", ".1f", " dB"), both("psnr_linear", ".1f", " dB")]
+        cells += [both("psnr_srgb", ".1f", " dB")]
         return f"| {' | '.join([title, count, *cells, lamp])} |"
 
     titles = {"all": "all photographs", "alone": "these alone"}
     chances = []
     for each in results:
         if each.scores is None or each.level is None:
-            lines.append(f"| {titles[each.poses]} | {each.cameras} | failed: {each.message} | | | | | | |")
+            lines.append(f"| {titles[each.poses]} | {each.cameras} | failed: {each.message} | | | | |")
             continue
         lamp = f"{each.scores['lamp_error_deg']:.1f}°"
         lines.append(row(titles[each.poses], str(each.cameras), each.scores["median"], each.level, lamp))

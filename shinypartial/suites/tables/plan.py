@@ -64,6 +64,8 @@ class Column:
     title: str
     digits: int = 2
     factor: float = 1.0
+    shown: bool = False
+    """Whether the page has it; its numbers have all."""
 
     @property
     def direction(self) -> Direction:
@@ -106,13 +108,13 @@ DEFAULT = Method(OURS, _fit("default", ""))
 BASELINE = Method(ORACLE, "shinypartial oracle {dataset} --output {prediction}")
 ON_OURS = "--config.surfels.initial thin-plate"
 ENVIRONMENT = (
-    Column("paper.environment.psnr_reinhard", "Environment PSNR"),
+    Column("paper.environment.psnr_reinhard", "Environment PSNR", shown=True),
     Column("paper.environment.ssim_reinhard", "SSIM", 3),
     Column("paper.environment.lpips_alex", "LPIPS", 3),
     Column("paper.environment.l1_reinhard", "L1", 3),
 )
 NORMALS = (
-    Column("paper.normals.mean_angular_error_deg", "Normals mean °"),
+    Column("paper.normals.mean_angular_error_deg", "Normals mean °", shown=True),
     Column("paper.normals.median_angular_error_deg", "median °"),
     Column("paper.normals.rmse_angular_error_deg", "RMSE °"),
     Column("paper.normals.fraction_within_5deg", "< 5° %", factor=100),
@@ -120,12 +122,13 @@ NORMALS = (
     Column("paper.normals.fraction_within_22_5deg", "< 22.5° %", factor=100),
 )
 RENDER = (
-    Column("paper.render.psnr", "Render PSNR"),
+    Column("paper.render.psnr", "Render PSNR", shown=True),
     Column("paper.render.ssim", "SSIM", 3),
     Column("render.lpips_alex", "LPIPS", 3),
     Column("paper.render.l1", "L1", 3),
 )
-COST = (Column("seconds", "CPU seconds", 0), Column("parameters", "Parameters", 0))
+SECONDS = Column("seconds", "CPU seconds", 0)
+COST = (SECONDS, Column("parameters", "Parameters", 0))
 OBSERVED = Column("environment.as_predicted.observed.psnr_linear", "Environment, observed, linear PSNR")
 SEES_ENVIRONMENT = (
     Column("normals_environment.mean_angular_error_deg", "Normals that see the environment, mean °"),
