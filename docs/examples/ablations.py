@@ -69,21 +69,6 @@ class Figures:
     paper: PaperFigures | None
 
 
-Column = tuple[str, tuple[str, ...]]
-"""A heading, and the place of the value among the figures of a fit."""
-COLUMNS: tuple[Column, ...] = (
-    ("Environment, observed dB", ("observed",)),
-    ("Normals, mean °", ("normal_mean",)),
-    ("Render dB", ("render",)),
-)
-PAPER_COLUMNS: tuple[Column, ...] = (
-    ("Environment dB", ("paper", "environment")),
-    ("Normals, mean °", ("paper", "normal_mean")),
-    ("median °", ("paper", "normal_median")),
-    ("Render dB", ("paper", "render")),
-)
-
-
 @dataclass(frozen=True)
 class Table:
     """Rows under a heading, with a sentence that says how to read them."""
@@ -91,31 +76,28 @@ class Table:
     title: str
     text: str
     rows: tuple[Row, ...]
-    columns: tuple[Column, ...] = COLUMNS
-    published: tuple[tuple[str, ...], ...] = ()
-    """Scene, name and cells of rows as the paper prints them."""
+    figure: tuple[str, ...] = ("observed",)
+    """The place of what is shown among the figures of a fit; nothing: the text alone."""
 
 
 SCENES = ("vase", "cola", "mirror", "deformed-mirror", "sculpture")
 LEVERS: tuple[tuple[str, tuple[str, ...]], ...] = (
-    ("visual hull without completion", ("--config.surfels.initial", "hull")),
     ("random surfels", ("--config.surfels.initial", "random")),
     ("flat surfels", ("--config.surfels.no-curved",)),
-    ("map by gradient descent", ("--config.environment.no-solve",)),
 )
 TABLES = {
     "levers": Table(
         "Leave one out",
-        "`panoless fit` without one of its parts, by the code of 2026-11-21, which fitted the sculpture by surfels. "
-        "Cells are medians over three seeds, with the range where they differ.",
+        "Environment, linear PSNR over observed directions, of `panoless fit` and without one of its parts: medians "
+        "over seeds.",
         (
             *(Row("default", scene) for scene in SCENES),
+            *(Row("surfels", scene, ("--model", "surfels")) for scene in SCENES),
             *(Row(name, "sculpture", ("--model", "surfels", *arguments)) for name, arguments in LEVERS),
-            *(Row("surfels", scene, ("--model", "surfels")) for scene in SCENES[:-1]),
             *(
                 Row(name, scene, (f"--config.environment.no-{option}",), one_seed=True)
                 for name, option, scenes in (
-                    ("pixels that see the object again in the map", "trace", SCENES[:3]),
+                    ("with pixels that see the object again", "trace", SCENES[:3]),
                     ("no fill", "fill", ("mirror", "deformed-mirror")),
                 )
                 for scene in scenes
@@ -142,7 +124,7 @@ TABLES = {
     "paper": Table(
         "The paper's method",
         "All 45,000 steps at a quarter of the resolution, with 6,250 surfels at first and 12,500 at most, scored at "
-        "400 pixels by the paper's protocol. Rows *as published* are of the paper's scenes at its size.",
+        "400 pixels. Environment by the paper's protocol.",
         tuple(
             Row(
                 preset,
@@ -162,15 +144,7 @@ TABLES = {
             )
             for scene in scenes
         ),
-        PAPER_COLUMNS,
-        (
-            ("their vase", "paper, as published", "18.51", "3.97", "2.73", "38.56"),
-            ("their vase", "paper-rho-weighted, as published", "13.94", "–", "–", "36.16"),
-            ("their vase", "paper-no-silhouette, as published", "12.91", "–", "–", "33.75"),
-            ("their vase", "paper-no-normal, as published", "8.68", "–", "–", "35.82"),
-            ("their cola", "paper, as published", "9.26", "6.25", "3.21", "–"),
-            ("their mirror", "paper, as published", "13.31", "4.64", "4.62", "–"),
-        ),
+        ("paper", "environment"),
     ),
 }
 
@@ -253,27 +227,26 @@ def found(table: str, row: Row, seeds: list[int]) -> list[Figures]:
     return [figures_of(folder) for folder in folders if (folder / "scores.json").exists()]
 
 
-def cell(fits: Sequence[dict[str, Any]], place: Sequence[str]) -> str:
-    """Median over fits, with the lowest and the highest where they differ."""
-    values = [functools.reduce(lambda part, key: part and part[key], place, fit) for fit in fits]
-    if None in values:
-        return "–"
-    middle, low, high = (f"{value:.2f}" for value in (statistics.median(values), min(values), max(values)))
-    return middle if low == high else f"{middle} ({low}–{high})"
+def cell(made: dict[str, Any] | None, place: Sequence[str]) -> str:
+    """Median over fits, in dB."""
+    values = (
+        [functools.reduce(lambda part, key: part and part[key], place, fit) for fit in made["fits"]] if made else []
+    )
+    return f"{statistics.median(values):.2f}" if values and None not in values else "–"
 
 
 def markdown(content: Table, known: dict[tuple[str, str], dict[str, Any]]) -> Iterator[str]:
-    """A table as Markdown, or the text alone where it has no columns."""
+    """A table as Markdown, scenes by variants."""
     yield from (f"## {content.title}", "", content.text, "")
-    if not content.columns:
+    if not content.figure:
         return
-    yield "| Scene | | " + " | ".join(name for name, _ in content.columns) + " |"
-    yield "| --- " * (len(content.columns) + 2) + "|"
-    yield from (f"| {' | '.join(row)} |" for row in content.published)
-    for row in content.rows:
-        if made := known.get((row.scene, row.name)):
-            cells = [cell(made["fits"], place) for _, place in content.columns]
-            yield f"| {row.scene} | {row.name} | {' | '.join(cells)} |"
+    names = list(dict.fromkeys(row.name for row in content.rows))
+    yield f"| Scene | {' | '.join(names)} |"
+    yield "| --- " * (1 + len(names)) + "|"
+    for scene in SCENES:
+        cells = [cell(known.get((scene, name)), content.figure) for name in names]
+        if set(cells) != {"–"}:
+            yield f"| {scene} | {' | '.join(cells)} |"
     yield ""
 
 

@@ -185,19 +185,19 @@ def _result(
 
 
 def table(results: Sequence[Result]) -> list[str]:
-    """Rows of Markdown: medians over all held-out cameras, with those of level ones behind the stroke."""
+    """Rows of Markdown: medians over all held-out cameras; of features, those of level ones behind the stroke."""
     lines = [
         "| Poses by | Cameras | Features off by | … across | Correlation | PSNR, sRGB | Brightest lamp off by |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
 
     def row(title: str, count: str, median: dict[str, Any], level: dict[str, Any] | None, lamp: str) -> str:
-        def both(name: str, spec: str, unit: str) -> str:
-            shown = [median[name]] + ([] if level is None else [level[name]])
-            return " / ".join("–" if each is None else f"{each:{spec}}" for each in shown) + unit
+        def text(figures: dict[str, Any], name: str, digits: int = 2) -> str:
+            return "–" if figures[name] is None else f"{figures[name]:.{digits}f}"
 
-        cells = [both("offset_deg", ".2f", "°"), both("across_deg", ".2f", "°"), both("correlation", ".2f", "")]
-        cells += [both("psnr_srgb", ".1f", " dB")]
+        offsets = " / ".join(text(each, "offset_deg") for each in (median, level) if each is not None)
+        cells = [f"{offsets}°", f"{text(median, 'across_deg')}°", text(median, "correlation")]
+        cells.append(f"{text(median, 'psnr_srgb', 1)} dB")
         return f"| {' | '.join([title, count, *cells, lamp])} |"
 
     titles = {"all": "all photographs", "alone": "these alone"}

@@ -9,7 +9,6 @@ from shinypartial.io.files import write_text
 from shinypartial.suites.stability.axes import Axis
 from shinypartial.suites.stability.collect import (
     LOST_DB,
-    LOST_FACTOR,
     REFUSED,
     Judged,
     Results,
@@ -104,16 +103,13 @@ def _loss_text(clean: float | None, value: float | None) -> str:
 
 
 def _limit_table(results: Results) -> Iterator[str]:
-    yield f"Level at which the environment loses {LOST_DB:g} dB, and at which the mean error of the normals is"
-    yield f"{LOST_FACTOR:g} times that of the clean fit, linear between levels: median over scenes, with the range. A"
-    yield "level without a result counts as lost. A dash: not within the levels."
+    yield f"Level at which the environment loses {LOST_DB:g} dB, linear between levels: median over scenes, with the"
+    yield "range. A level without a result counts as lost. A dash: not within the levels."
     yield ""
-    headings = [f"{method}: {what}" for method in results.methods for what in ("environment", "normals")]
-    yield "| Axis | " + " | ".join(headings) + " |"
-    yield "| --- " * (1 + len(headings)) + "|"
+    yield f"| Axis | {' | '.join(results.methods)} |"
+    yield "| --- " * (1 + len(results.methods)) + "|"
     for axis in results.axes:
-        found = [limits(results, axis, method) for method in results.methods]
-        cells = [_limit_text(axis, each) for one in found for each in (one.environment, one.normals)]
+        cells = [_limit_text(axis, limits(results, axis, method)) for method in results.methods]
         yield f"| {axis.title} | " + " | ".join(cells) + " |"
 
 

@@ -119,7 +119,7 @@ def _table_lines(table: Table, measured: list[Line]) -> Iterator[str]:
     if table.averaged:
         groups = {name: [*lines, *averages(lines, table.scenes)] for name, lines in groups.items()}
     places = list(dict.fromkeys(line.scene for line in groups["measured"]))
-    shown = [(i, column) for i, column in enumerate(table.columns) if column.shown]
+    shown = [(table.columns.index(column), column) for column in table.shown]
     headings = [
         place if k else f"{column.title} {column.direction.value}: {place}"
         for _, column in shown
@@ -166,4 +166,4 @@ def _text(column: Column, values: tuple[float, ...]) -> str:
     if not values:
         return "–"
     texts = [f"{value:,.{column.digits}f}" for value in (statistics.median(values), min(values), max(values))]
-    return texts[0] if len(set(texts)) == 1 else f"{texts[0]} ({texts[1]} to {texts[2]})"
+    return texts[0] if len(set(texts)) == 1 else f"{texts[0]} ({texts[1]}–{texts[2]})"

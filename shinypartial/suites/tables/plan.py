@@ -64,8 +64,6 @@ class Column:
     title: str
     digits: int = 2
     factor: float = 1.0
-    shown: bool = False
-    """Whether the page has it; its numbers have all."""
 
     @property
     def direction(self) -> Direction:
@@ -76,6 +74,35 @@ class Column:
 
 
 OF_COST = ("seconds", "parameters")
+
+
+ENVIRONMENT = (
+    Column("paper.environment.psnr_reinhard", "Environment PSNR"),
+    Column("paper.environment.ssim_reinhard", "SSIM", 3),
+    Column("paper.environment.lpips_alex", "LPIPS", 3),
+    Column("paper.environment.l1_reinhard", "L1", 3),
+)
+NORMALS = (
+    Column("paper.normals.mean_angular_error_deg", "Normals mean °"),
+    Column("paper.normals.median_angular_error_deg", "median °"),
+    Column("paper.normals.rmse_angular_error_deg", "RMSE °"),
+    Column("paper.normals.fraction_within_5deg", "< 5° %", factor=100),
+    Column("paper.normals.fraction_within_11_25deg", "< 11.25° %", factor=100),
+    Column("paper.normals.fraction_within_22_5deg", "< 22.5° %", factor=100),
+)
+RENDER = (
+    Column("paper.render.psnr", "Render PSNR"),
+    Column("paper.render.ssim", "SSIM", 3),
+    Column("render.lpips_alex", "LPIPS", 3),
+    Column("paper.render.l1", "L1", 3),
+)
+SECONDS = Column("seconds", "CPU seconds", 0)
+COST = (SECONDS, Column("parameters", "Parameters", 0))
+OBSERVED = Column("environment.as_predicted.observed.psnr_linear", "Environment, observed, linear PSNR")
+SEES_ENVIRONMENT = (
+    Column("normals_environment.mean_angular_error_deg", "Normals that see the environment, mean °"),
+    Column("normals_environment.median_angular_error_deg", "median °"),
+)
 
 
 @dataclass(frozen=True)
@@ -91,6 +118,8 @@ class Table:
     conditions: tuple[Condition, ...] = (Condition(),)
     averaged: bool = False
     """Whether means over scenes are shown, too."""
+    shown: tuple[Column, ...] = (ENVIRONMENT[0], NORMALS[0])
+    """Columns of the page, beside the seconds; its numbers have all."""
 
 
 def _fit(preset: str, options: str = "{schedule}") -> str:
@@ -107,33 +136,6 @@ PAPERS = Method(PAPER, _fit("paper"))
 DEFAULT = Method(OURS, _fit("default", ""))
 BASELINE = Method(ORACLE, "shinypartial oracle {dataset} --output {prediction}")
 ON_OURS = "--config.surfels.initial thin-plate"
-ENVIRONMENT = (
-    Column("paper.environment.psnr_reinhard", "Environment PSNR", shown=True),
-    Column("paper.environment.ssim_reinhard", "SSIM", 3),
-    Column("paper.environment.lpips_alex", "LPIPS", 3),
-    Column("paper.environment.l1_reinhard", "L1", 3),
-)
-NORMALS = (
-    Column("paper.normals.mean_angular_error_deg", "Normals mean °", shown=True),
-    Column("paper.normals.median_angular_error_deg", "median °"),
-    Column("paper.normals.rmse_angular_error_deg", "RMSE °"),
-    Column("paper.normals.fraction_within_5deg", "< 5° %", factor=100),
-    Column("paper.normals.fraction_within_11_25deg", "< 11.25° %", factor=100),
-    Column("paper.normals.fraction_within_22_5deg", "< 22.5° %", factor=100),
-)
-RENDER = (
-    Column("paper.render.psnr", "Render PSNR", shown=True),
-    Column("paper.render.ssim", "SSIM", 3),
-    Column("render.lpips_alex", "LPIPS", 3),
-    Column("paper.render.l1", "L1", 3),
-)
-SECONDS = Column("seconds", "CPU seconds", 0)
-COST = (SECONDS, Column("parameters", "Parameters", 0))
-OBSERVED = Column("environment.as_predicted.observed.psnr_linear", "Environment, observed, linear PSNR")
-SEES_ENVIRONMENT = (
-    Column("normals_environment.mean_angular_error_deg", "Normals that see the environment, mean °"),
-    Column("normals_environment.median_angular_error_deg", "median °"),
-)
 
 TABLES: dict[TableName, Table] = {
     "main": Table(
@@ -147,15 +149,16 @@ TABLES: dict[TableName, Table] = {
     ),
     "fairness": Table(
         "The same silhouettes for all",
-        "The strongest of the compared methods with the paper's silhouette term in its first steps.",
+        "With the paper's silhouette term in the first steps.",
         ("cola", "vase", "mirror"),
         (Method(SILHOUETTE, _fit("material-refgs-silhouette")), PAPERS, DEFAULT),
         (NORMALS[0], NORMALS[1], NORMALS[3], *COST),
         published.FAIRNESS,
+        shown=NORMALS[:1],
     ),
     "start": Table(
         "The same first surface for all",
-        "The compared methods as in the main table, but for where their primitives begin: on our first surface.",
+        "As in the main table, but primitives start on our first surface.",
         ("vase", "cola", "mirror"),
         tuple(Method(f"{each.name} on our first surface", f"{each.command} {ON_OURS}") for each in (*COMPARED, PAPERS)),
         (*ENVIRONMENT, *NORMALS, *COST),
@@ -176,10 +179,11 @@ TABLES: dict[TableName, Table] = {
         ),
         (*ENVIRONMENT, *RENDER, *COST),
         published.ABLATION,
+        shown=(ENVIRONMENT[0], RENDER[0]),
     ),
     "roughness": Table(
         "Roughness",
-        "The same scene of a rougher material. The paper prints no figures.",
+        "The same scene of a rougher material.",
         ("vase",),
         (COMPARED[1], COMPARED[3], PAPERS, DEFAULT, BASELINE),
         (ENVIRONMENT[0], OBSERVED, *NORMALS[:2], RENDER[0], *COST),
@@ -188,27 +192,29 @@ TABLES: dict[TableName, Table] = {
             Condition(f"roughness {level}", render=f"--roughness {level}") if level else Condition()
             for level in (0, 0.1, 0.2, 0.3)
         ),
+        shown=ENVIRONMENT[:1],
     ),
     "matter": Table(
         "More than a mirror",
-        "Scenes with parts that are rough, colored or matte. The paper prints no figures.",
+        "Scenes with parts that are rough, colored or matte.",
         ("teapot", "coffee"),
         (*COMPARED, PAPERS, DEFAULT, BASELINE),
         (ENVIRONMENT[0], OBSERVED, *NORMALS[:2], RENDER[0], *COST),
         {},
+        shown=(ENVIRONMENT[0], NORMALS[0], RENDER[0]),
     ),
     "self-reflection": Table(
         "Self-reflection",
-        "Scenes that see themselves; `not traced` takes every mirrored ray for one that meets the surroundings. The "
-        "paper prints no figures.",
+        "Scenes that see themselves; `not traced` takes every mirrored ray for one that meets the surroundings.",
         ("vase", "dish", "horseshoe"),
         (PAPERS, Method("ours, not traced", _fit("default", "--config.environment.no-trace")), DEFAULT, BASELINE),
         (ENVIRONMENT[0], OBSERVED, *NORMALS[:2], *SEES_ENVIRONMENT, *COST),
         {},
+        shown=(OBSERVED,),
     ),
     "pose-jitter": Table(
         "Cameras that are turned",
-        "Each training camera is turned by an angle about a random axis; the truth stays.",
+        "Training cameras are turned by an angle about random axes.",
         ("vase",),
         (PAPERS, Method("ours, poses believed", _fit("default", "--set poses.mode=off")), DEFAULT),
         (*ENVIRONMENT, *NORMALS[:2], *COST),

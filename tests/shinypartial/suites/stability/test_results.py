@@ -56,12 +56,9 @@ def test_a_limit_is_reached_between_levels(losses: list[float | None], expected:
 
 
 def test_limits_of_scenes() -> None:
-    found = limits(RESULTS, ROTATION, "fast")
-    assert found.environment == (0.75,)
-    assert found.normals == (None,)
-    failed = limits(Results(SIZE, (*VASE[:2], outcome(1.0, None))), ROTATION, "fast")
-    assert failed.environment == failed.normals == (1.0,)
-    assert limits(Results(SIZE, tuple(VASE[1:])), ROTATION, "fast").environment == ()
+    assert limits(RESULTS, ROTATION, "fast") == (0.75,)
+    assert limits(Results(SIZE, (*VASE[:2], outcome(1.0, None))), ROTATION, "fast") == (1.0,)
+    assert limits(Results(SIZE, tuple(VASE[1:])), ROTATION, "fast") == ()
 
 
 def test_auroc_of_verdicts() -> None:

@@ -39,7 +39,7 @@ def test_what_prints_alike_is_marked_alike_and_one_row_is_not_marked() -> None:
     assert [cells[name] for name in "abc"] == [["**10.00**"], ["**10.00**"], ["*9.00*"]]
     assert marked((PSNR,), [line("a", 10)]) == {"a": ["10.00"]}
     seeds = Line("vase", "a", ((1.0, 3.0, 2.0),))
-    assert marked((PSNR,), [seeds]) == {"a": ["2.00 (1.00 to 3.00)"]}
+    assert marked((PSNR,), [seeds]) == {"a": ["2.00 (1.00–3.00)"]}
     alike = Line("vase", "a", ((2.001, 2.002, 2.0),))
     assert marked((PSNR,), [alike]) == {"a": ["2.00"]}
 
