@@ -242,7 +242,7 @@ def markdown(content: Table, known: dict[tuple[str, str], dict[str, Any]]) -> It
         return
     names = list(dict.fromkeys(row.name for row in content.rows))
     yield f"| Scene | {' | '.join(names)} |"
-    yield "| --- " * (1 + len(names)) + "|"
+    yield "|---" * (1 + len(names)) + "|"
     for scene in SCENES:
         cells = [cell(known.get((scene, name)), content.figure) for name in names]
         if set(cells) != {"–"}:

@@ -187,32 +187,30 @@ def _result(
 def table(results: Sequence[Result]) -> list[str]:
     """Rows of Markdown: medians over all held-out cameras; of features, those of level ones behind the stroke."""
     lines = [
-        "| Poses by | Cameras | Features off by | … across | Correlation | PSNR, sRGB | Brightest lamp off by |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
+        "| Poses by | Cameras | Features off by | … across | Correlation | PSNR, sRGB |",
+        "|---|---|---|---|---|---|",
     ]
 
-    def row(title: str, count: str, median: dict[str, Any], level: dict[str, Any] | None, lamp: str) -> str:
+    def row(title: str, count: str, median: dict[str, Any], level: dict[str, Any] | None) -> str:
         def text(figures: dict[str, Any], name: str, digits: int = 2) -> str:
             return "–" if figures[name] is None else f"{figures[name]:.{digits}f}"
 
         offsets = " / ".join(text(each, "offset_deg") for each in (median, level) if each is not None)
         cells = [f"{offsets}°", f"{text(median, 'across_deg')}°", text(median, "correlation")]
         cells.append(f"{text(median, 'psnr_srgb', 1)} dB")
-        return f"| {' | '.join([title, count, *cells, lamp])} |"
+        return f"| {' | '.join([title, count, *cells])} |"
 
     titles = {"all": "all photographs", "alone": "these alone"}
     chances = []
     for each in results:
         if each.scores is None or each.level is None:
-            lines.append(f"| {titles[each.poses]} | {each.cameras} | failed: {each.message} | | | | |")
+            lines.append(f"| {titles[each.poses]} | {each.cameras} | failed: {each.message} | | | |")
             continue
-        lamp = f"{each.scores['lamp_error_deg']:.1f}°"
-        lines.append(row(titles[each.poses], str(each.cameras), each.scores["median"], each.level, lamp))
+        lines.append(row(titles[each.poses], str(each.cameras), each.scores["median"], each.level))
         chances.append(each.scores["chance"])
     if chances:
-        lamps = [each.scores["lamp_chance_deg"] for each in results if each.scores and each.scores["lamps"]]
         medians = {name: float(np.median([each[name] for each in chances])) for name in chances[0]}
-        lines.append(row("*chance: the map turned*", "", medians, None, f"{np.median(lamps):.1f}°"))
+        lines.append(row("*chance: the map turned*", "", medians, None))
     return lines
 
 

@@ -82,7 +82,7 @@ def _loss_table(results: Results) -> Iterator[str]:
     yield f"row. Losses of {LOST_DB:g} dB and more are bold, gains negative."
     yield ""
     yield f"| | {' | '.join(results.scenes)} |"
-    yield "| --- " * (1 + len(results.scenes)) + "|"
+    yield "|---" * (1 + len(results.scenes)) + "|"
     outcomes = [each for each in results.outcomes if each.cell.method == method and each.cell.axis is None]
     clean = {name: mean(each.environment_db for each in outcomes if each.cell.scene == name) for name in results.scenes}
     yield f"| Clean | {' | '.join('–' if each is None else f'{each:.2f}' for each in clean.values())} |"
@@ -107,7 +107,7 @@ def _limit_table(results: Results) -> Iterator[str]:
     yield "range. A level without a result counts as lost. A dash: not within the levels."
     yield ""
     yield f"| Axis | {' | '.join(results.methods)} |"
-    yield "| --- " * (1 + len(results.methods)) + "|"
+    yield "|---" * (1 + len(results.methods)) + "|"
     for axis in results.axes:
         cells = [_limit_text(axis, limits(results, axis, method)) for method in results.methods]
         yield f"| {axis.title} | " + " | ".join(cells) + " |"
@@ -126,7 +126,7 @@ def _limit_text(axis: Axis, positions: Sequence[float | None]) -> str:
 def _spread_lines(results: Results) -> Iterator[str]:
     yield "Standard deviation over seeds on clean data, of the environment and of the normals' mean error."
     yield ""
-    yield "| Scene | Method | Seeds | Environment | Normals |\n| --- | --- | --- | --- | --- |"
+    yield "| Scene | Method | Seeds | Environment | Normals |\n|---|---|---|---|---|"
     for scene in results.scenes:
         for method in results.methods:
             clean = [each for each in results.outcomes if each.cell.axis is None and not each.failure]
@@ -148,7 +148,7 @@ def _verdict_lines(results: Results) -> Iterator[str]:
     yield "not lost. Left out: fits without a risk, and those whose clean fit is refused,"
     yield f"{', '.join(refused) or 'none'}."
     yield ""
-    yield "| Scenes | Method | Fits | Lost | AUROC of the risk |\n| --- | --- | --- | --- | --- |"
+    yield "| Scenes | Method | Fits | Lost | AUROC of the risk |\n|---|---|---|---|---|"
     groups = {split: list(judged(results, split)) for split in SPLITS}
     for split, fits in groups.items():
         for method in results.methods:
@@ -161,7 +161,7 @@ def _verdict_lines(results: Results) -> Iterator[str]:
     yield ""
     headings = [f"{split}: {word}" for split in SPLITS for word in ("kept", "lost")]
     yield f"| Verdict of {main} | " + " | ".join(headings) + " |"
-    yield "| --- " * (1 + len(headings)) + "|"
+    yield "|---" * (1 + len(headings)) + "|"
     for verdict in VERDICTS:
         counts = (_counted(groups[split], main, verdict, lost) for split in SPLITS for lost in (False, True))
         yield f"| {verdict} | " + " | ".join(map(str, counts)) + " |"

@@ -54,13 +54,12 @@ def page_lines(results: Results, numbers: str) -> Iterator[str]:
     steps = "in fewer steps than published" if FEWER_STEPS in results.schedule else "in all of their steps"
     options = f", with `{results.schedule}`" if results.schedule else ""
     yield f"{size.train} training and {size.test} test views of {size.resolution} × {size.resolution} pixels. Rows"
-    yield "*as published* are figures of the paper, of its scenes at its size: compare orders, not levels. The paper's"
-    yield "method and the compared methods are [re-implementations](../explanation/compared-methods.md),"
+    yield "*as published* are figures of the paper, of its scenes at its size: compare orders, not levels. The other"
+    yield "methods are [re-implementations](../explanation/compared-methods.md),"
     yield f"{steps}{options}."
-    yield "Cells are medians over seeds, with the lowest and the highest where seeds differ. **Best** and *second best*"
-    yield "are marked among published and among measured rows, without the"
-    yield "[oracle baseline](../explanation/oracle-baseline.md). All scores follow the paper's protocol. Seconds are"
-    yield f"processor time of the whole command, averaged over scenes. [Numbers]({numbers}) have more columns."
+    yield "Cells are medians over seeds, with the range where seeds differ. **Best** and *second best* are marked,"
+    yield "without the [oracle baseline](../explanation/oracle-baseline.md). Scores follow the paper's protocol."
+    yield f"Seconds are means over scenes. [Numbers]({numbers}) have more columns."
     for table in TABLES.values():
         measured = list(_measured(table, results.outcomes))
         if measured:
@@ -119,20 +118,23 @@ def _table_lines(table: Table, measured: list[Line]) -> Iterator[str]:
     if table.averaged:
         groups = {name: [*lines, *averages(lines, table.scenes)] for name, lines in groups.items()}
     places = list(dict.fromkeys(line.scene for line in groups["measured"]))
-    shown = [(table.columns.index(column), column) for column in table.shown]
+    shown = [(table.columns.index(column), column) for column in table.shown if column != SECONDS]
     headings = [
         place if k else f"{column.title} {column.direction.value}: {place}"
         for _, column in shown
         for k, place in enumerate(places)
     ]
-    yield "| Method | " + " | ".join([*headings, f"{SECONDS.title} {SECONDS.direction.value}"]) + " |"
-    yield "| --- " * (2 + len(headings)) + "|"
+    if SECONDS in table.shown:
+        headings.append(f"{SECONDS.title} {SECONDS.direction.value}")
+    yield "| Method | " + " | ".join(headings) + " |"
+    yield "|---" * (1 + len(headings)) + "|"
     for name, lines in groups.items():
         marks = {place: marked(table.columns, [line for line in lines if line.scene == place]) for place in places}
         seconds = marked((SECONDS,), list(_seconds(table, lines)))
         for method in dict.fromkeys(line.method for line in lines if line.scene in places):
             rows = [marks[place].get(method) for place in places]
-            cells = [row[i] if row else "–" for i, _ in shown for row in rows] + seconds[method]
+            cells = [row[i] if row else "–" for i, _ in shown for row in rows]
+            cells += seconds[method] if SECONDS in table.shown else []
             label = f"{method}, as published" if name == "published" else method
             yield f"| {label} | " + " | ".join(cells) + " |"
 
