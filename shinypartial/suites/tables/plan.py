@@ -140,7 +140,7 @@ ON_OURS = "--config.surfels.initial thin-plate"
 TABLES: dict[TableName, Table] = {
     "main": Table(
         "Main table",
-        "All methods on the three scenes, and their means.",
+        "All methods on three scenes.",
         ("vase", "cola", "mirror"),
         (*COMPARED, PAPERS, DEFAULT, BASELINE),
         (*ENVIRONMENT, *NORMALS, *COST),
