@@ -1,4 +1,4 @@
-"""Make docs/results/ablations.md: every scene, one part left out, surfels flat and curved, the paper's method.
+"""Make the tables of docs/results/ablations.md: one part left out, surfels flat and curved, the paper's method.
 
     for S in vase cola mirror deformed-mirror sculpture; do shinypartial generate --scene $S --resolution 400; done
     for S in vase cola mirror deformed-mirror sculpture; do shinypartial oracle datasets/$S-400; done
@@ -7,20 +7,22 @@
 Every row is `panoless fit` and `shinypartial evaluate` in a process of its own. What was scored before is kept, so the
 command continues where it stopped; delete predictions/ablations and the runs of these names to begin anew. Normals and
 renders are scored on every fifth test view. `--seeds 0 1 2` sets the seeds, `--tables levers counts` makes some tables
-only, `--collect` writes the page from what is there.
+only, `--collect` none. The numbers lie in docs/results/ablations.json, and the tables between the marks of the page.
 """
 
 import argparse
+import functools
 import json
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from shinypartial.evaluation.scores import Scores, read_scores
-from shinypartial.io.files import atomic_write, write_json
+from shinypartial.io.files import write_between, write_json
 from shinypartial.prediction.format import read_info
 
 PAGE = Path("docs/results/ablations.md")
@@ -39,8 +41,6 @@ class Row:
     scene: str
     arguments: tuple[str, ...] = ()
     one_seed: bool = False
-    of_table: str = ""
-    """The table whose prediction it shares; else it has its own."""
 
 
 @dataclass(frozen=True)
@@ -69,25 +69,6 @@ class Figures:
     paper: PaperFigures | None
 
 
-Column = tuple[str, Callable[[Figures], float | None], int]
-COLUMNS: tuple[Column, ...] = (
-    ("Environment, observed dB", lambda f: f.observed, 2),
-    ("full dB", lambda f: f.full, 2),
-    ("Normals, mean °", lambda f: f.normal_mean, 2),
-    ("median °", lambda f: f.normal_median, 2),
-    ("Render dB", lambda f: f.render, 2),
-    ("AUROC", lambda f: f.auroc, 3),
-    ("Seconds", lambda f: f.seconds, 0),
-)
-PAPER_COLUMNS: tuple[Column, ...] = (
-    ("Environment dB", lambda f: f.paper and f.paper.environment, 2),
-    ("Normals, mean °", lambda f: f.paper and f.paper.normal_mean, 2),
-    ("median °", lambda f: f.paper and f.paper.normal_median, 2),
-    ("Render dB", lambda f: f.paper and f.paper.render, 2),
-    ("Seconds", lambda f: f.seconds, 0),
-)
-
-
 @dataclass(frozen=True)
 class Table:
     """Rows under a heading, with a sentence that says how to read them."""
@@ -95,40 +76,28 @@ class Table:
     title: str
     text: str
     rows: tuple[Row, ...]
-    columns: tuple[Column, ...] = ()
-    published: tuple[tuple[str, ...], ...] = ()
-    """Scene, name and cells of rows as the paper prints them."""
+    figure: tuple[str, ...] = ("observed",)
+    """The place of what is shown among the figures of a fit; nothing: the text alone."""
 
 
 SCENES = ("vase", "cola", "mirror", "deformed-mirror", "sculpture")
 LEVERS: tuple[tuple[str, tuple[str, ...]], ...] = (
-    ("default", ()),
-    ("hull without completion", ("--config.surfels.initial", "hull")),
     ("random surfels", ("--config.surfels.initial", "random")),
-    ("no warm-up", ("--config.environment.warmup", "0")),
     ("flat surfels", ("--config.surfels.no-curved",)),
-    ("all pixels vote (no robust weights)", ("--config.loss.robust-scale", "0")),
-    ("no closed-form map", ("--config.environment.no-solve",)),
-    ("sigmoid map", ("--config.environment.activation", "sigmoid", "--config.environment.no-solve")),
 )
 TABLES = {
-    "figures": Table(
-        "Figures",
-        "`panoless fit` as it is, beside the oracle baseline of each scene.",
-        tuple(Row("default", scene) for scene in SCENES),
-    ),
     "levers": Table(
         "Leave one out",
-        "The default without one of its parts, on the scene that is fitted with free surfels; and the ladder, "
-        "self-reflection and fill on the scenes in which it takes another rung, where they act. Their default is in "
-        "*Figures*; what takes part in these models does not depend on the seed.",
+        "Environment, linear PSNR over observed directions, of `panoless fit` and without one of its parts: medians "
+        "over seeds.",
         (
-            *(Row(name, "sculpture", arguments) for name, arguments in LEVERS),
-            *(Row("no ladder", scene, ("--model", "surfels")) for scene in SCENES[:-1]),
+            *(Row("default", scene) for scene in SCENES),
+            *(Row("surfels", scene, ("--model", "surfels")) for scene in SCENES),
+            *(Row(name, "sculpture", ("--model", "surfels", *arguments)) for name, arguments in LEVERS),
             *(
                 Row(name, scene, (f"--config.environment.no-{option}",), one_seed=True)
                 for name, option, scenes in (
-                    ("self-reflecting pixels vote in the map", "trace", SCENES[:3]),
+                    ("with pixels that see the object again", "trace", SCENES[:3]),
                     ("no fill", "fill", ("mirror", "deformed-mirror")),
                 )
                 for scene in scenes
@@ -137,10 +106,9 @@ TABLES = {
     ),
     "counts": Table(
         "Surfels, flat and curved",
-        "`--model surfels` with fewer and more surfels, with and without a linear normal field each. The charts are "
-        "those of `shinypartial chart predictions/ablations/counts-* --size primitives`.\n\n"
-        "![Environment PSNR (sRGB) against the number of surfels](images/chart-counts.svg)\n"
-        "![Median normal error against the number of surfels](images/chart-counts-normals.svg)",
+        "The vase; charts by `shinypartial chart predictions/ablations/counts-* --size primitives`.\n\n"
+        "![Environment PSNR (sRGB) against the number of surfels](../images/chart-counts.svg)\n"
+        "![Median normal error against the number of surfels](../images/chart-counts-normals.svg)",
         tuple(
             Row(
                 f"{count} {kind}",
@@ -151,14 +119,13 @@ TABLES = {
             for kind, switch in (("flat", "no-curved"), ("curved", "curved"))
             for count in (500, 1000, 2000, 4000, 8000, 16000)
         ),
+        (),
     ),
     "paper": Table(
         "The paper's method",
-        "Our implementation of the paper's method and of its ablations: the whole schedule of 45,000 iterations, at a "
-        "quarter of the resolution and with as many surfels a pixel (6,250 at first, 12,500 at most), scored as all "
-        "else at 400 pixels, under the protocol paper-v1. The paper's figures are of its own scenes, at its own size.",
-        tuple(Row("default", scene, one_seed=True, of_table="figures") for scene in SCENES)
-        + tuple(
+        "All 45,000 steps at a quarter of the resolution, with 6,250 surfels at first and 12,500 at most, scored at "
+        "400 pixels. Environment by the paper's protocol.",
+        tuple(
             Row(
                 preset,
                 scene,
@@ -177,15 +144,7 @@ TABLES = {
             )
             for scene in scenes
         ),
-        PAPER_COLUMNS,
-        (
-            ("their vase", "paper, as published", "18.51", "3.97", "2.73", "38.56"),
-            ("their vase", "paper-rho-weighted, as published", "13.94", "–", "–", "36.16"),
-            ("their vase", "paper-no-silhouette, as published", "12.91", "–", "–", "33.75"),
-            ("their vase", "paper-no-normal, as published", "8.68", "–", "–", "35.82"),
-            ("their cola", "paper, as published", "9.26", "6.25", "3.21", "–"),
-            ("their mirror", "paper, as published", "13.31", "4.64", "4.62", "–"),
-        ),
+        ("paper", "environment"),
     ),
 }
 
@@ -225,7 +184,7 @@ def paper_figures_of(scores: Scores) -> PaperFigures | None:
 def folder_of(table: str, row: Row, seed: int) -> Path:
     """Where the prediction of a row and a seed lies."""
     words = "".join(letter if letter.isalnum() else "-" for letter in row.name.lower())
-    return PREDICTIONS / f"{row.of_table or table}-{row.scene}-{words}-{seed}"
+    return PREDICTIONS / f"{table}-{row.scene}-{words}-{seed}"
 
 
 def thinned(dataset: Path) -> Path:
@@ -253,7 +212,7 @@ def make(table: str, row: Row, seed: int) -> None:
     script = Path(sys.executable).parent
     arguments = [*row.arguments, "--config.seed", str(seed), "--output", str(folder)]
     subprocess.run([script / "panoless", "fit", dataset, *arguments], check=True)
-    scoring = ["--dataset", dataset, "--protocol", "both" if table in ("figures", "paper") else "linear-v1"]
+    scoring = ["--dataset", dataset, "--protocol", "both" if table == "paper" else "linear-v1"]
     subprocess.run([script / "shinypartial", "evaluate", folder, *scoring], check=True)
 
 
@@ -268,59 +227,43 @@ def found(table: str, row: Row, seeds: list[int]) -> list[Figures]:
     return [figures_of(folder) for folder in folders if (folder / "scores.json").exists()]
 
 
-def cell(values: list[float | None], digits: int = 2) -> str:
-    """Median, and lowest to highest where there are several."""
-    known = [value for value in values if value is not None]
-    if not known:
-        return "–"
-    middle = f"{statistics.median(known):.{digits}f}"
-    return middle if len(known) == 1 else f"{middle} ({min(known):.{digits}f}–{max(known):.{digits}f})"
+def cell(made: dict[str, Any] | None, place: Sequence[str]) -> str:
+    """Median over fits, in dB."""
+    values = (
+        [functools.reduce(lambda part, key: part and part[key], place, fit) for fit in made["fits"]] if made else []
+    )
+    return f"{statistics.median(values):.2f}" if values and None not in values else "–"
 
 
-def markdown(table: str, seeds: list[int]) -> Iterator[str]:
-    """The lines of a table."""
-    content = TABLES[table]
-    columns = content.columns or COLUMNS
+def markdown(content: Table, known: dict[tuple[str, str], dict[str, Any]]) -> Iterator[str]:
+    """A table as Markdown, scenes by variants."""
     yield from (f"## {content.title}", "", content.text, "")
-    yield "| Scene | | " + " | ".join(name for name, _, _ in columns) + " | Model | Parameters |"
-    yield "| --- " * (len(columns) + 4) + "|"
-    for scene, name, *cells in content.published:
-        yield f"| {scene} | {name} | " + " | ".join(cells) + " |" + " – |" * (len(columns) + 2 - len(cells))
-    shown = set()
-    for row in content.rows:
-        figures = found(table, row, seeds)
-        oracle = Path("predictions") / f"{row.scene}-400-oracle"
-        if not content.columns and row.scene not in shown and (oracle / "scores.json").exists():
-            best = figures_of(oracle)
-            cells = f"{cell([best.observed])} | {cell([best.full])}"
-            yield f"| {row.scene} | oracle baseline | {cells} |" + " – |" * len(columns)
-        shown.add(row.scene)
-        if not figures:
-            continue
-        cells = [cell([of(figure) for figure in figures], digits) for _, of, digits in columns]
-        models = "/".join(sorted({figure.model or "?" for figure in figures}))
-        yield f"| {row.scene} | {row.name} | " + " | ".join([*cells, models, str(figures[0].parameters)]) + " |"
+    if not content.figure:
+        return
+    names = list(dict.fromkeys(row.name for row in content.rows))
+    yield f"| Scene | {' | '.join(names)} |"
+    yield "|---" * (1 + len(names)) + "|"
+    for scene in SCENES:
+        cells = [cell(known.get((scene, name)), content.figure) for name in names]
+        if set(cells) != {"–"}:
+            yield f"| {scene} | {' | '.join(cells)} |"
     yield ""
 
 
 def collect(seeds: list[int]) -> None:
-    """Write the page and the numbers behind it."""
-    num_parameters = {
-        table: [
-            {"name": row.name, "scene": row.scene, "arguments": row.arguments, "fits": [asdict(f) for f in figures]}
-            for row in content.rows
-            if (figures := found(table, row, seeds))
-        ]
-        for table, content in TABLES.items()
-    }
-    write_json(NUMBERS, num_parameters)
-    introduction = PAGE.read_text(encoding="utf-8").split("\n## ")[0].rstrip() if PAGE.exists() else "# Ablations"
-    lines = [introduction, ""]
-    for table in TABLES:
-        if num_parameters[table]:
-            lines.extend(markdown(table, seeds))
-    with atomic_write(PAGE) as temporary:
-        temporary.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+    """Bring the numbers up to date with what is there, then the tables of the page."""
+    numbers = json.loads(NUMBERS.read_text(encoding="utf-8")) if NUMBERS.exists() else {}
+    lines = []
+    for table, content in TABLES.items():
+        known = {(made["scene"], made["name"]): made for made in numbers.get(table, [])}
+        for row in content.rows:
+            if fits := [asdict(each) for each in found(table, row, seeds)]:
+                made = {"name": row.name, "scene": row.scene, "arguments": row.arguments, "fits": fits}
+                known[row.scene, row.name] = made
+        numbers[table] = list(known.values())
+        lines += markdown(content, known)
+    write_json(NUMBERS, numbers)
+    write_between(PAGE, "ablations", lines[:-1])
 
 
 def main() -> None:

@@ -22,7 +22,7 @@ from shinypartial.dataset.read import DEFAULT_FOLDER as DATASETS
 from shinypartial.dataset.read import open_dataset
 from shinypartial.dataset.schema import CHECKSUMS
 from shinypartial.evaluation.scores import read_scores
-from shinypartial.io.files import write_json, write_text
+from shinypartial.io.files import write_between, write_json
 from shinypartial.prediction.format import DEFAULT_FOLDER as PREDICTIONS
 from shinypartial.prediction.format import DESCRIPTION, ORACLE_SUFFIX, read_info
 
@@ -145,12 +145,7 @@ def collect(resolution: int) -> None:
             }
     write_json(NUMBERS, numbers)
     for name, page in PAGES.items():
-        begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
-        text = page.read_text(encoding="utf-8") if page.exists() else ""
-        if begin in text and end in text:
-            lines = table(numbers, ("observed",) if page.name == "README.md" else ("observed", "full"))
-            before, _, rest = text.partition(begin)
-            write_text(page, "\n".join([before + begin, "", *lines, "", end + rest.partition(end)[2]]))
+        write_between(page, name, table(numbers, ("observed",) if page.name == "README.md" else ("observed", "full")))
 
 
 def table(numbers: dict[str, Any], regions: Sequence[str]) -> list[str]:

@@ -100,6 +100,17 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
+def write_between(page: Path, name: str, lines: Iterable[str]) -> bool:
+    """Replace the lines between `<!-- NAME:begin -->` and `<!-- NAME:end -->` of a page; False without these marks."""
+    text = page.read_text(encoding="utf-8") if page.exists() else ""
+    before, begin, rest = text.partition(f"<!-- {name}:begin -->")
+    _, end, after = rest.partition(f"<!-- {name}:end -->")
+    if not end:
+        return False
+    write_text(page, "\n".join([before + begin, "", *lines, "", end + after]))
+    return True
+
+
 def write_json(path: Path, content: Any) -> None:
     """Write strict JSON (no NaN or infinity), whole or not at all."""
     write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")

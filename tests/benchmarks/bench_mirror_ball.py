@@ -26,10 +26,9 @@ from shinypartial.dataset.read import open_dataset
 from shinypartial.dataset.schema import Frame
 from shinypartial.dataset.subset import files_of
 from shinypartial.evaluation.direct_views import DIRECT_SCORES
-from shinypartial.io.files import link_or_copy, read_json, write_json
+from shinypartial.io.files import link_or_copy, read_json, write_between, write_json
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-BEGIN, END = "<!-- mirror-ball:begin -->", "<!-- mirror-ball:end -->"
 LEVEL_DEG = 15.0
 """Cameras below this elevation look at walls and ceiling, the others at the floor and the table."""
 
@@ -98,12 +97,10 @@ def main() -> None:
         print(json.dumps(asdict(results[-1])), file=sys.stderr)
     if options.json:
         write_json(options.json, {"held_out": held_out, "results": [asdict(each) for each in results]})
-    lines = "\n".join(table(results))
-    print(lines)
+    lines = table(results)
+    print("\n".join(lines))
     if options.page:
-        text = options.page.read_text(encoding="utf-8")
-        before, after = text.split(BEGIN)[0], text.split(END)[1]
-        options.page.write_text(f"{before}{BEGIN}\n\n{lines}\n\n{END}{after}", encoding="utf-8")
+        write_between(options.page, "mirror-ball", lines)
 
 
 class CommandError(Exception):
@@ -188,36 +185,32 @@ def _result(
 
 
 def table(results: Sequence[Result]) -> list[str]:
-    """Rows of Markdown: medians over all held-out cameras, with those of level ones behind the stroke."""
+    """Rows of Markdown: medians over all held-out cameras; of features, those of level ones behind the stroke."""
     lines = [
-        "| Poses by | Training cameras | Features off by | … across | Correlation in the band | Correlation | "
-        "PSNR, sRGB | PSNR, linear | Brightest lamp off by |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| Poses by | Cameras | Features off by | … across | Correlation | PSNR, sRGB |",
+        "|---|---|---|---|---|---|",
     ]
 
-    def row(title: str, count: str, median: dict[str, Any], level: dict[str, Any] | None, lamp: str) -> str:
-        def both(name: str, spec: str, unit: str) -> str:
-            shown = [median[name]] + ([] if level is None else [level[name]])
-            return " / ".join("–" if each is None else f"{each:{spec}}" for each in shown) + unit
+    def row(title: str, count: str, median: dict[str, Any], level: dict[str, Any] | None) -> str:
+        def text(figures: dict[str, Any], name: str, digits: int = 2) -> str:
+            return "–" if figures[name] is None else f"{figures[name]:.{digits}f}"
 
-        cells = [both("offset_deg", ".2f", "°"), both("across_deg", ".2f", "°"), both("correlation", ".2f", "")]
-        cells += [both("correlation_unfiltered", ".2f", "")]
-        cells += [both("psnr_srgb", ".1f", " dB"), both("psnr_linear", ".1f", " dB")]
-        return f"| {' | '.join([title, count, *cells, lamp])} |"
+        offsets = " / ".join(text(each, "offset_deg") for each in (median, level) if each is not None)
+        cells = [f"{offsets}°", f"{text(median, 'across_deg')}°", text(median, "correlation")]
+        cells.append(f"{text(median, 'psnr_srgb', 1)} dB")
+        return f"| {' | '.join([title, count, *cells])} |"
 
     titles = {"all": "all photographs", "alone": "these alone"}
     chances = []
     for each in results:
         if each.scores is None or each.level is None:
-            lines.append(f"| {titles[each.poses]} | {each.cameras} | failed: {each.message} | | | | | | |")
+            lines.append(f"| {titles[each.poses]} | {each.cameras} | failed: {each.message} | | | |")
             continue
-        lamp = f"{each.scores['lamp_error_deg']:.1f}°"
-        lines.append(row(titles[each.poses], str(each.cameras), each.scores["median"], each.level, lamp))
+        lines.append(row(titles[each.poses], str(each.cameras), each.scores["median"], each.level))
         chances.append(each.scores["chance"])
     if chances:
-        lamps = [each.scores["lamp_chance_deg"] for each in results if each.scores and each.scores["lamps"]]
         medians = {name: float(np.median([each[name] for each in chances])) for name in chances[0]}
-        lines.append(row("*chance: the map turned*", "", medians, None, f"{np.median(lamps):.1f}°"))
+        lines.append(row("*chance: the map turned*", "", medians, None))
     return lines
 
 

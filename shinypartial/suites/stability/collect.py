@@ -19,8 +19,8 @@ from shinypartial.suites.stability.axes import BY_NAME, Axis
 from shinypartial.suites.stability.plan import Cell, Plan
 
 FORMAT, FORMAT_VERSION = "shinypartial-stability", 1
-#: A fit is lost where its environment is this much worse than that of the clean fit, or its normals this many times.
-LOST_DB, LOST_FACTOR = 3.0, 3.0
+#: A fit is lost where its environment is this much worse than that of the clean fit.
+LOST_DB = 3.0
 #: The verdict on a fit that is of no use.
 REFUSED = "do not trust"
 DIGITS = 4
@@ -178,31 +178,18 @@ def crossing(positions: Sequence[float], losses: Sequence[float | None], limit: 
     return None
 
 
-@dataclass(frozen=True)
-class Limits:
-    """Positions on an axis at which scenes are lost; None for a scene that is not lost within the range."""
-
-    environment: tuple[float | None, ...]
-    normals: tuple[float | None, ...]
-
-
-def limits(results: Results, axis: Axis, method: str) -> Limits:
-    """Where each scene loses LOST_DB of its environment, and where its normals are LOST_FACTOR times worse."""
-    environment, normals = [], []
+def limits(results: Results, axis: Axis, method: str) -> tuple[float | None, ...]:
+    """Positions on an axis at which scenes lose LOST_DB of their environment; None for one that does not within it."""
+    found = []
     for scene in results.scenes:
         levels = results.along(axis, method, scene)
-        if 0.0 not in {position - axis.position(None) for position in levels} or len(levels) < 2:
+        if axis.position(None) not in levels or len(levels) < 2:
             continue
-        positions = list(levels)
         decibels = [mean(each.environment_db for each in level) for level in levels.values()]
-        degrees = [mean(each.normals_mean_deg for each in level) for level in levels.values()]
         if decibels[0] is not None:
             drops = [None if value is None else decibels[0] - value for value in decibels]
-            environment.append(crossing(positions, drops, LOST_DB))
-        if degrees[0]:
-            ratios = [None if value is None else value / degrees[0] for value in degrees]
-            normals.append(crossing(positions, ratios, LOST_FACTOR))
-    return Limits(tuple(environment), tuple(normals))
+            found.append(crossing(list(levels), drops, LOST_DB))
+    return tuple(found)
 
 
 def mean(values: Iterable[float | None]) -> float | None:

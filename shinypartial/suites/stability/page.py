@@ -1,4 +1,4 @@
-"""The page: curves, levels at which methods break, how well verdicts knew it, and the paper's figures beside ours."""
+"""The page: losses, levels at which methods are lost, curves, and how well verdicts find lost fits."""
 
 import math
 import statistics
@@ -6,10 +6,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from shinypartial.io.files import write_text
-from shinypartial.suites.stability.axes import BY_NAME, Axis
+from shinypartial.suites.stability.axes import Axis
 from shinypartial.suites.stability.collect import (
     LOST_DB,
-    LOST_FACTOR,
     REFUSED,
     Judged,
     Results,
@@ -25,8 +24,6 @@ from shinypartial.suites.stability.plan import TINY
 RESULTS, ASSETS = Path("results/stability.json"), Path("assets")
 SPLITS = ("development", "held-out")
 VERDICTS = ("trust", "partly", "do not trust")
-#: Pose jitter on the paper's own Vase (its supplement): degrees, and PSNR of the environment map, from one seed.
-PAPER_JITTER = {0.0: 18.41, 0.5: 12.04, 1.0: 11.71}
 
 
 def write_stability_page(page: Path, suite: Path, results: Results) -> None:
@@ -45,7 +42,7 @@ def page_lines(results: Results, pictures: Sequence[tuple[str, str]]) -> Iterato
     seeds = len({each.cell.seed for each in results.outcomes})
     yield from ("# Stability", "")
     counts = (_count(len(results.scenes), "scene"), _count(len(results.methods), "method"), _count(seeds, "seed"))
-    yield f"{_count(len(results.outcomes), 'fit')} on data that get worse step by step: {', '.join(counts)}."
+    yield f"{_count(len(results.outcomes), 'fit')} to photographs that are worse step by step: {', '.join(counts)}."
     if TINY not in results.scenes:
         yield f"Datasets have {size.train} training views of {size.resolution} × {size.resolution} pixels."
     yield from ("", f"- Scenes: {', '.join(results.scenes)}", f"- Methods: {', '.join(_methods(results))}")
@@ -53,19 +50,19 @@ def page_lines(results: Results, pictures: Sequence[tuple[str, str]]) -> Iterato
     yield from ("", "Environment: PSNR of linear light over the directions that the true training views observe.")
     yield "Normals: pooled over pixels of test views that see the environment."
     if results.axes:
-        yield from ("", "## Where methods break", "", *_limit_table(results))
+        yield from ("", "## Losses", "", *_loss_table(results))
+        yield from ("", "## Limits", "", *_limit_table(results))
         text = "Means over scenes; the band is the range over seeds. Failed fits are left out."
         yield from ("", "## Curves", "", text)
     for axis in results.axes:
         yield from ("", f"![Curves: {axis.title}]({ASSETS.as_posix()}/stability-{axis.name}.svg)")
     if seeds > 1:
         yield from ("", "## Spread over seeds", "", *_spread_lines(results))
-    yield from ("", "## How well the verdicts knew", "", *_verdict_lines(results))
-    yield from ("", "## Pose jitter, beside the paper", "", *_jitter_lines(results))
+    yield from ("", "## Verdicts", "", *_verdict_lines(results))
     if pictures:
-        yield from ("", "## What breaking looks like")
+        yield from ("", "## Maps")
         for name, caption in pictures:
-            yield from ("", f"![Environment maps: {caption}]({ASSETS.as_posix()}/{name})", "", f"{caption}.")
+            yield from ("", f"![Environment maps: {caption}]({ASSETS.as_posix()}/{name})")
     failed = [each for each in results.outcomes if each.failure]
     if failed:
         yield from ("", "## Failed fits", "", "| Fit | Last line |", "| --- | --- |")
@@ -79,17 +76,40 @@ def _methods(results: Results) -> Iterator[str]:
         yield method if len(scenes) == len(results.scenes) else f"{method} ({', '.join(scenes)} only)"
 
 
-def _limit_table(results: Results) -> Iterator[str]:
-    yield f"The level at which the environment has lost {LOST_DB:g} dB, and at which the mean error of the normals is"
-    yield f"{LOST_FACTOR:g} times that of the clean fit, linear between levels: median over scenes, and its range. A"
-    yield "level at which no seed gave a result counts as lost. A dash: not within the range of levels."
+def _loss_table(results: Results) -> Iterator[str]:
+    method = results.methods[0]
+    yield f"Loss of the environment by {method} in dB, against the clean fit of the scene, whose level is in the first"
+    yield f"row. Losses of {LOST_DB:g} dB and more are bold, gains negative."
     yield ""
-    headings = [f"{method}: {what}" for method in results.methods for what in ("environment", "normals")]
-    yield "| Axis | " + " | ".join(headings) + " |"
-    yield "| --- " * (1 + len(headings)) + "|"
+    yield f"| | {' | '.join(results.scenes)} |"
+    yield "|---" * (1 + len(results.scenes)) + "|"
+    outcomes = [each for each in results.outcomes if each.cell.method == method and each.cell.axis is None]
+    clean = {name: mean(each.environment_db for each in outcomes if each.cell.scene == name) for name in results.scenes}
+    yield f"| Clean | {' | '.join('–' if each is None else f'{each:.2f}' for each in clean.values())} |"
     for axis in results.axes:
-        found = [limits(results, axis, method) for method in results.methods]
-        cells = [_limit_text(axis, each) for one in found for each in (one.environment, one.normals)]
+        found = {scene: results.along(axis, method, scene) for scene in results.scenes}
+        for position in sorted({each for levels in found.values() for each in levels if each > 0}):
+            values = {name: mean(each.environment_db for each in found[name].get(position, [])) for name in clean}
+            cells = [_loss_text(clean[name], value) for name, value in values.items()]
+            yield f"| {axis.title}: {axis.text(position).strip()} | {' | '.join(cells)} |"
+
+
+def _loss_text(clean: float | None, value: float | None) -> str:
+    if clean is None or value is None:
+        return "–"
+    loss = clean - value
+    text = f"{round(loss, 1) + 0.0:.1f}"
+    return f"**{text}**" if loss >= LOST_DB else text
+
+
+def _limit_table(results: Results) -> Iterator[str]:
+    yield f"Level at which the environment loses {LOST_DB:g} dB, linear between levels: median over scenes, with the"
+    yield "range. A level without a result counts as lost. A dash: not within the levels."
+    yield ""
+    yield f"| Axis | {' | '.join(results.methods)} |"
+    yield "|---" * (1 + len(results.methods)) + "|"
+    for axis in results.axes:
+        cells = [_limit_text(axis, limits(results, axis, method)) for method in results.methods]
         yield f"| {axis.title} | " + " | ".join(cells) + " |"
 
 
@@ -106,7 +126,7 @@ def _limit_text(axis: Axis, positions: Sequence[float | None]) -> str:
 def _spread_lines(results: Results) -> Iterator[str]:
     yield "Standard deviation over seeds on clean data, of the environment and of the normals' mean error."
     yield ""
-    yield "| Scene | Method | Seeds | Environment | Normals |\n| --- | --- | --- | --- | --- |"
+    yield "| Scene | Method | Seeds | Environment | Normals |\n|---|---|---|---|---|"
     for scene in results.scenes:
         for method in results.methods:
             clean = [each for each in results.outcomes if each.cell.axis is None and not each.failure]
@@ -125,10 +145,10 @@ def _verdict_lines(results: Results) -> Iterator[str]:
     refused = dict.fromkeys(f"{each.cell.scene} with {each.cell.method}" for each in clean)
     yield f"A fit is *lost* where its environment is {LOST_DB:g} dB or more worse than that of the clean fit of the"
     yield "same scene, method and seed. AUROC: the chance that a lost fit states a higher risk than one that is"
-    yield "not lost. Fits that state no risk are left out, and those of a scene and method whose clean fit is"
-    yield f"refused by its own verdict: {', '.join(refused) or 'none'}."
+    yield "not lost. Left out: fits without a risk, and those whose clean fit is refused,"
+    yield f"{', '.join(refused) or 'none'}."
     yield ""
-    yield "| Scenes | Method | Fits | Lost | AUROC of the risk |\n| --- | --- | --- | --- | --- |"
+    yield "| Scenes | Method | Fits | Lost | AUROC of the risk |\n|---|---|---|---|---|"
     groups = {split: list(judged(results, split)) for split in SPLITS}
     for split, fits in groups.items():
         for method in results.methods:
@@ -141,7 +161,7 @@ def _verdict_lines(results: Results) -> Iterator[str]:
     yield ""
     headings = [f"{split}: {word}" for split in SPLITS for word in ("kept", "lost")]
     yield f"| Verdict of {main} | " + " | ".join(headings) + " |"
-    yield "| --- " * (1 + len(headings)) + "|"
+    yield "|---" * (1 + len(headings)) + "|"
     for verdict in VERDICTS:
         counts = (_counted(groups[split], main, verdict, lost) for split in SPLITS for lost in (False, True))
         yield f"| {verdict} | " + " | ".join(map(str, counts)) + " |"
@@ -150,21 +170,6 @@ def _verdict_lines(results: Results) -> Iterator[str]:
 def _counted(fits: Sequence[Judged], method: str, verdict: str, lost: bool) -> int:
     outcomes = (each.outcome for each in fits if each.lost == lost)
     return sum((each.cell.method, each.verdict) == (method, verdict) for each in outcomes)
-
-
-def _jitter_lines(results: Results) -> Iterator[str]:
-    yield "PSNR of the whole map by the paper's protocol, each camera turned by a fixed angle. The paper's vase"
-    yield "is its own, so that falls compare and levels do not."
-    yield ""
-    scene = next((each for each in ("vase", "tiny-vase") if each in results.scenes), results.scenes[0])
-    axis = BY_NAME["rotation"]
-    columns = [results.along(axis, method, scene) for method in results.methods]
-    yield f"| Rotation | Paper | {' | '.join(f'{method} on {scene}' for method in results.methods)} |"
-    yield "| --- " * (2 + len(columns)) + "|"
-    for position in sorted({each for column in columns for each in column} | set(PAPER_JITTER)):
-        values = [mean(each.environment_paper_db for each in column.get(position, [])) for column in columns]
-        texts = ["–" if value is None else f"{value:.2f} dB" for value in (PAPER_JITTER.get(position), *values)]
-        yield f"| {position:g}° | " + " | ".join(texts) + " |"
 
 
 def _count(number: int, noun: str) -> str:

@@ -1,17 +1,21 @@
-"""The page: each table with the paper's own figures first, and the best and the second best of each column marked."""
+"""The page: a row a method, the paper's figures first, with the best and the second best of each column marked."""
 
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from shinypartial.io.files import write_text
+from shinypartial.io.files import write_between, write_text
 from shinypartial.metrics.registry import Direction
 from shinypartial.suites.tables.collect import Outcome, Results, merged, write_results
-from shinypartial.suites.tables.plan import ORACLE, TABLES, Column, Table
+from shinypartial.suites.tables.plan import ORACLE, SECONDS, TABLES, Column, Table
 
 FEWER_STEPS = "--config.iterations"
 """What a schedule has that is not the whole one of each method."""
+MARKS = "tables"
+"""Between these marks of a page its tables stand; a page without them has nothing else."""
+MEAN = "mean"
+"""In place of a scene: means over the scenes."""
 Values = tuple[tuple[float, ...], ...]
 
 
@@ -38,27 +42,24 @@ def write_tables_page(page: Path, results: Results) -> Results:
     numbers = numbers_of(page)
     every = merged(numbers, results)
     write_results(numbers, every)
-    write_text(page, "\n".join(page_lines(every, numbers.name)) + "\n")
+    lines = list(page_lines(every, numbers.name))
+    if not write_between(page, MARKS, lines):
+        write_text(page, "\n".join(["# Tables of the paper", "", *lines]) + "\n")
     return every
 
 
 def page_lines(results: Results, numbers: str) -> Iterator[str]:
     """The page as Markdown."""
     size = results.size
-    whole = FEWER_STEPS not in results.schedule
-    title = "# Tables of the paper, by whole schedules" if whole else "# Tables of the paper"
-    yield from (title, "", "<!-- `shinypartial tables` makes this page. -->", "")
-    steps = "in all of their steps" if whole else "in fewer steps than published"
+    steps = "in fewer steps than published" if FEWER_STEPS in results.schedule else "in all of their steps"
     options = f", with `{results.schedule}`" if results.schedule else ""
-    yield f"{size.train} training and {size.test} test views of {size.resolution} × {size.resolution} pixels;"
-    yield "[what the methods are](../explanation/compared-methods.md). Rows *as published* are the paper's figures, of"
-    yield "its own scenes and its own size: compare orders, not levels. The paper's method and those that it compares"
-    yield f"with are our implementations, {steps}{options}."
-    yield "Of several seeds the median is given, with the lowest and the highest where they differ. **Best** and"
-    yield "*second best* are marked among the rows of a scene that were measured here, and among those published; the"
-    yield "[oracle baseline](../explanation/oracle-baseline.md), which knows the true normals, takes no part. Seconds"
-    yield "are processor time of the whole command. Environment, normals and renders follow the paper's protocol where"
-    yield f"nothing else is said. [Numbers]({numbers})"
+    yield f"{size.train} training and {size.test} test views of {size.resolution} × {size.resolution} pixels. Rows"
+    yield "*as published* are of the paper's scenes at its size: compare orders, not levels. The other methods are"
+    yield "[re-implementations](../explanation/compared-methods.md),"
+    yield f"{steps}{options}."
+    yield "Cells are medians over seeds, with the range where seeds differ. **Best** and *second best* are marked,"
+    yield "without the [oracle baseline](../explanation/oracle-baseline.md). Scores follow the paper's protocol."
+    yield f"Seconds are means over scenes. [Numbers]({numbers}) have more columns."
     for table in TABLES.values():
         measured = list(_measured(table, results.outcomes))
         if measured:
@@ -103,30 +104,47 @@ def averages(lines: Sequence[Line], scenes: Sequence[str]) -> list[Line]:
         if {line.scene for line in own} == set(scenes):
             columns = range(len(own[0].values))
             middles = [[line.middle(column) for line in own] for column in columns]
-            found.append(Line("mean", method, tuple(_mean(each) for each in middles)))
+            found.append(Line(MEAN, method, tuple(_mean(each) for each in middles)))
     return found
 
 
 def _mean(values: Sequence[float | None]) -> tuple[float, ...]:
     known = [value for value in values if value is not None]
-    return (statistics.fmean(known),) if len(known) == len(values) else ()
+    return (statistics.fmean(known),) if known and len(known) == len(values) else ()
 
 
 def _table_lines(table: Table, measured: list[Line]) -> Iterator[str]:
     groups = {"published": published_lines(table), "measured": measured}
     if table.averaged:
         groups = {name: [*lines, *averages(lines, table.scenes)] for name, lines in groups.items()}
-    arrows = [column.direction.value.strip("·") for column in table.columns]
-    headings = [f"{column.title} {arrow}".strip() for column, arrow in zip(table.columns, arrows, strict=True)]
-    yield "| Scene | Method | " + " | ".join(headings) + " |"
-    yield "| --- " * (2 + len(headings)) + "|"
-    for scene in dict.fromkeys(line.scene for line in groups["measured"]):
-        for name, lines in groups.items():
-            own = [line for line in lines if line.scene == scene]
-            marks = marked(table.columns, own)
-            for line in own:
-                label = f"{line.method}, as published" if name == "published" else line.method
-                yield f"| {scene} | {label} | " + " | ".join(marks[line.method]) + " |"
+    places = list(dict.fromkeys(line.scene for line in groups["measured"]))
+    shown = [(table.columns.index(column), column) for column in table.shown if column != SECONDS]
+    headings = [
+        place if k else f"{column.title} {column.direction.value}: {place}"
+        for _, column in shown
+        for k, place in enumerate(places)
+    ]
+    if SECONDS in table.shown:
+        headings.append(f"{SECONDS.title} {SECONDS.direction.value}")
+    yield "| Method | " + " | ".join(headings) + " |"
+    yield "|---" * (1 + len(headings)) + "|"
+    for name, lines in groups.items():
+        marks = {place: marked(table.columns, [line for line in lines if line.scene == place]) for place in places}
+        seconds = marked((SECONDS,), list(_seconds(table, lines)))
+        for method in dict.fromkeys(line.method for line in lines if line.scene in places):
+            rows = [marks[place].get(method) for place in places]
+            cells = [row[i] if row else "–" for i, _ in shown for row in rows]
+            cells += seconds[method] if SECONDS in table.shown else []
+            label = f"{method}, as published" if name == "published" else method
+            yield f"| {label} | " + " | ".join(cells) + " |"
+
+
+def _seconds(table: Table, lines: Sequence[Line]) -> Iterator[Line]:
+    """Of each method, the mean over what it was measured on."""
+    column = table.columns.index(SECONDS)
+    for method in dict.fromkeys(line.method for line in lines):
+        middles = [line.middle(column) for line in lines if line.method == method and line.scene != MEAN]
+        yield Line("", method, (_mean([each for each in middles if each is not None]),))
 
 
 def marked(columns: Sequence[Column], lines: Sequence[Line]) -> Mapping[str, list[str]]:
@@ -150,4 +168,4 @@ def _text(column: Column, values: tuple[float, ...]) -> str:
     if not values:
         return "–"
     texts = [f"{value:,.{column.digits}f}" for value in (statistics.median(values), min(values), max(values))]
-    return texts[0] if len(set(texts)) == 1 else f"{texts[0]} ({texts[1]} to {texts[2]})"
+    return texts[0] if len(set(texts)) == 1 else f"{texts[0]} ({texts[1]}–{texts[2]})"

@@ -76,35 +76,6 @@ class Column:
 OF_COST = ("seconds", "parameters")
 
 
-@dataclass(frozen=True)
-class Table:
-    """Rows and columns under a heading."""
-
-    title: str
-    text: str
-    scenes: tuple[str, ...]
-    methods: tuple[Method, ...]
-    columns: tuple[Column, ...]
-    figures: published.Figures
-    conditions: tuple[Condition, ...] = (Condition(),)
-    averaged: bool = False
-    """Whether means over scenes are shown, too."""
-
-
-def _fit(preset: str, options: str = "{schedule}") -> str:
-    return f"panoless fit {{dataset}} --preset {preset} {options} --config.seed {{seed}} --output {{prediction}}"
-
-
-COMPARED = (
-    Method(DR, _fit("3dgs-dr")),
-    Method(SHADER, _fit("gaussian-shader")),
-    Method(REF, _fit("ref-gaussian")),
-    Method(MATERIAL, _fit("material-refgs")),
-)
-PAPERS = Method(PAPER, _fit("paper"))
-DEFAULT = Method(OURS, _fit("default", ""))
-BASELINE = Method(ORACLE, "shinypartial oracle {dataset} --output {prediction}")
-ON_OURS = "--config.surfels.initial thin-plate"
 ENVIRONMENT = (
     Column("paper.environment.psnr_reinhard", "Environment PSNR"),
     Column("paper.environment.ssim_reinhard", "SSIM", 3),
@@ -125,39 +96,74 @@ RENDER = (
     Column("render.lpips_alex", "LPIPS", 3),
     Column("paper.render.l1", "L1", 3),
 )
-COST = (Column("seconds", "CPU seconds", 0), Column("parameters", "Parameters", 0))
+SECONDS = Column("seconds", "CPU seconds", 0)
+COST = (SECONDS, Column("parameters", "Parameters", 0))
 OBSERVED = Column("environment.as_predicted.observed.psnr_linear", "Environment, observed, linear PSNR")
 SEES_ENVIRONMENT = (
     Column("normals_environment.mean_angular_error_deg", "Normals that see the environment, mean °"),
     Column("normals_environment.median_angular_error_deg", "median °"),
 )
 
+
+@dataclass(frozen=True)
+class Table:
+    """Rows and columns under a heading."""
+
+    title: str
+    text: str
+    scenes: tuple[str, ...]
+    methods: tuple[Method, ...]
+    columns: tuple[Column, ...]
+    figures: published.Figures
+    conditions: tuple[Condition, ...] = (Condition(),)
+    averaged: bool = False
+    """Whether means over scenes are shown, too."""
+    shown: tuple[Column, ...] = (ENVIRONMENT[0], NORMALS[0])
+    """Columns of the page; its numbers have all."""
+
+
+def _fit(preset: str, options: str = "{schedule}") -> str:
+    return f"panoless fit {{dataset}} --preset {preset} {options} --config.seed {{seed}} --output {{prediction}}"
+
+
+COMPARED = (
+    Method(DR, _fit("3dgs-dr")),
+    Method(SHADER, _fit("gaussian-shader")),
+    Method(REF, _fit("ref-gaussian")),
+    Method(MATERIAL, _fit("material-refgs")),
+)
+PAPERS = Method(PAPER, _fit("paper"))
+DEFAULT = Method(OURS, _fit("default", ""))
+BASELINE = Method(ORACLE, "shinypartial oracle {dataset} --output {prediction}")
+ON_OURS = "--config.surfels.initial thin-plate"
+
 TABLES: dict[TableName, Table] = {
     "main": Table(
         "Main table",
-        "All methods on the three scenes, and their means.",
+        "All methods on three scenes.",
         ("vase", "cola", "mirror"),
         (*COMPARED, PAPERS, DEFAULT, BASELINE),
         (*ENVIRONMENT, *NORMALS, *COST),
         published.MAIN,
         averaged=True,
+        shown=(ENVIRONMENT[0], NORMALS[0], SECONDS),
     ),
     "fairness": Table(
         "The same silhouettes for all",
-        "The strongest of the compared methods with the paper's silhouette term in its first steps.",
+        "With the paper's silhouette term in the first steps.",
         ("cola", "vase", "mirror"),
         (Method(SILHOUETTE, _fit("material-refgs-silhouette")), PAPERS, DEFAULT),
         (NORMALS[0], NORMALS[1], NORMALS[3], *COST),
         published.FAIRNESS,
+        shown=NORMALS[:1],
     ),
     "start": Table(
         "The same first surface for all",
-        "The compared methods as in the main table, but for where their primitives begin: on our first surface.",
+        "As in the main table, but primitives start on our first surface.",
         ("vase", "cola", "mirror"),
         tuple(Method(f"{each.name} on our first surface", f"{each.command} {ON_OURS}") for each in (*COMPARED, PAPERS)),
         (*ENVIRONMENT, *NORMALS, *COST),
         {},
-        averaged=True,
     ),
     "ablation": Table(
         "Ablation of the paper's method",
@@ -173,10 +179,11 @@ TABLES: dict[TableName, Table] = {
         ),
         (*ENVIRONMENT, *RENDER, *COST),
         published.ABLATION,
+        shown=(ENVIRONMENT[0], RENDER[0]),
     ),
     "roughness": Table(
         "Roughness",
-        "The same scene of a rougher material. The paper prints no figures.",
+        "The same scene of a rougher material.",
         ("vase",),
         (COMPARED[1], COMPARED[3], PAPERS, DEFAULT, BASELINE),
         (ENVIRONMENT[0], OBSERVED, *NORMALS[:2], RENDER[0], *COST),
@@ -185,27 +192,29 @@ TABLES: dict[TableName, Table] = {
             Condition(f"roughness {level}", render=f"--roughness {level}") if level else Condition()
             for level in (0, 0.1, 0.2, 0.3)
         ),
+        shown=ENVIRONMENT[:1],
     ),
     "matter": Table(
         "More than a mirror",
-        "Scenes with parts that are rough, colored or matte. The paper prints no figures.",
+        "Scenes with parts that are rough, colored or matte.",
         ("teapot", "coffee"),
         (*COMPARED, PAPERS, DEFAULT, BASELINE),
         (ENVIRONMENT[0], OBSERVED, *NORMALS[:2], RENDER[0], *COST),
         {},
+        shown=(ENVIRONMENT[0], NORMALS[0], RENDER[0], SECONDS),
     ),
     "self-reflection": Table(
         "Self-reflection",
-        "Scenes that see themselves; `not traced` takes every mirrored ray for one that meets the surroundings. The "
-        "paper prints no figures.",
+        "Scenes that see themselves; `not traced` takes every mirrored ray for one that meets the surroundings.",
         ("vase", "dish", "horseshoe"),
         (PAPERS, Method("ours, not traced", _fit("default", "--config.environment.no-trace")), DEFAULT, BASELINE),
         (ENVIRONMENT[0], OBSERVED, *NORMALS[:2], *SEES_ENVIRONMENT, *COST),
         {},
+        shown=(OBSERVED,),
     ),
     "pose-jitter": Table(
         "Cameras that are turned",
-        "Each training camera is turned by an angle about a random axis; the truth stays.",
+        "Training cameras are turned by an angle about random axes.",
         ("vase",),
         (PAPERS, Method("ours, poses believed", _fit("default", "--set corrections.poses=off")), DEFAULT),
         (*ENVIRONMENT, *NORMALS[:2], *COST),

@@ -21,6 +21,7 @@ from shinypartial.io.files import (
     read_json,
     read_table,
     sha256_of,
+    write_between,
     write_json,
     write_text,
 )
@@ -169,6 +170,17 @@ def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="a file"):
         take(tmp_path / "file")
     assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_lines_are_replaced_between_marks_alone(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    assert not write_between(page, "a", ["new"])
+    page.write_text("head\n<!-- a:begin -->\nold\n<!-- a:end -->\n<!-- b:begin -->\ntail\n")
+    assert not write_between(page, "b", ["new"])
+    for _ in range(2):
+        assert write_between(page, "a", ["new"])
+    marked = "<!-- a:begin -->\n\nnew\n\n<!-- a:end -->"
+    assert page.read_text() == f"head\n{marked}\n<!-- b:begin -->\ntail\n"
 
 
 def test_json_round_trip_is_exact(tmp_path: Path) -> None:

@@ -56,12 +56,9 @@ def test_a_limit_is_reached_between_levels(losses: list[float | None], expected:
 
 
 def test_limits_of_scenes() -> None:
-    found = limits(RESULTS, ROTATION, "fast")
-    assert found.environment == (0.75,)
-    assert found.normals == (None,)
-    failed = limits(Results(SIZE, (*VASE[:2], outcome(1.0, None))), ROTATION, "fast")
-    assert failed.environment == failed.normals == (1.0,)
-    assert limits(Results(SIZE, tuple(VASE[1:])), ROTATION, "fast").environment == ()
+    assert limits(RESULTS, ROTATION, "fast") == (0.75,)
+    assert limits(Results(SIZE, (*VASE[:2], outcome(1.0, None))), ROTATION, "fast") == (1.0,)
+    assert limits(Results(SIZE, tuple(VASE[1:])), ROTATION, "fast") == ()
 
 
 def test_auroc_of_verdicts() -> None:
@@ -107,7 +104,9 @@ def test_the_page_is_the_same_for_the_same_results(tmp_path: Path) -> None:
     assert all((tmp_path / "a" / each).read_bytes() == (tmp_path / "b" / each).read_bytes() for each in files)
     page = (tmp_path / "a" / "stability.md").read_text()
     assert "| development | fast | 5 | 2 | 0.833 |" in page
-    assert "| 0.5° | 12.04 dB | 14.00 dB |" in page
+    assert "| Clean | 20.00 | 21.00 |" in page
+    assert "| Camera rotation: 0.5° | 1.0 | – |" in page
+    assert "| Camera rotation: 1° | **5.0** | – |" in page
     assert "error: &lt;none> \\| nothing" in page
 
 

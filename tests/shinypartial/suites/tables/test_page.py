@@ -39,7 +39,7 @@ def test_what_prints_alike_is_marked_alike_and_one_row_is_not_marked() -> None:
     assert [cells[name] for name in "abc"] == [["**10.00**"], ["**10.00**"], ["*9.00*"]]
     assert marked((PSNR,), [line("a", 10)]) == {"a": ["10.00"]}
     seeds = Line("vase", "a", ((1.0, 3.0, 2.0),))
-    assert marked((PSNR,), [seeds]) == {"a": ["2.00 (1.00 to 3.00)"]}
+    assert marked((PSNR,), [seeds]) == {"a": ["2.00 (1.00–3.00)"]}
     alike = Line("vase", "a", ((2.001, 2.002, 2.0),))
     assert marked((PSNR,), [alike]) == {"a": ["2.00"]}
 
@@ -58,10 +58,10 @@ def test_the_page_has_published_and_measured_rows_and_keeps_earlier_ones(tmp_pat
         page, Results(size, "--fast", (outcome("vase", PAPER, 10.0), Outcome("cola", PAPER, 0, failure="no|")))
     )
     text = page.read_text()
-    assert "| vase | PanoLess (paper), as published | **18.51** |" in text
-    assert "| vase | PanoLess (paper) | *10.00* |" in text
-    assert "| vase | ours | **20.00** |" in text
-    assert "| mean | ours | 21.00 |" in text
+    assert "| Environment PSNR ↑: vase | cola | mirror | mean | Normals mean ° ↓: vase |" in text
+    assert "| PanoLess (paper), as published | **18.51** | **9.26** | **13.31** | **13.69** | **3.97** |" in text
+    assert "| PanoLess (paper) | *10.00* | – | – | – |" in text
+    assert "| ours | **20.00** | 21.00 | 22.00 | 21.00 |" in text
     assert "| cola | PanoLess (paper) | 0 | no\\| |" in text
     assert len(read_results(page.with_suffix(".json")).outcomes) == 5
     with pytest.raises(InputError, match="Choose another --page"):
@@ -69,21 +69,27 @@ def test_the_page_has_published_and_measured_rows_and_keeps_earlier_ones(tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("schedule", "title", "said"),
+    ("schedule", "said"),
     [
-        ("", "# Tables of the paper, by whole schedules", "in all of their steps."),
-        ("--x 3", "# Tables of the paper, by whole schedules", "in all of their steps, with `--x 3`."),
-        (
-            "--config.iterations 60 --x 3",
-            "# Tables of the paper",
-            "in fewer steps than published, with `--config.iterations 60 --x 3`.",
-        ),
+        ("", "in all of their steps."),
+        ("--x 3", "in all of their steps, with `--x 3`."),
+        ("--config.iterations 60 --x 3", "in fewer steps than published, with `--config.iterations 60 --x 3`."),
     ],
 )
-def test_the_page_says_whether_schedules_are_whole(schedule: str, title: str, said: str) -> None:
-    lines = list(page_lines(Results(Size(80, 12, 3), schedule, ()), "tables.json"))
-    assert lines[0] == title
-    assert f"with are our implementations, {said}" in lines
+def test_the_page_says_whether_schedules_are_whole(schedule: str, said: str) -> None:
+    assert said in page_lines(Results(Size(80, 12, 3), schedule, ()), "tables.json")
+
+
+def test_text_around_the_marks_stays_and_seconds_are_means_over_scenes(tmp_path: Path) -> None:
+    page = tmp_path / "tables.md"
+    page.write_text("# Head\n<!-- tables:begin -->\nold\n<!-- tables:end -->\nTail\n")
+    pairs = (("vase", 30.0), ("cola", 60.0))
+    outcomes = tuple(Outcome(scene, OURS, 0, {PSNR.path: 20.0, "seconds": each}) for scene, each in pairs)
+    write_tables_page(page, Results(SIZE, "", outcomes))
+    lines = page.read_text().splitlines()
+    assert (lines[0], lines[-1]) == ("# Head", "Tail")
+    assert "old" not in lines
+    assert "| ours | 20.00 | 20.00 | – | – | 45 |" in lines
 
 
 def test_figures_are_those_of_the_scores(tmp_path: Path, sphere_dataset: Dataset) -> None:
