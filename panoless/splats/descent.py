@@ -23,7 +23,7 @@ MATERIAL_RATES = {
     "normal_residuals": 5e-3,
     "indirect_harmonics": 7.5e-3,
 }
-"""Rates by parameter, in the normalized frame, where a method has none of its own."""
+"""Rates by parameter, in the normalized frame, unless a method states another."""
 OUR_RATES = {"means": 1e-4, "quats": 2e-3, "log_scales": 3e-3, "opacity_logits": 2e-2, "environment": 3e-2}
 """Rates of shapes and map; that of the means in radii of the object."""
 PUBLISHED_RATES = {"means": 1.6e-4, "quats": 1e-3, "log_scales": 5e-3, "opacity_logits": 5e-2}
@@ -94,11 +94,11 @@ class Rates:
     def of(cls, config: FitConfig, unit: float) -> "Rates":
         """Those of a configuration; `unit` is that of the means."""
         if config.splats.rates == "ours":
-            own, memory = OUR_RATES, OUR_SQUARE_MEMORY
+            rates, memory = OUR_RATES, OUR_SQUARE_MEMORY
         else:
-            own = {**PUBLISHED_RATES, **PUBLISHED[config.splats.surfels.shading].rates}
+            rates = {**PUBLISHED_RATES, **PUBLISHED[config.splats.surfels.shading].rates}
             memory = PUBLISHED_SQUARE_MEMORY
-        return cls({**MATERIAL_RATES, **own, "means": own["means"] * unit}, memory)
+        return cls({**MATERIAL_RATES, **rates, "means": rates["means"] * unit}, memory)
 
 
 def first_map(config: FitConfig, generator: torch.Generator) -> Float[Tensor, "6 3 L L"]:

@@ -20,7 +20,7 @@ INITIAL_OPACITY_LOGIT = 2.2
 INITIAL_ROUGHNESS_LOGIT = -2.2
 RANDOM_OPACITY = 0.1
 OVERLAP = 0.8
-"""Radius of surfels over the side of the square that is there for one of them."""
+"""Radius of a surfel over the side of its share of the area, a square."""
 SAG_PX = 1.0
 """A surfel's disk may leave the first surface, or the hull, by so much at twice its radius."""
 LEAST_RADIUS_PX = 1.5

@@ -56,6 +56,14 @@ def help_text(arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypa
     return re.sub(r"[│╭╮╰╯─\s]+", " ", capsys.readouterr().out)
 
 
+def test_help_of_a_fit_fits_two_screens(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    assert main(["fit", "--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 100
+    assert max(map(len, lines)) <= 100
+
+
 def test_help_lists_every_option(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """But for the tuned numbers of the stages, each of which `--set` changes."""
     text = help_text(["fit"], capsys, monkeypatch)

@@ -37,7 +37,7 @@ def sphere_surfels(count: int, radius: float = 1.0, opacity_logit: float = 6.0) 
 def control_density_often(patch: pytest.MonkeyPatch) -> None:
     """Density control of all methods keeps a rhythm in a fit of some ten iterations."""
     for name, each in PUBLISHED.items():
-        first, last, every, reset, propagation = (share * each.steps for share in (0.1, 0.9, 0.2, 0.4, 0.3))
+        first, last, every, reset, propagation = (round(share * each.steps) for share in (0.1, 0.9, 0.2, 0.4, 0.3))
         often = replace(
             each,
             grows_from=first,

@@ -115,7 +115,7 @@ def test_gradients_of_materials(name: str, views: Views, view: TrainView) -> Non
     primitives, shading = sphere(name, views), SHADINGS[name]
     # Light from the object begins at 0, which is a kink.
     primitives = replace(primitives, indirect_harmonics=primitives.indirect_harmonics + 0.5)
-    occluder = shell(half=True) if shading.occlusion else None
+    occluder = shell(half=True) if shading.traces else None
     generator = torch.Generator().manual_seed(2)
 
     def total(values: dict[str, Tensor], light: Tensor) -> Tensor:
