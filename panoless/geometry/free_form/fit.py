@@ -11,6 +11,7 @@ from torch.utils.weak import WeakIdKeyDictionary
 
 from panoless.capture.poses import StatedCameras
 from panoless.capture.views import Views, split_held_out
+from panoless.deadline import check_time, improving
 from panoless.environment.rays import Rays
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
@@ -129,27 +130,33 @@ def fit_free_form(
     with torch.no_grad():
         usual = nuisance.freed([name for name in nuisance.free if name != Distortion.name]).of_views(kept)
         stage = coarse_stage(solved, start, schedule.coarse, progress, usual)
-        begun, hollowed = start, None
-        for lid in (start, *lids) if schedule.hollowed else ():
-            hollowed = concave_start(solved, lid, stage.surface)
+        decisions, later = dict[str, Decision](), dict[str, Decision]()
+        with improving():
+            check_time()
+            begun, hollowed = start, None
+            for lid in (start, *lids) if schedule.hollowed else ():
+                hollowed = concave_start(solved, lid, stage.surface)
+                if hollowed is not None:
+                    break
             if hollowed is not None:
-                break
-        if hollowed is not None:
-            deeper = coarse_stage(solved, hollowed, schedule.hollowed, nuisance=stage.nuisance)
-            stage = better(stage, deeper) if others else deeper
-            begun = hollowed if stage is deeper else start
-        stage, decisions = _needed(solved, stage, required)
-        if not all(each.kept for each in decisions.values()):
-            # A surface that gave way to blocks does not come back from them by further steps.
-            rounds = schedule.coarse if begun is start else schedule.hollowed
-            stage = coarse_stage(solved, begun, rounds, nuisance=stage.nuisance)
-        if others:
-            stage = keep_if_better(refitted_stages(solved, stage, schedule.refit), error, LEAST_GAIN)
-            if schedule.detailed and error(stage) > DETAILED_ERROR:
-                details = Progress("looking for details", sum(each.steps for each in schedule.detailed))
-                stage = better(stage, coarse_stage(solved, begun, schedule.detailed, details, stage.nuisance))
-            stage = keep_if_better(_stages(solved, stage, schedule.finer, progress), error, LEAST_FINER_GAIN)
-        stage, later = _needed(solved, _with_distortion(solved, stage), required)
+                deeper = coarse_stage(solved, hollowed, schedule.hollowed, nuisance=stage.nuisance)
+                stage = better(stage, deeper) if others else deeper
+                begun = hollowed if stage is deeper else start
+            stage, decisions = _needed(solved, stage, required)
+            if not all(each.kept for each in decisions.values()):
+                # A surface that gave way to blocks does not come back from them by further steps.
+                check_time()
+                rounds = schedule.coarse if begun is start else schedule.hollowed
+                stage = coarse_stage(solved, begun, rounds, nuisance=stage.nuisance)
+            if others:
+                stage = keep_if_better(refitted_stages(solved, stage, schedule.refit), error, LEAST_GAIN)
+                if schedule.detailed and error(stage) > DETAILED_ERROR:
+                    details = Progress("looking for details", sum(each.steps for each in schedule.detailed))
+                    stage = better(stage, coarse_stage(solved, begun, schedule.detailed, details, stage.nuisance))
+                stage = keep_if_better(_stages(solved, stage, schedule.finer, progress), error, LEAST_FINER_GAIN)
+            stage, later = _needed(solved, _with_distortion(solved, stage), required)
+        if stage.settings is None:
+            return FitStage.begun(start, nuisance), []
         skipped = progress.total - progress.done - stage.last.steps
         if skipped > 0:
             progress.advance(steps=skipped)
@@ -200,8 +207,9 @@ def coarse_stage(
 ) -> FitStage:
     """What rounds lead to from a first surface and from nuisance blocks."""
     stage = FitStage.begun(start, nuisance)
-    for settings in rounds:
-        stage = take_round(views, stage, settings, progress)
+    with improving():
+        for settings in rounds:
+            stage = take_round(views, stage, settings, progress)
     return stage
 
 

@@ -10,6 +10,7 @@ import torch
 from panoless.capture.poses import StatedCameras
 from panoless.capture.views import Views
 from panoless.config import FitConfig
+from panoless.deadline import improving
 from panoless.environment.surroundings import FAR, Surroundings
 from panoless.first_surface.completion import completed, trusted_hull
 from panoless.first_surface.mesh import TriangleMesh
@@ -109,7 +110,7 @@ def started(
     def settled(stage: FitStage, progress: Progress | None = None) -> FitStage:
         return taken(stage, schedule.coarse[:1], progress)
 
-    with torch.no_grad():
+    with torch.no_grad(), improving():
         begun = FitStage.begun(plain, nuisance)
         known = settled(begun)
         if disagreement(known) < LEAST_DISAGREEMENT:
@@ -128,6 +129,7 @@ def started(
         best = min(((each, judged(settled(each, progress))) for each in ended), key=lambda each: each[1])
         found = keep_if_better(((begun, judged(known)), best), lambda each: each[1], LEAST_GAIN)[0]
         return found.surface, found.nuisance
+    return plain, nuisance
 
 
 def _disagreement(views: Views, pixels: int, resolution: int) -> Callable[[FitStage], float]:
