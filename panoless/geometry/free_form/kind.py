@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
-from panoless.capture.corrections import Corrections
+from panoless.capture.corrections import NO_CORRECTIONS, Corrections
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.poses import Poses
 from panoless.capture.views import TrainView, Views, at_most_pixels
@@ -241,6 +241,8 @@ class FreeFormFamily(ExactFamily):
         )
         lids = () if np.array_equal(start.coefficients, first.plain.coefficients) else (first.surface,)
         stage, decisions = fit_free_form(views, start, schedule, lids=lids, nuisance=nuisance, required=required)
+        if stage.settings is None:  # The time limit came before the first round.
+            return _mirror(stage.surface, stage.trust, None, config), NO_CORRECTIONS, []
         with torch.no_grad():
             known = variances(views, stage)
         found = Corrected.by(stage.nuisance, known)
