@@ -164,7 +164,9 @@ def fit_free_form(
             unseen = predicted(solved, tested, stage)
             stage = replace(stage, nuisance=joined(stage.nuisance, unseen, len(views.train)))
         settings = replace(stage.last, rays=round(LAST_RAYS * stage.last.rays))
-        return take_round(views, stage, settings, progress, last=True), list((decisions | later).values())
+        with improving():
+            stage = take_round(views, stage, settings, progress, last=True)
+        return stage, list((decisions | later).values())
 
 
 def _needed(views: Views, stage: FitStage, required: Collection[str]) -> tuple[FitStage, dict[str, Decision]]:
