@@ -12,8 +12,8 @@ class FreeFormOptions:
     hollows: bool = True
     """Whether hollows that no silhouette shows are looked for."""
     starts: bool = True
-    """Whether several first surfaces are tried, and fine grids from the first surface on where much stays unexplained;
-    else one first surface takes the usual rounds."""
+    """Whether several first surfaces descend under coarse maps, and fine grids are tried from the first one on where
+    much stays unexplained. Else the usual rounds begin at the surface whose pixels disagree least."""
     finest_cells: Count = 60
     """Cells along the longest side of the finest grid of the usual rounds. Rounds with more are left out, but for the
     first."""

@@ -27,8 +27,6 @@ from shinypartial.io.progress import Progress
 
 TENSIONS = (0.0, 10.0, 30.0, 100.0)
 """Tensions τ of the plate between contacts (1/length² in the normalized frame) among which the pixels choose."""
-USUAL_TENSION = 30.0
-"""The one of a single plate."""
 CELLS = 40
 """Cells along the longest side of the first surface, before its first round."""
 MARGIN = 0.175
@@ -70,14 +68,14 @@ def first_surfaces(views: Views, config: FitConfig) -> FirstSurfaces:
     Silhouettes do not show how far an object bulges between their contacts: a stone does, a box does not. Plates are
     solved once, without the bound of the hull, which hardly changes their disagreement.
     """
-    carved, tensions = config.first_surface, TENSIONS if config.free_form.starts else (USUAL_TENSION,)
+    carved = config.first_surface
     known = trusted_hull(carve_hull(views, carved.hull_resolution, carved.hull_votes), views)
 
     def level_set(mesh: TriangleMesh) -> LevelSet:
         return level_set_of(mesh, CELLS, MARGIN)
 
     disagreement = _disagreement(views, PIXELS, RESOLUTION)
-    plates = {tension: level_set(completed(known, tension, rounds=1)) for tension in tensions}
+    plates = {tension: level_set(completed(known, tension, rounds=1)) for tension in TENSIONS}
     best = min(plates, key=lambda tension: disagreement(FitStage.begun(plates[tension])))
     plain, hull = level_set(completed(known, best)), level_set(known.surface)
     return FirstSurfaces(plain, hull, tuple(plates.values()))

@@ -71,8 +71,6 @@ SECOND = Round(20, 32, 0.20, 1, 20_000, 100.0, 5)
 """A round on the grid of the first, by pixels' centers."""
 FIRST = FirstSurfaceOptions(hull_resolution=56)
 CONFIG = replace(FitConfig(), free_form=OPTIONS, first_surface=FIRST)
-SEVERAL = replace(CONFIG, free_form=replace(OPTIONS, starts=True))
-"""With first surfaces of all tensions."""
 VIEWS, SIZE_PX = 20, 64
 
 
@@ -478,7 +476,7 @@ def test_flat_faces_that_no_outline_shows_are_found_by_a_descent() -> None:
     plain one by 22°.
     """
     views = body_views(block(), VIEWS, SIZE_PX)
-    first = first_surfaces(views, SEVERAL)
+    first = first_surfaces(views, CONFIG)
 
     def error_deg(schedule: Schedule) -> float:
         surface, _ = started(views, first, schedule)
@@ -492,7 +490,7 @@ def test_dominant_silhouettes_keep_faces_that_maps_of_few_texels_would_turn() ->
     """After two rounds of the descent from a rounded plate, by the mean of normals: 3.3° so, 17° by pixels alone."""
     body = block(exponent=10.0)
     views = body_views(body, 16, 56)
-    first = first_surfaces(views, SEVERAL).plates[1]
+    first = first_surfaces(views, CONFIG).plates[1]
 
     def error_deg(*, dominated: bool) -> float:
         rounds = [replace(each, silhouette_dominated=dominated) for each in DESCENT[:2]]
