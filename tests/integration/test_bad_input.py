@@ -290,6 +290,7 @@ def test_a_full_disk_while_the_checkpoint_is_written(workplace: Path, sphere_dat
     assert main(command) == 0
 
 
+@pytest.mark.slow
 def test_a_full_disk_while_the_prediction_is_written(workplace: Path, finished: Path) -> None:
     shutil.copytree(finished, workplace, dirs_exist_ok=True)
     done = run_with_limit(["export", "runs/out", "--output", "again"], workplace, limit=3_000)

@@ -304,6 +304,7 @@ def test_what_takes_no_steps_has_no_snapshots_and_the_command_says_why(
         "--config.environment.solve-resolution",
         "16",
         "--set",
+        "corrections.poses=off",
         "corrections.masks=off",
         "corrections.exposure=off",
         "corrections.lens=off",

@@ -78,7 +78,12 @@ def test_a_flat_mirror_takes_the_plane_and_a_bent_one_in_the_same_boundary_does_
     bend: float, frame_height: float
 ) -> None:
     """A dome whose normals turn by 4° at most has the same masks; a frame that mirrors itself misleads neither."""
-    geometry, selection = choose_geometry(framed(frame_height, bend), CONFIG)
+    state = begin(framed(frame_height, bend), CONFIG)
+    geometry, selection = state.geometry, state.selection
+    assert state.training is None
+    assert selection.chosen == geometry.kind
+    kinds = list(FAMILIES)
+    assert [each.kind for each in selection.candidates][: kinds.index("plane") + 1] == kinds[: kinds.index("plane") + 1]
     assert (geometry.kind == "plane") == (bend == 0)
     assert (verdicts(selection)["plane"] == Verdict.REFUSED_BY_HELD_OUT_VIEWS) == (bend > 0)
     plane = getattr(geometry, "plane", None) or geometry.height_field.plane
@@ -196,15 +201,6 @@ def test_silhouettes_turn_cameras_where_that_brings_a_shape_near() -> None:
     raw = RevolutionFamily().propose(wrong, FitConfig(), asked=True)
     assert raw is not None
     assert starts[1].proposal.silhouette_px < 0.8 * raw.silhouette_px
-
-
-def test_a_fit_remembers_why_it_took_its_kind() -> None:
-    """The table becomes part of the state, from which it goes into the prediction."""
-    state = begin(framed(0.0), CONFIG)
-    assert state.selection.chosen == state.geometry.kind
-    kinds = list(FAMILIES)
-    assert [each.kind for each in state.selection.candidates] == kinds[: kinds.index(state.geometry.kind) + 1]
-    assert state.training is None
 
 
 def test_a_goblet_takes_the_surface_of_revolution() -> None:

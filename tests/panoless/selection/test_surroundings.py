@@ -109,6 +109,7 @@ def test_a_flat_mirror_on_a_table_tells_how_high_it_stands() -> None:
     assert on_floor(views, fitted, lambda *_: pytest.fail("there is no floor"), CONFIG) is fitted
 
 
+@pytest.mark.slow
 def test_a_far_world_stays_far() -> None:
     family = PlaneFamily()
     proposal = Proposal(plane_of(RECTANGLE), 0.1, 1.0)

@@ -179,6 +179,7 @@ def test_deleted_files_are_made_again_and_nothing_is_rendered(made: Path, tmp_pa
     assert (root / CHECKSUMS).read_bytes() == (made / CHECKSUMS).read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="SIGKILL is a POSIX signal.")
 def test_a_killed_run_continues_without_rendering_anything_twice(tmp_path: Path) -> None:
     scene, root = write_recipe(tmp_path, train=12, test=12), tmp_path / "out"
@@ -236,6 +237,7 @@ def start_long_run(tmp_path: Path, views: int) -> "subprocess.Popen[str]":
 linux_only = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="Processes are looked up in /proc.")
 
 
+@pytest.mark.slow
 @linux_only
 def test_an_interrupt_ends_the_run_at_once_and_leaves_nothing_behind(tmp_path: Path) -> None:
     process = start_long_run(tmp_path, 200)
@@ -341,6 +343,7 @@ def test_a_full_disk_leaves_nothing_half_written(tmp_path: Path, limit_bytes: in
     assert [each for each in validate(root) if not each.warning] == []
 
 
+@pytest.mark.slow
 def test_writes_that_fail_between_frames_stop_the_run_cleanly(
     tmp_path: Path, spec: SceneSpec, monkeypatch: pytest.MonkeyPatch
 ) -> None:

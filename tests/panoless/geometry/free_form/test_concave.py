@@ -199,6 +199,7 @@ def test_a_convex_body_is_left_alone() -> None:
     assert concave_start(views, start, start) is None
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_what_steps_explain_is_not_searched(dish: tuple[Body, Views]) -> None:
     body, views = dish

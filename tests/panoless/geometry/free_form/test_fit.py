@@ -151,6 +151,7 @@ def dented() -> tuple[Body, Views, FitStage]:
     return body, views, take_round(views, FitStage.begun(dent), replace(FEW_PIXELS.coarse[-1], steps=1))
 
 
+@pytest.mark.slow
 def test_parts_that_pixels_distrust_are_refitted(dented: tuple[Body, Views, FitStage]) -> None:
     body, views, stage = dented
     cameras = cameras_around(7, 60)[1::2]
@@ -170,6 +171,7 @@ def test_waves_narrower_than_the_first_cells_are_found_under_coarse_maps() -> No
     assert np.median(normal_errors_deg(fitted(views, schedule), body, views, cameras[::5])) < 0.6
 
 
+@pytest.mark.slow
 def test_rounds_that_look_for_details_are_refused_where_held_out_views_gain_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -241,6 +243,7 @@ def solution() -> Solution:
     return Solution.at(make_task(views, SECOND), surface, full_trust(surface, 20), None, 2)
 
 
+@pytest.mark.slow
 def test_a_step_with_the_map_solved_again_gains_what_its_equations_promise(solution: Solution) -> None:
     step = gauss_newton_step(solution, 1e-3).coefficients
     promised = -float((step * solution.gradient()[0]).sum()) - float((step * solution.product(step)[0]).sum()) / 2
@@ -300,6 +303,7 @@ def test_a_start_that_descended_is_taken_where_pixels_agree_better(monkeypatch: 
     assert started(views, FirstSurfaces(right, right, (wrong,)), schedule)[0].cells == right.cells
 
 
+@pytest.mark.slow
 def test_the_plain_surface_descends_alone_where_pixels_agree_on_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Dominated by silhouettes; where any disagreement is little enough, a ball that is at hand is not tried."""
     views = body_views(sphere(), 8, 32)

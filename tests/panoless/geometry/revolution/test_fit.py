@@ -63,6 +63,7 @@ def map_error(photographs: Photographs, surface: SurfaceOfRevolution, turn: np.n
     return float(np.sqrt((error**2).mean()))
 
 
+@pytest.mark.slow
 def test_an_open_vessel_is_found_with_its_lip_its_wall_and_the_map() -> None:
     """Measured: normals 0.11° in the mean and 0.07° in the median, the lip to 0.001 (a pixel is 0.03), the map to
     0.008.
@@ -90,6 +91,7 @@ def test_a_closed_vessel_is_found_with_the_dish_in_its_lid() -> None:
     assert map_error(photographs, surface, UPRIGHT) < 0.03
 
 
+@pytest.mark.slow
 def test_a_deep_cup_is_open_though_no_ray_leaves_it_at_once() -> None:
     """What is inside is judged by rays that are mirrored often, before the rounds that refine it."""
     views = photograph(deep_cup(), VIEWS, SIZE).views

@@ -126,6 +126,7 @@ def test_a_ball_of_glass_is_refused(far: Taken, tmp_path: Path) -> None:
         capture_ball(BallRequest(written(tmp_path, glass, (0,)), tmp_path / "dataset"))
 
 
+@pytest.mark.slow
 def test_photographs_of_two_rooms_are_refused(far: Taken, near: Taken, tmp_path: Path) -> None:
     """Nothing says which of both is meant."""
     files = written(tmp_path, far, (0,)) + written(tmp_path, near, (1,))
