@@ -126,7 +126,7 @@ def test_plain_commands_write_no_events(
     assert "{" not in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("way", ["interrupt", "close the pipe"])
+@pytest.mark.parametrize("way", ["interrupt", pytest.param("close the pipe", marks=pytest.mark.slow)])
 def test_a_cancelled_fit_continues(way: str, tmp_path: Path, sphere_dataset: Dataset) -> None:
     process, lines = start(sphere_dataset, tmp_path), []
     assert process.stdout is not None
