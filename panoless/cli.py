@@ -33,8 +33,8 @@ class Fit(LongCommand):
     """Fit a dataset: its surface, an environment map and a visibility map; then export the prediction."""
 
     FIRST: ClassVar = (
-        "dataset preset output time_limit viewer device set config.model config.seed config.tint "
-        "config.exposure config.downscale config.environment.range config.environment.solve_resolution"
+        "dataset preset output time_limit viewer device set config.model config.tint config.downscale "
+        "config.environment.range"
     )
     dataset: Annotated[Path | None, tyro.conf.Positional] = None
     """Dataset folder, also plain NeRF-synthetic, or a bundled one: tiny-vase; else the newest in ./datasets."""

@@ -308,7 +308,7 @@ def _examine(family: Family, start: Start | None, views: Views, config: FitConfi
         return Candidate(family.kind, Verdict.REFUSED_BY_SILHOUETTES, "misses the silhouettes", *evidence), None
     surface = family.as_proposed(start.proposal, config)
     if is_matte(views, surface, config):
-        return Candidate(family.kind, Verdict.CHOSEN, MATTE, *evidence, 0.0), surface
+        return Candidate(family.kind, Verdict.CHOSEN, MATTE, *evidence), surface
     fitted = fit_jointly(family, _source(family), views, start.proposal, config)
     geometry, found = fitted.geometry, _found(fitted, views)
     views = fitted.corrections.applied(views, config)

@@ -15,7 +15,7 @@ def distorted_view(view: TrainView, k1: float) -> TrainView:
     camera = view.camera
     pinhole = Camera(np.eye(4), camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
     planes = torch.cat([view.radiance, view.mask[None]]).numpy().transpose(1, 2, 0)
-    bent = torch.from_numpy(warp(planes, undistorted_pixels(pinhole, k1, 0.0)).transpose(2, 0, 1).copy())
+    bent = torch.from_numpy(warp(planes, undistorted_pixels(pinhole, k1)).transpose(2, 0, 1).copy())
     mask = bent[3]
     return replace(view, radiance=bent[:3], mask=mask, solid=torch.nonzero(mask.flatten() > SOLID_ALPHA)[:, 0])
 

@@ -29,7 +29,7 @@ from tests.support.truth_prediction import write_truth_prediction
 EVERYTHING = Perturbation(
     CameraErrors(1.0, 0.5, 0.01, 1.02, (1.0, 0.0)),
     MaskErrors(erode_px=0.5, dilate_px=1.0, offset_px=0.7, wobble_px=0.5, holes=0.1, stray=0.1, empty=0.2),
-    SensorErrors(0.4, -0.05, 0.01, False, 0.5, 0.2, 0.1, 0.02, 0.01, 2.0, False, 90),
+    SensorErrors(0.4, -0.05, False, 0.5, 0.2, 0.1, 0.02, 0.01, False, 90),
     ViewChoice(keep=4, object_scale=0.9, cut=0.1),
     World(random_turn=True),
     seed=7,
