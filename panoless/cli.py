@@ -52,7 +52,7 @@ class Fit(LongCommand):
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the fit computes; `cuda` (NVIDIA or AMD) needs torch for it and Triton: docs/how-to/use-a-gpu.md."""
     time_limit: float | None = None
-    """Minutes after which the fit ends at its next checkpoint with what it has; the same command with more goes on."""
+    """Minutes after which the fit completes what it has; the same command with more goes on."""
     set: Annotated[
         tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="OPTION=VALUE [OPTION=VALUE ...]")
     ] = ()

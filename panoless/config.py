@@ -85,9 +85,8 @@ class FitConfig:
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     """Seed of the initial surfels and of the order of views."""
     model: Annotated[Model, tyro.conf.arg(prefix_name=False)] = "auto"
-    """`auto`: the simplest that explains held-out views; `sphere`: center and radius; `plane`: three numbers and a
-    boundary; `height_field`: a smooth height over that plane; `revolution`: an axis and a profile; `free_form`: a
-    closed smooth surface; `surfels`: curved."""
+    """`auto`: the simplest that explains held-out views; `sphere`, `plane`, `height_field` over a plane, `revolution`,
+    `free_form`: a closed smooth surface; `surfels`."""
     tint: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
     """Known reflectance of the mirror in red, green and blue (linear): what it shows is tint · environment."""
     exposure: NonNegative = 0.0
