@@ -86,17 +86,17 @@ def choose_geometry(views: Views, config: FitConfig) -> tuple[Geometry, Selectio
         refused[family.kind] = start if start is not None and is_near(start, views, config, bent=True) else None
         if geometry is None:
             continue
+        if candidate.reason == MATTE:
+            return _chosen(candidate, geometry, table)
         explains = candidate.verdict == Verdict.CHOSEN
         corrected = candidate.corrections.applied(views, config)
         bends = False
         with improving():
-            bends = explains and candidate.reason != MATTE and _bends_rather(family, geometry, start, corrected, config)
+            bends = explains and _bends_rather(family, geometry, start, corrected, config)
         if bends:
             table[-1] = candidate = replace(candidate, verdict=Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason=BENT)
             explains = False
         fitted.append((candidate, geometry))
-        if candidate.reason == MATTE:
-            break
         if explains and (family.told_by_outlines or error_of(fitted[-1]) <= DOUBTED_ERROR):
             break
     chosen = [each for each in fitted if each[0].verdict == Verdict.CHOSEN]
