@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -59,7 +60,7 @@ def fit(
         acquire_run(folder, dataset.root, dataset_hash(dataset), config, photographs_hash(dataset))
         state = load_state(folder)
         if state is not None and state.is_preliminary:
-            state = None
+            state = None if state.training is None else replace(state, environment=None, is_preliminary=False)
         if state is None or state.environment is None:
             with journal_in(folder), _noting_what_is_repeated(folder), time_limit(time_limit_s):
                 state = _finished(state, dataset, config, schedule, folder, device)

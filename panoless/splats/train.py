@@ -7,6 +7,7 @@ import torch
 
 from panoless.capture.views import Views
 from panoless.config import FitConfig
+from panoless.deadline import is_past_limit
 from panoless.environment.visibility import accumulate
 from panoless.splats.density import DensityStatistics, grow_and_prune, reset_opacities
 from panoless.splats.descent import PUBLISHED, Rates, first_map
@@ -27,10 +28,10 @@ OBSERVED_ALPHA = 0.5
 def train_surfels(
     views: Views, mirror: SurfelMirror, training: Training, config: FitConfig, observer: TrainingObserver
 ) -> tuple[SurfelMirror, Training]:
-    """Take the steps that remain."""
+    """Take the steps that remain, up to the time limit."""
     trainer = SurfelTrainer(views, mirror, training, config, observer)
     progress = Progress(observer.title, config.splats.iterations, training.iteration)
-    while trainer.iteration < config.splats.iterations:
+    while trainer.iteration < config.splats.iterations and not is_past_limit():
         start = time.monotonic()
         terms = trainer.step()
         observer.after_step(trainer.iteration, time.monotonic() - start, trainer.current)

@@ -172,6 +172,27 @@ def test_an_interrupted_fit_ends_as_an_uninterrupted_one(preset: str, tmp_path: 
     assert_same(pieces, whole)
 
 
+@pytest.mark.parametrize("model", ["surfels", "sphere"])
+def test_a_fit_that_a_time_limit_ended_continues(model: str, tmp_path: Path, many_views_dataset: Dataset) -> None:
+    """It has a map before, and ends as one without a limit."""
+    config = replace(tiny_config(iterations=6, count=60), model=model)
+    config = replace(config, corrections=replace(config.corrections, masks="off", lens="off"))
+    whole = fit(many_views_dataset, config, tmp_path / "whole")
+    limited = fit(many_views_dataset, config, tmp_path / "limited", time_limit_s=0.0)
+    assert limited.is_preliminary
+    assert limited.environment is not None
+    assert torch.isfinite(limited.environment).all()
+    again = fit(many_views_dataset, config, tmp_path / "limited")
+    assert not (again.is_preliminary or whole.is_preliminary)
+    if model == "surfels":
+        assert_same(again, whole)
+        return
+    assert again.geometry.state_dict() == whole.geometry.state_dict()
+    assert whole.environment is not None
+    assert again.environment is not None
+    assert torch.equal(again.environment, whole.environment)
+
+
 @pytest.mark.parametrize("preset", [name for name in PRESETS if name.startswith("paper")])
 def test_the_paper_presets_run_all_their_paths(
     preset: str, tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch
