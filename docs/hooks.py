@@ -3,6 +3,7 @@
 Links are written as they work in the repository; a link that leaves `docs` is rewritten for the site.
 """
 
+import ast
 import os
 import re
 from collections.abc import Iterator
@@ -16,6 +17,9 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 OPTIONS = "<!-- options -->"
+DECISIONS = "<!-- decisions -->"
+DECIDERS = ("decided", "keep_if_better", "is_clearly_lower", "explains_clearly_more", "is_matte")
+"""Functions that accept or refuse by evidence."""
 ROOMS = re.compile(r"<!-- rooms of (?P<package>\w+) -->")
 ORDER = (
     *("api", "capture", "first_surface", "environment", "geometry", "alignment", "selection"),
@@ -72,6 +76,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
     if OPTIONS in markdown:
         markdown = markdown.replace(OPTIONS, "\n".join(option_tables()))
+    if DECISIONS in markdown:
+        markdown = markdown.replace(DECISIONS, "\n".join(decision_table()))
     markdown = ROOMS.sub(lambda match: "\n".join(rooms(match["package"])), markdown)
     return LINK.sub(rewritten, markdown)
 
@@ -106,6 +112,37 @@ def option_tables() -> Iterator[str]:
                 name = prefix + item.name if tuned else (prefix + item.name).replace("_", "-")
                 option = "--model" if name == "model" else place + name
                 yield f"| `{option}` | `{' '.join(str(item.value).split())}` | {text_of(item)} |"
+
+
+def decision_table() -> Iterator[str]:
+    """Rows of all calls that accept or refuse: where, by which function, and what the calling function decides."""
+    yield "| Place | Test | What is decided |\n|---|---|---|"
+    for place, test, meaning in decisions():
+        yield f"| `{place}` | `{test}` | {meaning} |"
+
+
+def decisions() -> Iterator[tuple[str, str, str]]:
+    """Function or method of each call of `DECIDERS` in the engine, the one called, and the caller's first sentence."""
+    for path in sorted((ROOT / "panoless").rglob("*.py")):
+        parts = path.relative_to(ROOT / "panoless").with_suffix("").parts
+        if "splats" in parts:
+            continue
+        module = ast.parse(path.read_text(encoding="utf-8"))
+        classes = [each for each in module.body if isinstance(each, ast.ClassDef)]
+        for function in (item for each in (module, *classes) for item in each.body):
+            if isinstance(function, ast.FunctionDef) and function.name not in DECIDERS:
+                text = " ".join((ast.get_docstring(function) or "").split()).replace("|", "\\|")
+                meaning = text.partition(". ")[0].rstrip(".")
+                yield from ((".".join((*parts, function.name)), each, meaning) for each in _deciders_in(function))
+
+
+def _deciders_in(function: ast.FunctionDef) -> Iterator[str]:
+    """Names of `DECIDERS` that a function calls, as functions or as methods."""
+    for node in ast.walk(function):
+        if isinstance(node, ast.Call):
+            name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+            if name in DECIDERS:
+                yield name
 
 
 def option_groups(group: griffe.Class, prefix: str, *, tuned: bool) -> Iterator[tuple[griffe.Class, str, bool]]:

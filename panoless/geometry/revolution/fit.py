@@ -335,6 +335,7 @@ class Refinement:
     def _keep_areas(
         self, surface: SurfaceOfRevolution, start: SurfaceOfRevolution, environment: Tensor
     ) -> SurfaceOfRevolution:
+        """The outside by the areas of pixels, which sharpens its edges."""
         views = clear_of_lip(self.kept, start)
         if not has_edges(views, start, self.pixel):
             return start
