@@ -176,7 +176,8 @@ def test_an_interrupted_fit_ends_as_an_uninterrupted_one(preset: str, tmp_path: 
 def test_a_fit_that_a_time_limit_ended_continues(model: str, tmp_path: Path, many_views_dataset: Dataset) -> None:
     """It has a map before, and ends as one without a limit."""
     config = replace(tiny_config(iterations=6, count=60), model=model)
-    config = replace(config, corrections=replace(config.corrections, masks="off", lens="off"))
+    off = replace(config.corrections, poses="off", masks="off", exposure="off", lens="off")
+    config = replace(config, corrections=off)
     whole = fit(many_views_dataset, config, tmp_path / "whole")
     limited = fit(many_views_dataset, config, tmp_path / "limited", time_limit_s=0.0)
     assert limited.is_preliminary
