@@ -170,9 +170,8 @@ class ExactFamily:
             return _fitted(family, views, proposal, config), NO_CORRECTIONS, list(found.decisions)
         by = Corrected.by(found.state.nuisance, found.variances)
         corrected = by.applied(views, config)
-        again = propose(corrected)
-        if again is None:
-            again = start
+        shape = found.state.surface.as_proposed(by.scale)
+        again = (propose(corrected) or start) if shape is None else replace(start, shape=shape)
         around = found.state.nuisance.around(proposal.shape.surroundings).scaled(by.scale)
         geometry = _fitted(family, corrected, again.in_surroundings(around), config)
         return geometry.with_poses(by.poses), by.corrections, list(found.decisions)

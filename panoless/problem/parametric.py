@@ -1,7 +1,7 @@
 """What a surface of few numbers states of rays: where they meet it, where they touch it, and all first derivatives."""
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -120,3 +120,9 @@ class ParametricSurface(Protocol):
     def refined(self) -> "ParametricSurface":
         """The same surface with more numbers; itself where the kind has no more."""
         return self
+
+    def as_proposed(self, scale: float) -> Any:
+        """The shape that a fit of the kind starts from, in a world that many times as large; None: silhouettes alone
+        propose one that is as good.
+        """
+        return None
