@@ -21,8 +21,15 @@ CONFIG = replace(
 )
 
 
-@pytest.mark.parametrize("model", ["surfels", "free_form"])
-@pytest.mark.parametrize("radius", [0.05, 0.025], ids=["of two pixels", "of one pixel"])
+@pytest.mark.parametrize(
+    ("radius", "model"),
+    [
+        pytest.param(0.05, "surfels", id="of two pixels, surfels"),
+        pytest.param(0.05, "free_form", id="of two pixels, free form", marks=pytest.mark.slow),
+        pytest.param(0.025, "surfels", id="of one pixel, surfels"),
+        pytest.param(0.025, "free_form", id="of one pixel, free form"),
+    ],
+)
 def test_thin_and_disconnected_parts_end_in_a_verdict_or_in_a_message(
     radius: float, model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -30,6 +30,7 @@ TINY = ["--config.iterations", "4", "--config.surfels.count", "40"]
 AS_TOLD = [
     "--set",
     "first_surface.hull_resolution=24",
+    "corrections.poses=off",
     "corrections.masks=off",
     "corrections.exposure=off",
     "corrections.lens=off",
