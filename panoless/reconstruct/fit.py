@@ -139,6 +139,8 @@ def begin(views: Views, config: FitConfig) -> FitState:
     if config.model == SurfelMirror.kind:
         return _begin_surfels(views, config)
     geometry, selection = choose_geometry(views, config)
+    if selection.candidates[-1].is_matte:
+        return FitState(geometry, views.object_frame, selection)
     corrected = selection.corrections.applied(views, config)
     with improving():
         shown = without_scattered_light(views, corrected, geometry, selection.held_out_error, config)

@@ -9,6 +9,8 @@ from typing import Any
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
 from panoless.geometry.base import from_plain, to_plain
 
+MATTE = "one color a place explains the views, as of a matte object: no mirror was fitted"
+
 
 class Verdict(StrEnum):
     """What became of a candidate."""
@@ -43,6 +45,11 @@ class Candidate:
     principal_point_px: tuple[float, float] | None = None
     """By how much the principal point lies to the right and below of where it is said to be; None where that is not
     told."""
+
+    @property
+    def is_matte(self) -> bool:
+        """Whether no mirror was fitted."""
+        return self.reason == MATTE
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from panoless.geometry.exact import LARGEST_SHARE_LEFT
 from panoless.geometry.registry import FAMILIES
 from panoless.journal import remembered
 from panoless.problem.nuisance import SHIFT, STATED_FLOOR, TURN_DEG
-from panoless.selection.candidates import Candidate, Selection, Verdict, describe
+from panoless.selection.candidates import MATTE, Candidate, Selection, Verdict, describe
 from panoless.selection.fitted import Fitted, is_refined, missed_share
 from panoless.selection.held_out import LEAST_GAIN, held_out_errors, held_out_parts, is_matte
 from panoless.selection.joint import fit_jointly, followed, nuisance_kinds, proposed
@@ -35,7 +35,6 @@ BENT = "a bend explains clearly more"
 EXPLAINS = "explains held-out views"
 OTHER = "another kind is preferred"
 TOO_MUCH = "leaves too much unexplained"
-MATTE = "one color a place explains the views, as of a matte object: no mirror was fitted"
 NONE_HELD_OUT = "too few views to hold one out"
 LARGEST_SILHOUETTE_PX = 0.5
 """A candidate's silhouette lies at most this far from the masks' contours: median over views of the median."""
@@ -86,14 +85,11 @@ def choose_geometry(views: Views, config: FitConfig) -> tuple[Geometry, Selectio
         refused[family.kind] = start if start is not None and is_near(start, views, config, bent=True) else None
         if geometry is None:
             continue
-        if candidate.reason == MATTE:
+        if candidate.is_matte:
             return _chosen(candidate, geometry, table)
         explains = candidate.verdict == Verdict.CHOSEN
         corrected = candidate.corrections.applied(views, config)
-        bends = False
-        with improving():
-            bends = explains and _bends_rather(family, geometry, start, corrected, config)
-        if bends:
+        if explains and _bends_rather(family, geometry, start, corrected, config):
             table[-1] = candidate = replace(candidate, verdict=Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason=BENT)
             explains = False
         fitted.append((candidate, geometry))
@@ -234,13 +230,14 @@ def _bends_rather(family: Family, geometry: Geometry, start: Start | None, views
     others = [other for other in FAMILIES.values() if other.refines == family.kind]
     if held_out_parts(views) is None:
         return False
-    if geometry.surroundings.is_far:
-        return any(_bends_in_few_steps(other, geometry, views, config) for other in others)
-    far = replace(config, surroundings=replace(config.surroundings, mode="off"))
-    if start is None or not is_near(start, views, config, bent=True):
-        return False
-    fitted = (fit_jointly(other, _source(other), views, start.proposal, far) for other in others)
-    return any(explains_clearly_more(views, each.geometry, geometry) for each in fitted)
+    with improving():
+        if geometry.surroundings.is_far:
+            return any(_bends_in_few_steps(other, geometry, views, config) for other in others)
+        far = replace(config, surroundings=replace(config.surroundings, mode="off"))
+        if start is not None and is_near(start, views, config, bent=True):
+            fitted = (fit_jointly(other, _source(other), views, start.proposal, far) for other in others)
+            return any(explains_clearly_more(views, each.geometry, geometry) for each in fitted)
+    return False
 
 
 @remembered()
