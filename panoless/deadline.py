@@ -20,7 +20,6 @@ class OutOfTimeError(Exception):
 class _Clock:
     end: float
     improving: int = 0
-    passed: bool = False
 
 
 _clock: ContextVar[_Clock | None] = ContextVar("clock", default=None)
@@ -55,9 +54,7 @@ def improving() -> Iterator[None]:
 def is_past_limit() -> bool:
     """Whether the limit has ended, or should end, what improves a state."""
     clock = _clock.get()
-    if clock is not None and time.monotonic() > clock.end:
-        clock.passed = True
-    return clock is not None and clock.passed
+    return clock is not None and time.monotonic() > clock.end
 
 
 def check_time() -> None:

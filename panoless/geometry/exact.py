@@ -156,9 +156,7 @@ class ExactFamily:
         if not kinds or not LEAST_VIEWS <= len(views.train) <= MOST_VIEWS:
             return _fitted(family, views, proposal, config), NO_CORRECTIONS, []
         with torch.no_grad():
-            start = proposal
-            with improving():
-                start = self._proposed_again(views, proposal, kinds, config, propose)
+            start = self._proposed_again(views, proposal, kinds, config, propose)
             found = solve(
                 views,
                 self.unknowns(views, start, config),
@@ -180,14 +178,15 @@ class ExactFamily:
         self, views: Views, proposal: Proposal, kinds: Collection[type[Block]], config: FitConfig, propose: Propose
     ) -> Proposal:
         """A proposal of views that silhouettes corrected by the one before, as long as it comes nearer to the masks."""
-        for _ in range(PROPOSALS):
-            if proposal.silhouette_px <= NEAR_PX:
-                break
-            state = by_outlines(views, self.unknowns(views, proposal, config), nuisance_of(views, kinds))
-            again = propose(Corrected.by(state.nuisance).applied(views, config))
-            if again is None or again.silhouette_px > LARGEST_SHARE_LEFT * proposal.silhouette_px:
-                break
-            proposal = again.in_surroundings(proposal.shape.surroundings)
+        with improving():
+            for _ in range(PROPOSALS):
+                if proposal.silhouette_px <= NEAR_PX:
+                    break
+                state = by_outlines(views, self.unknowns(views, proposal, config), nuisance_of(views, kinds))
+                again = propose(Corrected.by(state.nuisance).applied(views, config))
+                if again is None or again.silhouette_px > LARGEST_SHARE_LEFT * proposal.silhouette_px:
+                    break
+                proposal = again.in_surroundings(proposal.shape.surroundings)
         return proposal
 
     def by_outlines(self, views: Views, proposal: Proposal, kinds: Collection[type[Block]], config: FitConfig) -> Poses:

@@ -11,11 +11,10 @@ from torch import Tensor
 
 from panoless.capture.contrast import Contrast
 from panoless.capture.views import TrainView, Views, at_most_pixels, split_held_out
+from panoless.environment.resolution import ERROR_SCALE
 from panoless.geometry.base import Geometry, SurfaceBuffers
 from panoless.numeric.robust import bounded_error
 
-SCALE = 0.1
-"""Scale s of errors ‖e‖²/(‖e‖² + s²) of linear radiance."""
 CELLS = 48
 """Along a side of the grid on which a matte surface has its colors."""
 
@@ -101,8 +100,8 @@ class WithoutMirror:
         for (view, surface), (_, pixels) in zip(held_out, at_most_pixels(tested, most_pixels), strict=True):
             radiance = contrast.shown(view.radiance_at(pixels))
             equal = torch.ones_like(radiance[:, 0])
-            plain.add(bounded_error(radiance.mean(0) - radiance, SCALE), equal)
-            matte.add(bounded_error(places.means(view, surface, pixels) - radiance, SCALE), equal)
+            plain.add(bounded_error(radiance.mean(0) - radiance, ERROR_SCALE), equal)
+            matte.add(bounded_error(places.means(view, surface, pixels) - radiance, ERROR_SCALE), equal)
         return cls(plain.value, matte.value)
 
 

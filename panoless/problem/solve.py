@@ -77,8 +77,9 @@ def take_round(views: Views, state: State, settings: Round, last: int) -> State:
 def by_outlines(views: Views, surface: ParametricSurface, nuisance: Nuisance) -> State:
     """A surface and cameras by silhouettes alone."""
     state = State(surface, nuisance)
-    for settings in OUTLINES:
-        state = take_round(views, state, settings, FINISH.resolution)
+    with improving():
+        for settings in OUTLINES:
+            state = take_round(views, state, settings, FINISH.resolution)
     return state
 
 
@@ -108,9 +109,7 @@ def solve(
 
     progress = Progress("solving for cameras, exposures and masks", len(rounds) + 2)
     usual = [kind for kind in kinds if kind is not Distortion]
-    state = State(surface, nuisance_of(views, usual))
-    with improving():
-        state = by_outlines(views, surface, state.nuisance)
+    state = by_outlines(views, surface, nuisance_of(views, usual))
     if begin is not None:
         state = replace(state, surface=begin(state))
     progress.advance()

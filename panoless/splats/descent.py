@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from panoless.config import FitConfig
-from panoless.environment.cubemap import initial_environment
+from panoless.environment.cubemap import GRAY, NOISE, initial_environment
 
 MATERIAL_RATES = {
     "albedo": 2.5e-3,
@@ -59,9 +59,9 @@ class Published:
     resets_every: int = 3_000
     """Steps between two opacity resets."""
     propagates_every: int = 1_000
-    gray: float = 0.5
+    gray: float = GRAY
     """Radiance of the first map."""
-    noise: float = 5.0
+    noise: float = NOISE
     """Half the width of the uniform noise on its logits, where a sigmoid takes them to radiance."""
 
 
@@ -83,6 +83,11 @@ PUBLISHED: dict[str, Published] = {
 """By `surfels.shading`: the paper's method, 3DGS-DR, GaussianShader, Ref-Gaussian and MaterialRefGS."""
 
 
+def published(config: FitConfig) -> Published:
+    """The numbers of the method that a configuration shades by."""
+    return PUBLISHED[config.splats.surfels.shading]
+
+
 @dataclass(frozen=True)
 class Rates:
     """Learning rates of Adam by parameter."""
@@ -96,12 +101,12 @@ class Rates:
         if config.splats.rates == "ours":
             rates, memory = OUR_RATES, OUR_SQUARE_MEMORY
         else:
-            rates = {**PUBLISHED_RATES, **PUBLISHED[config.splats.surfels.shading].rates}
+            rates = {**PUBLISHED_RATES, **published(config).rates}
             memory = PUBLISHED_SQUARE_MEMORY
         return cls({**MATERIAL_RATES, **rates, "means": rates["means"] * unit}, memory)
 
 
 def first_map(config: FitConfig, generator: torch.Generator) -> Float[Tensor, "6 3 L L"]:
     """The map before the first step, as its method starts it."""
-    published = PUBLISHED[config.splats.surfels.shading]
-    return initial_environment(config.environment, generator, published.gray, published.noise)
+    method = published(config)
+    return initial_environment(config.environment, generator, method.gray, method.noise)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from panoless.config import FitConfig
-from panoless.splats.descent import PUBLISHED, Published
+from panoless.splats.descent import Published, published
 from panoless.splats.kernels.objective import ObjectiveTerms
 from panoless.splats.kernels.rasterize import Channels
 from panoless.splats.rendering import DEPTH_BLEND
@@ -27,7 +27,7 @@ class Schedule:
 
     @property
     def _published(self) -> Published:
-        return PUBLISHED[self.config.splats.surfels.shading]
+        return published(self.config)
 
     def _share(self, step: float) -> float:
         """Of a step of the published schedule."""

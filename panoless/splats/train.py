@@ -10,7 +10,7 @@ from panoless.config import FitConfig
 from panoless.deadline import is_past_limit
 from panoless.environment.visibility import accumulate
 from panoless.splats.density import DensityStatistics, grow_and_prune, reset_opacities
-from panoless.splats.descent import PUBLISHED, Rates, first_map
+from panoless.splats.descent import Rates, first_map, published
 from panoless.splats.kernels.adam import UNBOUNDED
 from panoless.splats.mirror import SurfelMirror
 from panoless.splats.objective import LossTerms, generator_of
@@ -136,7 +136,7 @@ class SurfelTrainer:
                 self.statistics,
                 generator,
                 max_surfels=self.config.splats.density.max_surfels,
-                least_opacity=PUBLISHED[self.config.splats.surfels.shading].least_opacity if prune_faint else 0.0,
+                least_opacity=published(self.config).least_opacity if prune_faint else 0.0,
                 unit=self._unit,
             )
             self.optimizer.edit_surfels(edit.surfels, edit.source, edit.unchanged)

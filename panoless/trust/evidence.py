@@ -24,11 +24,11 @@ from panoless.capture.silhouettes import mask_distance_px, silhouette_distance_p
 from panoless.capture.views import TrainView, Views, at_most_pixels, split_held_out
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints, thinned
-from panoless.environment.resolution import densest_resolution
+from panoless.environment.resolution import ERROR_SCALE, densest_resolution
 from panoless.environment.sharpening import HARD, MIDDLE, SMOOTHNESS, TRIAL_STEPS, deblur_map
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, overlap, pixel_areas, usable_views
-from panoless.geometry.places import SCALE, Cells, Mean, WithoutMirror, surfaces_of
+from panoless.geometry.places import Cells, Mean, WithoutMirror, surfaces_of
 from panoless.geometry.registry import FAMILIES
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.robust import NORMAL_MEDIAN, bounded_error, robust_scale, robust_weight
@@ -244,14 +244,14 @@ def _light(
         error = contrast.shown(seen) - contrast.shown(areas.radiance)
         confidence.append(sample_cubemap(visibility[:, None], rays.directions)[:, 0])
         weight = rays.initial_weight() * (confidence[-1] > SURE if by_confidence else 1)
-        explained.add(bounded_error(error, SCALE), weight)
+        explained.add(bounded_error(error, ERROR_SCALE), weight)
         errors.append(error)
     for (view, surface), (_, pixels) in zip(held_out, at_most_pixels(tested, RAYS), strict=True):
         radiance = contrast.shown(view.radiance_at(pixels))
         normals = surface.normals_camera.flatten(1)[:, pixels]
         shaded = geometry.shade(environment, view.camera, pixels, normals).minimum(saturation)
         shown = contrast.shown(shaded) - radiance
-        parts.add(view, surface, pixels, bounded_error(shown, SCALE)[:, None])
+        parts.add(view, surface, pixels, bounded_error(shown, ERROR_SCALE)[:, None])
     if explained.weight <= 0:
         return nothing
     every, sure = torch.cat(errors), torch.cat(confidence)

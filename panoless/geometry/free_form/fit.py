@@ -130,7 +130,7 @@ def fit_free_form(
     with torch.no_grad():
         usual = nuisance.freed([name for name in nuisance.free if name != Distortion.name]).of_views(kept)
         stage = coarse_stage(solved, start, schedule.coarse, progress, usual)
-        decisions, later = dict[str, Decision](), dict[str, Decision]()
+        decisions = dict[str, Decision]()
         with improving():
             check_time()
             begun, hollowed = start, None
@@ -155,6 +155,7 @@ def fit_free_form(
                     stage = better(stage, coarse_stage(solved, begun, schedule.detailed, details, stage.nuisance))
                 stage = keep_if_better(_stages(solved, stage, schedule.finer, progress), error, LEAST_FINER_GAIN)
             stage, later = _needed(solved, _with_distortion(solved, stage), required)
+            decisions |= later
         if stage.settings is None:
             return FitStage.begun(start, nuisance), []
         skipped = progress.total - progress.done - stage.last.steps
@@ -166,7 +167,7 @@ def fit_free_form(
         settings = replace(stage.last, rays=round(LAST_RAYS * stage.last.rays))
         with improving():
             stage = take_round(views, stage, settings, progress, last=True)
-        return stage, list((decisions | later).values())
+        return stage, list(decisions.values())
 
 
 def _needed(views: Views, stage: FitStage, required: Collection[str]) -> tuple[FitStage, dict[str, Decision]]:
