@@ -2,6 +2,7 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -107,18 +108,34 @@ class Data:
 
     @classmethod
     def of(cls, views: Views, settings: Round, last: int, free: Collection[str] = ()) -> "Data":
-        """Of views, with maps of so many texels in the `last` round. A saturated pixel has no radiance to divide by a
-        gain that is `free`.
+        """Of views, with maps of so many texels in the `last` round. Where blocks are `free`, masks may be wrong, and a
+        saturated pixel has no radiance to divide by a gain.
         """
         outlines = outline_rays(views, longest_only=True)
         chosen = outlines.chosen(slice(None, None, max(1, len(outlines.size) // OUTLINE_POINTS)))
         pixels = solid_pixels(views, settings.rays) if settings.resolution else None
-        if pixels is not None:
+        if pixels is not None and free:
             kept = pixels.inner_px > INNER_PX
             if {Exposures.name, WhiteBalances.name} & set(free):
                 kept &= ~is_saturated(pixels.radiance)
             pixels = pixels.chosen(kept)
         return cls(pixels, chosen, StatedCameras.of(views), settings, settings.resolution >= last)
+
+
+@dataclass(frozen=True)
+class Traced:
+    """Rays of all pixels where cameras of a state are, and where they meet its surface."""
+
+    rays: PixelRays
+    hits: MirrorHits
+
+    @classmethod
+    def of(cls, data: Data, state: State) -> "Traced | None":
+        """None where no pixels take part."""
+        if data.pixels is None:
+            return None
+        rays = state.nuisance.moved(data.pixels.rays, data.cameras)
+        return cls(rays, state.surface.hits(rays))
 
 
 @dataclass(frozen=True)
@@ -136,15 +153,13 @@ class Photographs:
     following: FollowingMap
 
     @classmethod
-    def at(cls, data: Data, state: State, *, estimated: bool) -> "Photographs | None":
+    def at(cls, data: Data, state: State, traced: Traced, *, estimated: bool) -> "Photographs | None":
         """Of a state, with `estimated` noise; None where too few pixels see the surroundings."""
         assert data.pixels is not None, "photographs take part"
-        rays = state.nuisance.moved(data.pixels.rays, data.cameras)
-        hits = state.surface.hits(rays)
-        chosen = np.flatnonzero(hits.clear)
+        chosen = np.flatnonzero(traced.hits.clear)
         if len(chosen) < LEAST_CLEAR:
             return None
-        rays, hits = rays.chosen(chosen), chosen_hits(hits, chosen)
+        rays, hits = traced.rays.chosen(chosen), chosen_hits(traced.hits, chosen)
         radiance = state.nuisance.equalized(data.pixels.radiance[chosen], rays.view)
         mirrored = MirroredRays(rays.directions, hits.normals, hits.points, state.around)
         directions, seen = (torch.from_numpy(each).float() for each in (mirrored.looked_up, radiance))
@@ -160,22 +175,26 @@ class Photographs:
         following = FollowingMap.of(mirrored.looked_up, weights, data.settings.resolution)
         return cls(chosen, rays, hits, mirrored, environment, light, residual, sigma, following)
 
-    def rows(self) -> tuple[Float[np.ndarray, "Q 3 K"], Float[np.ndarray, "Q 3 6"]]:
-        """Of the light, by the surface's numbers and by (ω, τ) of the rays.
+    @cached_property
+    def by_normal(self) -> Float[np.ndarray, "Q 3 3"]:
+        """Derivatives of the light by the unit normals."""
+        across = np.stack(tangents(self.hits.normals), 2)
+        return np.matmul(self.mirrored.light_by_turns(self.environment, across), across.transpose(0, 2, 1))
+
+    def motion_rows(self) -> Float[np.ndarray, "Q 3 6"]:
+        """Of the light, by (ω, τ) of the rays.
 
         A hit moves by (1 − d nᵀ/(d·n)) (τ + t ω × d) along the surface, the normal by S times that, and the mirrored
         direction with normal and ray.
         """
         hits, directions = self.hits, self.rays.directions
-        across = np.stack(tangents(hits.normals), 2)
-        by_normal = np.matmul(self.mirrored.light_by_turns(self.environment, across), across.transpose(0, 2, 1))
-        along = np.matmul(by_normal, hits.shape)
+        along = np.matmul(self.by_normal, hits.shape)
         facing = (directions * hits.normals).sum(1)
         slide = np.matmul(along, directions[:, :, None]) * (hits.normals / facing[:, None])[:, None]
         by_shift = along - slide
         by_ray = self.mirrored.by_ray(self.mirrored.slopes(self.environment))
         by_turn = np.cross(directions[:, None], by_ray + hits.distance[:, None, None] * by_shift)
-        return np.matmul(by_normal, hits.rows), np.concatenate([by_turn, by_shift], 2)
+        return np.concatenate([by_turn, by_shift], 2)
 
     def wall_rows(self) -> Float[np.ndarray, "Q 3 1"]:
         """Of the light, by 1/D of the walls."""
@@ -183,17 +202,16 @@ class Photographs:
         found = self.mirrored.surroundings.rows(slopes, self.mirrored.points, self.mirrored.mirrored)
         return found[..., :1]
 
-    def cost(self, data: Data, state: State) -> float:
+    def cost(self, data: Data, state: State, traced: Traced) -> float:
         """½ Σ w ‖(1 − Π) e‖² of another state, under this map. A ray that no longer sees the surroundings costs what it
         did before, so it is not lost for gain.
         """
         assert data.pixels is not None, "photographs take part"
-        rays = state.nuisance.moved(data.pixels.rays.chosen(self.chosen), data.cameras)
-        hits = state.surface.hits(rays)
-        mirrored = MirroredRays(rays.directions, hits.normals, hits.points, state.around)
-        radiance = state.nuisance.equalized(data.pixels.radiance[self.chosen], rays.view)
+        rays, hits, chosen = traced.rays.chosen(self.chosen), traced.hits, self.chosen
+        mirrored = MirroredRays(rays.directions, hits.normals[chosen], hits.points[chosen], state.around)
+        radiance = state.nuisance.equalized(data.pixels.radiance[chosen], rays.view)
         residual = mirrored.light(self.environment) - radiance
-        return self.following.cost(np.where(hits.clear[:, None], residual, self.residual))
+        return self.following.cost(np.where(hits.clear[chosen, None], residual, self.residual))
 
 
 def chosen_hits(hits: MirrorHits, chosen: Int[np.ndarray, "Q"]) -> MirrorHits:
@@ -217,8 +235,8 @@ class Equations:
     anchor: Float[np.ndarray, "_"] | None
 
     @classmethod
-    def at(cls, data: Data, state: State) -> "Equations":
-        """With the map solved for the state."""
+    def at(cls, data: Data, state: State, traced: Traced | None = None) -> "Equations":
+        """With the map solved for the state, whose pixels may be traced."""
         surface, nuisance, count = state.surface, state.nuisance, state.surface.count
         by_view, shared = (nuisance.free_blocks(by_view=each) for each in (True, False))
         views, size, others = len(data.cameras.centers), sum(b.size for b in by_view), len(shared)
@@ -239,15 +257,15 @@ class Equations:
             return np.concatenate([empty, *rows], 2), np.concatenate(columns, 1)
 
         gradient, matrix = np.zeros(unknowns), np.zeros((unknowns, unknowns))
-        photographs = None
-        if data.pixels is not None:
-            photographs = Photographs.at(data, state, estimated=free)
+        traced = traced or Traced.of(data, state)
+        photographs = None if traced is None else Photographs.at(data, state, traced, estimated=free)
         if photographs is not None:
-            by_surface, by_motion = photographs.rows()
-            rows, columns = beside(photographs.rays, by_motion, photographs)
+            hits, rays = photographs.hits, photographs.rays
+            by_motion = photographs.motion_rows() if free else np.zeros((len(rays.view), 3, 6))
+            rows, columns = beside(rays, by_motion, photographs)
             gradient, matrix = photographs.following.sparse_equations(
-                np.concatenate([by_surface, rows], 2),
-                np.concatenate([photographs.hits.columns, columns], 1),
+                np.concatenate([np.matmul(photographs.by_normal, hits.rows), rows], 2),
+                np.concatenate([hits.columns, columns], 1),
                 unknowns,
                 photographs.residual,
             )
@@ -295,8 +313,8 @@ class Equations:
             found.value,
         )
 
-    def cost(self, state: State, step: Float[np.ndarray, "D"]) -> float:
-        """Of a state after a step."""
+    def cost(self, state: State, step: Float[np.ndarray, "D"], traced: Traced | None = None) -> float:
+        """Of a state after a step, whose pixels are traced."""
         total = CORRELATED * state.nuisance.prior_cost
         if self.anchor is not None:
             value = self.anchor + step[: len(self.anchor)]
@@ -305,25 +323,28 @@ class Equations:
         if state is self.state:
             total += 0.0 if seen is None else seen.following.cost(seen.residual)
         else:
-            total += 0.0 if seen is None else seen.cost(self.data, state)
+            total += 0.0 if seen is None or traced is None else seen.cost(self.data, state, traced)
             rays = state.nuisance.moved(self.data.outlines, self.data.cameras)
             found = state.surface.silhouette(rays)
             distance = found.pixels - state.nuisance.offsets_px(rays.view)
         lost = np.where(found.valid, bounded_error(distance, self.scale_px), 1.0)[self.silhouette.counted]
         return total + (self.scale_px / CONTOUR_SIGMA_PX) ** 2 * float(lost.sum()) / 2
 
-    def after_step(self) -> tuple[State, float]:
-        """The state after the least damped of the tried steps that lowers the cost, and by which share of it."""
+    def after_step(self) -> tuple[State, float, Traced | None]:
+        """The state after the least damped of the tried steps that lowers the cost, by which share of it, and its
+        pixels.
+        """
         limit, diagonal = self.state.surface.limit, np.diag(self.matrix)
         before = self.cost(self.state, np.zeros_like(diagonal))
         for damping in DAMPINGS:
             damped = self.matrix + damping * np.diag(diagonal)
             step = damped_step(self.gradient, damped, largest=limit.largest, limited=limit.limited)
             moved = self.state.stepped(step)
-            cost = self.cost(moved, step)
+            traced = Traced.of(self.data, moved)
+            cost = self.cost(moved, step, traced)
             if cost < before:
-                return moved, 1 - cost / before
-        return self.state, 0.0
+                return moved, 1 - cost / before, traced
+        return self.state, 0.0, None
 
     def covariances(self) -> dict[str, Float[np.ndarray, "N N"]]:
         """Posterior covariances of the numbers of each free block, group after group: the part of C H⁻¹, with the

@@ -11,6 +11,7 @@ first, silhouettes alone turn cameras. What all views share is free under finer 
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -21,6 +22,7 @@ from panoless.journal import remembered
 from panoless.problem.equations import Data, Equations, Round, State
 from panoless.problem.evidence import Decision, decided
 from panoless.problem.nuisance import (
+    NO_NUISANCE,
     Block,
     CameraPoses,
     Distortion,
@@ -30,6 +32,7 @@ from panoless.problem.nuisance import (
 from panoless.problem.parametric import ParametricSurface
 from shinypartial.io.progress import Progress
 
+AnySurface = TypeVar("AnySurface", bound=ParametricSurface)
 LEAST_FALL = 1e-3
 """A round ends with a step that lowers its cost by a smaller share."""
 SHARED_RESOLUTION = 64
@@ -67,11 +70,22 @@ def take_round(views: Views, state: State, settings: Round, last: int) -> State:
         coarse = [] if settings.resolution == 0 else [CameraPoses.name]
         nuisance = nuisance.freed([name for name in nuisance.locked.free if name not in coarse])
     state = State(state.surface.settled(), nuisance)
+    traced = None
     for _ in range(settings.steps):
-        state, fall = Equations.at(data, state).after_step()
+        state, fall, traced = Equations.at(data, state, traced).after_step()
         if fall < LEAST_FALL:
             break
     return replace(state, nuisance=state.nuisance.freed(names))
+
+
+def after_round(views: Views, surface: AnySurface, settings: Round, last: int) -> AnySurface:
+    """A surface after one round in which nothing beside it is unknown."""
+    return cast(AnySurface, take_round(views, State(surface, NO_NUISANCE), settings, last).surface)
+
+
+def by_outlines_alone(views: Views, surface: AnySurface) -> AnySurface:
+    """A surface by silhouettes alone, from cameras as stated."""
+    return cast(AnySurface, by_outlines(views, surface, NO_NUISANCE).surface)
 
 
 def by_outlines(views: Views, surface: ParametricSurface, nuisance: Nuisance) -> State:

@@ -95,8 +95,10 @@ class HeightField:
         column, along_v = cubic_bsplines_at(v, columns, derivatives)
         index = (row[:, None, None] + np.arange(4)[:, None]) * columns + column[:, None, None] + np.arange(4)
         orders = [(i, j) for i, j in ORDERS if i + j <= derivatives]
-        weights = [(along_u[i][:, :, None] * along_v[j][:, None]) / self.spacing ** (i + j) for i, j in orders]
-        return index.reshape(-1, 16), np.stack(weights).reshape(len(orders), -1, 16)
+        weights = np.empty((len(orders), len(u), 4, 4))
+        for each, (i, j) in zip(weights, orders, strict=True):
+            np.multiply(along_u[i][:, :, None], along_v[j][:, None] / self.spacing ** (i + j), out=each)
+        return index.reshape(-1, 16), weights.reshape(len(orders), -1, 16)
 
     def heights(self, places: Float[np.ndarray, "P 2"], derivatives: int = 2) -> Float[np.ndarray, "K P"]:
         """h, h_u, h_v, h_uu, h_uv and h_vv at plane coordinates, or h and the slopes, or h alone."""
@@ -183,9 +185,6 @@ class VisibleReflections:
     """Pixels of a view (flat indices) that see the environment by way of a height field, and how."""
 
     pixels: Int[Tensor, "P"]
-    origins: Float[np.ndarray, "P 3"]
-    directions: Float[np.ndarray, "P 3"]
-    """Of camera depth 1, in the normalized frame."""
     hits: HeightFieldHits
     outgoing: Float[np.ndarray, "P 3"]
     """Where they look in the map: unit, in the normalized frame."""
@@ -216,8 +215,6 @@ def visible_reflections(
     points = origins[kept] + chosen.distance[:, None] * directions[kept]
     return VisibleReflections(
         pixels[torch.from_numpy(kept).to(pixels.device)],
-        origins[kept],
-        directions[kept],
         chosen,
         plane.surroundings.looked_up(points, outgoing @ height_field.frame),
     )

@@ -7,12 +7,11 @@ from either side. A frame in front of it is flat and says how the plane of the f
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
 
 from panoless.capture.silhouettes import MaskContours
 from panoless.geometry.height_field.model import HeightField
-from panoless.geometry.plane.silhouette import BoundaryResiduals, boundary_jacobian, boundary_residuals, vertex_pull
-from panoless.numeric.gauss_newton import jacobian_of_rows, normal_equations
+from panoless.geometry.plane.silhouette import BoundaryResiduals, boundary_jacobian, boundary_residuals
+from panoless.numeric.gauss_newton import jacobian_of_rows
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -36,20 +35,9 @@ def edge_jacobian(residuals: BoundaryResiduals, height_field: HeightField) -> "c
     ends = residuals.ends(len(boundary))
     shares = residuals.by_height[:, None] * np.stack([1 - residuals.along, residuals.along], 1)
     by_height = jacobian_of_rows(
-        (shares[:, :, None] * basis[0][ends]).reshape(len(ends), -1),
-        index[ends].reshape(len(ends), -1),
+        (shares[:, :, None] * basis[0][ends]).reshape(-1, 32),
+        index[ends].reshape(-1, 32),
         height_field.coefficients.size,
     )
     known = sparse.diags(np.append([framed, framed, 0.0, framed], np.ones(boundary.size)))
     return sparse.hstack([boundary_jacobian(residuals, len(boundary)) @ known, by_height]).tocsr()
-
-
-def edge_equations(
-    residuals: BoundaryResiduals, height_field: HeightField, scale: float
-) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
-    """Gradient Jᵀ W e and matrix Jᵀ W J of the distances in pixels, at that robust scale."""
-    weights, size = residuals.weights(scale), height_field.plane.boundary.size
-    gradient, matrix = normal_equations(edge_jacobian(residuals, height_field), residuals.pixels, weights)
-    held = np.arange(4, 4 + size)
-    matrix[held, held] += vertex_pull(residuals, weights, size // 2)
-    return gradient, matrix

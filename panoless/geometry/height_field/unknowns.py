@@ -5,16 +5,16 @@ is seen there changes by ∇δ + (D²h d) δ/(d_z − ∇h·d). How far a map ca
 texels: coarse ones hold against it, and where they do means nothing.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from panoless.environment.surroundings import Surroundings
-from panoless.geometry.height_field.fit import BENDING, apply_height_field_step
 from panoless.geometry.height_field.model import HeightField
 from panoless.geometry.height_field.silhouette import edge_jacobian, edge_residuals
 from panoless.geometry.plane.model import passes_frame
+from panoless.geometry.plane.silhouette import apply_plane_step
 from panoless.geometry.plane.unknowns import LIMIT, boundary_motion_rows, vertices_kept
 from panoless.problem.observations import contours_of
 from panoless.problem.parametric import (
@@ -27,12 +27,17 @@ from panoless.problem.parametric import (
 )
 from panoless.problem.rays import PixelRays
 
+BENDING = 1e-4
+"""Weight of the bending energy beside photographs."""
+
 
 @dataclass(frozen=True)
 class HeightFieldUnknowns(ParametricSurface):
     """Those of the plane and its boundary, and then the coefficients."""
 
     height_field: HeightField
+    bending: float = BENDING
+    """Weight of the bending energy, a share of the mean diagonal of the data."""
 
     @property
     def surroundings(self) -> Surroundings:
@@ -94,15 +99,18 @@ class HeightFieldUnknowns(ParametricSurface):
         """The bending energy, and what keeps vertices."""
         field, found = self.height_field, vertices_kept(matrix, self.height_field.plane)
         part = slice(self.first, None)
-        found[part, part] = BENDING * np.trace(matrix[part, part]) / field.coefficients.size * field.bending()
+        found[part, part] = self.bending * np.trace(matrix[part, part]) / field.coefficients.size * field.bending()
         value = np.zeros(self.count)
         value[part] = field.coefficients.ravel()
         return Regularization(found, value)
 
     def stepped(self, step: Float[np.ndarray, "D"]) -> "HeightFieldUnknowns":
         """Moved."""
-        return HeightFieldUnknowns(apply_height_field_step(self.height_field, step))
+        field, (of_plane, of_heights) = self.height_field, np.split(step, [self.first])
+        plane = apply_plane_step(field.plane, of_plane)
+        coefficients = field.coefficients + of_heights.reshape(field.coefficients.shape)
+        return replace(self, height_field=replace(field, plane=plane, coefficients=coefficients))
 
     def refined(self) -> "HeightFieldUnknowns":
         """With half as large cells."""
-        return HeightFieldUnknowns(self.height_field.with_halved_cells())
+        return replace(self, height_field=self.height_field.with_halved_cells())
