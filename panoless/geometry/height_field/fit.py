@@ -33,8 +33,9 @@ SLOPE_STEPS = (0.1, 0.05, 0.025)
 """By these the best of them is made steeper or flatter, unless it is flat."""
 EDGE_BENDING = 1e-2
 """Weight of the bending energy in the first steps, against the mean diagonal of the data."""
-ROUNDS = (*JOINT_ROUNDS, FINISH)
-"""From coarse to fine. Only in the last do photographs determine the tilt of the whole."""
+ROUNDS = (*JOINT_ROUNDS, replace(FINISH, rays=200_000))
+"""From coarse to fine; known cameras need fewer pixels. Only in the last do photographs determine the tilt of the
+whole."""
 DOMES = Round(16, 0.5, 60_000, 0)
 """The map under which domes are compared."""
 CLEARANCES = (0.03, 0.06, 0.12)
