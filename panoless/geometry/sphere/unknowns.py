@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Float
 
 from panoless.environment.surroundings import Surroundings
-from panoless.geometry.sphere.fit import OutlineRays, OutlineResiduals
 from panoless.geometry.sphere.model import Sphere
 from panoless.numeric.gauss_newton import jacobian_of_rows
 from panoless.problem.parametric import (
@@ -60,22 +59,25 @@ class SphereUnknowns(ParametricSurface):
         return MirrorHits(clear, distance, found.points, found.normals, shape, rows, columns)
 
     def silhouette(self, rays: PixelRays) -> Silhouette:
-        """The angle by which rays pass outside (see `OutlineResiduals`)."""
-        touching = OutlineRays(rays.view, rays.origins, rays.directions, 1 / rays.size)
-        found = OutlineResiduals(self.sphere, touching)
-        rows = found.rows * [1, 1, 1, not self.radius_known]
-        toward = self.sphere.center - rays.origins
-        passing = (toward * rays.directions).sum(1)[:, None] * rays.directions - toward
-        outward = passing / np.maximum(np.linalg.norm(passing, axis=1, keepdims=True), 1e-12)
-        by_turn = np.cross(rays.directions, outward) / rays.size[:, None]
+        """β − α in pixels, and its derivatives. With p = c − o, β is the angle between a ray r and p, and that of a ray
+        that touches is α = arcsin(ρ/‖p‖):
+
+        ∂β/∂c = ((p·r) p⊥/‖p⊥‖ − ‖p⊥‖ r)/‖p‖², ∂α/∂(c, ρ) = (−ρ p/‖p‖², 1)/√(‖p‖² − ρ²).
+
+        The angle stays where all is scaled about a camera, so one view moves nothing along what it leaves open.
+        """
+        directions, radius, toward = rays.directions, self.sphere.radius, self.sphere.center - rays.origins
+        square, along = ((toward * each).sum(1, keepdims=True) for each in (toward, directions))
+        passing = toward - along * directions
+        across = np.maximum(np.linalg.norm(passing, axis=1, keepdims=True), 1e-12)
+        room = np.sqrt(np.maximum(square - radius**2, 1e-12))
+        angle = np.arctan2(across, along) - np.arcsin(np.clip(radius / np.sqrt(square), -1, 1))
+        by_center = (along * passing / across - across * directions) / square + radius * toward / square / room
+        by_radius = -(not self.radius_known) / room
+        by_turn = -np.cross(directions, passing / across)
+        rows = np.concatenate([angle, by_center, by_radius, by_turn, -by_center], 1) / rays.size[:, None]
         columns, seen = np.tile(np.arange(4), (len(rays.size), 1)), np.ones(len(rays.size), dtype=bool)
-        return Silhouette(
-            found.pixels,
-            seen,
-            seen,
-            jacobian_of_rows(rows, columns, 4),
-            np.concatenate([by_turn, -found.rows[:, :3]], 1),
-        )
+        return Silhouette(rows[:, 0], seen, seen, jacobian_of_rows(rows[:, 1:5], columns, 4), rows[:, 5:])
 
     def regularization(self, matrix: Float[np.ndarray, "4 4"]) -> Regularization:
         """A radius that is known stays."""

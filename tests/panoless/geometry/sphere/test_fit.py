@@ -14,10 +14,11 @@ from panoless.config import FitConfig
 from panoless.environment.options import SurroundingsOptions
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import observe_views
-from panoless.geometry.sphere.fit import Cones, OutlineRays, fit_sphere
+from panoless.geometry.sphere.fit import Cones, fit_sphere
 from panoless.geometry.sphere.kind import SphereFamily, SphereMirror
 from panoless.geometry.sphere.options import SphereOptions
 from panoless.kernels.cubemap import sample_cubemap
+from panoless.problem.rays import PixelRays
 from panoless.selection.candidates import Verdict
 from panoless.selection.choose import DOUBTED_ERROR, LARGEST_ERROR, choose_geometry
 from panoless.selection.options import CorrectionOptions
@@ -62,7 +63,7 @@ def fitted(views: Views, config: FitConfig = CONFIG) -> SphereMirror:
 
 def tangent_rays(
     center: Float[np.ndarray, "3"], half_axes: Float[np.ndarray, "3"], origins: Float[np.ndarray, "V 3"]
-) -> OutlineRays:
+) -> PixelRays:
     """Rays that touch an ellipsoid, by way of the unit sphere that it is a stretched image of.
 
     Seen from the distance d, tangent points of that lie on a circle at 1/d before its center, of radius √(1 − 1/d²).
@@ -75,8 +76,9 @@ def tangent_rays(
         ring = np.sqrt(1 - distance**-2) * np.stack([np.cos(turn), np.sin(turn)], 1) @ across
         rays = center + half_axes * (away / distance**2 + ring) - origin
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        parts.append((np.full(40, view), np.tile(origin, (40, 1)), rays, np.full(40, 300.0)))
-    return OutlineRays(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+        steps, size = np.zeros((40, 2, 3)), np.full(40, 1 / 300)
+        parts.append((np.tile(origin, (40, 1)), rays, steps, size, np.full(40, view)))
+    return PixelRays(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(2, 5))
@@ -105,7 +107,7 @@ def test_an_egg_is_no_sphere_whatever_the_noise_of_masks(
     origins = 4 * np.stack([np.sin(turns), -np.cos(turns), 0.2 + 0 * turns], 1)
     rays = tangent_rays(np.array([0.1, 0.0, 0.2]), np.array(half_axes, float), origins)
     rng = np.random.default_rng(1)
-    shaken = rays.directions + rng.normal(size=rays.directions.shape) * noise_px / rays.pixels_per_rad[:, None]
+    shaken = rays.directions + rng.normal(size=rays.directions.shape) * noise_px * rays.size[:, None]
     shaken /= np.linalg.norm(shaken, axis=1, keepdims=True)
     assert Cones.of(replace(rays, directions=shaken)).are_of_a_sphere() == is_sphere
 
