@@ -12,6 +12,7 @@ from torch.nn.functional import normalize
 
 from panoless.capture.encoding import SATURATED
 from panoless.environment.cubemap import flat_texels
+from panoless.environment.material_field import MaterialField
 from panoless.environment.rays import Rays
 from panoless.numeric.robust import robust_weight
 from shinypartial.core.harmonics import project, real_harmonics
@@ -38,6 +39,8 @@ class Reflectance:
     """Share of the light that is scattered."""
     scattered: Float[np.ndarray, "9 3"] = field(default_factory=lambda: np.zeros((9, 3)))
     """That light: coefficients of the harmonics up to degree 2 of the normal."""
+    field: MaterialField | None = None
+    """By which places differ from both."""
 
     @property
     def tint(self) -> tuple[float, float, float]:
@@ -51,20 +54,43 @@ class Reflectance:
         red, green, blue = self.albedo.clip(0, 1).tolist()
         return (red, green, blue) if self.albedo.any() else None
 
+    @property
+    def uneven_share(self) -> float | None:
+        """Share of the surface that differs; None where none does."""
+        return None if self.field is None else self.field.extent
+
+    @property
+    def is_scattering(self) -> bool:
+        """Whether any light is scattered."""
+        return bool(self.albedo.any()) or self.field is not None
+
+    @property
+    def is_perfect(self) -> bool:
+        """Whether all light is mirrored."""
+        return not self.is_scattering and min(self.tint) == 1
+
     def exposed(self, factor: float) -> "Reflectance":
         """The same in light that many times as bright."""
-        return replace(self, scattered=factor * self.scattered)
+        field = None if self.field is None else self.field.exposed(factor)
+        return replace(self, scattered=factor * self.scattered, field=field)
 
-    def share(self, cosines: Float[Tensor, "*P"]) -> Float[Tensor, "3 *P"]:
-        """F of cos θ in [0, 1]; grazing rays see all of the light."""
-        at_normal = torch.from_numpy(self.at_normal).to(cosines).reshape(3, *[1] * cosines.ndim)
-        return at_normal + (1 - at_normal) * grazing(cosines)
-
-    def scattering(self, normals_world: Float[Tensor, "3 *P"]) -> Float[Tensor, "3 *P"]:
-        """Radiance that unit normals scatter; zero where they are."""
-        normals = normals_world.flatten(1).T.double().cpu().numpy()
+    def shown(
+        self,
+        cosines: Float[Tensor, "P"],
+        normals_world: Float[Tensor, "P 3"],
+        points: Float[Tensor, "P 3"],
+    ) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
+        """F of cos θ in [0, 1], with F₀ and what is scattered as they are at points of the normalized frame; grazing
+        rays see all of the light. Where normals are zero, nothing is scattered.
+        """
+        normals = normals_world.double().cpu().numpy()
         light = np.where(normals.any(1, keepdims=True), real_harmonics(normals, 2) @ self.scattered, 0.0)
-        return torch.from_numpy(np.maximum(light, 0)).to(normals_world).T.reshape(normals_world.shape)
+        at_normal = np.broadcast_to(self.at_normal, light.shape)
+        if self.field is not None:
+            share, scattered = self.field.at(points.double().cpu().numpy())
+            at_normal, light = (at_normal + share).clip(0, 1), light + scattered
+        mirrored, matte = (torch.from_numpy(each.copy()).to(cosines) for each in (at_normal, light.clip(0)))
+        return mirrored + (1 - mirrored) * grazing(cosines)[:, None], matte
 
 
 def grazing(cosines: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:

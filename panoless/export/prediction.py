@@ -151,6 +151,7 @@ def export_prediction(
         surroundings=_near_surroundings(around, state.frame),
         reflectance=None if state.reflectance is None else state.reflectance.tint,
         albedo=None if state.reflectance is None else state.reflectance.scattered_share,
+        uneven=None if state.reflectance is None else state.reflectance.uneven_share,
         roughness=state.roughness,
         blur_px=state.blur_px,
         left_out=LEFT_OUT.get(config.splats.surfels.shading),

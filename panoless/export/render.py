@@ -55,8 +55,16 @@ def render(
         tint = specular.new_tensor(config.tint)[:, None, None]
         scattered = torch.zeros_like(specular)
         if reflectance is not None:
-            tint = reflectance.share(buffers.cosines(camera))
-            scattered = buffers.alpha * reflectance.scattering(normals)
+            tint = torch.ones_like(specular)
+            tint.flatten(1)[:, pixels], scattered.flatten(1)[:, pixels] = (
+                each.T
+                for each in reflectance.shown(
+                    buffers.cosines(camera).flatten()[pixels],
+                    normals.flatten(1)[:, pixels].T,
+                    buffers.points(camera, pixels),
+                )
+            )
+            scattered = buffers.alpha * scattered
         radiance, albedo = compose(buffers.albedo, specular, buffers.alpha, config.splats.alpha_applied), buffers.albedo
         if encoding.srgb:
             alpha = buffers.alpha.clamp(min=ALPHA_FLOOR)

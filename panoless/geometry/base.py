@@ -51,6 +51,13 @@ class SurfaceBuffers:
         cosines = -(normalize(self.normals_camera, dim=0) * rays).sum(0)
         return torch.where(self.alpha > 0, cosines.clamp(0, 1), 1.0)
 
+    def points(self, camera: RasterCamera, pixels: Int[Tensor, "P"]) -> Float[Tensor, "P 3"]:
+        """Where pixels (flat indices) of `camera` see the surface, in the normalized frame."""
+        rays = unit_rays_camera(camera, self.depth.device).flatten(1)[:, pixels]
+        points_camera = rays / rays[2] * self.depth.flatten()[pixels]
+        to_camera = camera.world_to_camera
+        return (points_camera - to_camera[:3, 3:]).T @ to_camera[:3, :3]
+
 
 def beside_outline(met: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     """Pixels among whose eight neighbors and themselves some hit a surface and some miss it."""

@@ -74,10 +74,8 @@ class Cells:
 
     def _index(self, view: TrainView, surface: SurfaceBuffers, pixels: Int[Tensor, "P"]) -> Int[Tensor, "P"]:
         """Cells of the cube of side 2 in which pixels see the surface; the nearest for what lies beyond."""
-        rays = view.rays_camera.flatten(1)[:, pixels]
-        points_camera = rays / rays[2] * surface.depth.flatten()[pixels]
-        points = view.camera_to_world_rotation @ (points_camera - view.camera.world_to_camera[:3, 3:])
-        grid = ((points + 1) / 2 * self.side).long().clamp(0, self.side - 1)
+        points = surface.points(view.camera, pixels)
+        grid = ((points.T + 1) / 2 * self.side).long().clamp(0, self.side - 1)
         return (grid[0] * self.side + grid[1]) * self.side + grid[2]
 
 

@@ -19,8 +19,10 @@ from panoless.environment.visibility import agreement, visibility_from_agreement
 from panoless.geometry.base import Geometry, observe_views, pixel_areas, usable_views
 from panoless.journal import remembered
 from panoless.reconstruct.state import FitState
-from panoless.selection.material import Softness, as_perfect_mirror, earned_reflectance, earned_softness
+from panoless.selection.material import as_perfect_mirror, earned_reflectance
+from panoless.selection.softness import Softness, earned_softness
 from panoless.splats.training import Training
+from shinypartial.io.events import note
 
 GRAY = 0.5
 
@@ -39,9 +41,10 @@ def complete(state: FitState, views: Views, config: FitConfig) -> tuple[Views, F
     if config.environment.solve or state.training is None:
         state.reflectance = earned_reflectance(usable, state.geometry, config)
     if state.reflectance is not None:
+        if state.reflectance.uneven_share is not None:
+            note(f"Material: differs on {state.reflectance.uneven_share:.0%} of the seen surface.")
         views = as_perfect_mirror(views, usable, state.geometry, state.reflectance, encoding_of(config))
-        shown = zip(usable.train, views.train, strict=True)
-        usable = replace(usable, train=tuple(replace(part, radiance=view.radiance) for part, view in shown))
+        usable = usable_views(views, state.geometry)
         config = replace(config, tint=state.reflectance.tint)
         state.reflectance = state.reflectance.exposed(1 / exposure)
     softness = Softness()

@@ -231,25 +231,25 @@ def _bends_rather(family: Family, geometry: Geometry, start: Start | None, views
     if held_out_parts(views) is None:
         return False
     with improving():
-        if geometry.surroundings.is_far:
-            return any(_bends_in_few_steps(other, geometry, views, config) for other in others)
-        far = replace(config, surroundings=replace(config.surroundings, mode="off"))
-        if start is not None and is_near(start, views, config, bent=True):
-            fitted = (fit_jointly(other, _source(other), views, start.proposal, far) for other in others)
-            return any(explains_clearly_more(views, each.geometry, geometry) for each in fitted)
+        bent = (_bent(other, geometry, start, views, config) for other in others)
+        return any(each is not None and explains_clearly_more(views, each, geometry) for each in bent)
     return False
 
 
 @remembered()
-def _bends_in_few_steps(other: Family, geometry: Geometry, views: Views, config: FitConfig) -> bool:
-    """With the cameras where the geometry has them, from the shape before the first step on."""
-    posed = geometry.corrected(views)
-    proposal = proposed(_source(other), posed, config)
-    if proposal is None:
-        return False
-    start = other.before_steps(posed, proposal, config)
-    bent = followed(other, posed, proposal, start, start.surroundings, config)
-    return explains_clearly_more(posed, bent, geometry.with_poses(None))
+def _bent(other: Family, geometry: Geometry, start: Start | None, views: Views, config: FitConfig) -> Geometry | None:
+    """A kind that refines a geometry; in few steps with its cameras, from the shape before the first step on."""
+    if geometry.surroundings.is_far:
+        posed = geometry.corrected(views)
+        proposal = proposed(_source(other), posed, config)
+        if proposal is None:
+            return None
+        begin = other.before_steps(posed, proposal, config)
+        return followed(other, posed, proposal, begin, begin.surroundings, config).with_poses(geometry.poses)
+    if start is None or not is_near(start, views, config, bent=True):
+        return None
+    far = replace(config, surroundings=replace(config.surroundings, mode="off"))
+    return fit_jointly(other, _source(other), views, start.proposal, far).geometry
 
 
 @remembered(lambda _, config: f"Stage 1 of 1: {FAMILIES[config.model].label}")

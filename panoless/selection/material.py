@@ -1,38 +1,46 @@
-"""What the mirror is made of, by what a finished geometry explains: a metal's color, which pales at grazing angles,
-what it scatters, and how rough it is; or how blurred the pictures are that look as if it were.
+"""What share of the light the object mirrors, and what it scatters beside, by what a finished geometry explains: a
+metal's color, which pales at grazing angles, evenly scattered light, and places that differ.
 
 It is taken for a perfect mirror until held-out views speak against it.
 """
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from panoless.capture.encoding import NO_TINT, SATURATED, RadianceEncoding, encoding_of
+from panoless.capture.rays import project
 from panoless.capture.views import TrainView, Views, split_held_out
 from panoless.config import FitConfig
-from panoless.environment.footprints import PixelFootprints, thinned
-from panoless.environment.lobe import Lobe
+from panoless.environment.material_field import MaterialPixels
 from panoless.environment.rays import Rays, joined_rays
-from panoless.environment.reflectance import Reflectance, find_reflectance, lamp_light, left_unexplained, unsaturated
-from panoless.environment.resolution import ERROR_SCALE
-from panoless.environment.roughness import SHARPENING_ROUNDS, sharpened_map
+from panoless.environment.reflectance import (
+    Reflectance,
+    cosines_of_incidence,
+    find_reflectance,
+    grazing,
+    lamp_light,
+    left_unexplained,
+    normals_of,
+    unsaturated,
+)
+from panoless.environment.resolution import ERROR_SCALE, count_rays
 from panoless.environment.solve import solve_environment
-from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, pixel_areas, usable_views
+from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, usable_views
 from panoless.journal import remembered
+from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.robust import bounded_error
 from panoless.selection.held_out import held_out_parts, is_clearly_lower
 
 RAYS = 100_000
-"""About so many pixels of all views tell the reflectance."""
+"""About so many pixels of all views determine an even reflectance."""
 RESOLUTION = 64
-"""Most texels along a face side of the maps under which reflectance, roughness and blur are judged."""
+"""Most texels along a face side of the maps under which reflectances are judged."""
 LARGEST_REFLECTANCE = 0.97
 """Of the channel that is mirrored least, above which held-out views do not decide."""
 LEAST_GAIN = 0.02
@@ -41,35 +49,36 @@ LEAST_ALBEDO = 0.02
 """Share of scattered light, in the channel that has most of it, from which held-out views decide."""
 LEAST_SCATTERING_GAIN = 0.1
 """Share by which scattered light has to lower the held-out error."""
-FIRST_BLUR_PX = 0.5
-"""Standard deviation of the blur that is tried first (px)."""
-BLURS_PX = (0.25, 2.0)
-"""Among these it is searched for (px)."""
-FIRST_ROUGHNESS = 0.085
-"""The roughness that is tried first."""
-LEAST_ROUGHNESS_GAIN = 0.01
-"""Share by which that has to lower the held-out error, also that of a sharp map which its lobe smooths afterwards."""
-LEAST_UNEXPLAINED = 0.01
-"""Held-out error of a sharp map from which anything softer is tried."""
-ROUGHNESSES = (0.06, 0.3)
-"""Among these a roughness is searched for."""
-TRIALS = 6
-"""So many are tried in the search, which tells it to 15 %, and in that of a blur."""
-JUDGED_PIXELS = 60_000
-"""About so many pixels at most make a map under which roughness is judged: two or three a texel."""
-JUDGED_ROUNDS = 8
-"""Steps that sharpen it for the first question; the search takes those of the exported map."""
 LEAST_SCATTERING_ERROR = 0.05
 """Held-out error of a fit from which the shape is looked for again without scattered light, where there is some."""
+FIELD_RESOLUTION = 128
+"""Most texels along a face side of the maps under which places are determined."""
+LEAST_FIELD_ERROR = 0.03
+"""Held-out error from which places may differ."""
+PIXELS = 300_000
+"""About so many pixels of all views at most determine how, and maps."""
+FIELD_ROUNDS = 3
+"""In which places and the map are determined in turn."""
+WHOLLY = 0.999
+"""Share of the texels around a direction that were seen, from which a map predicts it."""
+MANY_RADII = 1e3
+"""Distance at which a ray's direction is projected: beyond the near plane."""
+PIXELS_A_CELL = 3.0
+"""Side of a cell in pixels of the median view."""
+LEAST_CELLS, MOST_CELLS = 32, 128
+"""Along a side of the lattice."""
+LEAST_SHARE = 0.25
+"""Mirrored share, in the channel that is mirrored least, below which a pixel shows nothing of the surroundings."""
 
 
 @remembered()
 def earned_reflectance(views: Views, geometry: Geometry, config: FitConfig) -> Reflectance | None:
     """The reflectance of the object, if held-out views are clearly better explained by it; else None. Views are those
-    of usable pixels. One that scatters light, too, has to explain them clearly better than one that does not.
+    of usable pixels. One that scatters light, too, has to explain them clearly better than one that does not, and one
+    that differs from place to place clearly better than either.
 
-    Four fifths of the views tell it and the map by which the others are judged, then all views tell it anew. Nobody
-    asks where a tint is given, or in a high dynamic range.
+    Four fifths of the views determine it and the map by which the others are judged, then all views determine it.
+    Nothing is determined where a tint is given, or in a high dynamic range.
     """
     options, encoding = config.material, encoding_of(config)
     resolution = config.environment.trial_resolution(RESOLUTION)
@@ -92,9 +101,25 @@ def earned_reflectance(views: Views, geometry: Geometry, config: FitConfig) -> R
             other, best = (_errors(kept, held_out, each, resolution) for each in (found, earned))
             if is_clearly_lower(other, best, least):
                 earned = found
-        if earned is perfect:
-            return None
-        return find_reflectance(joined_rays(seen), resolution, lamps if earned is matte else None)
+        even = perfect
+        if earned is not perfect:
+            even = find_reflectance(joined_rays(seen), resolution, lamps if earned is matte else None)
+        if _differs(views, geometry, earned, config):
+            finest = config.environment.trial_resolution(FIELD_RESOLUTION)
+            return SeenSurface.of(views, geometry, encoding.saturation).with_field(even, finest)
+        return None if earned is perfect else even
+
+
+def _differs(views: Views, geometry: Geometry, even: Reflectance, config: FitConfig) -> bool:
+    """Whether places that differ explain held-out views clearly better than an even reflectance."""
+    parts, resolution = held_out_parts(views), config.environment.trial_resolution(FIELD_RESOLUTION)
+    if parts is None:
+        return False
+    known, tested = (SeenSurface.of(part, geometry, encoding_of(config).saturation) for part in parts)
+    errors = tested.errors(even, known, resolution)
+    if errors.mean() < LEAST_FIELD_ERROR:
+        return False
+    return is_clearly_lower(tested.errors(known.with_field(even, resolution), known, resolution), errors)
 
 
 def _errors(
@@ -108,21 +133,102 @@ def _errors(
     return np.array([np.average(part) if len(part) else 0.0 for part in parts])
 
 
+@dataclass(frozen=True)
+class SeenSurface:
+    """Pixels that see the surroundings, where they see a surface, and how. Arrays hold one row a pixel of all views."""
+
+    rays: Rays
+    points: Float[Tensor, "P 3"]
+    """In the normalized frame."""
+    view: Int[np.ndarray, "P"]
+    saturation: Float[Tensor, "3"]
+    cells: int
+    """Along the lattice on which places may differ."""
+
+    @classmethod
+    def of(cls, views: Views, geometry: Geometry, saturation: Float[Tensor, "3"]) -> "SeenSurface":
+        """Of usable pixels."""
+        seen = observe_views(views, geometry, PIXELS)
+        rays = [replace(each, radiance=each.radiance.to(each.directions)) for each in seen]
+        points = [
+            geometry.buffers(view.camera).points(view.camera, _pixels_of(view, each))
+            for view, each in zip(views.train, rays, strict=True)
+        ]
+        number = np.repeat(np.arange(len(rays)), [len(each.radiance) for each in rays])
+        sizes = [view.camera.fx / float(np.linalg.norm(view.position)) for view in views.train]
+        cells = int(np.clip(2 * np.median(sizes) / PIXELS_A_CELL, LEAST_CELLS, MOST_CELLS))
+        return cls(joined_rays(rays), torch.cat(points), number, saturation.to(points[0]), cells)
+
+    def map_under(self, reflectance: Reflectance, resolution: int) -> Float[Tensor, "6 3 L L"]:
+        """The map of what a perfect mirror would have shown: (c − D)/F, weighted by F²."""
+        share, scattered = self._shown(reflectance)
+        seen = self.rays.radiance
+        saturated = self.rays.reaches(SATURATED * self.saturation)[:, None]
+        mirrored = torch.where(saturated, seen, (seen - scattered).clamp(min=0)) / share.clamp(min=LEAST_SHARE)
+        trust = self.rays.initial_weight() * share.amin(1) ** 2
+        return solve_environment([Rays(self.rays.directions, mirrored, trust)], resolution)
+
+    def errors(self, reflectance: Reflectance, known: "SeenSurface", resolution: int) -> Float[np.ndarray, "V"]:
+        """Mean of ‖e‖²/(‖e‖² + s²) of each view under the map of others, over directions that those saw."""
+        share, scattered = self._shown(reflectance)
+        light = sample_cubemap(known.map_under(reflectance, resolution), self.rays.directions)
+        error = (share * light + scattered).minimum(self.saturation) - self.rays.radiance
+        bounded = bounded_error(error, ERROR_SCALE).double().cpu().numpy()
+        observed = (count_rays([known.rays], resolution) > 0).to(light)
+        counted = (sample_cubemap(observed, self.rays.directions)[:, 0] > WHOLLY).cpu().numpy()
+        found: np.ndarray = np.bincount(self.view, bounded * counted) / np.maximum(np.bincount(self.view, counted), 1)
+        return found
+
+    def with_field(self, even: Reflectance, resolution: int) -> Reflectance:
+        """The reflectance with places that differ from it: these and the map are determined in turn."""
+        found, pixels = even, MaterialPixels.of(self.points.double().cpu().numpy(), self.cells)
+        known = ~self.rays.reaches(SATURATED * self.saturation).cpu().numpy()
+        share, scattered = self._shown(even)
+        pale = 1 - grazing(cosines_of_incidence(self.rays))[:, None]
+        for _ in range(FIELD_ROUNDS):
+            light = sample_cubemap(self.map_under(found, resolution), self.rays.directions)
+            left = self.rays.radiance - share * light - scattered
+            slopes, residual = (each.double().cpu().numpy() for each in (light * pale, left))
+            field = pixels.field(slopes, residual, known)
+            found = replace(even, field=field)
+        return found
+
+    def _shown(self, reflectance: Reflectance) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
+        return reflectance.shown(cosines_of_incidence(self.rays), normals_of(self.rays), self.points)
+
+
+def _pixels_of(view: TrainView, rays: Rays) -> Int[Tensor, "P"]:
+    """Flat indices of the pixels through whose centers rays came."""
+    assert rays.incoming is not None
+    camera = view.camera
+    x, y = (each.floor().long() for each in project(camera, MANY_RADII * rays.incoming @ view.camera_to_world_rotation))
+    return y.clamp(0, camera.height - 1) * camera.width + x.clamp(0, camera.width - 1)
+
+
 def _without(
-    radiance: Float[Tensor, "3 H W"],
+    view: TrainView,
     posed: TrainView,
     surface: SurfaceBuffers,
-    found: Reflectance,
+    reflectance: Reflectance,
     encoding: RadianceEncoding,
-) -> Float[Tensor, "3 H W"]:
-    """(c − D)/F, at most the saturation over F₀, which what is saturated becomes: it may be any brighter."""
-    normals = torch.einsum("ij,jhw->ihw", posed.camera_to_world_rotation, normalize(surface.normals_camera, dim=0))
-    mirrored = (radiance - found.scattering(normals)).clamp(min=0)
-    saturated = radiance >= SATURATED * encoding.saturation.to(radiance)[:, None, None]
-    mirrored = torch.where(saturated, radiance, mirrored)
-    at_normal = torch.tensor(found.tint).to(radiance)[:, None, None]
-    share = found.share(surface.cosines(posed.camera))
-    return replace(encoding, tint=found.tint).without_gain(mirrored / at_normal, share / at_normal)
+) -> TrainView:
+    """(c − D)/F, at most the saturation over F₀, which what is saturated becomes: it may be any brighter. Pixels that
+    mirror too little are not solid.
+    """
+    pixels = torch.nonzero(surface.alpha.flatten() > 0)[:, 0].to(view.radiance.device)
+    normals = normalize(surface.normals_camera.flatten(1)[:, pixels], dim=0).T @ posed.camera_to_world_rotation.T
+    cosines, points = surface.cosines(posed.camera).flatten()[pixels], surface.points(posed.camera, pixels)
+    share, scattered = reflectance.shown(cosines, normals, points)
+    radiance, at_normal = view.radiance_at(pixels), torch.tensor(reflectance.tint).to(view.radiance)
+    mirrored = torch.where(
+        radiance >= SATURATED * encoding.saturation.to(radiance), radiance, (radiance - scattered).clamp(min=0)
+    )
+    shown = replace(encoding, tint=reflectance.tint).without_gain((mirrored / at_normal).T, (share / at_normal).T)
+    changed = view.radiance.clone()
+    changed.flatten(1)[:, pixels] = shown
+    dim = torch.zeros_like(view.mask, dtype=torch.bool).flatten()
+    dim[pixels] = share.amin(1) < LEAST_SHARE * at_normal.amin()
+    return replace(view, radiance=changed, solid=view.solid[~dim[view.solid]])
 
 
 def as_perfect_mirror(
@@ -131,11 +237,9 @@ def as_perfect_mirror(
     """The views as a perfect mirror would have shown them. `posed` are the same with their cameras as the geometry has
     them.
     """
-    train = []
-    for view, seen in zip(views.train, posed.train, strict=True):
-        radiance = _without(view.radiance, seen, geometry.buffers(seen.camera), reflectance, encoding)
-        train.append(replace(view, radiance=radiance))
-    return replace(views, train=tuple(train))
+    parts = zip(views.train, posed.train, strict=True)
+    shown = (_without(*each, geometry.buffers(each[1].camera), reflectance, encoding) for each in parts)
+    return replace(views, train=tuple(shown))
 
 
 def without_scattered_light(
@@ -152,122 +256,7 @@ def without_scattered_light(
         return None
     usable = usable_views(corrected, geometry)
     found = earned_reflectance(usable, geometry, config)
-    if found is None or not found.albedo.any():
+    if found is None or not found.is_scattering:
         return None
     mirror = as_perfect_mirror(views, usable, geometry, found, encoding_of(config))
     return mirror, replace(config, tint=found.tint)
-
-
-@dataclass(frozen=True)
-class Softness:
-    """What blurs the mirrored light on its way to the pixels."""
-
-    roughness: float | None = None
-    """Of the object, in (0, 0.5]; None: it is smooth."""
-    blur_px: float | None = None
-    """Standard deviation of a Gaussian over the pictures; None: they are sharp."""
-
-
-@remembered()
-def earned_softness(
-    views: Views,
-    geometry: Geometry,
-    config: FitConfig,
-    *,
-    first_roughness: float = FIRST_ROUGHNESS,
-    roughnesses: tuple[float, float] = ROUGHNESSES,
-    trials: int = TRIALS,
-) -> Softness:
-    """Roughness of the object or blur of the pictures, if held-out views are clearly better explained by one of them.
-    Views are those of usable pixels.
-
-    Four fifths of the views make the maps by which the others are judged: one that is shown as it is, one that a lobe
-    blurs, and one under wider pixels, after the same steps from the same start, and on areas of pixels, because a map
-    that knows of none is better blurred for that. A lobe averages noise, too, as that of compression. So a map that is
-    shown as it is has to explain less even where the lobe smooths it afterwards, which averages as much. A first value
-    of each tells whether to search on, and for which (Brent 1973). Where the sharp map leaves next to nothing
-    unexplained, nothing softer is needed. A lobe blurs all directions alike, a wider pixel
-    those that a curved part spreads. Nobody asks where the roughness is known, or in a high dynamic range, in which a
-    mean of encoded values is not the encoding of the mean.
-    """
-    options, encoding = config.material, encoding_of(config)
-    if encoding.high_dynamic_range or options.roughness == options.blur == "off":
-        return Softness()
-    if options.roughness == "auto" and options.known_roughness > 0:
-        return Softness(options.known_roughness)
-    with torch.no_grad():
-        trial = _SoftnessTrial.of(views, geometry, config)
-        if trial is None:
-            return Softness()
-        rounds = JUDGED_ROUNDS
-        sharp = trial.errors(Softness(), rounds)
-        if sharp.mean() < LEAST_UNEXPLAINED:
-            return Softness()
-        smoothing = Softness(roughness=first_roughness)
-        smoothed = trial.errors(Softness(), rounds, smoothing)
-        asked = []
-        if options.roughness == "auto":
-            asked.append(smoothing)
-        if options.blur == "auto":
-            asked.append(Softness(blur_px=FIRST_BLUR_PX))
-        errors = [trial.errors(each, rounds) for each in asked]
-        best = int(np.argmin([each.mean() for each in errors]))
-        is_more_than_smooth = errors[best].mean() < (1 - LEAST_ROUGHNESS_GAIN) * smoothed.mean()
-        if not is_more_than_smooth or not is_clearly_lower(errors[best], sharp, LEAST_ROUGHNESS_GAIN):
-            return Softness()
-        if asked[best].roughness is None:
-            return Softness(blur_px=trial.searched(lambda value: Softness(blur_px=value), BLURS_PX, trials))
-        return Softness(roughness=trial.searched(lambda value: Softness(roughness=value), roughnesses, trials))
-
-
-@dataclass(frozen=True)
-class _SoftnessTrial:
-    """Areas of pixels of the views that make a map, those of each other view, and the start of that map."""
-
-    known: list[PixelFootprints]
-    held_out: list[list[PixelFootprints]]
-    start: Float[Tensor, "6 3 L L"]
-    saturation: Float[Tensor, "3"]
-
-    @classmethod
-    def of(cls, views: Views, geometry: Geometry, config: FitConfig) -> "_SoftnessTrial | None":
-        """None where there are too few views."""
-        parts = held_out_parts(views)
-        if parts is None:
-            return None
-        known, *held_out = (
-            thinned(pixel_areas(each, geometry, config.environment.rays), JUDGED_PIXELS)
-            for each in (parts[0], *(replace(views, train=(view,)) for view in parts[1].train))
-        )
-        if not known:
-            return None
-        start = solve_environment([each.rays() for each in known], config.environment.trial_resolution(RESOLUTION))
-        return cls(known, held_out, start, encoding_of(config).saturation)
-
-    @remembered()
-    def errors(self, softness: Softness, rounds: int, smoothing: Softness = Softness()) -> Float[np.ndarray, "V"]:
-        """Mean of ‖e‖²/(‖e‖² + s²) of each held-out view with that softness, after so many rounds, under the map that
-        the lobe of another one then smooths.
-        """
-        lobe, smoother = (Lobe.of(each.roughness, self.start.shape[-1]) for each in (softness, smoothing))
-        blur_px = softness.blur_px or 0.0
-        known = [each.widened(blur_px) for each in self.known]
-        found = sharpened_map(self.start, known, lobe, self.saturation, rounds)
-        shown, found_errors = smoother.blurred(lobe.blurred(found)), []
-        for view in self.held_out:
-            wider = [each.widened(blur_px) for each in view]
-            error = [each.seen(shown).minimum(self.saturation.to(shown)) - each.radiance for each in wider]
-            found_errors.append(float(bounded_error(torch.cat(error), ERROR_SCALE).mean()) if error else 0.0)
-        return np.array(found_errors)
-
-    def searched(self, softness: Callable[[float], Softness], bounds: tuple[float, float], trials: int) -> float:
-        """The value between bounds that leaves the least error after the steps of the exported map; by logarithms."""
-        from scipy.optimize import minimize_scalar
-
-        found = minimize_scalar(
-            lambda logarithm: float(self.errors(softness(math.exp(logarithm)), SHARPENING_ROUNDS).mean()),
-            bounds=np.log(bounds),
-            method="bounded",
-            options={"maxiter": trials},
-        )
-        return math.exp(found.x)

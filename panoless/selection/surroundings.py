@@ -113,9 +113,7 @@ def on_floor(
         of_found, before = (_errors(kept, held_out, each) for each in (found, near.surroundings))
     if not is_clearly_lower(of_found, before, LEAST_REFINED_FLOOR_GAIN):
         return near
-    again = follow(near, found)
-    better = again is not None and explains_clearly_more(views, again, near, LEAST_REFINED_FLOOR_GAIN)
-    return again if again is not None and better else near
+    return follow(near, found) or near
 
 
 def _up(views: Views) -> Float[np.ndarray, "3"]:

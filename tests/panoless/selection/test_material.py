@@ -106,3 +106,41 @@ def test_a_veil_of_scattered_light_is_taken_off() -> None:
         assert one.camera.fx != other.camera.fx
     assert without_scattered_light(veiled, veiled, MIRROR, 0.0, CONFIG) is None
     assert without_scattered_light(PERFECT, PERFECT, MIRROR, 0.3, CONFIG) is None
+
+
+COLOR = np.array([0.6, 0.1, 0.05])
+
+
+def labeled(view: TrainView) -> TrainView:
+    """With a matte label on one side of the body."""
+    label = torch.from_numpy(on_label(view).reshape(view.mask.shape)) & (view.mask > 0.5)
+    color = torch.from_numpy(COLOR).float()[:, None, None]
+    return replace(view, radiance=torch.where(label, color, view.radiance))
+
+
+def on_label(view: TrainView) -> np.ndarray:
+    """Which pixels see it."""
+    hits = MIRROR.surface.hits(*rays_of(view.camera))
+    return hits.met & (hits.points[:, 1] < -0.3) & (np.abs(hits.points[:, 0]) < 0.25)
+
+
+def test_a_label_is_found_and_left_out() -> None:
+    """It is matte, and the mirror beside it stays as it was."""
+    views = replace(PERFECT, train=tuple(labeled(view) for view in PERFECT.train))
+    found = earned_reflectance(views, MIRROR, CONFIG)
+    assert found is not None
+    assert found.field is not None
+    assert found.tint == (1, 1, 1)
+    clean = as_perfect_mirror(views, views, MIRROR, found, LDR)
+    kept = of_label = left = 0
+    for before, view, true in zip(views.train, clean.train, PERFECT.train, strict=True):
+        label = on_label(before)[before.solid.numpy()]
+        stays = np.isin(before.solid.numpy(), view.solid.numpy())
+        of_label, left = of_label + int(label.sum()), left + int((label & ~stays).sum())
+        kept += int((stays & ~label).sum())
+        same = view.solid[~np.isin(view.solid.numpy(), before.solid.numpy()[label])]
+        apart = (view.radiance - true.radiance).flatten(1)[:, same].abs()
+        assert float(apart.median()) < 0.01
+    assert of_label > 200
+    assert left > 0.6 * of_label
+    assert kept > 0.9 * (sum(len(view.solid) for view in views.train) - of_label)

@@ -12,7 +12,7 @@ from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.options import MaterialOptions
 from panoless.geometry.revolution.kind import RevolutionMirror
-from panoless.selection.material import Softness, _SoftnessTrial, earned_softness
+from panoless.selection.softness import Softness, _SoftnessTrial, earned_softness
 from tests.support.mirror_revolution import around, goblet, rays_of, revolution_views
 
 ROUGHNESS = 0.3

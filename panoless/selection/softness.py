@@ -1,0 +1,162 @@
+"""How rough the object is, or how blurred pictures are that look as if it were, by what a finished geometry explains.
+
+Neither is taken for granted: held-out views decide.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from panoless.capture.encoding import encoding_of
+from panoless.capture.views import Views
+from panoless.config import FitConfig
+from panoless.environment.footprints import PixelFootprints, thinned
+from panoless.environment.lobe import Lobe
+from panoless.environment.resolution import ERROR_SCALE
+from panoless.environment.roughness import SHARPENING_ROUNDS, sharpened_map
+from panoless.environment.solve import solve_environment
+from panoless.geometry.base import Geometry, pixel_areas
+from panoless.journal import remembered
+from panoless.numeric.robust import bounded_error
+from panoless.selection.held_out import held_out_parts, is_clearly_lower
+
+RESOLUTION = 64
+"""Most texels along a face side of the maps under which roughness and blur are judged."""
+FIRST_BLUR_PX = 0.5
+"""Standard deviation of the blur that is tried first (px)."""
+BLURS_PX = (0.25, 2.0)
+"""Among these it is searched for (px)."""
+FIRST_ROUGHNESS = 0.085
+"""The roughness that is tried first."""
+LEAST_ROUGHNESS_GAIN = 0.01
+"""Share by which that has to lower the held-out error, also that of a sharp map which its lobe smooths afterwards."""
+LEAST_UNEXPLAINED = 0.01
+"""Held-out error of a sharp map from which anything softer is tried."""
+ROUGHNESSES = (0.06, 0.3)
+"""Among these a roughness is searched for."""
+TRIALS = 6
+"""So many are tried in the search, which tells it to 15 %, and in that of a blur."""
+JUDGED_PIXELS = 60_000
+"""About so many pixels at most make a map under which roughness is judged: two or three a texel."""
+JUDGED_ROUNDS = 8
+"""Steps that sharpen it for the first question; the search takes those of the exported map."""
+
+
+@dataclass(frozen=True)
+class Softness:
+    """What blurs the mirrored light on its way to the pixels."""
+
+    roughness: float | None = None
+    """Of the object, in (0, 0.5]; None: it is smooth."""
+    blur_px: float | None = None
+    """Standard deviation of a Gaussian over the pictures; None: they are sharp."""
+
+
+@remembered()
+def earned_softness(
+    views: Views,
+    geometry: Geometry,
+    config: FitConfig,
+    *,
+    first_roughness: float = FIRST_ROUGHNESS,
+    roughnesses: tuple[float, float] = ROUGHNESSES,
+    trials: int = TRIALS,
+) -> Softness:
+    """Roughness of the object or blur of the pictures, if held-out views are clearly better explained by one of them.
+    Views are those of usable pixels.
+
+    Four fifths of the views make the maps by which the others are judged: one that is shown as it is, one that a lobe
+    blurs, and one under wider pixels, after the same steps from the same start, and on areas of pixels, because a map
+    that knows of none is better blurred for that. A lobe averages noise, too, as that of compression. So a map that is
+    shown as it is has to explain less even where the lobe smooths it afterwards, which averages as much. A first value
+    of each tells whether to search on, and for which (Brent 1973). Where the sharp map leaves next to nothing
+    unexplained, nothing softer is needed. A lobe blurs all directions alike, a wider pixel
+    those that a curved part spreads. Nobody asks where the roughness is known, or in a high dynamic range, in which a
+    mean of encoded values is not the encoding of the mean.
+    """
+    options, encoding = config.material, encoding_of(config)
+    if encoding.high_dynamic_range or options.roughness == options.blur == "off":
+        return Softness()
+    if options.roughness == "auto" and options.known_roughness > 0:
+        return Softness(options.known_roughness)
+    with torch.no_grad():
+        trial = _SoftnessTrial.of(views, geometry, config)
+        if trial is None:
+            return Softness()
+        rounds = JUDGED_ROUNDS
+        sharp = trial.errors(Softness(), rounds)
+        if sharp.mean() < LEAST_UNEXPLAINED:
+            return Softness()
+        smoothing = Softness(roughness=first_roughness)
+        smoothed = trial.errors(Softness(), rounds, smoothing)
+        asked = []
+        if options.roughness == "auto":
+            asked.append(smoothing)
+        if options.blur == "auto":
+            asked.append(Softness(blur_px=FIRST_BLUR_PX))
+        errors = [trial.errors(each, rounds) for each in asked]
+        best = int(np.argmin([each.mean() for each in errors]))
+        is_more_than_smooth = errors[best].mean() < (1 - LEAST_ROUGHNESS_GAIN) * smoothed.mean()
+        if not is_more_than_smooth or not is_clearly_lower(errors[best], sharp, LEAST_ROUGHNESS_GAIN):
+            return Softness()
+        if asked[best].roughness is None:
+            return Softness(blur_px=trial.searched(lambda value: Softness(blur_px=value), BLURS_PX, trials))
+        return Softness(roughness=trial.searched(lambda value: Softness(roughness=value), roughnesses, trials))
+
+
+@dataclass(frozen=True)
+class _SoftnessTrial:
+    """Areas of pixels of the views that make a map, those of each other view, and the start of that map."""
+
+    known: list[PixelFootprints]
+    held_out: list[list[PixelFootprints]]
+    start: Float[Tensor, "6 3 L L"]
+    saturation: Float[Tensor, "3"]
+
+    @classmethod
+    def of(cls, views: Views, geometry: Geometry, config: FitConfig) -> "_SoftnessTrial | None":
+        """None where there are too few views."""
+        parts = held_out_parts(views)
+        if parts is None:
+            return None
+        known, *held_out = (
+            thinned(pixel_areas(each, geometry, config.environment.rays), JUDGED_PIXELS)
+            for each in (parts[0], *(replace(views, train=(view,)) for view in parts[1].train))
+        )
+        if not known:
+            return None
+        start = solve_environment([each.rays() for each in known], config.environment.trial_resolution(RESOLUTION))
+        return cls(known, held_out, start, encoding_of(config).saturation)
+
+    @remembered()
+    def errors(self, softness: Softness, rounds: int, smoothing: Softness = Softness()) -> Float[np.ndarray, "V"]:
+        """Mean of ‖e‖²/(‖e‖² + s²) of each held-out view with that softness, after so many rounds, under the map that
+        the lobe of another one then smooths.
+        """
+        lobe, smoother = (Lobe.of(each.roughness, self.start.shape[-1]) for each in (softness, smoothing))
+        blur_px = softness.blur_px or 0.0
+        known = [each.widened(blur_px) for each in self.known]
+        found = sharpened_map(self.start, known, lobe, self.saturation, rounds)
+        shown, found_errors = smoother.blurred(lobe.blurred(found)), []
+        for view in self.held_out:
+            wider = [each.widened(blur_px) for each in view]
+            error = [each.seen(shown).minimum(self.saturation.to(shown)) - each.radiance for each in wider]
+            found_errors.append(float(bounded_error(torch.cat(error), ERROR_SCALE).mean()) if error else 0.0)
+        return np.array(found_errors)
+
+    def searched(self, softness: Callable[[float], Softness], bounds: tuple[float, float], trials: int) -> float:
+        """The value between bounds that leaves the least error after the steps of the exported map; by logarithms."""
+        from scipy.optimize import minimize_scalar
+
+        found = minimize_scalar(
+            lambda logarithm: float(self.errors(softness(math.exp(logarithm)), SHARPENING_ROUNDS).mean()),
+            bounds=np.log(bounds),
+            method="bounded",
+            options={"maxiter": trials},
+        )
+        return math.exp(found.x)
