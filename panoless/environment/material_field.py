@@ -101,30 +101,33 @@ class MaterialPixels:
         self,
         light: Float[np.ndarray, "P 3"],
         residual: Float[np.ndarray, "P 3"],
-        known: Bool[np.ndarray, "P"],
+        saturated: Bool[np.ndarray, "P 3"],
     ) -> MaterialField:
         """min Σ w ‖y − E Δs − Δd‖² + λ Σ ‖Δ(v) − Δ(v′)‖² + μ Σ ‖Δ(v)‖², with Geman–McClure weights w.
 
-        Pixels whose radiance is not `known` do not count. Where more than a share of the error is left, both changes
-        are zero.
+        A channel that is `saturated` may be brighter, so it counts only where less is shown. Where more than a share
+        of the error is left at a vertex, both changes are zero.
         """
         changes, left = np.zeros((2, len(self.vertices), 3)), residual
         squares = self.adjoint.multiply(self.adjoint).tocsr()
         for scale in ROBUST_SCALES:
-            trust = (known * robust_weight(left, scale))[:, None]
+            trust = robust_weight(left, scale)[:, None] * ~(saturated & (left <= 0))
 
-            def pulled(value: Float[np.ndarray, "P 3"], trust: Float[np.ndarray, "P 1"] = trust) -> np.ndarray:
+            def pulled(value: Float[np.ndarray, "P 3"], trust: Float[np.ndarray, "P 3"] = trust) -> np.ndarray:
                 return np.stack([self.adjoint @ (trust * light * value), self.adjoint @ (trust * value)])
 
             def product(value: Float[np.ndarray, "2 N 3"], pulled: Callable[..., np.ndarray] = pulled) -> np.ndarray:
                 return pulled(self._shown(value, light)) + np.stack([self.penalty @ each for each in value])
 
-            diagonal = np.stack([squares @ (trust * light**2), squares @ np.broadcast_to(trust, light.shape)])
+            diagonal = np.stack([squares @ (trust * light**2), squares @ trust])
             diagonal += self.penalty.diagonal()[:, None]
             gradient = pulled(left) - np.stack([self.penalty @ each for each in changes])
             changes = changes + solve_by_products(product, gradient, 1 / diagonal, STEPS, TOLERANCE)
             left = residual - self._shown(changes, light)
-        before, after = (self.adjoint @ (known * bounded_error(each, JUDGED_SCALE)) for each in (residual, left))
+        before, after = (
+            self.adjoint @ bounded_error(np.where(saturated, each.clip(min=0), each), JUDGED_SCALE)
+            for each in (residual, left)
+        )
         changes *= (after < LARGEST_SHARE_LEFT * before)[:, None]
         return MaterialField(self.cells, self.vertices, changes[0], changes[1])
 

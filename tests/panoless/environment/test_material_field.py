@@ -15,7 +15,7 @@ RANDOM = np.random.default_rng(5)
 POINTS = RANDOM.normal(size=(30_000, 3))
 POINTS /= np.linalg.norm(POINTS, axis=1, keepdims=True) * 1.01
 LIGHT = RANDOM.uniform(0.1, 0.9, size=(30_000, 3))
-EVERY = np.ones(len(POINTS), dtype=bool)
+NOWHERE = np.zeros_like(POINTS, dtype=bool)
 LABEL = POINTS[:, 0] > 0.6
 WELL_INSIDE, WELL_OUTSIDE = POINTS[:, 0] > 0.75, POINTS[:, 0] < 0.45
 COLOR = np.array([0.5, 0.2, 0.1])
@@ -23,7 +23,7 @@ COLOR = np.array([0.5, 0.2, 0.1])
 
 def fitted(radiance: Float[np.ndarray, "P 3"]) -> MaterialField:
     """Beside a perfect mirror."""
-    return MaterialPixels.of(POINTS, CELLS).field(LIGHT, radiance - LIGHT, EVERY)
+    return MaterialPixels.of(POINTS, CELLS).field(LIGHT, radiance - LIGHT, NOWHERE)
 
 
 def test_trilinear_weights_reproduce_linear_functions() -> None:
@@ -45,6 +45,13 @@ def test_a_glaze_keeps_a_part_of_the_mirror() -> None:
     share, scattered = fitted(0.4 * LIGHT + COLOR).at(POINTS)
     assert share.mean(0) == pytest.approx(-0.6 * np.ones(3), abs=0.03)
     assert scattered.mean(0) == pytest.approx(COLOR, abs=0.02)
+
+
+def test_a_saturated_label_is_at_least_as_bright() -> None:
+    shown = np.where(LABEL[:, None], 1.0, LIGHT)
+    field = MaterialPixels.of(POINTS, CELLS).field(LIGHT, shown - LIGHT, shown == 1)
+    share, scattered = field.at(POINTS)
+    assert ((1 + share) * LIGHT + scattered)[WELL_INSIDE].mean() == pytest.approx(1, abs=0.1)
 
 
 def test_what_varies_without_the_light_is_no_material() -> None:
