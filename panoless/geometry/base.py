@@ -15,7 +15,7 @@ from torch.utils.weak import WeakIdKeyDictionary
 from panoless.capture.corrections import Corrections
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.poses import Poses
-from panoless.capture.rays import unit_rays_camera
+from panoless.capture.rays import pixel_rays, pose_of, unit_rays_camera
 from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
@@ -24,10 +24,15 @@ from panoless.environment.surroundings import Surroundings
 from panoless.kernels.camera import RasterCamera
 from panoless.problem.evidence import Decision
 from panoless.problem.nuisance import Block
+from panoless.problem.observations import outline_rays
+from panoless.problem.parametric import ParametricSurface
 
 Numbers = TypeVar("Numbers")
 SOLID_SURFACE_ALPHA = 0.9
 """A pixel with more alpha than this shows the surface."""
+SAMPLES = 4
+"""Rays along a side of a pixel at the outline, for its alpha, and of every pixel, for the mean light over its area."""
+MERIDIANS, RINGS = 128, 64
 _last_usable: MutableMapping["Geometry", tuple[Callable[[], Views | None], Views]] = WeakIdKeyDictionary()
 """The views that were asked for last, and the answer."""
 
@@ -90,6 +95,53 @@ def buffers_from_arrays(
 
 
 @dataclass(frozen=True)
+class RayHits:
+    """First points of rays on a surface; the nearest points of rays that miss it."""
+
+    met: Bool[np.ndarray, "P"]
+    points: Float[np.ndarray, "P 3"]
+    normals: Float[np.ndarray, "P 3"]
+    """Unit, outward."""
+
+
+@runtime_checkable
+class ClosedForm(Protocol):
+    """A surface with ray hits in closed form."""
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """What it mirrors."""
+        ...
+
+    def hits(self, origins: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"]) -> RayHits:
+        """The first hit of every ray; directions of any length."""
+        ...
+
+
+def buffers_by_hits(surface: ClosedForm, camera: RasterCamera, samples: int = SAMPLES) -> SurfaceBuffers:
+    """Depth and normals of rays through pixel centers; alpha the share of `samples`² rays that hit, at the outline.
+
+    Where only the center misses, depth and normal are those of where its ray comes nearest.
+    """
+    shape, (rotation, center) = (camera.height, camera.width), pose_of(camera)
+    everything = np.arange(camera.height * camera.width)
+    hits = surface.hits(*pixel_rays(camera, everything))
+    alpha = hits.met.astype(np.float64)
+    mixed = np.flatnonzero(beside_outline(hits.met.reshape(shape)))
+    parts = [surface.hits(*pixel_rays(camera, mixed, place)).met for place in parts_of_pixel(samples)]
+    alpha[mixed] = np.stack(parts, 1).mean(1)
+    covered = alpha > 0
+    depth = ((hits.points - center) @ rotation[2]) * covered
+    normals = (hits.normals * covered[:, None]) @ rotation.T
+    return buffers_from_arrays(alpha.reshape(shape), depth.reshape(shape), normals.T.reshape(3, *shape), camera)
+
+
+def parts_of_pixel(samples: int) -> list[tuple[float, float]]:
+    """The middles of the parts of a pixel, so many along a side."""
+    return [((i + 0.5) / samples, (j + 0.5) / samples) for j, i in np.ndindex(samples, samples)]
+
+
+@dataclass(frozen=True)
 class Mesh:
     """A surface as a file holds it, in world units: vertices with named columns beside x, y, z, and polygons."""
 
@@ -104,6 +156,16 @@ class Mesh:
     ) -> "Mesh":
         """A surface with the unit normals of its vertices as columns nx, ny, nz."""
         return cls(vertices, faces, dict(zip(("nx", "ny", "nz"), normals_world.T, strict=True)))
+
+    @staticmethod
+    def unit_sphere() -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 4"]]:
+        """Vertices and quadrilaterals between 128 meridians and 64 rings of ‖u‖ = 1; triangles' worth at the poles."""
+        polar, turn = np.pi * np.arange(RINGS + 1) / RINGS, 2 * np.pi * np.arange(MERIDIANS) / MERIDIANS
+        across, up = np.sin(polar)[:, None], np.cos(polar)[:, None] + 0 * turn
+        vertices = np.stack([across * np.cos(turn), across * np.sin(turn), up], -1).reshape(-1, 3)
+        index = np.arange(len(vertices)).reshape(RINGS + 1, MERIDIANS)
+        upper, lower = index[:-1], index[1:]
+        return vertices, np.stack([upper, lower, np.roll(lower, -1, 1), np.roll(upper, -1, 1)], -1).reshape(-1, 4)
 
 
 @runtime_checkable
@@ -212,6 +274,15 @@ class Proposal:
         """The same shape there, for a kind that knows near surroundings."""
         fitted = None if self.fitted is None else self.fitted.in_surroundings(surroundings)
         return replace(self, shape=replace(self.shape, surroundings=surroundings), fitted=fitted)
+
+    @classmethod
+    def of(cls, views: Views, shape: ClosedForm, unknowns: ParametricSurface) -> "Proposal":
+        """A shape with medians over the views: distance of contours from its silhouette (px), overlap with masks."""
+        rays = outline_rays(views, longest_only=True)
+        away = np.abs(unknowns.silhouette(rays).pixels)
+        medians = [np.median(away[rays.view == view]) for view in np.unique(rays.view)]
+        overlaps = [overlap(buffers_by_hits(shape, view.camera).alpha.to(view.mask), view.mask) for view in views.train]
+        return cls(shape, float(np.median(medians)), float(np.median(overlaps)))
 
 
 Propose = Callable[[Views], Proposal | None]

@@ -1,18 +1,18 @@
 """What kinds in closed form share: exact rays, one map, no steps of optimization."""
 
 from collections.abc import Collection
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
 from panoless.capture.encoding import encoding_of
 from panoless.capture.poses import Poses
-from panoless.capture.rays import pixel_rays, unit_rays_camera
+from panoless.capture.rays import pixel_rays, reflect, unit_rays_camera
 from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.deadline import improving
@@ -24,10 +24,13 @@ from panoless.environment.sharpening import sharpest_map
 from panoless.environment.solve import merged, solve_environment
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import (
+    ClosedForm,
     Family,
     Geometry,
     Proposal,
     Propose,
+    SurfaceBuffers,
+    buffers_by_hits,
     from_plain,
     observe_views,
     to_plain,
@@ -39,7 +42,7 @@ from panoless.problem.corrected import Corrected
 from panoless.problem.evidence import Decision
 from panoless.problem.nuisance import Block, nuisance_of
 from panoless.problem.parametric import ParametricSurface
-from panoless.problem.solve import LEAST_VIEWS, MOST_VIEWS, by_outlines, solve
+from panoless.problem.solve import FINISH, LEAST_VIEWS, MOST_VIEWS, ROUNDS, after_round, by_outlines, solve
 
 PROPOSALS = 3
 """Most by corrected silhouettes."""
@@ -56,6 +59,29 @@ class ExactGeometry:
 
     poses: Poses | None = field(default=None, kw_only=True)
     """Of the training views, where these were unknowns."""
+
+    @property
+    def shape(self) -> Any:
+        """The surface: the first field of the kind."""
+        return getattr(self, fields(self)[1].name)
+
+    @property
+    def num_parameters(self) -> int:
+        """Number of unknowns of the surface."""
+        return int(self.shape.num_parameters)
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """Surroundings of the surface."""
+        return cast(Surroundings, self.shape.surroundings)
+
+    def in_surroundings(self, surroundings: Surroundings) -> Any:
+        """The same surface in other surroundings."""
+        return replace(self, **{fields(self)[1].name: replace(self.shape, surroundings=surroundings)})
+
+    def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
+        """See `buffers_by_hits`."""
+        return buffers_by_hits(self.shape, camera)
 
     @property
     def num_primitives(self) -> int:
@@ -99,12 +125,11 @@ class ExactGeometry:
         normals_camera: Float[Tensor, "3 P"],
     ) -> Float[Tensor, "P 3"]:
         """The map where the normals mirror the pixels' centers to."""
-        mirror = cast(Geometry, self)
-        if mirror.surroundings.is_far:
+        if self.surroundings.is_far:
             return shade_centers(environment, camera, pixels, normals_camera)
         directions = mirrored_directions(camera, pixels, normals_camera)
-        depth = mirror.buffers(camera).depth
-        return sample_cubemap(environment, looked_up(mirror.surroundings, camera, depth, pixels, directions))
+        depth = self.buffers(camera).depth
+        return sample_cubemap(environment, looked_up(self.surroundings, camera, depth, pixels, directions))
 
     def to(self, device: torch.device) -> Any:
         """Itself: its numbers are arrays in main memory."""
@@ -124,13 +149,30 @@ class ExactGeometry:
 class ExactFamily:
     """A kind that is fitted at once, without steps."""
 
+    geometry: ClassVar[type[Geometry]]
     refines: ClassVar[str | None] = None
     needs_depth: ClassVar[bool] = True
     told_by_outlines: ClassVar[bool] = False
 
+    def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
+        """The geometry of the shape."""
+        return cast(Any, self.geometry)(proposal.shape)
+
     def before_steps(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """The proposal itself."""
-        return cast(Family, self).as_proposed(proposal, config)
+        return self.as_proposed(proposal, config)
+
+    def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
+        """The shape after rounds of the joint solve in which nothing else is free: all of `ROUNDS` and `FINISH`, or the
+        last from an earlier fit. The unknowns need `as_proposed`.
+        """
+        fitted = proposal.fitted
+        start = proposal if fitted is None else replace(proposal, shape=fitted.shape)
+        surface = self.unknowns(views, start, config)
+        with torch.no_grad():
+            for settings in (*(ROUNDS if fitted is None else ()), FINISH):
+                surface = after_round(views, surface, settings, FINISH.resolution)
+        return self.as_proposed(replace(start, shape=surface.as_proposed(1.0)), config)
 
     def unknowns(self, views: Views, proposal: Proposal, config: FitConfig) -> ParametricSurface:
         """A proposal as a surface of few numbers."""
@@ -210,9 +252,14 @@ class SeenByCenters(ExactGeometry):
     that are shifted by parts of a pixel.
     """
 
+    def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
+        """Solid pixels that see the surroundings."""
+        return self.seen(view, view.solid)[0]
+
     def seen(self, view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Int[Tensor, "Q"], Float[Tensor, "Q 3"]]:
-        """Which of the pixels see the surroundings, in order, and where these look in the map."""
-        raise NotImplementedError
+        """Which of the pixels see the surroundings, in order, and where these look in the map: after one reflection."""
+        outgoing, met = reflected(self.shape, *pixel_rays(view.camera, pixels.cpu().numpy()))
+        return pixels[torch.from_numpy(met).to(pixels.device)], torch.from_numpy(outgoing[met]).to(view.radiance)
 
     def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
         """The rays of those of the pixels that see the surroundings."""
@@ -235,6 +282,15 @@ def _shifted(view: TrainView, right: float, down: float) -> TrainView:
     """A view whose rays through pixel centers are those through other places within the pixels."""
     camera = view.camera
     return replace(view, camera=replace(camera, cx=camera.cx - right, cy=camera.cy - down))
+
+
+def reflected(
+    surface: ClosedForm, origins: Float[np.ndarray, "P 3"], directions: Float[np.ndarray, "P 3"]
+) -> tuple[Float[np.ndarray, "P 3"], Bool[np.ndarray, "P"]]:
+    """Directions in the map of rays after one reflection by a surface, and which rays meet it."""
+    hits = surface.hits(origins, directions)
+    outgoing = reflect(directions / np.linalg.norm(directions, axis=1, keepdims=True), hits.normals)
+    return surface.surroundings.looked_up(hits.points, outgoing), hits.met
 
 
 def shade_centers(

@@ -89,8 +89,8 @@ class ParametricSurface(Protocol):
 
     @property
     def limit(self) -> StepLimit:
-        """Of a step."""
-        ...
+        """Of a step: a fifth, in radii of the object or radians, of every number."""
+        return StepLimit(0.2, slice(self.count))
 
     @property
     def unseen(self) -> Float[np.ndarray, "D U"] | None:
@@ -106,8 +106,8 @@ class ParametricSurface(Protocol):
         ...
 
     def regularization(self, matrix: Float[np.ndarray, "D D"]) -> Regularization:
-        """What stands beside data of that normal matrix."""
-        ...
+        """What stands beside data of that normal matrix: nothing."""
+        return Regularization(np.zeros_like(matrix))
 
     def stepped(self, step: Float[np.ndarray, "D"]) -> "ParametricSurface":
         """After a step of its numbers."""

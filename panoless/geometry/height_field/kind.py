@@ -1,7 +1,7 @@
 """The height field as a kind of geometry."""
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -11,7 +11,7 @@ from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.surroundings import Surroundings
-from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, poses_from_plain, to_plain
+from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers
 from panoless.geometry.exact import ExactFamily, SeenByCenters
 from panoless.geometry.height_field.fit import CELLS, best_dome, fit_height_field
 from panoless.geometry.height_field.model import (
@@ -42,15 +42,6 @@ class HeightFieldMirror(SeenByCenters):
         plane = replace(self.height_field.plane, surroundings=surroundings)
         return replace(self, height_field=replace(self.height_field, plane=plane))
 
-    @property
-    def num_parameters(self) -> int:
-        """The plane's numbers and the coefficients of the height."""
-        return self.height_field.num_parameters
-
-    def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
-        """Solid pixels whose reflected rays pass the frame."""
-        return visible_reflections(self.height_field, view, view.solid).pixels
-
     def seen(self, view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Int[Tensor, "Q"], Float[Tensor, "Q 3"]]:
         """Those of the pixels whose reflected rays pass the frame."""
         visible = visible_reflections(self.height_field, view, pixels)
@@ -64,15 +55,6 @@ class HeightFieldMirror(SeenByCenters):
         """Quadrilaterals within the boundary, with the exact normals of the spline."""
         points, faces = self.height_field.quadrilaterals()
         return Mesh.smooth(frame.to_world(points), faces, self.height_field.normals_at(points))
-
-    def state_dict(self) -> dict[str, Any]:
-        """All numbers as lists and plain values."""
-        return {"height_field": to_plain(self.height_field), "poses": to_plain(self.poses)}
-
-    @classmethod
-    def from_state_dict(cls, content: dict[str, Any]) -> "HeightFieldMirror":
-        """The geometry that `state_dict` was taken from."""
-        return cls(from_plain(HeightField, content["height_field"]), poses=poses_from_plain(content))
 
 
 class HeightFieldFamily(ExactFamily):

@@ -1,6 +1,6 @@
 """The plane as a kind of geometry."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -10,7 +10,6 @@ from torch import Tensor
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
-from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import SOLID_SURFACE_ALPHA, Geometry, Mesh, Proposal, SurfaceBuffers
 from panoless.geometry.exact import ExactFamily, SeenByCenters, looked_up, mirrored_directions
 from panoless.geometry.plane.fit import fit_plane
@@ -30,20 +29,6 @@ class PlaneMirror(SeenByCenters):
     plane: Plane
     occlusion_test: bool = True
     """Whether pixels that show the frame in the mirror are left out."""
-
-    @property
-    def surroundings(self) -> Surroundings:
-        """Those of the plane."""
-        return self.plane.surroundings
-
-    def in_surroundings(self, surroundings: Surroundings) -> "PlaneMirror":
-        """The same plane there."""
-        return replace(self, plane=replace(self.plane, surroundings=surroundings))
-
-    @property
-    def num_parameters(self) -> int:
-        """Normal and offset, the boundary's vertices, the frame's height."""
-        return self.plane.num_parameters
 
     def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
         """Solid pixels that do not show the frame in the mirror."""

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from panoless.capture.views import Views
-from panoless.geometry.base import overlap
-from panoless.geometry.sphere.model import Sphere, sphere_buffers
+from panoless.geometry.base import Proposal
+from panoless.geometry.sphere.model import Sphere
 from panoless.geometry.sphere.unknowns import SphereUnknowns
 from panoless.numeric.cones import nearest_cone
 from panoless.numeric.factorize import regularize
@@ -32,8 +32,6 @@ CONE_SCALE_PX = 0.5
 """Robust scale of a cone (px)."""
 NOISE_SCALE = 3.0
 """A robust scale is no less than so many medians of the distances."""
-SAMPLES = 4
-"""Rays along each side of a pixel at the outline that tell how far it is covered, and of every pixel what it shows."""
 
 ORIGIN_PULL = 1e-6
 """Weight of a center at the origin of the normalized frame, for views that leave its distance open; not tuned."""
@@ -115,18 +113,7 @@ def _second_harmonic(
     return float(np.linalg.norm(np.linalg.solve(moment, weighted.T @ values)))
 
 
-@dataclass(frozen=True)
-class SphereFit:
-    """A sphere and how well it explains the masks, view by view."""
-
-    sphere: Sphere
-    median_px: Float[np.ndarray, "V"]
-    """Median distance of the mask's contour from the outline."""
-    overlap: Float[np.ndarray, "V"]
-    """Σ min(alpha, mask) / Σ max(alpha, mask)."""
-
-
-def fit_sphere(views: Views, radius: float = 0.0, *, asked: bool) -> SphereFit | None:
+def fit_sphere(views: Views, radius: float = 0.0, *, asked: bool) -> Proposal | None:
     """The sphere that explains the masks best; None where their outlines are no cones, unless it was `asked` for.
 
     A `radius` that is known, in units of the world, stays as it is; 0: unknown.
@@ -137,10 +124,4 @@ def fit_sphere(views: Views, radius: float = 0.0, *, asked: bool) -> SphereFit |
         return None
     known = radius / views.object_frame.radius
     surface = by_outlines_alone(views, SphereUnknowns(cones.sphere(known), known > 0))
-    sphere, size = surface.sphere, np.abs(surface.silhouette(rays).pixels)
-    medians = [np.median(size[rays.view == view]) for view in np.unique(rays.view)]
-    overlaps = []
-    for view in views.train:
-        alpha = sphere_buffers(sphere, view.camera, SAMPLES).alpha.to(view.mask)
-        overlaps.append(overlap(alpha, view.mask))
-    return SphereFit(sphere, np.array(medians), np.array(overlaps))
+    return Proposal.of(views, surface.sphere, surface)

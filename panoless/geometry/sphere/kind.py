@@ -1,7 +1,7 @@
 """The sphere as a kind of geometry."""
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -14,11 +14,10 @@ from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays
-from panoless.environment.surroundings import Surroundings
-from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, poses_from_plain, to_plain
+from panoless.geometry.base import SAMPLES, Geometry, Mesh, Proposal, parts_of_pixel
 from panoless.geometry.exact import ExactFamily, ExactGeometry
-from panoless.geometry.sphere.fit import SAMPLES, fit_sphere
-from panoless.geometry.sphere.model import CENTER, Sphere, mirrored, parts_of_pixel, sphere_buffers
+from panoless.geometry.sphere.fit import fit_sphere
+from panoless.geometry.sphere.model import CENTER, Sphere, mirrored
 from panoless.geometry.sphere.unknowns import SphereUnknowns
 from panoless.kernels.camera import RasterCamera
 from panoless.kernels.cubemap import sample_cubemap
@@ -29,9 +28,6 @@ WIDEST_FOOTPRINT_RAD = 0.2
 OPERATOR_TRUST = 0.01
 """Rays that show who takes the pictures count so little that any other view of their directions decides."""
 
-MERIDIANS = 128
-RINGS = 64
-
 
 @dataclass(frozen=True)
 class SphereMirror(ExactGeometry):
@@ -41,20 +37,6 @@ class SphereMirror(ExactGeometry):
     sphere: Sphere
     operator_deg: float = 0.0
     """Rays that return to their camera within this angle are hardly trusted."""
-
-    @property
-    def num_parameters(self) -> int:
-        """Center and radius."""
-        return self.sphere.num_parameters
-
-    @property
-    def surroundings(self) -> Surroundings:
-        """Those of the sphere."""
-        return self.sphere.surroundings
-
-    def in_surroundings(self, surroundings: Surroundings) -> "SphereMirror":
-        """The same sphere there."""
-        return replace(self, sphere=replace(self.sphere, surroundings=surroundings))
 
     def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
         """Solid pixels whose centers the sphere covers."""
@@ -103,31 +85,10 @@ class SphereMirror(ExactGeometry):
         light = sample_cubemap(environment, directions.flatten(0, 1)).unflatten(0, met.shape)
         return (light * weight[..., None]).sum(1) / weight.sum(1).clamp(min=1)[:, None]
 
-    def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
-        """By intersection; alpha by a grid of rays at the outline."""
-        return sphere_buffers(self.sphere, camera, SAMPLES)
-
     def mesh(self, frame: ObjectFrame) -> Mesh:
-        """Quadrilaterals between 128 meridians and 64 rings, with exact normals; triangles' worth at the poles."""
-        polar = np.pi * np.arange(RINGS + 1) / RINGS
-        turn = 2 * np.pi * np.arange(MERIDIANS) / MERIDIANS
-        across, up = np.sin(polar)[:, None], np.cos(polar)[:, None] + 0 * turn
-        normals = np.stack([across * np.cos(turn), across * np.sin(turn), up], -1).reshape(-1, 3)
-        index = np.arange(len(normals)).reshape(RINGS + 1, MERIDIANS)
-        upper, lower = index[:-1], index[1:]
-        faces = np.stack([upper, lower, np.roll(lower, -1, 1), np.roll(upper, -1, 1)], -1).reshape(-1, 4)
+        """Quadrilaterals between meridians and rings, with exact normals."""
+        normals, faces = Mesh.unit_sphere()
         return Mesh.smooth(frame.to_world(self.sphere.center + self.sphere.radius * normals), faces, normals)
-
-    def state_dict(self) -> dict[str, Any]:
-        """All numbers as lists and plain values."""
-        known = {"operator_deg": self.operator_deg, "poses": to_plain(self.poses)}
-        return {"sphere": to_plain(self.sphere), **known}
-
-    @classmethod
-    def from_state_dict(cls, content: dict[str, Any]) -> "SphereMirror":
-        """The geometry that `state_dict` was taken from."""
-        sphere = from_plain(Sphere, content["sphere"])
-        return cls(sphere, content["operator_deg"], poses=poses_from_plain(content))
 
     def _trust_by_return(self, view: TrainView, outgoing: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
         """Little where rays come back to their camera, which sees itself and who holds it there."""
@@ -160,19 +121,13 @@ class SphereFamily(ExactFamily):
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """Center and radius by outlines."""
         found = fit_sphere(views, config.sphere.radius, asked=asked)
-        if found is not None:
-            return Proposal(found.sphere, float(np.median(found.median_px)), float(np.median(found.overlap)))
-        if asked:
+        if found is None and asked:
             raise InputError(
                 expected="masks with an outline, for --model sphere",
                 found="none within the pictures",
                 remedy="Check that the ball lies within the pictures.",
             )
-        return None
-
-    def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
-        """The sphere."""
-        return SphereMirror(proposal.shape)
+        return found
 
     def unknowns(self, views: Views, proposal: Proposal, config: FitConfig) -> SphereUnknowns:
         """See there."""

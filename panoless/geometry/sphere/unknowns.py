@@ -8,14 +8,7 @@ from jaxtyping import Float
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.sphere.model import Sphere
 from panoless.numeric.gauss_newton import jacobian_of_rows
-from panoless.problem.parametric import (
-    LEAST_COSINE,
-    MirrorHits,
-    ParametricSurface,
-    Regularization,
-    Silhouette,
-    StepLimit,
-)
+from panoless.problem.parametric import LEAST_COSINE, MirrorHits, ParametricSurface, Regularization, Silhouette
 from panoless.problem.rays import PixelRays
 
 
@@ -35,11 +28,6 @@ class SphereUnknowns(ParametricSurface):
     def count(self) -> int:
         """Four."""
         return 4
-
-    @property
-    def limit(self) -> StepLimit:
-        """A fifth of the object's radius."""
-        return StepLimit(0.2, slice(4))
 
     def hits(self, rays: PixelRays) -> MirrorHits:
         """n = (x − c)/ρ with S = 1/ρ; at a fixed ray x moves by d (n·δc + δρ)/(n·d)."""

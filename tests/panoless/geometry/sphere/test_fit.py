@@ -118,11 +118,11 @@ def test_outlines_give_center_and_radius(count: int) -> None:
     views = ball_views(count)
     found = fit_sphere(views, asked=False)
     assert found is not None
-    center, radius = in_world(views, SphereMirror(found.sphere))
+    center, radius = in_world(views, SphereMirror(found.shape))
     assert np.abs(center).max() < 2e-3
     assert radius == pytest.approx(1.0, abs=2e-3)
-    assert np.median(found.median_px) < 0.05
-    assert np.median(found.overlap) > 0.99
+    assert found.silhouette_px < 0.05
+    assert found.overlap > 0.99
 
 
 @pytest.mark.parametrize("radius", [0.0, 2.5])
