@@ -91,6 +91,8 @@ FINEST_MAP_RAYS = 2_000_000
 """Rays of the map that has the resolution of the last round."""
 LEAST_GAIN = 0.02
 """Share of the held-out error by which a refinement has to be better to be kept."""
+Refined = tuple[SurfaceOfRevolution, PixelBundles, Float[Tensor, "6 3 L L"]]
+"""A surface, and held-out pixels and the map by which it is judged."""
 
 
 @dataclass(frozen=True)
@@ -209,12 +211,18 @@ class Refinement:
             surface, environment = self.refine_by_centers(surface, each, environment)
             progress.advance()
         assert environment is not None, "there is a fine round"
-        mapped = None
-        for refine in (self.refine_areas, self.refine_interior, self.refine_floor, self.refine_lip):
+        mapped, refinements = None, [self.by_areas, self.by_interior, self.by_floor, self.by_lip]
+        while refinements:
             if surface is not mapped:
                 environment, mapped = self.solve_finest_map(surface, environment), surface
-            surface = refine(surface, environment)
-            progress.advance()
+            refine = refinements.pop(0)
+            proposed = refine(surface, environment)
+            if proposed is not None:
+                surface = self.keep_if_better(surface, *proposed)
+            if surface is not mapped and refine == self.by_interior:
+                refinements.insert(0, self.by_areas)
+            else:
+                progress.advance()
         return surface
 
     def keep_if_better(
@@ -327,65 +335,56 @@ class Refinement:
         views = clear_of_lip(self.views, surface)
         return solve_map(views, surface, FINEST_MAP_RAYS, ROUNDS[: self.rounds][-1].resolution, environment)
 
-    def refine_areas(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
-        """Grooves and edges, by pixels as areas, where there are any."""
-        return self._keep_areas(surface, surface, environment)
-
     @remembered()
-    def _keep_areas(
-        self, surface: SurfaceOfRevolution, start: SurfaceOfRevolution, environment: Tensor
-    ) -> SurfaceOfRevolution:
-        """The outside by the areas of pixels, which sharpens its edges."""
-        views = clear_of_lip(self.kept, start)
-        if not has_edges(views, start, self.pixel):
-            return start
+    def by_areas(self, surface: SurfaceOfRevolution, environment: Tensor) -> Refined | None:
+        """Grooves and edges of the outside, by pixels as areas, where there are any."""
+        views = clear_of_lip(self.kept, surface)
+        if not has_edges(views, surface, self.pixel):
+            return None
         candidate = refine_by_footprints(
             views.train,
             self.contours,
-            start,
+            surface,
             environment,
             pixels=self.pixels // 2,
             rounds=ROUNDS[: self.rounds],
         )
-        held_out = informative_pixels(self.held_out.train, start, self.pixels // 8, self.pixel)
-        return self.keep_if_better(surface, candidate, PixelBundles.of(held_out), environment)
+        held_out = informative_pixels(self.held_out.train, surface, self.pixels // 8, self.pixel)
+        return candidate, PixelBundles.of(held_out), environment
 
-    def refine_interior(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
-        """An interior searched anew under a better map, and then its grooves and edges."""
+    @remembered()
+    def by_interior(self, surface: SurfaceOfRevolution, environment: Tensor) -> Refined | None:
+        """An interior searched again under a better map."""
         blurred = avg_pool2d(environment, max(environment.shape[-1] // SEARCHED_RESOLUTION, 1))
         outer = surface.profile[: surface.lip + 1]
         closed = replace(surface, profile=np.concatenate([outer, [[0.0, outer[-1, 1]]]]))
         found = search_interior(self.kept, closed, blurred, self.pixel)
-        # The search samples the outside anew, too, which would blunt its edges.
+        # The search samples the outside again, too, which would blunt its edges.
         candidate = replace(surface, profile=np.concatenate([outer, found.profile[found.lip + 1 :]]))
-        seen = self._held_out_ends(closed)
-        if self.keep_if_better(surface, candidate, seen, blurred) is surface:
-            return surface
-        return self._keep_areas(surface, candidate, environment)
+        return candidate, self._held_out_ends(closed), blurred
 
     @remembered()
-    def refine_floor(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
+    def by_floor(self, surface: SurfaceOfRevolution, environment: Tensor) -> Refined | None:
         """The floor, where enough pixels see it by way of the walls or from below."""
         seen, judging = (floor_pixels(part, surface) for part in (self.kept, self.held_out))
         if len(seen.radiance) < LEAST_FLOOR_PIXELS or not len(judging.radiance):
-            return surface
-        candidate = fit_floor(seen, surface, environment, self.pixel)
-        return self.keep_if_better(surface, candidate, judging, environment)
+            return None
+        return fit_floor(seen, surface, environment, self.pixel), judging, environment
 
     @remembered()
-    def refine_lip(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
+    def by_lip(self, surface: SurfaceOfRevolution, environment: Tensor) -> Refined | None:
         """The lip, where the wall is long enough and pixels mix it with what lies around it.
 
         It moves more of the wall than these pixels see, so the vessel as a whole must not be explained worse.
         """
         if surface.arc_lengths[surface.lip] < 2 * LENGTH_PX * self.pixel:
-            return surface
+            return None
         parts = ((self.kept, LIP_PIXELS), (self.held_out, LIP_PIXELS // 2))
         seen, judging = (lip_pixels(part.train, surface, count) for part, count in parts)
         if min(len(seen.radiance), len(judging.radiance)) < LEAST_LIP_PIXELS:
-            return surface
+            return None
         candidate = refine_lip(seen, surface, environment, self.pixel)
         whole = PixelBundles.of(evenly(self.held_out, WHOLE_PIXELS), CENTER)
         if self._error(whole, candidate, environment) > self._error(whole, surface, environment):
-            return surface
-        return self.keep_if_better(surface, candidate, judging, environment)
+            return None
+        return candidate, judging, environment

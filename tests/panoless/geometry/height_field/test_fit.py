@@ -182,13 +182,17 @@ def test_photographs_of_nothing_but_the_frame_are_left_out(views: Views) -> None
 
 @pytest.mark.parametrize("factor", [1.5, 1.0])
 def test_no_step_raises_the_cost(truth: HeightField, views: Views, factor: float) -> None:
-    """It falls from bumps half again as high; at the true ones a step of noise is refused or helps."""
-    found = linearized(data_of(views, 32), replace(truth, coefficients=factor * truth.coefficients))
+    """From bumps half again as high, of which the map that is solved there takes a part, that of photographs falls by a
+    third; at the true ones a step of noise is refused or helps.
+    """
+    data = data_of(views, 32)
+    silent = replace(data, outlines=data.outlines.chosen(slice(0, 0)))
+    found = linearized(silent, replace(truth, coefficients=factor * truth.coefficients))
     moved, fall, traced = found.after_step()
     before, after = (found.cost(state, np.zeros(state.surface.count), traced) for state in (found.state, moved))
     assert after <= before
     assert fall == pytest.approx(1 - after / before, abs=1e-4)
-    assert factor == 1.0 or fall > 0.25
+    assert factor == 1.0 or fall > 1 / 3
 
 
 def test_the_cost_has_the_gradient_of_its_equations(truth: HeightField, views: Views) -> None:

@@ -64,7 +64,8 @@ def refine_areas(views: Views, start: SurfaceOfRevolution) -> SurfaceOfRevolutio
     with torch.no_grad():
         # The two coarse rounds take a tenth of the time.
         fit = Refinement(views, start, rounds=2, pixels=24_000)
-        return fit.refine_areas(start, solve_map(views, start, 1_000_000, 64))
+        proposed = fit.by_areas(start, solve_map(views, start, 1_000_000, 64))
+        return start if proposed is None else fit.keep_if_better(start, *proposed)
 
 
 @pytest.fixture(scope="module")
