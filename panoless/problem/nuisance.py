@@ -136,7 +136,7 @@ class CameraPoses(Block):
     name = "poses"
     size = 6
     unit, scale = "°", 180 / math.pi
-    floor = 5e-4
+    floor = 2e-4
 
     @property
     def measured(self) -> slice:

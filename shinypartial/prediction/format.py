@@ -218,8 +218,8 @@ class PredictionInfo:
     it found the object to mirror at normal incidence, where that is not all of it; `albedo` what share it found to
     be scattered evenly; `uneven` on which share of the seen surface its material differs from both; `roughness`
     how rough, in units of Blender's principled shader, where it is not smooth; `blur_px` by how much it found the
-    pictures blurred (standard deviation of a Gaussian), where they are not sharp; `masks` is "dataset" where the method wrote none and its test views were cut out by the dataset's;
-    `left_out` names the parts of a published method that its re-implementation lacks. Each is None where it is
+    pictures blurred (standard deviation of a Gaussian), where they are not sharp; `masks` is
+    "dataset" where the method wrote none and its test views were cut out by the dataset's; `left_out` names the parts of a published method that its re-implementation lacks. Each is None where it is
     unknown or has no meaning.
     """
 
