@@ -219,8 +219,8 @@ class PredictionInfo:
     be scattered evenly; `uneven` on which share of the seen surface its material differs from both; `roughness`
     how rough, in units of Blender's principled shader, where it is not smooth; `blur_px` by how much it found the
     pictures blurred (standard deviation of a Gaussian), where they are not sharp; `masks` is
-    "dataset" where the method wrote none and its test views were cut out by the dataset's; `left_out` names the parts of a published method that its re-implementation lacks. Each is None where it is
-    unknown or has no meaning.
+    "dataset" where the method wrote none and its test views were cut out by the dataset's; `left_out` names the
+    parts of a published method that its re-implementation lacks. Each is None where it is unknown or has no meaning.
     """
 
     method: str
