@@ -18,7 +18,6 @@ from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays
-from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import (
     Geometry,
     Mesh,
@@ -89,15 +88,6 @@ class FreeFormMirror(ExactGeometry):
     trust: Trust
     occlusion_test: bool = True
     """Whether pixels that see the object again are left out."""
-
-    @property
-    def surroundings(self) -> Surroundings:
-        """Those of the surface."""
-        return self.surface.surroundings
-
-    def in_surroundings(self, surroundings: Surroundings) -> "FreeFormMirror":
-        """The same surface there."""
-        return replace(self, surface=replace(self.surface, surroundings=surroundings))
 
     @property
     def num_parameters(self) -> int:

@@ -13,7 +13,6 @@ from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints
 from panoless.environment.rays import Rays
-from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers, from_plain, poses_from_plain, to_plain
 from panoless.geometry.exact import ExactFamily, ExactGeometry
 from panoless.geometry.revolution.deblurred_map import pixel_footprints
@@ -37,20 +36,6 @@ class RevolutionMirror(ExactGeometry):
     surface: SurfaceOfRevolution
     occlusion_test: bool = True
     """Whether pixels that see the object again are left out."""
-
-    @property
-    def surroundings(self) -> Surroundings:
-        """Those of the surface."""
-        return self.surface.surroundings
-
-    def in_surroundings(self, surroundings: Surroundings) -> "RevolutionMirror":
-        """The same surface there."""
-        return replace(self, surface=replace(self.surface, surroundings=surroundings))
-
-    @property
-    def num_parameters(self) -> int:
-        """Axis and origin, and the profile's vertices."""
-        return self.surface.num_parameters
 
     def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:
         """Solid pixels, but for those beside the lip of an open wall, which mix two surfaces."""
