@@ -64,11 +64,6 @@ class Reflectance:
         """Whether any light is scattered."""
         return bool(self.albedo.any()) or self.field is not None
 
-    @property
-    def is_perfect(self) -> bool:
-        """Whether all light is mirrored."""
-        return not self.is_scattering and min(self.tint) == 1
-
     def exposed(self, factor: float) -> "Reflectance":
         """The same in light that many times as bright."""
         field = None if self.field is None else self.field.exposed(factor)
