@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import max_pool2d, normalize
 
 from panoless.capture.encoding import NO_TINT, SATURATED, RadianceEncoding, encoding_of
 from panoless.capture.rays import project
@@ -69,6 +69,8 @@ LEAST_CELLS, MOST_CELLS = 32, 128
 """Along a side of the lattice."""
 LEAST_SHARE = 0.25
 """Mirrored share, in the channel that is mirrored least, below which a pixel shows nothing of the surroundings."""
+BESIDE_PX = 3
+"""As far beside such a pixel, one shows a mixture: the side of a cell."""
 
 
 @remembered()
@@ -213,7 +215,7 @@ def _without(
     encoding: RadianceEncoding,
 ) -> TrainView:
     """(c − D)/F, at most the saturation over F₀, which what is saturated becomes: it may be any brighter. Pixels that
-    mirror too little are not solid.
+    mirror too little, and those beside them, which mix two materials, are not solid.
     """
     pixels = torch.nonzero(surface.alpha.flatten() > 0)[:, 0].to(view.radiance.device)
     normals = normalize(surface.normals_camera.flatten(1)[:, pixels], dim=0).T @ posed.camera_to_world_rotation.T
@@ -226,8 +228,9 @@ def _without(
     shown = replace(encoding, tint=reflectance.tint).without_gain((mirrored / at_normal).T, (share / at_normal).T)
     changed = view.radiance.clone()
     changed.flatten(1)[:, pixels] = shown
-    dim = torch.zeros_like(view.mask, dtype=torch.bool).flatten()
-    dim[pixels] = share.amin(1) < LEAST_SHARE * at_normal.amin()
+    dim = torch.zeros_like(view.mask)
+    dim.flatten()[pixels] = (share.amin(1) < LEAST_SHARE * at_normal.amin()).to(dim)
+    dim = max_pool2d(dim[None], 2 * BESIDE_PX + 1, 1, BESIDE_PX)[0].flatten() > 0
     return replace(view, radiance=changed, solid=view.solid[~dim[view.solid]])
 
 
