@@ -69,8 +69,6 @@ LEAST_CELLS, MOST_CELLS = 32, 128
 """Along a side of the lattice."""
 LEAST_SHARE = 0.25
 """Mirrored share, in the channel that is mirrored least, below which a pixel shows nothing of the surroundings."""
-BESIDE_PX = 3
-"""As far beside such a pixel, one shows a mixture: the side of a cell."""
 
 
 @remembered()
@@ -157,8 +155,8 @@ class SeenSurface:
             for view, each in zip(views.train, rays, strict=True)
         ]
         number = np.repeat(np.arange(len(rays)), [len(each.radiance) for each in rays])
-        sizes = [view.camera.fx / float(np.linalg.norm(view.position)) for view in views.train]
-        cells = int(np.clip(2 * np.median(sizes) / PIXELS_A_CELL, LEAST_CELLS, MOST_CELLS))
+        size_px = np.median([_size_px(view) for view in views.train])
+        cells = int(np.clip(size_px / PIXELS_A_CELL, LEAST_CELLS, MOST_CELLS))
         return cls(joined_rays(rays), torch.cat(points), number, saturation.to(points[0]), cells)
 
     def map_under(self, reflectance: Reflectance, resolution: int) -> Float[Tensor, "6 3 L L"]:
@@ -199,6 +197,11 @@ class SeenSurface:
         return reflectance.shown(cosines_of_incidence(self.rays), normals_of(self.rays), self.points)
 
 
+def _size_px(view: TrainView) -> float:
+    """Of the cube around the object, seen from the front."""
+    return 2 * view.camera.fx / float(np.linalg.norm(view.position))
+
+
 def _pixels_of(view: TrainView, rays: Rays) -> Int[Tensor, "P"]:
     """Flat indices of the pixels through whose centers rays came."""
     assert rays.incoming is not None
@@ -215,7 +218,7 @@ def _without(
     encoding: RadianceEncoding,
 ) -> TrainView:
     """(c − D)/F, at most the saturation over F₀, which what is saturated becomes: it may be any brighter. Pixels that
-    mirror too little, and those beside them, which mix two materials, are not solid.
+    mirror too little, and those within a cell beside them, which mix two materials, are not solid.
     """
     pixels = torch.nonzero(surface.alpha.flatten() > 0)[:, 0].to(view.radiance.device)
     normals = normalize(surface.normals_camera.flatten(1)[:, pixels], dim=0).T @ posed.camera_to_world_rotation.T
@@ -230,8 +233,10 @@ def _without(
     changed.flatten(1)[:, pixels] = shown
     dim = torch.zeros_like(view.mask)
     dim.flatten()[pixels] = (share.amin(1) < LEAST_SHARE * at_normal.amin()).to(dim)
-    dim = max_pool2d(dim[None], 2 * BESIDE_PX + 1, 1, BESIDE_PX)[0].flatten() > 0
-    return replace(view, radiance=changed, solid=view.solid[~dim[view.solid]])
+    if reflectance.field is not None:
+        beside = max(1, round(_size_px(posed) / reflectance.field.cells))
+        dim = max_pool2d(dim[None], 2 * beside + 1, 1, beside)[0]
+    return replace(view, radiance=changed, solid=view.solid[dim.flatten()[view.solid] == 0])
 
 
 def as_perfect_mirror(
