@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from panoless.numeric.conjugate_gradients import solve_by_products
 from panoless.numeric.robust import bounded_error, robust_weight
@@ -101,17 +101,15 @@ class MaterialPixels:
         self,
         light: Float[np.ndarray, "P 3"],
         residual: Float[np.ndarray, "P 3"],
-        saturated: Bool[np.ndarray, "P 3"],
     ) -> MaterialField:
         """min Σ w ‖y − E Δs − Δd‖² + λ Σ ‖Δ(v) − Δ(v′)‖² + μ Σ ‖Δ(v)‖², with Geman–McClure weights w.
 
-        A channel that is `saturated` may be brighter, so it counts only where less is shown. Where more than a share
-        of the error is left at a vertex, both changes are zero.
+        Where more than a share of the error is left at a vertex, both changes are zero.
         """
         changes, left = np.zeros((2, len(self.vertices), 3)), residual
         squares = self.adjoint.multiply(self.adjoint).tocsr()
         for scale in ROBUST_SCALES:
-            trust = robust_weight(left, scale)[:, None] * ~(saturated & (left <= 0))
+            trust = np.repeat(robust_weight(left, scale)[:, None], 3, 1)
 
             def pulled(value: Float[np.ndarray, "P 3"], trust: Float[np.ndarray, "P 3"] = trust) -> np.ndarray:
                 return np.stack([self.adjoint @ (trust * light * value), self.adjoint @ (trust * value)])
@@ -124,10 +122,7 @@ class MaterialPixels:
             gradient = pulled(left) - np.stack([self.penalty @ each for each in changes])
             changes = changes + solve_by_products(product, gradient, 1 / diagonal, STEPS, TOLERANCE)
             left = residual - self._shown(changes, light)
-        before, after = (
-            self.adjoint @ bounded_error(np.where(saturated, each.clip(min=0), each), JUDGED_SCALE)
-            for each in (residual, left)
-        )
+        before, after = (self.adjoint @ bounded_error(each, JUDGED_SCALE) for each in (residual, left))
         changes *= (after < LARGEST_SHARE_LEFT * before)[:, None]
         return MaterialField(self.cells, self.vertices, changes[0], changes[1])
 

@@ -182,14 +182,13 @@ class SeenSurface:
     def with_field(self, even: Reflectance, resolution: int) -> Reflectance:
         """The reflectance with places that differ from it: these and the map are determined in turn."""
         found, pixels = even, MaterialPixels.of(self.points.double().cpu().numpy(), self.cells)
-        saturated = (self.rays.radiance >= SATURATED * self.saturation).cpu().numpy()
         share, scattered = self._shown(even)
         pale = 1 - grazing(cosines_of_incidence(self.rays))[:, None]
         for _ in range(FIELD_ROUNDS):
             light = sample_cubemap(self.map_under(found, resolution), self.rays.directions)
             left = self.rays.radiance - share * light - scattered
             slopes, residual = (each.double().cpu().numpy() for each in (light * pale, left))
-            field = pixels.field(slopes, residual, saturated)
+            field = pixels.field(slopes, residual)
             found = replace(even, field=field)
         return found
 

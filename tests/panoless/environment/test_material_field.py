@@ -15,7 +15,6 @@ RANDOM = np.random.default_rng(5)
 POINTS = RANDOM.normal(size=(30_000, 3))
 POINTS /= np.linalg.norm(POINTS, axis=1, keepdims=True) * 1.01
 LIGHT = RANDOM.uniform(0.1, 0.9, size=(30_000, 3))
-NOWHERE = np.zeros_like(POINTS, dtype=bool)
 LABEL = POINTS[:, 0] > 0.6
 WELL_INSIDE, WELL_OUTSIDE = POINTS[:, 0] > 0.75, POINTS[:, 0] < 0.45
 COLOR = np.array([0.5, 0.2, 0.1])
@@ -23,7 +22,7 @@ COLOR = np.array([0.5, 0.2, 0.1])
 
 def fitted(radiance: Float[np.ndarray, "P 3"]) -> MaterialField:
     """Beside a perfect mirror."""
-    return MaterialPixels.of(POINTS, CELLS).field(LIGHT, radiance - LIGHT, NOWHERE)
+    return MaterialPixels.of(POINTS, CELLS).field(LIGHT, radiance - LIGHT)
 
 
 def test_trilinear_weights_reproduce_linear_functions() -> None:
@@ -49,7 +48,7 @@ def test_a_glaze_keeps_a_part_of_the_mirror() -> None:
 
 def test_a_saturated_label_is_at_least_as_bright() -> None:
     shown = np.where(LABEL[:, None], 1.0, LIGHT)
-    field = MaterialPixels.of(POINTS, CELLS).field(LIGHT, shown - LIGHT, shown == 1)
+    field = fitted(shown)
     share, scattered = field.at(POINTS)
     assert ((1 + share) * LIGHT + scattered)[WELL_INSIDE].mean() == pytest.approx(1, abs=0.1)
 
