@@ -9,7 +9,6 @@ y = E Δs(x) + Δd(x),
 which is linear in both. A light that varies from view to view separates the two.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -107,24 +106,35 @@ class MaterialPixels:
         Where more than a share of the error is left at a vertex, both changes are zero.
         """
         changes, left = np.zeros((2, len(self.vertices), 3)), residual
-        squares = self.adjoint.multiply(self.adjoint).tocsr()
         for scale in ROBUST_SCALES:
-            trust = np.repeat(robust_weight(left, scale)[:, None], 3, 1)
-
-            def pulled(value: Float[np.ndarray, "P 3"], trust: Float[np.ndarray, "P 3"] = trust) -> np.ndarray:
-                return np.stack([self.adjoint @ (trust * light * value), self.adjoint @ (trust * value)])
-
-            def product(value: Float[np.ndarray, "2 N 3"], pulled: Callable[..., np.ndarray] = pulled) -> np.ndarray:
-                return pulled(self._shown(value, light)) + np.stack([self.penalty @ each for each in value])
-
-            diagonal = np.stack([squares @ (trust * light**2), squares @ trust])
-            diagonal += self.penalty.diagonal()[:, None]
-            gradient = pulled(left) - np.stack([self.penalty @ each for each in changes])
-            changes = changes + solve_by_products(product, gradient, 1 / diagonal, STEPS, TOLERANCE)
+            changes = changes + self._step(changes, left, light, robust_weight(left, scale)[:, None])
             left = residual - self._shown(changes, light)
         before, after = (self.adjoint @ bounded_error(each, JUDGED_SCALE) for each in (residual, left))
         changes *= (after < LARGEST_SHARE_LEFT * before)[:, None]
         return MaterialField(self.cells, self.vertices, changes[0], changes[1])
+
+    def _step(
+        self,
+        changes: Float[np.ndarray, "2 N 3"],
+        left: Float[np.ndarray, "P 3"],
+        light: Float[np.ndarray, "P 3"],
+        trust: Float[np.ndarray, "P 1"],
+    ) -> Float[np.ndarray, "2 N 3"]:
+        """From changes to the least squares of these weights."""
+
+        def pulled(value: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "2 N 3"]:
+            return np.stack([self.adjoint @ (trust * light * value), self.adjoint @ (trust * value)])
+
+        def product(value: Float[np.ndarray, "2 N 3"]) -> Float[np.ndarray, "2 N 3"]:
+            return pulled(self._shown(value, light)) + self._penalized(value)
+
+        squares = self.adjoint.power(2)
+        diagonal = np.stack([squares @ (trust * light**2), np.repeat(squares @ trust, 3, 1)])
+        diagonal += self.penalty.diagonal()[:, None]
+        return solve_by_products(product, pulled(left) - self._penalized(changes), 1 / diagonal, STEPS, TOLERANCE)
+
+    def _penalized(self, changes: Float[np.ndarray, "2 N 3"]) -> Float[np.ndarray, "2 N 3"]:
+        return np.stack([self.penalty @ each for each in changes])
 
     def _shown(self, changes: Float[np.ndarray, "2 N 3"], light: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
         """E Δs + Δd."""

@@ -73,15 +73,16 @@ class Reflectance:
         self,
         cosines: Float[Tensor, "P"],
         normals_world: Float[Tensor, "P 3"],
-        points: Float[Tensor, "P 3"],
+        points: Float[Tensor, "P 3"] | None,
     ) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
         """F of cos θ in [0, 1], with F₀ and what is scattered as they are at points of the normalized frame; grazing
-        rays see all of the light. Where normals are zero, nothing is scattered.
+        rays see all of the light. Where normals are zero, nothing is scattered. Points matter where places differ only.
         """
         normals = normals_world.double().cpu().numpy()
         light = np.where(normals.any(1, keepdims=True), real_harmonics(normals, 2) @ self.scattered, 0.0)
         at_normal = np.broadcast_to(self.at_normal, light.shape)
         if self.field is not None:
+            assert points is not None, "places differ"
             share, scattered = self.field.at(points.double().cpu().numpy())
             at_normal, light = (at_normal + share).clip(0, 1), light + scattered
         mirrored, matte = (torch.from_numpy(each.copy()).to(cosines) for each in (at_normal, light.clip(0)))

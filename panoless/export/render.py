@@ -57,12 +57,7 @@ def render(
         if reflectance is not None:
             tint = torch.ones_like(specular)
             tint.flatten(1)[:, pixels], scattered.flatten(1)[:, pixels] = (
-                each.T
-                for each in reflectance.shown(
-                    buffers.cosines(camera).flatten()[pixels],
-                    normals.flatten(1)[:, pixels].T,
-                    buffers.points(camera, pixels),
-                )
+                each.T for each in buffers.shown(reflectance, camera, pixels)
             )
             scattered = buffers.alpha * scattered
         radiance, albedo = compose(buffers.albedo, specular, buffers.alpha, config.splats.alpha_applied), buffers.albedo

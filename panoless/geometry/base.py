@@ -20,6 +20,7 @@ from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays
+from panoless.environment.reflectance import Reflectance
 from panoless.environment.surroundings import Surroundings
 from panoless.kernels.camera import RasterCamera
 from panoless.problem.evidence import Decision
@@ -62,6 +63,16 @@ class SurfaceBuffers:
         points_camera = rays / rays[2] * self.depth.flatten()[pixels]
         to_camera = camera.world_to_camera
         return (points_camera - to_camera[:3, 3:]).T @ to_camera[:3, :3]
+
+    def shown(
+        self, reflectance: Reflectance, camera: RasterCamera, pixels: Int[Tensor, "P"]
+    ) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
+        """The share of the light that a surface of that reflectance mirrors, and what it scatters, at pixels of
+        `camera`.
+        """
+        normals = normalize(self.normals_camera.flatten(1)[:, pixels], dim=0).T @ camera.world_to_camera[:3, :3]
+        points = None if reflectance.field is None else self.points(camera, pixels)
+        return reflectance.shown(self.cosines(camera).flatten()[pixels], normals, points)
 
 
 def beside_outline(met: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:

@@ -6,12 +6,13 @@ It is taken for a perfect mirror until held-out views speak against it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import max_pool2d, normalize
+from torch.nn.functional import max_pool2d
 
 from panoless.capture.encoding import NO_TINT, SATURATED, RadianceEncoding, encoding_of
 from panoless.capture.rays import project
@@ -137,27 +138,31 @@ def _errors(
 class SeenSurface:
     """Pixels that see the surroundings, where they see a surface, and how. Arrays hold one row a pixel of all views."""
 
-    rays: Rays
-    points: Float[Tensor, "P 3"]
-    """In the normalized frame."""
-    view: Int[np.ndarray, "P"]
+    views: Views
+    geometry: Geometry
+    parts: tuple[Rays, ...]
+    """Of each view."""
     saturation: Float[Tensor, "3"]
-    cells: int
-    """Along the lattice on which places may differ."""
 
     @classmethod
     def of(cls, views: Views, geometry: Geometry, saturation: Float[Tensor, "3"]) -> "SeenSurface":
         """Of usable pixels."""
         seen = observe_views(views, geometry, PIXELS)
-        rays = [replace(each, radiance=each.radiance.to(each.directions)) for each in seen]
-        points = [
-            geometry.buffers(view.camera).points(view.camera, _pixels_of(view, each))
-            for view, each in zip(views.train, rays, strict=True)
-        ]
-        number = np.repeat(np.arange(len(rays)), [len(each.radiance) for each in rays])
-        size_px = np.median([_size_px(view) for view in views.train])
-        cells = int(np.clip(size_px / PIXELS_A_CELL, LEAST_CELLS, MOST_CELLS))
-        return cls(joined_rays(rays), torch.cat(points), number, saturation.to(points[0]), cells)
+        parts = tuple(replace(each, radiance=each.radiance.to(each.directions)) for each in seen)
+        return cls(views, geometry, parts, saturation.to(parts[0].directions))
+
+    @cached_property
+    def rays(self) -> Rays:
+        """Of all views."""
+        return joined_rays(self.parts)
+
+    @cached_property
+    def points(self) -> Float[Tensor, "P 3"]:
+        """Where they meet the surface, in the normalized frame: only places that differ need them."""
+        pairs = zip(self.views.train, self.parts, strict=True)
+        return torch.cat(
+            [self.geometry.buffers(view.camera).points(view.camera, _pixels_of(view, rays)) for view, rays in pairs]
+        )
 
     def map_under(self, reflectance: Reflectance, resolution: int) -> Float[Tensor, "6 3 L L"]:
         """The map of what a perfect mirror would have shown: (c − D)/F, weighted by F²."""
@@ -176,12 +181,15 @@ class SeenSurface:
         bounded = bounded_error(error, ERROR_SCALE).double().cpu().numpy()
         observed = (count_rays([known.rays], resolution) > 0).to(light)
         counted = (sample_cubemap(observed, self.rays.directions)[:, 0] > WHOLLY).cpu().numpy()
-        found: np.ndarray = np.bincount(self.view, bounded * counted) / np.maximum(np.bincount(self.view, counted), 1)
+        view = np.repeat(np.arange(len(self.parts)), [len(each.radiance) for each in self.parts])
+        found: np.ndarray = np.bincount(view, bounded * counted) / np.maximum(np.bincount(view, counted), 1)
         return found
 
     def with_field(self, even: Reflectance, resolution: int) -> Reflectance:
         """The reflectance with places that differ from it: these and the map are determined in turn."""
-        found, pixels = even, MaterialPixels.of(self.points.double().cpu().numpy(), self.cells)
+        size_px = np.median([_size_px(view) for view in self.views.train])
+        cells = int(np.clip(size_px / PIXELS_A_CELL, LEAST_CELLS, MOST_CELLS))
+        found, pixels = even, MaterialPixels.of(self.points.double().cpu().numpy(), cells)
         share, scattered = self._shown(even)
         pale = 1 - grazing(cosines_of_incidence(self.rays))[:, None]
         for _ in range(FIELD_ROUNDS):
@@ -193,7 +201,8 @@ class SeenSurface:
         return found
 
     def _shown(self, reflectance: Reflectance) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
-        return reflectance.shown(cosines_of_incidence(self.rays), normals_of(self.rays), self.points)
+        points = None if reflectance.field is None else self.points
+        return reflectance.shown(cosines_of_incidence(self.rays), normals_of(self.rays), points)
 
 
 def _size_px(view: TrainView) -> float:
@@ -220,9 +229,7 @@ def _without(
     mirror too little, and those within a cell beside them, which mix two materials, are not solid.
     """
     pixels = torch.nonzero(surface.alpha.flatten() > 0)[:, 0].to(view.radiance.device)
-    normals = normalize(surface.normals_camera.flatten(1)[:, pixels], dim=0).T @ posed.camera_to_world_rotation.T
-    cosines, points = surface.cosines(posed.camera).flatten()[pixels], surface.points(posed.camera, pixels)
-    share, scattered = reflectance.shown(cosines, normals, points)
+    share, scattered = surface.shown(reflectance, posed.camera, pixels)
     radiance, at_normal = view.radiance_at(pixels), torch.tensor(reflectance.tint).to(view.radiance)
     mirrored = torch.where(
         radiance >= SATURATED * encoding.saturation.to(radiance), radiance, (radiance - scattered).clamp(min=0)
