@@ -10,6 +10,7 @@ PREDICTION/decomposition.jpg          optional: a photograph, and what was recov
 PREDICTION/snapshots/000250           optional: earlier moments of the fit, each a prediction folder
 """
 
+import math
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -192,6 +193,16 @@ class FoundCamera:
     turn_sigma_deg: tuple[NonNegative, NonNegative, NonNegative] | None = None
     shift_sigma: tuple[NonNegative, NonNegative, NonNegative] | None = None
     gain: tuple[NonNegative, NonNegative, NonNegative] | None = None
+
+    @property
+    def turn_length_deg(self) -> float:
+        """The angle of the turn, 0 where there is none."""
+        return math.hypot(*(self.turn_deg or (0.0,)))
+
+    @property
+    def shift_length(self) -> float:
+        """By how much its center is moved (world units), 0 where it is not."""
+        return math.hypot(*(self.shift or (0.0,)))
 
 
 @dataclass(frozen=True)

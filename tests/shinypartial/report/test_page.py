@@ -16,7 +16,15 @@ from shinypartial.evaluation.scores import read_scores, score_rows, write_scores
 from shinypartial.io.images import write_png
 from shinypartial.io.picture_sheet import write_picture_sheet
 from shinypartial.metrics import perceptual
-from shinypartial.prediction.format import DECOMPOSITION, Candidate, ModelSelection, Trust, read_info, write_info
+from shinypartial.prediction.format import (
+    DECOMPOSITION,
+    Candidate,
+    FoundCamera,
+    ModelSelection,
+    Trust,
+    read_info,
+    write_info,
+)
 from shinypartial.report.line_chart import LEFT, Series, color_bar, line_chart
 from shinypartial.report.page import summary_lines, write_report
 from tests.support.truth_prediction import write_truth_prediction
@@ -125,6 +133,20 @@ def test_the_choice_of_the_model_is_a_table_and_a_sentence(evaluated: Path, page
     assert "revolution was chosen (&lt;better&gt; by 4 σ); plane: rejected (16 px away)." in text
     for word in ("16.2 px", "65.1%", "–", "0.0534 px", "99.9%", "0.0311"):
         assert word in text
+    write_info(evaluated, info)
+
+
+def test_what_was_estimated_of_each_training_view_is_a_table(evaluated: Path, page: str) -> None:
+    info = read_info(evaluated)
+    assert "Training views" not in page
+    cameras = (
+        FoundCamera("turned", turn_deg=(0.3, 0.0, 0.4), turn_sigma_deg=(0.01, 0.02, 0.03)),
+        FoundCamera("moved", shift=(0.03, 0.04, 0.0), shift_sigma=(0.001, 0.002, 0.001), gain=(0.9, 1.0, 1.1)),
+    )
+    write_info(evaluated, replace(info, cameras=cameras))
+    text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", write_report(evaluated).read_text(encoding="utf-8")))
+    assert "turned 0.500° 0.030° – – – – –" in text
+    assert "moved – – 0.05 0.002 0.900 1.000 1.100" in text
     write_info(evaluated, info)
 
 
