@@ -1,5 +1,6 @@
 """A kind of geometry in one file: the ellipsoid of the page *Add a kind of geometry*."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -42,10 +43,14 @@ class Config(FitConfig):
 
 
 @pytest.fixture(autouse=True)
-def registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The kind and its example for the contract of surfaces of few numbers."""
-    monkeypatch.setitem(FAMILIES, "ellipsoid", kind.EllipsoidFamily())
+def registered(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The kind and its example for the contract of surfaces of few numbers. The order of kinds is that of selection."""
     monkeypatch.setitem(contract.SURFACES, "ellipsoid", lambda: kind.EllipsoidUnknowns(tilted()))
+    kinds = dict(FAMILIES)
+    FAMILIES["ellipsoid"] = kind.EllipsoidFamily()
+    yield
+    FAMILIES.clear()
+    FAMILIES.update(kinds)
 
 
 @pytest.fixture(scope="module")
@@ -84,8 +89,8 @@ def test_the_page_shows_one_short_file() -> None:
     assert isinstance(kind.EllipsoidMirror(tilted()), Geometry)
 
 
-def test_the_option_names_all_registered_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(FAMILIES, "ellipsoid")
+def test_the_option_names_all_registered_kinds() -> None:
+    del FAMILIES["ellipsoid"]
     assert get_args(Model) == ("auto", *FAMILIES, "surfels")
 
 
@@ -138,9 +143,9 @@ def test_photographs_correct_masks(views: Views) -> None:
     assert normal_errors_deg(geometry, views).mean() < 0.1
 
 
-def test_model_selection_takes_it_where_no_sphere_does(views: Views, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_model_selection_takes_it_where_no_sphere_does(views: Views) -> None:
     for name in set(FAMILIES) - {"sphere", "ellipsoid"}:
-        monkeypatch.delitem(FAMILIES, name)
+        del FAMILIES[name]
     _, selection = choose_geometry(views, Config(model="auto"))
     assert {each.kind: each.verdict for each in selection.candidates} == {
         "sphere": Verdict.NOT_PROPOSED,

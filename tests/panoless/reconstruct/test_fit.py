@@ -194,6 +194,7 @@ def test_a_fit_that_a_time_limit_ended_continues(model: str, tmp_path: Path, man
     assert torch.equal(again.environment, whole.environment)
 
 
+@pytest.mark.splats
 @pytest.mark.parametrize("preset", [name for name in PRESETS if name.startswith("paper")])
 def test_the_paper_presets_run_all_their_paths(
     preset: str, tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch

@@ -72,7 +72,7 @@ def verdicts(selection: Selection) -> dict[str, Verdict]:
 
 @pytest.mark.parametrize(
     ("bend", "frame_height"),
-    [(0.0, 0.0), (0.0, 0.1), *(pytest.param(0.1, frame, marks=pytest.mark.slow) for frame in (0.0, 0.1))],
+    [(0.0, 0.0), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((0.0, 0.1), (0.1, 0.0), (0.1, 0.1)))],
 )
 def test_a_flat_mirror_takes_the_plane_and_a_bent_one_in_the_same_boundary_does_not(
     bend: float, frame_height: float

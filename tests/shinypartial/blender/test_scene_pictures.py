@@ -138,6 +138,7 @@ def test_the_mask_of_self_reflection_is_what_a_ray_caster_finds(name: str) -> No
     assert agree[seen.solid].mean() >= 0.99
 
 
+@pytest.mark.slow
 def test_self_reflection_is_found_where_it_must_be() -> None:
     share = {name: see(name).view.self_reflection[see(name).solid].mean() for name in scene_names()}
     convex = {"sphere", "pebble", "rounded-block", "chrome-block"}

@@ -324,7 +324,7 @@ def test_an_unknown_scene_is_refused_with_what_exists() -> None:
 
 @pytest.mark.parametrize(
     "limit_bytes",
-    [400, pytest.param(3000, marks=pytest.mark.slow), 100_000],
+    [400, *(pytest.param(each, marks=pytest.mark.slow) for each in (3000, 100_000))],
     ids=["at the manifest", "at the map", "at Blender's file"],
 )
 def test_a_full_disk_leaves_nothing_half_written(tmp_path: Path, limit_bytes: int) -> None:

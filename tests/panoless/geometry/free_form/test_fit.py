@@ -430,6 +430,7 @@ def test_the_matrix_with_all_unknowns_is_symmetric(solution: Solution) -> None:
     assert dot(one, one) > 0
 
 
+@pytest.mark.slow
 def test_blocks_of_views_end_where_scipy_ends(solution: Solution) -> None:
     """Under a surface and a map that stay: the cost of exposures and masks is no higher than that of its minimum."""
     nuisance = nuisance_of(body_views(wavy_ball(), 12, 20), [Exposures, MaskOffsets])

@@ -56,6 +56,7 @@ def test_a_photograph_of_another_room_is_left_out(far: Taken) -> None:
     assert 1 not in posed.adjusted.rotations
 
 
+@pytest.mark.slow
 def test_wrong_rotations_of_another_program_are_not_kept(far: Taken) -> None:
     """Structure from motion that mistook three equal cans for one another: two cameras by a quarter turn each."""
     wrong = dict(enumerate(far.truth))
