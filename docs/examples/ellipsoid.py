@@ -96,7 +96,7 @@ class EllipsoidUnknowns(ParametricSurface):
         rows = -np.einsum("pi,pik->pk", outward, _moves(points))
         jacobian = jacobian_of_rows(rows, np.tile(np.arange(9), (len(rows), 1)), 9)
         pixels, motions = (level - 1) * level / pixel, motion_rows(outward, directions, middle)
-        return Silhouette(pixels, valid, valid, jacobian, motions)
+        return Silhouette(pixels, valid.astype(float), valid, jacobian, motions)
 
     def stepped(self, step: Float[np.ndarray, "9"]) -> "EllipsoidUnknowns":
         """c + δ and e⁻ˢ Q e⁻ˢ, which stays positive."""

@@ -29,15 +29,12 @@ from panoless.problem.nuisance import (
 from panoless.problem.observations import Pixels, is_saturated, outline_rays, solid_pixels
 from panoless.problem.parametric import MirrorHits, ParametricSurface, Silhouette
 from panoless.problem.rays import PixelRays
-from panoless.problem.rows import CHI_MEDIAN, CORRELATED, rows_of
+from panoless.problem.rows import CHI_MEDIAN, CONTOUR_SIGMA_PX, CORRELATED, rows_of
 from shinypartial.core.sphere import tangents
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-CONTOUR_SIGMA_PX = 0.05
-"""Standard deviation of a contour point (px): less than its error, because errors of the map are common to all rays of
-a texel."""
 RADIANCE_SIGMA = 0.05
 """Standard deviation of a pixel (linear radiance) where nothing beside the surface is unknown."""
 LEAST_SIGMA = 0.005
@@ -278,8 +275,8 @@ class Equations:
         silhouette = surface.silhouette(outlines)
         distance = silhouette.pixels - nuisance.offsets_px(outlines.view)
         least = CONTOUR_SCALE_PX if data.settings.resolution else data.settings.robust_scale
-        scale = robust_scale(distance[silhouette.counted], least, NOISE_MULTIPLE)
-        weights = silhouette.counted * robust_weight(distance, scale) / CONTOUR_SIGMA_PX**2
+        scale = robust_scale(distance[silhouette.weights > 0], least, NOISE_MULTIPLE)
+        weights = silhouette.weights * robust_weight(distance, scale) / CONTOUR_SIGMA_PX**2
         rows, columns = beside(outlines, silhouette.by_motion[:, None], None)
         by_outlines, of_outlines = normal_equations(
             _jacobian(silhouette, rows[:, 0], columns, unknowns), distance, weights
@@ -327,8 +324,8 @@ class Equations:
             rays = state.nuisance.moved(self.data.outlines, self.data.cameras)
             found = state.surface.silhouette(rays)
             distance = found.pixels - state.nuisance.offsets_px(rays.view)
-        lost = np.where(found.valid, bounded_error(distance, self.scale_px), 1.0)[self.silhouette.counted]
-        return total + (self.scale_px / CONTOUR_SIGMA_PX) ** 2 * float(lost.sum()) / 2
+        lost = np.where(found.valid, bounded_error(distance, self.scale_px), 1.0)
+        return total + (self.scale_px / CONTOUR_SIGMA_PX) ** 2 * float(self.silhouette.weights @ lost) / 2
 
     def after_step(self) -> tuple[State, float, Traced | None]:
         """The state after the least damped of the tried steps that lowers the cost, by which share of it, and its

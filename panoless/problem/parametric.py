@@ -40,8 +40,8 @@ class Silhouette:
     """By how many pixels rays pass outside of the silhouette of a surface."""
 
     pixels: Float[np.ndarray, "S"]
-    counted: Bool[np.ndarray, "S"]
-    """Whether the derivatives are known."""
+    weights: Float[np.ndarray, "S"]
+    """Precisions over that of a contour point; 0 where the derivatives are not known."""
     valid: Bool[np.ndarray, "S"]
     """Whether there is a distance at all."""
     jacobian: "csr_matrix"

@@ -13,6 +13,9 @@ from panoless.problem.rays import PixelRays
 
 CHI_MEDIAN = 1.538
 """Median length of a vector of three normal numbers, in their standard deviation."""
+CONTOUR_SIGMA_PX = 0.05
+"""Standard deviation of a contour point (px): less than its error, because errors of the map are common to all rays of
+a texel."""
 CORRELATED = 16.0
 """Pixels that err alike under a map that is too coarse, or a surface that is wrong: patches of 4 × 4."""
 

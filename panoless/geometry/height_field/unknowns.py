@@ -93,7 +93,7 @@ class HeightFieldUnknowns(ParametricSurface):
         found = edge_residuals(contours_of(rays), self.height_field)
         jacobian = edge_jacobian(found, self.height_field)
         motions = boundary_motion_rows(found, self.height_field.plane, rays)
-        return Silhouette(found.pixels, found.counted, found.valid, jacobian, motions)
+        return Silhouette(found.pixels, found.counted.astype(float), found.valid, jacobian, motions)
 
     def regularization(self, matrix: Float[np.ndarray, "D D"]) -> Regularization:
         """The bending energy, and what keeps vertices."""

@@ -72,9 +72,8 @@ class PlaneUnknowns(ParametricSurface):
         """How far rays pass outside of the boundary or of the frame."""
         found = boundary_residuals(contours_of(rays), self.plane)
         jacobian = boundary_jacobian(found.framed(self.plane.frame_height > 0), len(self.plane.boundary))
-        return Silhouette(
-            found.pixels, found.counted, found.valid, jacobian, boundary_motion_rows(found, self.plane, rays)
-        )
+        motions = boundary_motion_rows(found, self.plane, rays)
+        return Silhouette(found.pixels, found.counted.astype(float), found.valid, jacobian, motions)
 
     def regularization(self, matrix: Float[np.ndarray, "D D"]) -> Regularization:
         """Along a straight side nothing else keeps a vertex where it is."""

@@ -106,6 +106,28 @@ class ProfileSplines:
         return matrix
 
 
+def side_normals(surface: SurfaceOfRevolution) -> Float[np.ndarray, "S 2 2"]:
+    """Outward normals (ρ, h) at both ends of every side."""
+    return np.stack([np.sin(surface.angles), -np.cos(surface.angles)], 2)
+
+
+def vertex_motions(surface: SurfaceOfRevolution) -> tuple[Float[np.ndarray, "M 2"], Float[np.ndarray, "M 2"]]:
+    """How vertices between two sides move (ρ, h) with the shifts of the side before and of the one after them.
+
+    They take the mean; over an edge, they go to the corner of both shifted sides.
+    """
+    normal = side_normals(surface)
+    before, after = normal[:-1, 1], normal[1:, 0]
+    sine = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    corner = (np.abs(sine) > LEAST_CORNER_SINE)[:, None]
+    divisor = np.where(corner, sine[:, None], 1.0)
+    across = np.stack([after[:, 1], -after[:, 0]], 1), np.stack([-before[:, 1], before[:, 0]], 1)
+    by_before, by_after = (
+        np.where(corner, edge / divisor, normal / 2) for edge, normal in zip(across, (before, after), strict=True)
+    )
+    return by_before, by_after
+
+
 def apply_step(
     surface: SurfaceOfRevolution, splines: ProfileSplines, step: Float[np.ndarray, "D"]
 ) -> SurfaceOfRevolution:
@@ -116,19 +138,13 @@ def apply_step(
     spacing = float(np.median(np.linalg.norm(np.diff(profile[1:], axis=0), axis=1)))
     limit = LARGEST_SHIFT_SIDES * spacing
     sides = np.arange(last)
-    normal = np.stack([np.sin(surface.angles), -np.cos(surface.angles)], 2)
     shifts = []
     for end in (0, 1):
         values, index = splines.values(sides, np.full(last, float(end)))
         shifts.append(np.clip((values * step[4:][index]).sum(1), -limit, limit))
-    # A vertex between two sides takes the mean; over an edge, the corner of both shifted sides.
-    before, after = normal[:-1, 1], normal[1:, 0]
-    sine = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
-    corner = np.abs(sine) > LEAST_CORNER_SINE
-    a, b, divisor = shifts[1][:-1], shifts[0][1:], np.where(corner, sine, 1.0)
-    exact = np.stack([a * after[:, 1] - b * before[:, 1], b * before[:, 0] - a * after[:, 0]], 1) / divisor[:, None]
-    mean = (before * a[:, None] + after * b[:, None]) / 2
-    profile[1:-1] += np.where(corner[:, None], exact, mean)
+    normal = side_normals(surface)
+    by_before, by_after = vertex_motions(surface)
+    profile[1:-1] += by_before * shifts[1][:-1, None] + by_after * shifts[0][1:, None]
     profile[1] = surface.profile[1] + normal[1, 0] * shifts[0][1]
     # Beyond a thin lip nothing holds a spline: it takes the shift of the vertex before.
     profile[-1] += normal[-1, 1] * (shifts[1][-1] if splines.counts[1] else shifts[0][-1])

@@ -45,6 +45,9 @@ BLUNT_CELLS = 4.0
 """A profile wider than this (cells) may end flat, where silhouettes stop telling its slope."""
 WIDEST_WITHIN = 0.6
 """The widest place of the body has a height below this (radii of the object frame)."""
+CUT_RATIO, CUT_CELLS = 3.0, 1.0
+"""An end cell narrower than its neighbor by this many times what that is narrower than the next, and so many cells
+more, is cut by an edge."""
 LEAST_CELLS = 5
 """Fewer cells make no profile."""
 GRAZING_RAD = math.radians(10.0)
@@ -156,7 +159,8 @@ def outer_surface(
     radius = np.where(np.isfinite(smallest), smallest, 0.0)
     heights = -TALLEST + (np.arange(cells) + 0.5) * cell
     ends = _ends(origins, heights, radius, cell)
-    for lowest, highest in [*ends[extent:], *reversed(ends[:extent])]:
+    for first, last in [*ends[extent:], *reversed(ends[:extent])]:
+        lowest, highest = (_uncut(radius, *each, cell) for each in ((first, last), (last, first)))
         if highest - lowest >= LEAST_CELLS:
             outer = np.stack([radius, heights], 1)[lowest : highest + 1]
             profile = closed_profile(outer)
@@ -194,6 +198,18 @@ def _ends(
         steep = radius[inward] - radius[end] > steepest * cell * np.abs(inward - end)
         pairs.append((int(inward[np.argmax(steep)]) if steep.any() else end, end, beyond))
     return list(dict.fromkeys(zip(*pairs, strict=True)))
+
+
+def _uncut(radius: Float[np.ndarray, "C"], end: int, other: int, cell: float) -> int:
+    """The end cell of a profile, or its neighbor where an edge, such as that of a mouth, cuts it.
+
+    A profile through what is left of it would fold as soon as the edge is fitted.
+    """
+    inward = 1 if other > end else -1
+    if abs(other - end) < LEAST_CELLS:
+        return end
+    narrower, before = (radius[end + (k + 1) * inward] - radius[end + k * inward] for k in (0, 1))
+    return end + inward * int(narrower > CUT_RATIO * abs(before) + CUT_CELLS * cell)
 
 
 def _blunt_end(radius: Float[np.ndarray, "C"], widest: int, tip: int, steepest: float, cell: float) -> int:

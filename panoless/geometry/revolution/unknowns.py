@@ -4,15 +4,23 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from panoless.environment.surroundings import Surroundings
-from panoless.geometry.revolution.model import SurfaceOfRevolution, trace_reflections
+from panoless.geometry.revolution.lip import SPOILED_PX
+from panoless.geometry.revolution.model import Hits, SurfaceOfRevolution, trace_reflections
 from panoless.geometry.revolution.photometric import normal_motion
-from panoless.geometry.revolution.profile import ProfileSplines, apply_step, resample_profile
+from panoless.geometry.revolution.profile import (
+    ProfileSplines,
+    apply_step,
+    resample_profile,
+    side_normals,
+    vertex_motions,
+)
 from panoless.geometry.revolution.silhouette import (
     LARGEST_TURN_RAD,
     ContourRays,
+    SilhouetteResiduals,
     axis_motion,
     parameter_columns,
     silhouette_residuals,
@@ -28,10 +36,13 @@ from panoless.problem.parametric import (
     motion_rows,
 )
 from panoless.problem.rays import PixelRays
+from panoless.problem.rows import CONTOUR_SIGMA_PX
 
 AXIS_NUMBERS = 4
 KNOT_PX, STIFF_PX = 3.0, 8.0
 """Spacing of the splines (px): for silhouettes, and for photographs, under which a proposal changes smoothly."""
+END_PX, END_SIGMA_PX = 4.0, 0.3
+"""Silhouettes so near to an end (px) have this standard deviation (px): edges are round, corners are not."""
 BENDING = 1e-3
 """Penalty on second differences of a step, in mean diagonals of the normal matrix."""
 
@@ -66,10 +77,13 @@ class RevolutionUnknowns(ParametricSurface):
         return StepLimit(LARGEST_TURN_RAD, slice(AXIS_NUMBERS))
 
     def hits(self, rays: PixelRays) -> MirrorHits:
-        """Where rays meet the outside and are mirrored once. What silhouettes leave open, its ends, is left out."""
+        """Where rays meet the outside and are mirrored once.
+
+        Its ends are left out: their corners bend what silhouettes show, and cameras would turn to make up for that.
+        """
         paths = trace_reflections(self.surface, rays.origins, rays.directions)
         first, count = paths.first, len(rays.size)
-        once = np.flatnonzero((paths.bounces == 1) & (first.side > 0) & (first.side < self.surface.lip))
+        once = np.flatnonzero((paths.bounces == 1) & ~self._is_end(first, SPOILED_PX))
         motion = normal_motion(rays.directions[once], first.of(once), self.surface, self.splines, self.pixel)
         kept = once[motion.kept]
         clear, distance = np.zeros(count, dtype=bool), np.where(first.met, first.distance, 0.0)
@@ -88,32 +102,47 @@ class RevolutionUnknowns(ParametricSurface):
         found = silhouette_residuals(
             ContourRays(rays.view, rays.origins, rays.directions, lengths), surface, self.pixel
         )
-        # At a corner, such as the edge of the base, sides have other normals than what the ray touches.
-        base = found.side <= 0
-        side, along = np.maximum(found.side, 1), np.where(base, 0.0, found.along)
-        values, index = self.splines.values(side, along)
+        # At a corner, that of the base or of the lid, sides have other normals than what the ray touches.
+        last = max(surface.lip - 1, 1)
+        base = (found.side <= 0) | ((found.side == 1) & (found.along <= 0))
+        lid = (found.side > last) | ((found.side == last) & (found.along >= 1))
+        side, along = np.clip(found.side, 1, last), np.where(base, 0.0, np.where(lid, 1.0, found.along))
         directions = rays.directions @ surface.frame.T
         azimuth = np.stack([-found.points[:, 1], found.points[:, 0], np.zeros(count)], 1)
         touched = np.cross(directions, azimuth)
         touched /= np.maximum(np.linalg.norm(touched, axis=1, keepdims=True), 1e-12)
-        outward = np.where(base[:, None], self._radial(found.points), found.normals)
+        radial = self._radial(found.points)
+        outward = np.where((base | lid)[:, None], radial, found.normals)
         touched *= np.sign((touched * outward).sum(1, keepdims=True))
-        angle = surface.angles[side, 0]
-        steep = np.sin(angle)[:, None] * self._radial(found.points) - np.cos(angle)[:, None] * np.eye(3)[2]
-        share = np.where(base, (steep * touched).sum(1), 1.0)
-        inverse = found.valid[:, None] / lengths[:, None]
-        rows = np.concatenate([-axis_motion(found.points, touched), -values * share[:, None]], 1) * inverse
+        in_half_plane = np.stack([(touched * radial).sum(1), touched[:, 2]], 1)
+        by_wall, by_lid = (each[last] for each in vertex_motions(surface))
+        share = np.where(base, in_half_plane @ side_normals(surface)[1, 0], 1.0)
+        share = np.where(lid, in_half_plane @ by_wall, share)
+        values, index = self.splines.values(side, along)
+        more, beyond = self.splines.values(np.full(count, last + 1), np.zeros(count))
+        splines = np.concatenate([values * share[:, None], more * (lid * (in_half_plane @ by_lid))[:, None]], 1)
+        met = found.side >= 0
+        inverse = met[:, None] / lengths[:, None]
+        rows = np.concatenate([-axis_motion(found.points, touched), -splines], 1) * inverse
+        columns = np.concatenate([parameter_columns(index), AXIS_NUMBERS + beyond], 1)
         normals = touched @ surface.frame
         points = found.points @ surface.frame + surface.origin
         distance = ((points - rays.origins) * rays.directions).sum(1)
         by_shift = normals * inverse
         return Silhouette(
-            np.where(found.side >= 0, found.pixels, 0.0),
-            found.valid,
-            found.side >= 0,
-            jacobian_of_rows(rows, parameter_columns(index), self.count),
+            np.where(met, found.pixels, 0.0),
+            met * np.where(self._is_end(found, END_PX), (CONTOUR_SIGMA_PX / END_SIGMA_PX) ** 2, 1.0),
+            met,
+            jacobian_of_rows(rows, columns, self.count),
             np.nan_to_num(motion_rows(by_shift, rays.directions, distance)),
         )
+
+    def _is_end(self, met: Hits | SilhouetteResiduals, reach_px: float) -> Bool[np.ndarray, "P"]:
+        """Whether that is the base, the lid, or so near to one."""
+        length, side = self.surface.arc_lengths, np.maximum(met.side, 0)
+        place = length[side] + met.along * (length[side + 1] - length[side])
+        reach: float = reach_px * self.pixel
+        return (place < length[1] + reach) | (place > length[self.surface.lip] - reach)
 
     def _radial(self, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
         """Unit directions from the axis, in its frame."""

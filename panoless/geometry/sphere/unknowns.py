@@ -65,7 +65,7 @@ class SphereUnknowns(ParametricSurface):
         by_turn = -np.cross(directions, passing / across)
         rows = np.concatenate([angle, by_center, by_radius, by_turn, -by_center], 1) / rays.size[:, None]
         columns, seen = np.tile(np.arange(4), (len(rays.size), 1)), np.ones(len(rays.size), dtype=bool)
-        return Silhouette(rows[:, 0], seen, seen, jacobian_of_rows(rows[:, 1:5], columns, 4), rows[:, 5:])
+        return Silhouette(rows[:, 0], seen.astype(float), seen, jacobian_of_rows(rows[:, 1:5], columns, 4), rows[:, 5:])
 
     def regularization(self, matrix: Float[np.ndarray, "4 4"]) -> Regularization:
         """A radius that is known stays."""

@@ -13,9 +13,12 @@ from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.geometry.height_field.model import flat_height_field
 from panoless.geometry.registry import FAMILIES
+from panoless.geometry.revolution.model import closed_profile
+from panoless.geometry.revolution.silhouette import contour_rays
+from panoless.geometry.revolution.unknowns import RevolutionUnknowns
 from panoless.problem.corrected import Corrected
 from panoless.problem.nuisance import CameraPoses, Exposures, FocalLength, MaskOffsets
-from panoless.problem.solve import Solved, solve
+from panoless.problem.solve import Solved, by_outlines_alone, solve
 from panoless.selection.joint import nuisance_kinds
 from tests.support.mirror_body import body_views, sphere
 from tests.support.mirror_height_field import height_field_views
@@ -102,3 +105,17 @@ def test_a_wrong_focal_length_is_found_with_a_flat_mirror(factor: float) -> None
     focal = found.state.nuisance.get(FocalLength)
     assert focal is not None
     assert np.exp(focal.values[0, 0]) == pytest.approx(1 / factor, abs=0.005)
+
+
+def test_silhouettes_put_an_end_that_is_too_low_where_it_is() -> None:
+    """A lid is the corner of wall and top: rays over its far edge, normal to neither, move both."""
+    true = goblet()
+    views = revolution_views(true, around(12), subpixels=1)
+    pixel = contour_rays(views).pixel
+    outer = true.profile[1 : true.lip + 1]
+    low = closed_profile(outer[outer[:, 1] < true.profile[true.lip, 1] - 1.2 * pixel])
+    start = replace(true, profile=low, lip=len(low) - 2)
+    found = by_outlines_alone(views, RevolutionUnknowns(start, pixel)).surface
+    before, after = (np.linalg.norm(each.profile[each.lip] - true.profile[true.lip]) for each in (start, found))
+    assert before > 1.2 * pixel
+    assert after < 0.3 * pixel
