@@ -11,7 +11,7 @@ from torch import Tensor
 
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
 from panoless.capture.encoding import encoding_of
-from panoless.capture.poses import Poses
+from panoless.capture.poses import Poses, StatedCameras
 from panoless.capture.rays import pixel_rays, reflect, unit_rays_camera
 from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
@@ -208,9 +208,12 @@ class ExactFamily:
             )
         if not found.state.nuisance.blocks:
             return _fitted(family, views, proposal, config), NO_CORRECTIONS, list(found.decisions)
-        by = Corrected.by(found.state.nuisance, found.variances)
+        surface, nuisance = found.state.surface, found.state.nuisance
+        if surface.as_proposed(1.0) is None:
+            nuisance = nuisance.without_common(StatedCameras.of(views))
+        by = Corrected.by(nuisance, found.variances)
         corrected = by.applied(views, config)
-        shape = found.state.surface.as_proposed(by.scale)
+        shape = surface.as_proposed(by.scale)
         again = (propose(corrected) or start) if shape is None else replace(start, shape=shape)
         around = found.state.nuisance.around(proposal.shape.surroundings).scaled(by.scale)
         geometry = _fitted(family, corrected, again.in_surroundings(around), config)

@@ -274,6 +274,14 @@ class Nuisance:
         left = Nuisance(tuple(each for each in self.blocks if each.name not in names))
         return left.freed(self.free)
 
+    def without_common(self, cameras: StatedCameras) -> "Nuisance":
+        """With poses in a world without what moves all cameras alike, of which damped steps leave some."""
+        found = self.get(CameraPoses)
+        if found is None:
+            return self
+        _, poses = found.poses.without_common(cameras, found.precision)
+        return self.replaced([replace(found, values=poses.stacked)])
+
     def of_views(self, numbers: Sequence[int]) -> "Nuisance":
         """Of some of the views."""
         index = np.asarray(numbers, dtype=np.int64)

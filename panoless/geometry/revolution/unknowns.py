@@ -160,10 +160,6 @@ class RevolutionUnknowns(ParametricSurface):
         """Moved."""
         return replace(self, surface=apply_step(self.surface, self.splines, step))
 
-    def as_proposed(self, scale: float) -> SurfaceOfRevolution:
-        """Silhouettes alone fold a profile at an open end, where they show the rim from both sides."""
-        return replace(self.surface, profile=self.surface.profile * scale, origin=self.surface.origin * scale)
-
     def settled(self) -> "RevolutionUnknowns":
         """With vertices about a pixel apart."""
         return replace(self, surface=resample_profile(self.surface, self.pixel))

@@ -170,16 +170,3 @@ def test_silhouettes_change_with_motions_of_their_rays(name: str) -> None:
         kept = (found.weights > 0) & (ahead.weights > 0) & (behind.weights > 0)
         difference = (ahead.pixels - behind.pixels)[kept] / 2
         assert np.median(np.abs(difference - found.by_motion[kept, axis] * 1e-5)) < 0.02 * scale
-
-
-def test_a_start_in_a_larger_world_is_as_many_times_as_large() -> None:
-    """Rays from scaled origins meet it as many times as far away, with the same normals."""
-    surface, scale = vase(), 1.03
-    assert isinstance(surface, RevolutionUnknowns)
-    larger = replace(surface, surface=surface.as_proposed(scale))
-    rays = inner()
-    found, again = surface.hits(rays), larger.hits(replace(rays, origins=rays.origins * scale))
-    both = found.clear & again.clear
-    assert both.sum() > 10
-    assert np.allclose(again.distance[both], scale * found.distance[both])
-    assert np.allclose(again.normals[both], found.normals[both], atol=1e-9)
