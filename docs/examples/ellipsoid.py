@@ -87,8 +87,7 @@ class EllipsoidUnknowns(ParametricSurface):
         """
         surface, directions = self.surface, rays.directions
         middle = surface.chords(rays.origins, directions)[0]
-        valid = middle > 0
-        middle = np.where(valid, middle, 1.0)
+        valid, middle = middle > 0, np.where(middle > 0, middle, 1.0)
         points = rays.origins + middle[:, None] * directions - surface.center
         gradient = points @ surface.matrix
         pixel = np.maximum(np.linalg.norm(gradient, axis=1), 1e-12) * middle * rays.size
@@ -103,9 +102,10 @@ class EllipsoidUnknowns(ParametricSurface):
         center, back = self.surface.center + step[:3], expm(-np.tensordot(step[3:], STRAINS, 1))
         return replace(self, surface=replace(self.surface, center=center, matrix=back @ self.surface.matrix @ back))
 
-    def as_proposed(self, scale: float) -> Ellipsoid:
-        """The ellipsoid in a world of that scale."""
-        return replace(self.surface, center=self.surface.center * scale, matrix=self.surface.matrix / scale**2)
+    @property
+    def shape(self) -> Ellipsoid:
+        """The ellipsoid."""
+        return self.surface
 
 
 def _moves(points: Vectors) -> Float[np.ndarray, "P 3 9"]:

@@ -164,7 +164,7 @@ class ExactFamily:
 
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """The shape after rounds of the joint solve in which nothing else is free: all of `ROUNDS` and `FINISH`, or the
-        last from an earlier fit. The unknowns need `as_proposed`.
+        last from an earlier fit. The unknowns need `shape`.
         """
         fitted = proposal.fitted
         start = proposal if fitted is None else replace(proposal, shape=fitted.shape)
@@ -172,7 +172,7 @@ class ExactFamily:
         with torch.no_grad():
             for settings in (*(ROUNDS if fitted is None else ()), FINISH):
                 surface = after_round(views, surface, settings, FINISH.resolution)
-        return self.as_proposed(replace(start, shape=surface.as_proposed(1.0)), config)
+        return self.as_proposed(replace(start, shape=surface.shape), config)
 
     def unknowns(self, views: Views, proposal: Proposal, config: FitConfig) -> ParametricSurface:
         """A proposal as a surface of few numbers."""
@@ -208,15 +208,11 @@ class ExactFamily:
             )
         if not found.state.nuisance.blocks:
             return _fitted(family, views, proposal, config), NO_CORRECTIONS, list(found.decisions)
-        surface, nuisance = found.state.surface, found.state.nuisance
-        if surface.as_proposed(1.0) is None:
-            nuisance = nuisance.without_common(StatedCameras.of(views))
+        nuisance = found.state.nuisance.without_common(StatedCameras.of(views))
         by = Corrected.by(nuisance, found.variances)
         corrected = by.applied(views, config)
-        shape = surface.as_proposed(by.scale)
-        again = (propose(corrected) or start) if shape is None else replace(start, shape=shape)
-        around = found.state.nuisance.around(proposal.shape.surroundings).scaled(by.scale)
-        geometry = _fitted(family, corrected, again.in_surroundings(around), config)
+        around = nuisance.around(proposal.shape.surroundings).scaled(by.scale)
+        geometry = _fitted(family, corrected, (propose(corrected) or start).in_surroundings(around), config)
         return geometry.with_poses(by.poses), by.corrections, list(found.decisions)
 
     def _proposed_again(

@@ -121,8 +121,7 @@ class ParametricSurface(Protocol):
         """The same surface with more numbers; itself where the kind has no more."""
         return self
 
-    def as_proposed(self, scale: float) -> Any:
-        """The shape that a fit of the kind starts from, in a world that many times as large; None: silhouettes alone
-        propose one that is as good.
-        """
+    @property
+    def shape(self) -> Any:
+        """As proposals of the kind have it, for the default `fit`; None where a kind has its own."""
         return None

@@ -1,6 +1,5 @@
 """What a reader may rely on: documented names, short modules, file names that say something, checked shapes."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ from jaxtyping import TypeCheckError
 from panoless.capture.poses import StatedCameras
 from panoless.problem.observations import dual
 from tests.architecture.source import ROOT, source_files, source_texts, undocumented, unknown_in_docstrings
-from tests.conftest import checked_modules
+from tests.conftest import UNCHECKED, checked_modules
 
 MAX_LINES = 450
 EMPTY_NAMES = {"utils", "util", "helpers", "helper", "misc", "common", "stuff"}
@@ -75,8 +74,7 @@ def test_tests_check_dtypes() -> None:
 
 
 def test_all_but_the_compiled_kernels_are_checked() -> None:
-    """In CI, those of the benchmark neither."""
-    checked = (*checked_modules(), *(("shinypartial",) if os.environ.get("CI") else ()))
+    checked = *checked_modules(), *UNCHECKED
 
     def is_checked(path: Path) -> bool:
         module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")

@@ -125,6 +125,11 @@ class SurfaceOfRevolution:
         """Length of the profile up to each vertex."""
         return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(self.profile, axis=0), axis=1)))
 
+    def arc_length_at(self, side: Int[np.ndarray, "P"], along: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
+        """Length of the profile up to places on its sides."""
+        length = self.arc_lengths
+        return length[side] + along * (length[side + 1] - length[side])
+
     @property
     def is_open(self) -> bool:
         """Whether it is a wall without thickness, which ends at the lip."""

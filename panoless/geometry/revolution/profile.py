@@ -82,8 +82,7 @@ class ProfileSplines:
 
         On the base they are zero.
         """
-        length = self.surface.arc_lengths
-        place = length[side] + along * (length[side + 1] - length[side])
+        place = self.surface.arc_length_at(side, along)
         inner = (side >= self.surface.lip).astype(np.int64)
         start, knot = np.array(self.starts)[inner], np.array(self.knots)[inner]
         pieces = np.array(self.counts)[inner] - 3

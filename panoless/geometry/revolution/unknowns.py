@@ -139,8 +139,7 @@ class RevolutionUnknowns(ParametricSurface):
 
     def _is_end(self, met: Hits | SilhouetteResiduals, reach_px: float) -> Bool[np.ndarray, "P"]:
         """Whether that is the base, the lid, or so near to one."""
-        length, side = self.surface.arc_lengths, np.maximum(met.side, 0)
-        place = length[side] + met.along * (length[side + 1] - length[side])
+        length, place = self.surface.arc_lengths, self.surface.arc_length_at(np.maximum(met.side, 0), met.along)
         reach: float = reach_px * self.pixel
         return (place < length[1] + reach) | (place > length[self.surface.lip] - reach)
 
