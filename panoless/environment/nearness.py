@@ -111,14 +111,12 @@ def with_floor(seen: LeavingRays, up: Float[np.ndarray, "3"]) -> tuple[Surroundi
 
 
 def found_surroundings(
-    seen: LeavingRays, start: Surroundings, resolutions: Sequence[int] = RESOLUTIONS, *, tilts: bool = False
+    seen: LeavingRays, start: Surroundings, resolutions: Sequence[int] = RESOLUTIONS
 ) -> Surroundings:
-    """After a step under a map of each of the resolutions. A floor stays level unless it `tilts`, too: wrong normals
-    ask for tilts.
-    """
+    """After a step under a map of each of the resolutions. A floor stays level: wrong normals would tilt it."""
     for resolution in resolutions:
         free = np.ones(start.num_unknowns, bool)
-        if start.floor is not None and not tilts:
+        if start.floor is not None:
             free[len(start.coefficients) : -1] = False
         change = np.zeros(start.num_unknowns)
         change[free] = Linearized.at(seen, start, resolution, free).step()

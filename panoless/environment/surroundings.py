@@ -119,9 +119,10 @@ class Surroundings:
         floor = None if self.floor is None else self.floor.after(step[count:])
         return Surroundings(self.coefficients + step[:count], floor)
 
-    def after_walls(self, step: Float[np.ndarray, "K"]) -> "Surroundings":
-        """With changed coefficients alone."""
-        return replace(self, coefficients=self.coefficients + step)
+    @property
+    def without_walls(self) -> "Surroundings":
+        """With the floor alone."""
+        return replace(self, coefficients=np.zeros(0))
 
     def scaled(self, factor: float) -> "Surroundings":
         """As many times as large."""

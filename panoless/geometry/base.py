@@ -23,8 +23,8 @@ from panoless.environment.rays import Rays
 from panoless.environment.reflectance import Reflectance
 from panoless.environment.surroundings import Surroundings
 from panoless.kernels.camera import RasterCamera
+from panoless.problem.blocks import Block
 from panoless.problem.evidence import Decision
-from panoless.problem.nuisance import Block
 from panoless.problem.observations import outline_rays
 from panoless.problem.parametric import ParametricSurface
 

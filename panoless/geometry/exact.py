@@ -38,9 +38,10 @@ from panoless.geometry.base import (
 from panoless.kernels.camera import RasterCamera, reflection_directions_world
 from panoless.kernels.constants import SUB_PIXELS
 from panoless.kernels.cubemap import sample_cubemap
+from panoless.problem.blocks import Block
 from panoless.problem.corrected import Corrected
 from panoless.problem.evidence import Decision
-from panoless.problem.nuisance import Block, nuisance_of
+from panoless.problem.nuisance import nuisance_of
 from panoless.problem.parametric import ParametricSurface
 from panoless.problem.solve import FINISH, LEAST_VIEWS, MOST_VIEWS, ROUNDS, after_round, by_outlines, solve
 
@@ -194,9 +195,10 @@ class ExactFamily:
         """The fit to photographs as they are stated where the scene needs none of the blocks; else that to photographs
         which are corrected by what a surface of few numbers leaves to the blocks.
         """
-        family = cast(Family, self)
+        family, around = cast(Family, self), proposal.shape.surroundings
         if not kinds or not LEAST_VIEWS <= len(views.train) <= MOST_VIEWS:
             return _fitted(family, views, proposal, config), NO_CORRECTIONS, []
+        proposal = proposal.in_surroundings(around.without_walls)
         with torch.no_grad():
             start = self._proposed_again(views, proposal, kinds, config, propose)
             found = solve(
@@ -205,6 +207,7 @@ class ExactFamily:
                 kinds,
                 required,
                 lambda state: self.begun(Corrected.by(state.nuisance).applied(views, config), state.surface, config),
+                around=around,
             )
         if not found.state.nuisance.blocks:
             return _fitted(family, views, proposal, config), NO_CORRECTIONS, list(found.decisions)

@@ -10,16 +10,16 @@ from panoless.capture.corrections import Corrections
 from panoless.capture.poses import Poses
 from panoless.capture.views import Views
 from panoless.config import FitConfig
-from panoless.problem.nuisance import (
+from panoless.problem.blocks import (
     CameraPoses,
     Distortion,
     Exposures,
     FocalLength,
     MaskOffset,
     MaskOffsets,
-    Nuisance,
     WhiteBalances,
 )
+from panoless.problem.nuisance import Nuisance
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,8 @@ from panoless.environment.surroundings import Surroundings
 from panoless.numeric.factorize import regularize
 from panoless.numeric.gauss_newton import damped_step, normal_equations
 from panoless.numeric.robust import bounded_error, robust_scale, robust_weight
-from panoless.problem.nuisance import (
-    Exposures,
-    Nuisance,
-    Walls,
-    WhiteBalances,
-)
+from panoless.problem.blocks import Exposures, WhiteBalances
+from panoless.problem.nuisance import Nuisance
 from panoless.problem.observations import Pixels, is_saturated, outline_rays, solid_pixels
 from panoless.problem.parametric import MirrorHits, ParametricSurface, Silhouette
 from panoless.problem.rays import PixelRays
@@ -193,11 +189,10 @@ class Photographs:
         by_turn = np.cross(directions[:, None], by_ray + hits.distance[:, None, None] * by_shift)
         return np.concatenate([by_turn, by_shift], 2)
 
-    def wall_rows(self) -> Float[np.ndarray, "Q 3 1"]:
-        """Of the light, by 1/D of the walls."""
+    def surroundings_rows(self) -> Float[np.ndarray, "Q 3 D"]:
+        """Of the light, by the unknowns of the surroundings."""
         slopes = slopes_of(self.environment, self.mirrored.looked_up)
-        found = self.mirrored.surroundings.rows(slopes, self.mirrored.points, self.mirrored.mirrored)
-        return found[..., :1]
+        return self.mirrored.surroundings.rows(slopes, self.mirrored.points, self.mirrored.mirrored)
 
     def cost(self, data: Data, state: State, traced: Traced) -> float:
         """½ Σ w ‖(1 − Π) e‖² of another state, under this map. A ray that no longer sees the surroundings costs what it
@@ -236,7 +231,8 @@ class Equations:
         """With the map solved for the state, whose pixels may be traced."""
         surface, nuisance, count = state.surface, state.nuisance, state.surface.count
         by_view, shared = (nuisance.free_blocks(by_view=each) for each in (True, False))
-        views, size, others = len(data.cameras.centers), sum(b.size for b in by_view), len(shared)
+        views = len(data.cameras.centers)
+        size, others = (sum(block.size for block in blocks) for blocks in (by_view, shared))
         unknowns = count + views * size + others
         free = bool(by_view or shared)
         numbers = np.arange(size), count + views * size + np.arange(others)
@@ -244,8 +240,8 @@ class Equations:
         def beside(rays: PixelRays, by_motion: np.ndarray, seen: Photographs | None) -> tuple[np.ndarray, ...]:
             light = None if seen is None else seen.light
             rows = [
-                seen.wall_rows()
-                if seen is not None and isinstance(each, Walls)
+                seen.surroundings_rows()[..., each.surroundings_columns]
+                if seen is not None and each.surroundings_columns is not None
                 else rows_of(each, rays, data.cameras, by_motion, light)
                 for each in (*by_view, *shared)
             ]
@@ -290,9 +286,12 @@ class Equations:
                 gradient[where] += CORRELATED * block.precision[view] @ block.values[view]
                 matrix[where, where] += CORRELATED * block.precision[view]
             start += block.size
-        for number, block in zip(numbers[1], shared, strict=True):
-            gradient[number] += CORRELATED * block.precision[0, 0, 0] * block.values[0, 0]
-            matrix[number, number] += CORRELATED * block.precision[0, 0, 0]
+        start = count + views * size
+        for block in shared:
+            where = slice(start, start + block.size)
+            gradient[where] += CORRELATED * block.precision[0] @ block.values[0]
+            matrix[where, where] += CORRELATED * block.precision[0]
+            start += block.size
         found = surface.regularization(matrix[:count, :count])
         matrix[:count, :count] += found.matrix
         if found.value is not None:
@@ -358,9 +357,10 @@ class Equations:
             places = start + size * np.arange(len(block.values))[:, None] + np.arange(block.size)
             found[block.name] = whole[np.ix_(places.ravel(), places.ravel())]
             start += block.size
-        last = len(whole) - len(shared)
-        for number, block in enumerate(shared):
-            found[block.name] = whole[last + number, last + number].reshape(1, 1)
+        start = len(whole) - sum(each.size for each in shared)
+        for block in shared:
+            where = slice(start, start + block.size)
+            found[block.name], start = whole[where, where], start + block.size
         return found
 
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from panoless.problem.nuisance import Block
+from panoless.problem.blocks import Block
 
 DEVIATIONS = 2.78
 """z: standard deviations of a normal number that are exceeded as seldom."""
@@ -52,11 +52,11 @@ def decided(
     """Whether a block is needed, by the posterior variances of its unknowns or by their covariance, to both of which
     what model errors amount to is added; one that is `required` is kept.
     """
-    value, floor = block.values.ravel(), block.floor**2
+    value, floor = block.values.ravel(), np.tile(block.floor**2, len(block.values))
     if covariance is None:
         score = float((value**2 / (variances.ravel() + floor)).mean())
     else:
-        score = float(value @ np.linalg.solve(covariance + floor * np.eye(value.size), value)) / value.size
+        score = float(value @ np.linalg.solve(covariance + np.diag(floor), value)) / value.size
     share = 2 / (9 * value.size)
     bound = (1 - share + DEVIATIONS * math.sqrt(share)) ** 3
     sigma = block.scale * math.sqrt(float(variances[:, block.measured].mean()))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from panoless.capture.poses import StatedCameras
-from panoless.problem.nuisance import Block
+from panoless.problem.blocks import Block
 from panoless.problem.rays import PixelRays
 
 CHI_MEDIAN = 1.538

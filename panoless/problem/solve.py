@@ -18,17 +18,12 @@ from jaxtyping import Float
 
 from panoless.capture.views import Views
 from panoless.deadline import improving, is_past_limit
+from panoless.environment.surroundings import FAR, Surroundings
 from panoless.journal import remembered
+from panoless.problem.blocks import Block, CameraPoses, Distortion
 from panoless.problem.equations import Data, Equations, Round, State
 from panoless.problem.evidence import Decision, decided
-from panoless.problem.nuisance import (
-    NO_NUISANCE,
-    Block,
-    CameraPoses,
-    Distortion,
-    Nuisance,
-    nuisance_of,
-)
+from panoless.problem.nuisance import NO_NUISANCE, Nuisance, nuisance_of
 from panoless.problem.parametric import ParametricSurface
 from shinypartial.io.progress import Progress
 
@@ -68,7 +63,8 @@ def take_round(views: Views, state: State, settings: Round, last: int) -> State:
     nuisance = state.nuisance
     if settings.resolution < SHARED_RESOLUTION:
         coarse = [] if settings.resolution == 0 else [CameraPoses.name]
-        nuisance = nuisance.freed([name for name in nuisance.locked.free if name not in coarse])
+        known = nuisance.under_coarse(settings.resolution)
+        nuisance = nuisance.freed([name for name in known.free if name not in coarse])
     state = State(state.surface.settled(), nuisance)
     traced = None
     for _ in range(settings.steps):
@@ -104,11 +100,13 @@ def solve(
     required: Collection[str],
     begin: Callable[[State], ParametricSurface] | None = None,
     rounds: Sequence[Round] = ROUNDS,
+    around: Surroundings = FAR,
 ) -> Solved:
     """The surface with those of the nuisance blocks that the scene needs, and those that are `required`.
 
     All are free from the first round on. Those that are not needed are fixed before the others go on under a finer map.
-    After silhouettes alone, `begin` may choose another surface for photographs to start from.
+    After silhouettes alone, `begin` may choose another surface for photographs to start from. Walls start as they are
+    `around` it; the surface itself knows of none.
     """
     last = rounds[-1]
 
@@ -123,7 +121,7 @@ def solve(
 
     progress = Progress("solving for cameras, exposures and masks", len(rounds) + 2)
     usual = [kind for kind in kinds if kind is not Distortion]
-    state = by_outlines(views, surface, nuisance_of(views, usual))
+    state = by_outlines(views, surface, nuisance_of(views, usual, around))
     if begin is not None:
         state = replace(state, surface=begin(state))
     progress.advance()
@@ -142,6 +140,6 @@ def solve(
             return Solved(replace(state, nuisance=left), (*gone, *(each for each in decisions if each.kept)), known)
         if settings is last:
             more = [Distortion] if Distortion in kinds else []
-            left = nuisance_of(views, [*more, *(type(each) for each in left.blocks)]).replaced(left.blocks)
+            left = nuisance_of(views, [*more, *(type(each) for each in left.blocks)], around).replaced(left.blocks)
             state = replace(state, surface=state.surface.refined())
         settings, state = FINISH, take_round(views, replace(state, nuisance=left), FINISH, FINISH.resolution)

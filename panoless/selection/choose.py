@@ -21,7 +21,7 @@ from panoless.geometry.base import Family, Geometry, Proposal, usable_views
 from panoless.geometry.exact import LARGEST_SHARE_LEFT
 from panoless.geometry.registry import FAMILIES
 from panoless.journal import remembered
-from panoless.problem.nuisance import SHIFT, STATED_FLOOR, TURN_DEG
+from panoless.problem.blocks import SHIFT, STATED_FLOOR, TURN_DEG
 from panoless.selection.candidates import MATTE, Candidate, Selection, Verdict, describe
 from panoless.selection.fitted import Fitted, is_refined, missed_share
 from panoless.selection.held_out import LEAST_GAIN, held_out_errors, held_out_parts, is_matte

@@ -1,6 +1,6 @@
 """A fit of one kind, and which part of the object it misses."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from jaxtyping import Float, Int
 from torch import Tensor, nonzero
@@ -27,10 +27,6 @@ class Fitted:
     corrections: Corrections = NO_CORRECTIONS
     decisions: tuple[Decision, ...] = ()
     """Which nuisance blocks the scene needs."""
-
-    def with_geometry(self, geometry: Geometry) -> "Fitted":
-        """The same with another geometry."""
-        return replace(self, geometry=geometry)
 
 
 def is_refined(kind: str) -> bool:

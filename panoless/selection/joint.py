@@ -8,19 +8,20 @@ from panoless.config import FitConfig
 from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import Family, Geometry, Proposal
 from panoless.journal import remembered
-from panoless.problem.nuisance import (
+from panoless.problem.blocks import (
     Block,
     CameraPoses,
     Distortion,
     Exposures,
     FocalLength,
+    Ground,
     MaskOffset,
     MaskOffsets,
     Walls,
     WhiteBalances,
 )
 from panoless.selection.fitted import Fitted
-from panoless.selection.surroundings import brought_near, explains_clearly_more, on_floor, proposed_surroundings
+from panoless.selection.surroundings import explains_clearly_more, proposed_surroundings
 
 
 def nuisance_kinds(config: FitConfig) -> tuple[list[type[Block]], list[str]]:
@@ -36,11 +37,12 @@ def nuisance_kinds(config: FitConfig) -> tuple[list[type[Block]], list[str]]:
     if corrections.exposure != "off" and not encoding_of(config).high_dynamic_range:
         kinds += [Exposures, WhiteBalances]
     if config.surroundings.mode != "off":
-        kinds.append(Walls)
+        kinds += [Walls, Ground]
     if corrections.masks != "off":
         kinds += [MaskOffset, MaskOffsets]
     required = [CameraPoses.name] if corrections.poses == "on" else []
-    return kinds, [*required, *([FocalLength.name, Distortion.name] if corrections.lens == "on" else [])]
+    required += [FocalLength.name, Distortion.name] if corrections.lens == "on" else []
+    return kinds, [*required, Ground.name, *([Walls.name] if config.surroundings.mode == "on" else [])]
 
 
 @remembered()
@@ -59,8 +61,8 @@ def followed(
 
 
 def fit_jointly(family: Family, source: Family, views: Views, start: Proposal, config: FitConfig) -> Fitted:
-    """A fit in the surroundings that the proposal asks for, if it explains clearly more than one in a far world; else
-    in nearer ones as long as these explain clearly more. `source` makes the proposals of the kind.
+    """A fit whose walls start where the proposal has them, above the floor that it shows, if held-out views are
+    clearly better explained than without one. `source` makes the proposals of the kind.
     """
 
     def solved(around: Surroundings) -> Fitted:
@@ -75,17 +77,8 @@ def fit_jointly(family: Family, source: Family, views: Views, start: Proposal, c
 
     around = proposed_surroundings(family, views, start, config)
     found = solved(around)
+    if around.floor is None or config.surroundings.mode == "on":
+        return found
     corrected = found.corrections.applied(views, config)
-
-    def follow(fitted: Geometry, surroundings: Surroundings) -> Geometry | None:
-        return followed(family, corrected, start, fitted, surroundings, config)
-
-    if around.is_far:
-        return found.with_geometry(brought_near(corrected, found.geometry, follow, config))
-    near = on_floor(corrected, found.geometry, follow, config)
-    if config.surroundings.mode == "on":
-        return found.with_geometry(near)
-    far = follow(near, FAR)
-    if far is None or explains_clearly_more(corrected, near, far):
-        return found.with_geometry(near)
-    return solved(FAR)
+    far = followed(family, corrected, start, found.geometry, FAR, config)
+    return found if explains_clearly_more(corrected, found.geometry, far) else solved(FAR)

@@ -4,7 +4,6 @@ A shape that believes in a far world bends until it agrees with a near one as we
 that is. A shape from silhouettes alone knows of no light, so it tells the distance at once.
 """
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +15,7 @@ from panoless.config import FitConfig
 from panoless.environment.nearness import LeavingRays, Linearized, found_surroundings, upward, with_floor
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
-from panoless.environment.surroundings import FAR, SHARPEST, Surroundings
+from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import Family, Geometry, Proposal, usable_views
 from panoless.journal import remembered
 from panoless.selection.held_out import LEAST_GAIN, is_clearly_lower
@@ -31,18 +30,10 @@ CHECKED_RESOLUTION = 8
 """…and a first step under a map of so many texels along a face side."""
 LEAST_PULL = 0.0003
 """Share of the cost that this step has to promise: 0.02 to 0.06 in rooms, up to 0.0001 in far worlds."""
-FIRST_INVERSE_DISTANCE = 0.1
-"""1/D, in inverse radii of the object, in which a fit is tried first that a far world leaves pulled like that."""
 LARGEST_FLOOR_COST = 0.99
 """Share of the cost in a far world that a floor may leave where it is looked at closer."""
 LEAST_FLOOR_GAIN = 0.02
 """Share by which a floor has to lower the held-out error of a shape from silhouettes."""
-REFINED_FLOOR_RESOLUTIONS = (64, 64, 128, 128, 128)
-"""Texels along a face side of the maps of all steps by which a fit tells its floor again."""
-REFINED_FLOOR_RAYS = 200_000
-"""About so many pixels of all views tell it: three of them a texel."""
-LEAST_REFINED_FLOOR_GAIN = 0.005
-"""Share by which that has to lower the held-out error."""
 JUDGED_RAYS = 400_000
 """About so many pixels of all views tell whether a fit in near surroundings explains more than a far one."""
 JUDGED_RESOLUTION = 64
@@ -91,59 +82,10 @@ def proposed_surroundings(
     return best
 
 
-def on_floor(
-    views: Views,
-    near: Geometry,
-    follow: Callable[[Geometry, Surroundings], Geometry | None],
-    config: FitConfig,
-    *,
-    resolutions: Sequence[int] = REFINED_FLOOR_RESOLUTIONS,
-) -> Geometry:
-    """A fit above a floor that a shape from silhouettes told, or above that floor as the fit tells it, tilts included,
-    if held-out views are clearly better explained.
-    """
-    if near.surroundings.floor is None:
-        return near
-    with torch.no_grad():
-        posed = views if near.poses is None else near.poses.moved(views)
-        kept, held_out = split_held_out(leaving_rays(posed, near, REFINED_FLOOR_RAYS))
-        if not kept or not held_out:
-            return near
-        found = found_surroundings(joined(kept), near.surroundings, resolutions, tilts=True)
-        of_found, before = (_errors(kept, held_out, each) for each in (found, near.surroundings))
-    if not is_clearly_lower(of_found, before, LEAST_REFINED_FLOOR_GAIN):
-        return near
-    return follow(near, found) or near
-
-
 def _up(views: Views) -> Float[np.ndarray, "3"]:
     """Where up is, if cameras were held level."""
     rotations = np.stack([view.camera.world_to_camera[:3, :3].cpu().numpy().astype(np.float64) for view in views.train])
     return upward(rotations[:, 0], -rotations[:, 1])
-
-
-def brought_near(
-    views: Views, far: Geometry, follow: Callable[[Geometry, Surroundings], Geometry | None], config: FitConfig
-) -> Geometry:
-    """The fit of a kind in a far world, or in near surroundings that a shape from silhouettes did not tell.
-
-    A shape that bent until it agreed with a far world hides most of how near it is, but not all. Where rays ask for
-    near surroundings, `follow` takes the fit on in a wide sphere and then in one half as wide, as long as held-out
-    views are explained clearly better.
-    """
-    best, inverse = far, FIRST_INVERSE_DISTANCE
-    if config.surroundings.mode == "off":
-        return far
-    with torch.no_grad():
-        posed = views if far.poses is None else far.poses.moved(views)
-        if not _is_pulled(_few_rays(posed, far)):
-            return far
-    while inverse < SHARPEST:
-        near = follow(best, Surroundings(np.array([inverse])))
-        if near is None or near.surroundings.is_far or not explains_clearly_more(views, near, best):
-            break
-        best, inverse = near, 2 * inverse
-    return best
 
 
 def _few_rays(views: Views, geometry: Geometry) -> LeavingRays:

@@ -25,8 +25,9 @@ from panoless.geometry.free_form.trust import Trust, full_trust
 from panoless.journal import remembered
 from panoless.numeric.factorize import regularize
 from panoless.numeric.gauss_newton import keep_if_better
+from panoless.problem.blocks import CameraPoses, Distortion, Walls
 from panoless.problem.evidence import Decision, decided
-from panoless.problem.nuisance import NO_NUISANCE, CameraPoses, Distortion, Nuisance, nuisance_of
+from panoless.problem.nuisance import NO_NUISANCE, Nuisance, nuisance_of
 from panoless.problem.observations import solid_pixels
 from shinypartial.io.progress import Progress
 
@@ -42,10 +43,6 @@ SETTLING_STEPS = 3
 """In which distortion is found beside what is known."""
 POSE_STEPS = 6
 """Most steps to the blocks of views that took no part in a fit."""
-SHARED_STEPS = 8
-"""Most steps from an earlier fit in near surroundings…"""
-LEAST_SHARED_GAIN = 3e-4
-"""…which end when one lowers the cost by less than this share."""
 FIRST_MAP_ROUNDS = 3
 """Robust rounds of the map at the start of a round of steps."""
 HELD_OUT_RAYS = 200_000
@@ -147,6 +144,7 @@ def fit_free_form(
                 # A surface that gave way to blocks does not come back from them by further steps.
                 check_time()
                 rounds = schedule.coarse if begun is start else schedule.hollowed
+                begun = replace(begun, surroundings=stage.surface.surroundings)
                 stage = coarse_stage(solved, begun, rounds, nuisance=stage.nuisance)
             if others:
                 stage = keep_if_better(refitted_stages(solved, stage, schedule.refit), error, LEAST_GAIN)
@@ -176,7 +174,11 @@ def _needed(views: Views, stage: FitStage, required: Collection[str]) -> tuple[F
     blocks = [each for each in stage.nuisance.blocks if each.name in stage.nuisance.free]
     decisions = {each.name: decided(each, known[each.name], required=each.name in required) for each in blocks}
     needless = [each.name for each in decisions.values() if not each.kept]
-    return replace(stage, nuisance=stage.nuisance.without(needless)), decisions
+    left = replace(stage, nuisance=stage.nuisance.without(needless))
+    if Walls.name not in needless:
+        return left, decisions
+    surface = replace(stage.surface, surroundings=stage.surface.surroundings.without_walls)
+    return replace(left, surface=surface, environment=None), decisions
 
 
 def _with_distortion(views: Views, stage: FitStage) -> FitStage:
@@ -189,15 +191,11 @@ def _with_distortion(views: Views, stage: FitStage) -> FitStage:
 
 
 def continued_fit(views: Views, fitted: FitStage, schedule: Schedule) -> FitStage:
-    """What an earlier fit led to after its last round was taken again, with views that changed a little. In near
-    surroundings that takes more steps.
-    """
+    """What an earlier fit led to after its last round was taken again, with views that changed a little."""
     rounds = [*schedule.detailed, *schedule.coarse, *schedule.finer]
     last = next((each for each in reversed(rounds) if each.cells == fitted.surface.cells), rounds[-1])
     stage, settings = replace(fitted, settings=last), replace(last, rays=round(LAST_RAYS * last.rays))
     with torch.no_grad():
-        if not stage.surface.surroundings.is_far:
-            settings = replace(settings, steps=SHARED_STEPS, least_gain=LEAST_SHARED_GAIN)
         return take_round(views, stage, settings, Progress("fitting on", settings.steps), last=True)
 
 
@@ -283,7 +281,7 @@ def take_round(
     """A stage after the steps of a round; in the `last` one outlines count more where photographs agree with them."""
     surface, nuisance = stage.surface, stage.nuisance
     if settings.robust_scale > SHARED_SCALE:
-        stage = replace(stage, nuisance=nuisance.locked)
+        stage = replace(stage, nuisance=nuisance.under_coarse(settings.resolution))
     if stage.settings is None or stage.settings.cells != settings.cells:
         surface = surface.resampled(settings.cells)
     task = make_task(views, settings, stage.nuisance)
@@ -333,12 +331,15 @@ def variances(views: Views, stage: FitStage) -> dict[str, Float[np.ndarray, "B M
         of_views = np.einsum("bmm->bm", np.linalg.inv(regularize(solution.beside[0].matrix, "cameras")))
     for block in by_view:
         found[block.name], start = factor * of_views[:, start : start + block.size], start + block.size
-    around = len(stage.surface.surroundings.coefficients)
-    for index, block in enumerate(shared):
+    start, size = 0, sum(each.size for each in shared)
+    of_all = np.zeros(size)
+    for index in range(size):
         unit = [np.zeros_like(each.value) for each in solution.beside]
-        unit[-1][0, around + index] = 1.0
+        unit[-1][0, index] = 1.0
         column = solved_equations(solution, (np.zeros(stage.surface.shape), unit), stage.damping)
-        found[block.name] = np.full((1, 1), factor * max(float(column.beside[-1][0, around + index]), 1e-30))
+        of_all[index] = factor * max(float(column.beside[-1][0, index]), 1e-30)
+    for block in shared:
+        found[block.name], start = of_all[None, start : start + block.size], start + block.size
     return found
 
 

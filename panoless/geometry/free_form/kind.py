@@ -37,9 +37,10 @@ from panoless.geometry.free_form.start import first_surfaces, started
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.trust import Trust, full_trust
 from panoless.kernels.camera import RasterCamera
+from panoless.problem.blocks import Block
 from panoless.problem.corrected import Corrected
 from panoless.problem.evidence import Decision, decided
-from panoless.problem.nuisance import Block, Walls, nuisance_of
+from panoless.problem.nuisance import nuisance_of
 from panoless.problem.observations import inner_distance_px
 from panoless.problem.rays import PixelRays
 
@@ -226,9 +227,7 @@ class FreeFormFamily(ExactFamily):
         the plain surface.
         """
         schedule, first = Schedule.of(config.free_form), proposal.shape
-        start, nuisance = started(
-            views, first, schedule, nuisance_of(views, [each for each in kinds if each is not Walls])
-        )
+        start, nuisance = started(views, first, schedule, nuisance_of(views, kinds, first.surroundings))
         lids = () if np.array_equal(start.coefficients, first.plain.coefficients) else (first.surface,)
         stage, decisions = fit_free_form(views, start, schedule, lids=lids, nuisance=nuisance, required=required)
         if stage.settings is None:  # The time limit came before the first round.

@@ -28,7 +28,8 @@ from panoless.kernels.level_set import (
 )
 from panoless.kernels.reference.cubemap import padded_texels
 from panoless.numeric.robust import bounded_error, robust_weight
-from panoless.problem.nuisance import NO_NUISANCE, Block, Nuisance, block_diagonal
+from panoless.problem.blocks import Block
+from panoless.problem.nuisance import NO_NUISANCE, Nuisance, block_diagonal
 from panoless.problem.rays import PixelRays
 from panoless.problem.rows import BlockRows, Linearized, rows_of
 
@@ -45,8 +46,6 @@ BAND_CELLS = 3.5
 PHOTOGRAPH_CURVATURE = 0.5
 """Factor of the photographs' part of the Gauss–Newton matrix where the surface alone is unknown: their cost bends less
 where the map follows."""
-LEAST_WALLS_SHARE = 1e-3
-"""Share of the trace of the walls' matrix that is added to its diagonal."""
 AGREED_OUTLINE_PX = 0.1
 """Photographs and masks agree where the outlines are this near to those of the masks…"""
 AGREED_PULL_PX = 0.01
@@ -134,7 +133,7 @@ class Solution:
         nuisance: Nuisance = NO_NUISANCE,
     ) -> "Solution":
         """With the map solved in so many robust rounds from another one, or from nothing."""
-        settings = task.settings
+        settings, surface = task.settings, replace(surface, surroundings=nuisance.around(surface.surroundings))
         rays = nuisance.moved(task.pixels.rays, task.cameras)
         radiance = nuisance.equalized(task.pixels.radiance, rays.view)
         sights = Sights.of(surface, rays, settings.samples, LEAST_COSINE)
@@ -313,21 +312,23 @@ class Solution:
 
     @cached_property
     def beside(self) -> tuple[Linearized, ...]:
-        """What is free beside the surface: blocks of views, then the walls and blocks of all views."""
+        """What is free beside the surface: blocks of views, then those of all views."""
         by_view, shared = (self.nuisance.free_blocks(by_view=each) for each in (True, False))
-        of_views = (self._of_views(by_view),) if by_view else ()
-        of_all = () if not shared and self.surface.surroundings.is_far else (self._of_all(shared),)
-        return of_views + of_all
+        return ((self._of_views(by_view),) if by_view else ()) + ((self._of_all(shared),) if shared else ())
 
     @property
     def _curvature(self) -> float:
-        """Factor of the photographs' part of the matrix: one where cameras or surroundings are unknown, too."""
+        """Factor of the photographs' part of the matrix: one where others are unknown, too."""
         return 1.0 if self.beside else PHOTOGRAPH_CURVATURE
 
     def _rows_of(self, block: Block) -> tuple[Float[np.ndarray, "P 3 M"], Float[np.ndarray, "S 1 M"]]:
         """Of photographs and of silhouettes, by the unknowns of a block."""
         cameras = self.task.cameras
-        seen = rows_of(block, self.rays, cameras, self._motion_rows, self._light)
+        if block.surroundings_columns is not None:
+            rows = self.surface.surroundings.rows(self.slopes, self.points, self.sights.mirrored)
+            seen = rows[..., block.surroundings_columns]
+        else:
+            seen = rows_of(block, self.rays, cameras, self._motion_rows, self._light)
         return seen, rows_of(block, self._outlined, cameras, self._silhouettes[1])
 
     @cached_property
@@ -353,22 +354,17 @@ class Solution:
         )
 
     def _of_all(self, blocks: Sequence[Block]) -> Linearized:
-        """Coefficients of the walls, whose prior only damps, and then the blocks of all views."""
-        around = len(self.surface.surroundings.coefficients)
         photographs, silhouettes = self.photographs, self.silhouettes
-        walls = self.surface.surroundings.rows(self.slopes, self.points, self.sights.mirrored)[..., :around]
-        pairs = [(walls, np.zeros((*silhouettes.residual.shape, around))), *map(self._rows_of, blocks)]
-        seen, outlined = (np.concatenate(each, 2) for each in zip(*pairs, strict=True))
+        seen, outlined = (np.concatenate(each, 2) for each in zip(*map(self._rows_of, blocks), strict=True))
         seen = seen * (photographs.weights > 0)[:, None, None]
         beyond = np.stack([self.beyond_map(np.ascontiguousarray(column)) for column in np.moveaxis(seen, 2, 0)], 2)
         all_alike = [np.zeros(len(each.weights), int) for each in (photographs, silhouettes)]
         of_silhouettes = BlockRows(all_alike[1], outlined, silhouettes.weights)
         matrix = np.einsum("pck,p,pcl->kl", seen, photographs.weights, beyond) + of_silhouettes.blocks(1)[0]
-        least = LEAST_WALLS_SHARE * max(float(np.trace(matrix)), 1e-30)
-        parts = [least * np.eye(around)[None], *(self.task.prior_factor * each.precision for each in blocks)]
-        precision, value = block_diagonal(parts), np.concatenate([np.zeros(around), *(b.values[0] for b in blocks)])
+        precision = self.task.prior_factor * block_diagonal([each.precision for each in blocks])
+        value = np.concatenate([each.values for each in blocks], 1)
         of_photographs = BlockRows(all_alike[0], seen, photographs.weights)
-        return Linearized(of_photographs, of_silhouettes, value[None], precision, matrix + precision)
+        return Linearized(of_photographs, of_silhouettes, value, precision, matrix + precision)
 
     def gradient(self) -> tuple[Float[np.ndarray, "A B C"], list[Float[np.ndarray, "_ _"]]]:
         """Of the cost, over active coefficients and over what is unknown beside them."""
@@ -400,13 +396,10 @@ class Solution:
 
     def after(self, change: Float[np.ndarray, "A B C"], beside: Sequence[Float[np.ndarray, "_ _"]]) -> "Solution":
         """Moved by a step, with hits, visibility and map computed again."""
-        surface, moved = self.surface, list(beside)
-        surface = replace(surface, coefficients=surface.coefficients + change)
+        moved = list(beside)
+        surface = replace(self.surface, coefficients=self.surface.coefficients + change)
         by_view = moved.pop(0) if self.nuisance.free_blocks(by_view=True) else None
-        shared, around = (moved[0][0] if moved else np.zeros(0)), len(surface.surroundings.coefficients)
-        if not surface.surroundings.is_far:
-            surface = replace(surface, surroundings=surface.surroundings.after_walls(shared[:around]))
-        nuisance = self.nuisance.stepped(by_view, shared[around:] if moved else None)
+        nuisance = self.nuisance.stepped(by_view, moved[0][0] if moved else None)
         return Solution.at(self.task, surface, self.trust, self.environment, self.task.map_rounds, nuisance)
 
     def diagonal(self, smoothing_diagonal: float) -> Float[np.ndarray, "A B C"]:

@@ -8,7 +8,8 @@ from jaxtyping import Float
 from panoless.capture.poses import StatedCameras
 from panoless.capture.views import Views
 from panoless.geometry.free_form.schedule import Round
-from panoless.problem.nuisance import NO_NUISANCE, Exposures, Nuisance, WhiteBalances
+from panoless.problem.blocks import Exposures, WhiteBalances
+from panoless.problem.nuisance import NO_NUISANCE, Nuisance
 from panoless.problem.observations import Pixels, is_saturated, outline_rays, solid_pixels
 from panoless.problem.rays import PixelRays
 

@@ -16,8 +16,8 @@ from panoless.geometry.registry import FAMILIES
 from panoless.geometry.revolution.model import closed_profile
 from panoless.geometry.revolution.silhouette import contour_rays
 from panoless.geometry.revolution.unknowns import RevolutionUnknowns
+from panoless.problem.blocks import CameraPoses, Exposures, FocalLength, MaskOffsets
 from panoless.problem.corrected import Corrected
-from panoless.problem.nuisance import CameraPoses, Exposures, FocalLength, MaskOffsets
 from panoless.problem.solve import Solved, by_outlines_alone, solve
 from panoless.selection.joint import nuisance_kinds
 from tests.support.mirror_body import body_views, sphere

@@ -11,13 +11,14 @@ from panoless.capture.rays import pixel_rays, reflect
 from panoless.capture.views import TrainView
 from panoless.config import FitConfig
 from panoless.environment.surroundings import Floor, Surroundings
-from panoless.geometry.base import Geometry, Proposal
+from panoless.geometry.base import Proposal
 from panoless.geometry.height_field.kind import HeightFieldFamily
 from panoless.geometry.height_field.model import flat_height_field
 from panoless.geometry.plane.kind import PlaneFamily
 from panoless.geometry.plane.model import Plane
 from panoless.kernels.camera import RasterCamera
-from panoless.selection.surroundings import brought_near, explains_clearly_more, on_floor, proposed_surroundings
+from panoless.problem.blocks import Ground, Walls
+from panoless.selection.surroundings import explains_clearly_more, proposed_surroundings
 from tests.support.mirror_height_field import height_field_views
 from tests.support.mirror_plane import RECTANGLE, arc, camera_at, disc, plane_of, reflecting_views
 from tests.support.synthetic_dataset import environment_radiance
@@ -86,9 +87,7 @@ def above() -> list[RasterCamera]:
 
 @pytest.mark.slow
 def test_a_flat_mirror_on_a_table_tells_how_high_it_stands() -> None:
-    """Depth within 5 % at 64 px, though the disk that is taken reaches too far. Above a floor that leans by 10° a fit
-    goes on above one that leans by less than 3°.
-    """
+    """Depth within 5 % at 64 px, though the disk that is taken reaches too far. A fit levels one that leans by 10°."""
     plane = plane_of(RECTANGLE)
     views = reflecting_views(plane, above())
     views = replace(views, train=tuple(in_room(view, plane, 6.0, 0.7) for view in views.train))
@@ -96,17 +95,13 @@ def test_a_flat_mirror_on_a_table_tells_how_high_it_stands() -> None:
     found = proposed_surroundings(PlaneFamily(), views, proposal, CONFIG, rays_taken=RAYS)
     assert found.floor is not None
     assert found.floor.depth == pytest.approx(0.7, rel=0.05)
-    fitted = PlaneFamily().as_proposed(proposal, CONFIG)
-    assert fitted is not None
     leaning = np.array([0.15, 0.1, 1.0]) / np.linalg.norm([0.15, 0.1, 1.0])
-    wrong = fitted.in_surroundings(replace(found, floor=replace(found.floor, up=leaning)))
-    coarse = (16, 32, 32, 32)
-    again = on_floor(views, wrong, lambda before, around: before.in_surroundings(around), CONFIG, resolutions=coarse)
-    assert again.surroundings.floor is not None
-    assert again.surroundings.floor.up[2] > np.cos(np.radians(3)) > np.cos(np.radians(10)) > leaning[2]
-    right = fitted.in_surroundings(Surroundings(np.array([1 / 6]), Floor(np.array([0.0, 0.0, 1.0]), 0.7, 3.0)))
-    assert on_floor(views, right, lambda *_: pytest.fail("nothing is gained"), CONFIG, resolutions=coarse) is right
-    assert on_floor(views, fitted, lambda *_: pytest.fail("there is no floor"), CONFIG) is fitted
+    wrong = proposal.in_surroundings(replace(found, floor=Floor(leaning, found.floor.depth, 3.0)))
+    fitted, _, decisions = PlaneFamily().solve(views, wrong, [Walls, Ground], [Ground.name], CONFIG, lambda _: proposal)
+    assert fitted.surroundings.floor is not None
+    assert fitted.surroundings.floor.up[2] > np.cos(np.radians(0.5)) > np.cos(np.radians(10)) > leaning[2]
+    assert fitted.surroundings.floor.depth == pytest.approx(0.7, rel=0.02)
+    assert Ground.name in [each.name for each in decisions if each.kept]
 
 
 @pytest.mark.slow
@@ -116,19 +111,14 @@ def test_a_far_world_stays_far() -> None:
     assert proposed_surroundings(family, FAR_VIEWS, proposal, CONFIG, rays_taken=RAYS).is_far
 
 
-def test_a_fit_in_a_far_world_is_brought_into_ever_nearer_walls() -> None:
-    """Spheres of 10, 5 and 2.5 radii about a mirror in one of 4: the second is the last that explains more. A far
-    world stays far.
-    """
+def test_walls_are_unknowns_of_a_fit() -> None:
+    """From 8 radii they come to 4 within 5 % at 48 px, and go where they are infinitely far."""
     plane = plane_of(RECTANGLE)
-    views = replace(FAR_VIEWS, train=tuple(in_room(view, plane, 4.0) for view in FAR_VIEWS.train))
-    far, tried = PlaneFamily().as_proposed(Proposal(plane, 0.1, 1.0), CONFIG), list[float]()
-    assert far is not None
-
-    def follow(before: Geometry, surroundings: Surroundings) -> Geometry:
-        tried.extend(surroundings.coefficients)
-        return before.in_surroundings(surroundings)
-
-    assert brought_near(views, far, follow, CONFIG).surroundings.coefficients == pytest.approx([0.2])
-    assert tried == pytest.approx([0.1, 0.2, 0.4])
-    assert brought_near(FAR_VIEWS, far, follow, CONFIG).surroundings.is_far
+    near = replace(FAR_VIEWS, train=tuple(in_room(view, plane, 4.0) for view in FAR_VIEWS.train))
+    proposal = Proposal(plane, 0.1, 1.0).in_surroundings(Surroundings(np.array([1 / 8])))
+    (fitted, _, needed), (far, _, needless) = (
+        PlaneFamily().solve(views, proposal, [Walls], [], CONFIG, lambda _: proposal) for views in (near, FAR_VIEWS)
+    )
+    assert fitted.surroundings.coefficients == pytest.approx([0.25], rel=0.05)
+    assert far.surroundings.is_far
+    assert [each.kept for each in (*needed, *needless)] == [True, False]

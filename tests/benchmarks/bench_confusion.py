@@ -1,0 +1,138 @@
+"""Which explanations a fit gives for one error and for two at once: `python -m tests.benchmarks.bench_confusion`.
+
+A development scene is rendered, spoiled by one of twelve errors or by two of them, and fitted by `panoless fit`. A row
+of the table is what was wrong, its columns are what the fit states: nuisance blocks that were kept, roughness and blur.
+Noise and JPEG compression are controls, which nothing should explain. `--errors poses exposures` is a short run.
+Folders
+that are complete are used as they are, so a run that was stopped goes on.
+"""
+
+import subprocess
+import sys
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from shinypartial.io.files import read_json, write_json
+
+RENDERED = {"rough": ["--roughness=0.15"], "near room": ["--surroundings-radii=5"]}
+"""Errors of what is photographed: options of `shinypartial generate`."""
+PERTURBED = {
+    "poses": ["--cameras.rotation-deg=0.3"],
+    "focal length": ["--cameras.focal-factor=1.02"],
+    "distortion": ["--sensor.k1=0.05"],
+    "exposures": ["--sensor.exposure-sigma-stops=0.15"],
+    "white balances": ["--sensor.white-balance-sigma-stops=0.1"],
+    "larger masks": ["--masks.dilate-px=1"],
+    "masks of views": ["--masks.offset-px=1"],
+    "blur": ["--sensor.blur-px=0.7"],
+    "noise": ["--sensor.shot-noise=0.02", "--sensor.read-noise=0.01"],
+    "JPEG": ["--sensor.srgb8", "--sensor.jpeg-quality=90"],
+}
+"""Errors of photographs: options of `shinypartial perturb`."""
+EXPLAINED = {
+    "poses": {"poses"},
+    "focal length": {"focal length"},
+    "distortion": {"distortion"},
+    "exposures": {"exposures"},
+    "white balances": {"white balances"},
+    "larger masks": {"mask offset"},
+    "masks of views": {"mask offsets"},
+    "near room": {"walls"},
+    "rough": {"roughness"},
+    "blur": {"blur"},
+    "noise": set[str](),
+    "JPEG": set[str](),
+}
+"""What each should be explained by."""
+COLUMNS = sorted(set().union(*EXPLAINED.values()))
+
+
+@dataclass(frozen=True)
+class Options:
+    """Render, spoil and fit."""
+
+    output: Path = Path("confusion")
+    """Folder for datasets and fits."""
+    scene: str = "vase"
+    resolution: int = 160
+    train: int = 40
+    errors: tuple[str, ...] = tuple(EXPLAINED)
+    """Errors that take part, alone and in pairs."""
+    pairs: bool = True
+    """Whether pairs follow the single ones."""
+    json: Path | None = None
+    """Also write what was found here."""
+
+
+def main() -> None:
+    """Print the table."""
+    options = tyro.cli(Options, description=__doc__)
+    cases: list[tuple[str, ...]] = [(), *((each,) for each in options.errors)]
+    cases += [*combinations(options.errors, 2)] if options.pairs else []
+    results = []
+    for case in cases:
+        results.append(_found(case, options))
+        print(_row(results[-1]), flush=True)
+        if options.json:
+            write_json(options.json, {"scene": options.scene, "resolution": options.resolution, "results": results})
+    right = sum(not each["missed"] and not each["false"] for each in results)
+    print(f"{right} of {len(results)} cases end with their explanations and no others")
+
+
+def _found(case: tuple[str, ...], options: Options) -> dict[str, Any]:
+    name = "-".join(each.replace(" ", "_") for each in case) or "clean"
+    fit = options.output / f"{name}-fit"
+    if not (fit / "scores.json").exists():
+        clean = _rendered(case, options)
+        dataset = options.output / name
+        spoiled = [option for each in case for option in PERTURBED.get(each, [])]
+        if not spoiled:
+            dataset = clean
+        elif not dataset.exists():
+            _run("shinypartial", "perturb", str(clean), *spoiled, "--seed=3", f"--output={dataset}")
+        _run("panoless", "fit", str(dataset), f"--output={fit}")
+        _run("shinypartial", "evaluate", str(fit), f"--dataset={clean}")
+    info, scores = read_json(fit / "prediction.json", "a prediction"), read_json(fit / "scores.json", "scores")
+    chosen = info["model_selection"]["candidates"][-1]
+    evidence = info["verdict"]["evidence"]
+    stated = {each["name"] for each in chosen.get("blocks") or () if each["kept"]}
+    stated |= {each for each, size in (("roughness", "roughness"), ("blur", "blur_px")) if evidence.get(size)}
+    wanted = set().union(*(EXPLAINED[each] for each in case)) if case else set[str]()
+    return {
+        "errors": case,
+        "stated": sorted(stated),
+        "missed": sorted(wanted - stated),
+        "false": sorted(stated - wanted),
+        "verdict": info["verdict"]["verdict"],
+        "normals_deg": scores["normals"]["median_angular_error_deg"],
+        "seconds": round(sum(info["seconds"].values())),
+    }
+
+
+def _rendered(case: tuple[str, ...], options: Options) -> Path:
+    """The dataset without errors of photographs."""
+    flags = [option for each in case for option in RENDERED.get(each, [])]
+    dataset = options.output / "-".join(["rendered", *(each.replace(" ", "_") for each in case if each in RENDERED)])
+    if not dataset.exists():
+        size = [f"--resolution={options.resolution}", f"--train={options.train}", "--test=5"]
+        _run("shinypartial", "generate", f"--scene={options.scene}", *size, *flags, f"--output={dataset}")
+    return dataset
+
+
+def _row(result: dict[str, Any]) -> str:
+    marks = " ".join("x" if each in result["stated"] else "." for each in COLUMNS)
+    wrong = [f"{word}: {', '.join(result[word])}" for word in ("missed", "false") if result[word]]
+    name = " + ".join(result["errors"]) or "none"
+    return f"{name:34} {marks}  {result['normals_deg']:.2f}° {result['verdict']}  {'; '.join(wrong)}"
+
+
+def _run(program: str, *arguments: str) -> None:
+    subprocess.run([str(Path(sys.executable).parent / program), *arguments], check=True, stdout=subprocess.DEVNULL)
+
+
+if __name__ == "__main__":
+    main()
