@@ -15,7 +15,7 @@ pose that makes up for such a surface explains views that took no part better, t
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -49,8 +49,16 @@ def decided(
     *,
     required: bool = False,
 ) -> Decision:
-    """Whether a block is needed, by the posterior variances of its unknowns or by their covariance, to both of which
-    what model errors amount to is added; one that is `required` is kept.
+    """Whether a block is needed; one that is `required` is kept."""
+    found = scored(block, variances, covariance)
+    return replace(found, kept=required or found.score > found.bound)
+
+
+def scored(
+    block: Block, variances: Float[np.ndarray, "B M"], covariance: Float[np.ndarray, "N N"] | None = None
+) -> Decision:
+    """The score of a block that is kept, by the posterior variances of its unknowns or by their covariance, to both of
+    which what model errors amount to is added.
     """
     value, floor = block.values.ravel(), np.tile(block.floor**2, len(block.values))
     if covariance is None:
@@ -60,4 +68,4 @@ def decided(
     share = 2 / (9 * value.size)
     bound = (1 - share + DEVIATIONS * math.sqrt(share)) ** 3
     sigma = block.scale * math.sqrt(float(variances[:, block.measured].mean()))
-    return Decision(block.name, required or score > bound, score, bound, block.rms, sigma, block.unit)
+    return Decision(block.name, True, score, bound, block.rms, sigma, block.unit)

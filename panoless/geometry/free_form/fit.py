@@ -1,6 +1,6 @@
 """A free-form surface from silhouettes and photographs: accepted Gauss–Newton steps, from coarse to fine."""
 
-from collections.abc import Collection, Iterator, MutableMapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, MutableMapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -121,8 +121,8 @@ def fit_free_form(
             known[stage] = held_out_error(solved, tested, stage)
         return known[stage]
 
-    def better(stage: FitStage, other: FitStage) -> FitStage:
-        return keep_if_better((stage, other), error, LEAST_GAIN)
+    def best(stages: Iterable[FitStage], least_gain: float = LEAST_GAIN) -> FitStage:
+        return keep_if_better(stages, error, least_gain) if others else next(iter(stages))
 
     with torch.no_grad():
         usual = nuisance.freed([name for name in nuisance.free if name != Distortion.name]).of_views(kept)
@@ -130,15 +130,12 @@ def fit_free_form(
         decisions = dict[str, Decision]()
         with improving():
             check_time()
-            begun, hollowed = start, None
-            for lid in (start, *lids) if schedule.hollowed else ():
-                hollowed = concave_start(solved, lid, stage.surface)
-                if hollowed is not None:
-                    break
+            begun = start
+            hollowed = _hollowed_start(solved, (start, *lids) if schedule.hollowed and others else (), stage.surface)
             if hollowed is not None:
-                deeper = coarse_stage(solved, hollowed, schedule.hollowed, nuisance=stage.nuisance)
-                stage = better(stage, deeper) if others else deeper
-                begun = hollowed if stage is deeper else start
+                plain, deeper = stage, coarse_stage(solved, hollowed, schedule.hollowed, nuisance=stage.nuisance)
+                stage = best((plain, deeper))
+                begun = start if stage is plain else hollowed
             stage, decisions = _needed(solved, stage, required)
             if not all(each.kept for each in decisions.values()):
                 # A surface that gave way to blocks does not come back from them by further steps.
@@ -146,12 +143,11 @@ def fit_free_form(
                 rounds = schedule.coarse if begun is start else schedule.hollowed
                 begun = replace(begun, surroundings=stage.surface.surroundings)
                 stage = coarse_stage(solved, begun, rounds, nuisance=stage.nuisance)
-            if others:
-                stage = keep_if_better(refitted_stages(solved, stage, schedule.refit), error, LEAST_GAIN)
-                if schedule.detailed and error(stage) > DETAILED_ERROR:
-                    details = Progress("looking for details", sum(each.steps for each in schedule.detailed))
-                    stage = better(stage, coarse_stage(solved, begun, schedule.detailed, details, stage.nuisance))
-                stage = keep_if_better(_stages(solved, stage, schedule.finer, progress), error, LEAST_FINER_GAIN)
+            stage = best(refitted_stages(solved, stage, schedule.refit))
+            if others and schedule.detailed and error(stage) > DETAILED_ERROR:
+                details = Progress("looking for details", sum(each.steps for each in schedule.detailed))
+                stage = best((stage, coarse_stage(solved, begun, schedule.detailed, details, stage.nuisance)))
+            stage = best(_stages(solved, stage, schedule.finer, progress), LEAST_FINER_GAIN)
             stage, later = _needed(solved, _with_distortion(solved, stage), required)
             decisions |= later
         if stage.settings is None:
@@ -166,6 +162,12 @@ def fit_free_form(
         with improving():
             stage = take_round(views, stage, settings, progress, last=True)
         return stage, list(decisions.values())
+
+
+def _hollowed_start(views: Views, lids: Sequence[LevelSet], surface: LevelSet) -> LevelSet | None:
+    """A start with hollows under the first of the lids that has any."""
+    found = (concave_start(views, lid, surface) for lid in lids)
+    return next((each for each in found if each is not None), None)
 
 
 def _needed(views: Views, stage: FitStage, required: Collection[str]) -> tuple[FitStage, dict[str, Decision]]:

@@ -39,7 +39,7 @@ from panoless.geometry.free_form.trust import Trust, full_trust
 from panoless.kernels.camera import RasterCamera
 from panoless.problem.blocks import Block
 from panoless.problem.corrected import Corrected
-from panoless.problem.evidence import Decision, decided
+from panoless.problem.evidence import Decision, scored
 from panoless.problem.nuisance import nuisance_of
 from panoless.problem.observations import inner_distance_px
 from panoless.problem.rays import PixelRays
@@ -237,7 +237,7 @@ class FreeFormFamily(ExactFamily):
         found = Corrected.by(stage.nuisance, known)
         surface, trust = stage.surface.scaled(found.scale), stage.trust.scaled(found.scale)
         gone = [each for each in decisions if not each.kept]
-        kept = [decided(each, known[each.name], required=True) for each in stage.nuisance.blocks]
+        kept = [scored(each, known[each.name]) for each in stage.nuisance.blocks]
         return _mirror(surface, trust, found.poses, config), found.corrections, [*gone, *kept]
 
 
