@@ -220,6 +220,7 @@ def test_the_paper_presets_run_all_their_paths(
     assert (max(consistencies) > 0) == (config.splats.loss.lambda_normal_consistency > 0)
 
 
+@pytest.mark.splats
 def test_the_paper_method_learns(tmp_path: Path, sphere_dataset: Dataset) -> None:
     config = replace(tiny_config("paper", iterations=150, count=1000))
     config = replace(config, splats=replace(config.splats, density=replace(config.splats.density, enabled=False)))
@@ -229,7 +230,9 @@ def test_the_paper_method_learns(tmp_path: Path, sphere_dataset: Dataset) -> Non
     assert sum(losses[-3:]) < 0.85 * sum(losses[:3])
 
 
-@pytest.mark.parametrize("preset", ["default", "paper", "paper-rho-weighted"])
+@pytest.mark.parametrize(
+    "preset", ["default", *(pytest.param(each, marks=pytest.mark.splats) for each in ("paper", "paper-rho-weighted"))]
+)
 def test_what_is_not_learned_does_not_change(preset: str, tmp_path: Path, sphere_dataset: Dataset) -> None:
     config = tiny_config(preset, iterations=12, count=60)
     config = replace(config, splats=replace(config.splats, density=replace(config.splats.density, enabled=False)))
@@ -294,6 +297,7 @@ def test_every_epoch_sees_every_view_once(views: Views) -> None:
     assert orders[0] != orders[1] != orders[2]
 
 
+@pytest.mark.splats
 def test_published_rates_are_in_units_of_the_cameras_extent(views: Views) -> None:
     """The papers' code counts in it; ours count in radii of the object."""
     here = tiny_config("paper", count=60)

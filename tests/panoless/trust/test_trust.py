@@ -31,6 +31,12 @@ def evidence(views: Views) -> Evidence:
     return gather_evidence(views, MIRROR, VISIBILITY, CONFIG)
 
 
+@pytest.fixture(scope="module")
+def clean(views: Views) -> Evidence:
+    """Of the views as they are."""
+    return evidence(views)
+
+
 def each(views: Views, change) -> Views:
     return replace(views, train=tuple(change(index, view) for index, view in enumerate(views.train)))
 
@@ -42,9 +48,9 @@ def turned(view: TrainView, vector_deg: list[float]) -> TrainView:
     return replace(view, camera=replace(view.camera, world_to_camera=pose))
 
 
-def test_the_true_mirror_is_trusted(views: Views) -> None:
+def test_the_true_mirror_is_trusted(clean: Evidence) -> None:
     """It leaves a third of what one color a view or a place leaves, or less, and its silhouette is the mask's."""
-    found = evidence(views)
+    found = clean
     assert found.unexplained is not None
     assert found.one_color is not None
     assert found.matte is not None
@@ -56,7 +62,7 @@ def test_the_true_mirror_is_trusted(views: Views) -> None:
     assert judge(found).verdict == "trust"
 
 
-def test_the_share_of_places_that_are_not_explained_is_measured_and_named(views: Views) -> None:
+def test_the_share_of_places_that_are_not_explained_is_measured_and_named(views: Views, clean: Evidence) -> None:
     """The right half of each picture shows anything, as a part does whose shape is wrong."""
 
     def half_wrong(index: int, view: TrainView) -> TrainView:
@@ -67,7 +73,7 @@ def test_the_share_of_places_that_are_not_explained_is_measured_and_named(views:
         colors[:, right] = torch.rand((3, len(right)), generator=generator).round()
         return replace(view, radiance=colors.reshape(view.radiance.shape))
 
-    clean, mixed = evidence(views), evidence(each(views, half_wrong))
+    mixed = evidence(each(views, half_wrong))
     assert clean.unexplained_part is not None
     assert mixed.unexplained_part is not None
     assert clean.unexplained_part < 0.02
@@ -77,7 +83,7 @@ def test_the_share_of_places_that_are_not_explained_is_measured_and_named(views:
     assert "lies where its shape explains little of it" in verdict.reason
 
 
-def test_what_the_shape_leaves_bare_is_measured_and_named(views: Views) -> None:
+def test_what_the_shape_leaves_bare_is_measured_and_named(views: Views, clean: Evidence) -> None:
     """A corner of each picture that masks show and the shape lacks, but not the edge of masks that are too large."""
 
     def with_a_corner(index: int, view: TrainView) -> TrainView:
@@ -89,14 +95,14 @@ def test_what_the_shape_leaves_bare_is_measured_and_named(views: Views) -> None:
         return replace(view, mask=max_pool2d(view.mask[None], 5, 1, 2)[0])
 
     bare = evidence(each(views, with_a_corner))
-    assert evidence(views).missed == evidence(each(views, wider)).missed == 0
+    assert clean.missed == evidence(each(views, wider)).missed == 0
     assert bare.missed > LARGEST_MISSED
     verdict = judge(replace(bare, silhouette_px=0.0, view_shift_px=0.0))
     assert verdict.verdict != "trust"
     assert "bare" in verdict.reason
 
 
-def test_what_the_shape_has_too_much_is_measured_and_named(views: Views) -> None:
+def test_what_the_shape_has_too_much_is_measured_and_named(views: Views, clean: Evidence) -> None:
     """A quarter of each mask that is cut off, far from which the shape goes on; but not the edge of masks too small."""
 
     def cut(index: int, view: TrainView) -> TrainView:
@@ -109,7 +115,7 @@ def test_what_the_shape_has_too_much_is_measured_and_named(views: Views) -> None
         return replace(view, mask=1 - max_pool2d(1 - view.mask[None], 3, 1, 1)[0])
 
     grown = evidence(each(views, cut))
-    assert evidence(views).surplus == evidence(each(views, narrower)).surplus == 0
+    assert clean.surplus == evidence(each(views, narrower)).surplus == 0
     covered = [
         float((turn.mask > 0.5).sum() / (view.mask > 0.5).sum())
         for turn, view in zip(views.train, each(views, cut).train, strict=True)
@@ -232,10 +238,10 @@ def test_views_without_the_object_count_for_nothing(views: Views) -> None:
 
 
 @pytest.mark.parametrize("figure", ["unexplained", "view_shift_px", "silhouette_px", "saturated"])
-def test_no_worse_figure_lowers_the_risk(views: Views, figure: str) -> None:
-    found, risks = evidence(views), []
+def test_no_worse_figure_lowers_the_risk(clean: Evidence, figure: str) -> None:
+    risks = []
     for value in np.linspace(0, 2, 11):
-        risks.append(judge(replace(found, **{figure: float(value)})).risk)
+        risks.append(judge(replace(clean, **{figure: float(value)})).risk)
     assert risks == sorted(risks)
     assert risks[-1] > 1
 
@@ -248,10 +254,9 @@ def test_photographs_of_one_color_tell_nothing(views: Views, radiance: float) ->
     assert verdict.remedy == TEXTURE
 
 
-def test_a_verdict_holds_every_figure_by_name(views: Views) -> None:
-    found = evidence(views)
+def test_a_verdict_holds_every_figure_by_name(clean: Evidence) -> None:
     of_balls = {"rim_px", "agreement"}
-    assert set(judge(found).evidence) == {field.name for field in fields(Evidence)} - of_balls
+    assert set(judge(clean).evidence) == {field.name for field in fields(Evidence)} - of_balls
 
 
 def test_a_rough_mirror_is_not_trusted(views: Views) -> None:
@@ -294,14 +299,13 @@ def test_what_pixels_blur_is_not_unexplained(views: Views) -> None:
     assert by_area.unexplained < 0.5 * by_center.unexplained
 
 
-def test_views_from_one_place_are_doubted_however_well_they_agree(views: Views) -> None:
+def test_views_from_one_place_are_doubted_however_well_they_agree(views: Views, clean: Evidence) -> None:
     """Each camera sees the cap of 15° around it, (1 − cos 15°)/2 of the sphere, and the same one no more than once."""
     one = views.train[7]
     at_once = evidence(replace(views, train=(one,) * 15))
     cap = (1 - np.cos(VIEWED_WITHIN_RAD)) / 2
     assert at_once.viewed == pytest.approx(cap, rel=0.05)
-    around = evidence(views)
-    assert 5 * cap < around.viewed < 15 * cap
-    verdict = judge(replace(around, viewed=at_once.viewed))
+    assert 5 * cap < clean.viewed < 15 * cap
+    verdict = judge(replace(clean, viewed=at_once.viewed))
     assert (verdict.verdict, verdict.remedy) == ("do not trust", AROUND)
     assert "15 views see the object from 2% of all directions" in verdict.reason

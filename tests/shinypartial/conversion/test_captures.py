@@ -44,7 +44,7 @@ def straight(view: View) -> np.ndarray:
 
 def write_orb(root: Path, axes_of_normals: Callable[[Camera], np.ndarray]) -> Path:
     """A capture in `blender_HDR` with its ground truth; the first map has a photographer, black on +X."""
-    capture, truth = root / "blender_HDR/ball_scene001", root / "ground_truth/ball_scene001"
+    capture, truth = capture_of(root), root / "ground_truth/ball_scene001"
     frames: dict[str, list[dict[str, object]]] = {"train": [], "test": []}
     for split, index, camera in cameras():
         view, name = render_sphere(camera), f"{index:04d}"
@@ -94,11 +94,25 @@ NORMAL_AXES = {
 }
 
 
-@pytest.mark.parametrize("axes", NORMAL_AXES)
-def test_stanford_orb_comes_back_in_whatever_axes_normals_are(tmp_path: Path, axes: str) -> None:
-    capture, output = write_orb(tmp_path, NORMAL_AXES[axes]), tmp_path / "dataset"
-    made = import_capture("stanford-orb", capture, output)
+@pytest.fixture(scope="module")
+def world_orb(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture of Stanford-ORB whose normals are the world's, and `dataset`, made of it; tests only read them."""
+    root = tmp_path_factory.mktemp("orb")
+    made = import_capture("stanford-orb", write_orb(root, NORMAL_AXES["world"]), root / "dataset")
     assert (made.train, made.test, made.left_out) == (6, 3, ())
+    return root
+
+
+def capture_of(root: Path) -> Path:
+    return root / "blender_HDR/ball_scene001"
+
+
+@pytest.mark.parametrize("axes", NORMAL_AXES)
+def test_stanford_orb_comes_back_in_whatever_axes_normals_are(tmp_path: Path, world_orb: Path, axes: str) -> None:
+    output = world_orb / "dataset"
+    if axes != "world":
+        output = tmp_path / "dataset"
+        import_capture("stanford-orb", write_orb(tmp_path, NORMAL_AXES[axes]), output)
     assert validate(output) == []
     assert "coverage" in (unscored(output) or "")
     dataset = open_dataset(output)
@@ -114,9 +128,8 @@ def test_stanford_orb_comes_back_in_whatever_axes_normals_are(tmp_path: Path, ax
             assert np.degrees(np.arccos(cosine.min().clip(-1, 1))) < 0.4  # 8 bits a component.
 
 
-def test_stanford_orb_is_scored(tmp_path: Path) -> None:
-    import_capture("stanford-orb", write_orb(tmp_path, NORMAL_AXES["OpenGL camera"]), tmp_path / "dataset")
-    truth = write_truth_prediction(tmp_path / "truth", open_dataset(tmp_path / "dataset"))
+def test_stanford_orb_is_scored(tmp_path: Path, world_orb: Path) -> None:
+    truth = write_truth_prediction(tmp_path / "truth", open_dataset(world_orb / "dataset"))
     scores = evaluate(truth, protocol="linear-v1")
     assert scores.environment is not None
     assert scores.normals is not None
@@ -124,10 +137,9 @@ def test_stanford_orb_is_scored(tmp_path: Path) -> None:
     assert scores.normals.mean_angular_error_deg < 0.1
 
 
-def test_the_light_of_stanford_orb_is_that_of_most_views(tmp_path: Path) -> None:
-    import_capture("stanford-orb", write_orb(tmp_path, NORMAL_AXES["world"]), tmp_path / "dataset")
+def test_the_light_of_stanford_orb_is_that_of_most_views(world_orb: Path) -> None:
     # Two bilinear lookups in 64 rows flatten a sun of peak 3 by 0.03.
-    _compare_light(tmp_path / "dataset", 0.05)
+    _compare_light(world_orb / "dataset", 0.05)
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -189,11 +201,12 @@ def turn_a_camera(capture: Path) -> None:
 
 
 @pytest.mark.parametrize("change", [as_pictures, turn_a_camera])
-def test_another_capture_of_the_same_name_is_refused(tmp_path: Path, change: Callable[[Path], None]) -> None:
-    capture, output = write_orb(tmp_path, NORMAL_AXES["world"]), tmp_path / "dataset"
+def test_another_capture_of_the_same_name_is_refused(
+    tmp_path: Path, world_orb: Path, change: Callable[[Path], None]
+) -> None:
+    capture, output = capture_of(world_orb), Path(shutil.copytree(world_orb / "dataset", tmp_path / "dataset"))
     other = Path(shutil.copytree(capture, tmp_path / "other" / capture.name))
     change(other)
-    import_capture("stanford-orb", capture, output)
     before = {path: sha256_of(path) for path in output.rglob("*") if path.is_file()}
     with pytest.raises(InputError, match="different: import_of"):
         import_capture("stanford-orb", other, output)

@@ -93,26 +93,15 @@ def normal_errors_deg(surface: LevelSet, body: Body, views: Views, cameras: list
     return np.concatenate(errors)
 
 
-def fitted_ring(count: int, size_px: int) -> tuple[Views, FreeFormMirror]:
+@pytest.fixture(scope="module")
+def ring() -> tuple[Views, FreeFormMirror]:
     """A torus, which sees itself, and its fit."""
-    views, family = body_views(torus(), count, size_px), FreeFormFamily()
+    views, family = body_views(torus(), 16, 80), FreeFormFamily()
     proposal = family.propose(views, CONFIG, asked=False)
     assert proposal is not None
     geometry, _, _ = family.solve(views, proposal, (), (), CONFIG, lambda _: None)
     assert isinstance(geometry, FreeFormMirror)
     return views, geometry
-
-
-@pytest.fixture(scope="module")
-def ring() -> tuple[Views, FreeFormMirror]:
-    """In as many pixels as show its normals."""
-    return fitted_ring(16, 80)
-
-
-@pytest.fixture(scope="module")
-def coarse_ring() -> tuple[Views, FreeFormMirror]:
-    """In few views of few pixels."""
-    return fitted_ring(10, 48)
 
 
 @pytest.mark.parametrize(
@@ -357,9 +346,9 @@ def test_the_same_views_give_the_same_surface() -> None:
     np.testing.assert_array_equal(one.coefficients, other.coefficients)
 
 
-def test_the_kind_keeps_the_protocol(coarse_ring: tuple[Views, FreeFormMirror]) -> None:
+def test_the_kind_keeps_the_protocol(ring: tuple[Views, FreeFormMirror]) -> None:
     """State, rays, buffers, light, mesh and surfels of one fit."""
-    views, geometry = coarse_ring
+    views, geometry = ring
     again = FreeFormMirror.from_state_dict(geometry.state_dict())
     np.testing.assert_array_equal(again.surface.coefficients, geometry.surface.coefficients)
     np.testing.assert_array_equal(again.trust.values, geometry.trust.values)
@@ -570,9 +559,9 @@ def test_photographs_agree_with_masks_unless_outlines_lie_to_one_side_of_them(so
         assert not larger(level + off_px * cells_a_pixel).outlines_agree
 
 
-def test_rays_that_pass_the_box_of_a_surface_cost_as_outliers(coarse_ring: tuple[Views, FreeFormMirror]) -> None:
+def test_rays_that_pass_the_box_of_a_surface_cost_as_outliers(ring: tuple[Views, FreeFormMirror]) -> None:
     """So a camera that turns away from the object gains nothing."""
-    views, geometry = coarse_ring
+    views, geometry = ring
     away = turned_by(views, 60.0, 0)
     outlines = outline_rays(views)
     costs = [
