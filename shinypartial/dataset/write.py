@@ -183,14 +183,20 @@ def environment_files(root: Path) -> tuple[Path, ...]:
     return (root / ENVIRONMENT_LATLONG, *cube, root / ENVIRONMENT_LATLONG_Y_UP)
 
 
+LEAST_CUBE = 8
+"""Texels along a face side at least."""
+
+
 def write_environment(root: Path, latlong: Float[np.ndarray, "H W 3"], cube_resolution: int = 256) -> None:
     """Write the ground-truth environment as lat-long, cubemap and the tagged Y-up lat-long.
 
-    The other two are resampled from the lat-long map as it is stored, so that all three agree.
+    The other two are resampled from the lat-long map as it is stored, so that all three agree. Faces of a cubemap have
+    `cube_resolution` texels a side at most, and no more than half of the map's rows, which are as wide.
     """
     write_exr_rgb(root / ENVIRONMENT_LATLONG, latlong)
     stored = read_exr_rgb(root / ENVIRONMENT_LATLONG)
-    for name, face in zip(FACES, latlong_to_cube(stored, cube_resolution), strict=True):
+    side = min(cube_resolution, max(len(stored) // 2, LEAST_CUBE))
+    for name, face in zip(FACES, latlong_to_cube(stored, side), strict=True):
         write_exr_rgb(root / ENVIRONMENT_CUBE / f"{name}.exr", face)
     write_exr_rgb(root / ENVIRONMENT_LATLONG_Y_UP, latlong_to_y_up(stored), y_up_environment=True)
 

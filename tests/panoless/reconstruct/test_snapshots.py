@@ -35,7 +35,7 @@ from shinypartial.prediction.format import SNAPSHOTS, prediction_folders, read_i
 from shinypartial.prediction.format import snapshot_folders as exported_snapshots
 from tests.support.mirror_sphere import sphere_surfels, tiny_config
 
-pytestmark = pytest.mark.usefixtures("often")
+pytestmark = [pytest.mark.splats, pytest.mark.usefixtures("often")]
 CONFIG = tiny_config(iterations=24, count=120)
 MARKS = snapshot_schedule(4, (), CONFIG.splats.iterations)
 

@@ -16,7 +16,7 @@ from tests.support.splat_scenes import blended, random_splats
 from tests.support.surfel_scenes import IMAGES, random_scene, tilted_camera
 from tests.support.triton_compilation import Launch, launch_of
 
-pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
+pytestmark = [pytest.mark.splats, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
 
 ROOT = Path(__file__).resolve().parents[4]
 ELEMENTWISE = {
