@@ -24,6 +24,8 @@ TURN_DEG, SHIFT = 0.5, 0.005
 """Standard deviations of a camera's turn and shift (radii of the object), where a dataset states none."""
 STATED_FLOOR = 0.1
 """Share of both that is added, in squares, to a stated covariance: an adjustment knows of noise alone."""
+SURROUNDINGS_RESOLUTION = 16
+"""Texels along a face side from which near walls and a floor are free."""
 AnyBlock = TypeVar("AnyBlock", bound="Block")
 
 
@@ -41,10 +43,6 @@ class Block:
     """Standard deviation of an unknown by errors of surface, map and masks, which noise does not show."""
     sigma: ClassVar[float] = 1.0
     """Standard deviation of the prior of an unknown."""
-    least_resolution: ClassVar[int | None] = None
-    """Texels along a face side of the coarsest map that determines it where it is one of all views; None: a fine one
-    alone does.
-    """
     surroundings_columns: ClassVar[slice | None] = None
     """Its columns of `Surroundings.rows`; None: it is no part of the surroundings."""
     moves_silhouettes: ClassVar[bool] = False
@@ -52,6 +50,13 @@ class Block:
     values: Float[np.ndarray, "B M"]
     precision: Float[np.ndarray, "B M M"]
     """Inverse covariances of the prior."""
+
+    @property
+    def least_resolution(self) -> int | None:
+        """Texels along a face side of the coarsest map that determines it where it is one of all views; None: a fine
+        one alone does.
+        """
+        return None
 
     @property
     def rms(self) -> float:
@@ -255,7 +260,6 @@ class Walls(Block):
     unit = "1/radius"
     model_error = 0.001
     sigma = 0.1
-    least_resolution = 16
 
     @classmethod
     def of(cls, views: Views, around: Surroundings) -> "Walls":
@@ -267,6 +271,11 @@ class Walls(Block):
         """Those of surroundings."""
         values = around.coefficients if len(around.coefficients) else np.zeros(1)
         return cls(values[None], np.eye(len(values))[None] / cls.sigma**2)
+
+    @property
+    def least_resolution(self) -> int | None:
+        """Walls that are near already; those that are far look like a longer lens."""
+        return SURROUNDINGS_RESOLUTION if self.values.any() else None
 
     @property
     def surroundings_columns(self) -> slice:  # type: ignore[override]
@@ -294,7 +303,6 @@ class Ground(Block):
     unit = "radii"
     model_error = 0.01
     sigma = 0.1
-    least_resolution = 16
     surroundings_columns = slice(-FLOOR_UNKNOWNS, None)
     floor_now: Floor
 
@@ -304,6 +312,11 @@ class Ground(Block):
         if around.floor is None:
             return None
         return cls(np.zeros((1, cls.count)), np.eye(cls.count)[None] / cls.sigma**2, around.floor)
+
+    @property
+    def least_resolution(self) -> int:
+        """As near walls."""
+        return SURROUNDINGS_RESOLUTION
 
     @property
     def rms(self) -> float:

@@ -16,7 +16,7 @@ from typing import Any
 
 import tyro
 
-from shinypartial.io.files import read_json, write_json
+from shinypartial.io.files import read_json, write_between, write_json
 
 RENDERED = {"rough": ["--roughness=0.15"], "near room": ["--surroundings-radii=5"]}
 """Errors of what is photographed: options of `shinypartial generate`."""
@@ -48,7 +48,6 @@ EXPLAINED = {
     "JPEG": set[str](),
 }
 """What each should be explained by."""
-COLUMNS = sorted(set().union(*EXPLAINED.values()))
 
 
 @dataclass(frozen=True)
@@ -64,8 +63,8 @@ class Options:
     """Errors that take part, alone and in pairs."""
     pairs: bool = True
     """Whether pairs follow the single ones."""
-    json: Path | None = None
-    """Also write what was found here."""
+    page: Path | None = None
+    """Also write the table into this page, and what was found beside it as JSON."""
 
 
 def main() -> None:
@@ -77,10 +76,10 @@ def main() -> None:
     for case in cases:
         results.append(_found(case, options))
         print(_row(results[-1]), flush=True)
-        if options.json:
-            write_json(options.json, {"scene": options.scene, "resolution": options.resolution, "results": results})
-    right = sum(not each["missed"] and not each["false"] for each in results)
-    print(f"{right} of {len(results)} cases end with their explanations and no others")
+        if options.page:
+            head = {"scene": options.scene, "resolution": options.resolution, "train": options.train}
+            write_json(options.page.with_suffix(".json"), {**head, "results": results})
+            write_between(options.page, "confusion", _table(results))
 
 
 def _found(case: tuple[str, ...], options: Options) -> dict[str, Any]:
@@ -124,10 +123,24 @@ def _rendered(case: tuple[str, ...], options: Options) -> Path:
 
 
 def _row(result: dict[str, Any]) -> str:
-    marks = " ".join("x" if each in result["stated"] else "." for each in COLUMNS)
-    wrong = [f"{word}: {', '.join(result[word])}" for word in ("missed", "false") if result[word]]
-    name = " + ".join(result["errors"]) or "none"
-    return f"{name:34} {marks}  {result['normals_deg']:.2f}° {result['verdict']}  {'; '.join(wrong)}"
+    """What was wrong, what the fit states, what is false in that, and how good it is."""
+    stated = [f"**{each}**" if each in result["false"] else each for each in result["stated"]]
+    columns = (stated, result["missed"], [f"{result['normals_deg']:.2f}°"], [result["verdict"]])
+    return (
+        " | ".join(["| " + (" + ".join(result["errors"]) or "none"), *(", ".join(each) or "–" for each in columns)])
+        + " |"
+    )
+
+
+def _table(results: list[dict[str, Any]]) -> list[str]:
+    right = sum(not each["missed"] and not each["false"] for each in results)
+    head = ["| What is wrong | Stated | Missed | Normals | Verdict |", "|---|---|---|---|---|"]
+    return [
+        f"{right} of {len(results)} cases end with their explanations and no others; false ones are bold.",
+        "",
+        *head,
+        *map(_row, results),
+    ]
 
 
 def _run(program: str, *arguments: str) -> None:
