@@ -174,8 +174,8 @@ class CameraPoses(Block):
     name = "poses"
     count = 6
     unit, scale = "°", 180 / math.pi
-    model_error = 0.1
-    """In pixels: contours and maps of few pixels determine no camera better."""
+    model_error = 0.15
+    """In pixels: the standard deviation of contours, whose errors in a view are alike."""
     pixel: tuple[float, float] = (0.0, 0.0)
     """Turn (rad) and shift (normalized frame) by which the object moves by a pixel: medians over views."""
 

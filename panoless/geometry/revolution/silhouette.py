@@ -45,9 +45,10 @@ BLUNT_CELLS = 4.0
 """A profile wider than this (cells) may end flat, where silhouettes stop telling its slope."""
 WIDEST_WITHIN = 0.6
 """The widest place of the body has a height below this (radii of the object frame)."""
-CUT_RATIO, CUT_CELLS = 3.0, 1.0
-"""An end cell narrower than its neighbor by this many times what that is narrower than the next, and so many cells
-more, is cut by an edge."""
+EDGE_RAD = math.radians(75.0)
+"""A profile that turns inward by more at one cell has an edge there…"""
+MOST_BEYOND = 0.05
+"""…if no more than this share of its cells lies beyond."""
 LEAST_CELLS = 5
 """Fewer cells make no profile."""
 GRAZING_RAD = math.radians(10.0)
@@ -201,15 +202,19 @@ def _ends(
 
 
 def _uncut(radius: Float[np.ndarray, "C"], end: int, other: int, cell: float) -> int:
-    """The end cell of a profile, or its neighbor where an edge, such as that of a mouth, cuts it.
+    """The end cell of a profile, or one of its neighbors where an edge, such as that of a mouth, lies: it cuts the end
+    cell, and levels seen by few views leave a blunt cone beyond it.
 
-    A profile through what is left of it would fold as soon as the edge is fitted.
+    A profile through what is left there would fold as soon as the edge is fitted.
     """
     inward = 1 if other > end else -1
     if abs(other - end) < LEAST_CELLS:
         return end
-    narrower, before = (radius[end + (k + 1) * inward] - radius[end + k * inward] for k in (0, 1))
-    return end + inward * int(narrower > CUT_RATIO * abs(before) + CUT_CELLS * cell)
+    beyond = np.arange(1, 1 + max(int(MOST_BEYOND * abs(other - end)), 1))
+    edges = end + inward * beyond
+    toward = np.arctan2(radius[edges] - radius[edges + 2 * inward], 2 * cell)
+    turns = toward - np.arctan2(radius[end] - radius[edges], beyond * cell)
+    return int(edges[np.argmax(turns)]) if turns.max() > EDGE_RAD else end
 
 
 def _blunt_end(radius: Float[np.ndarray, "C"], widest: int, tip: int, steepest: float, cell: float) -> int:

@@ -132,9 +132,6 @@ def goblet_fit():
     return propose_revolution(revolution_views(goblet(), around(12)))
 
 
-@pytest.mark.xfail(
-    reason="steps that are accepted one by one stop at 0.16° in 48-pixel masks of a stem, strictly: 0.1°"
-)
 def test_outlines_give_axis_and_profile(goblet_fit) -> None:
     """A tilted axis to a tenth of a degree, toward the end that cameras look into, and the outside to a tenth of a
     pixel (0.02 units), from masks alone.
