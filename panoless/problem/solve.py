@@ -43,7 +43,9 @@ ROUNDS = (
 )
 """With several rays a texel: a texel that one ray sees follows it wherever it goes."""
 FINISH = Round(128, 0.1, 250_000, 3)
-"""Where blocks seem needed: with distortion, which others hide, and a finer surface, for which poses make up."""
+"""With a finer surface, for which poses make up."""
+DISTORTED = replace(FINISH, steps=8)
+"""With distortion, which others hide and which comes slowly."""
 
 
 @dataclass(frozen=True)
@@ -135,11 +137,12 @@ def solve(
         needless = [each for each in decisions if not each.kept]
         gone += needless
         left = state.nuisance.without([each.name for each in needless])
-        if not left.blocks or (not needless and settings is FINISH) or is_past_limit():
+        more = [Distortion] if settings is last and Distortion in kinds else []
+        if not (left.blocks or more) or (not needless and settings is DISTORTED) or is_past_limit():
             progress.advance(steps=progress.total - progress.done)
             return Solved(replace(state, nuisance=left), (*gone, *(each for each in decisions if each.kept)), known)
         if settings is last:
-            more = [Distortion] if Distortion in kinds else []
             left = nuisance_of(views, [*more, *(type(each) for each in left.blocks)], around).replaced(left.blocks)
             state = replace(state, surface=state.surface.refined())
-        settings, state = FINISH, take_round(views, replace(state, nuisance=left), FINISH, FINISH.resolution)
+        settings = DISTORTED
+        state = take_round(views, replace(state, nuisance=left), settings, settings.resolution)
