@@ -43,13 +43,16 @@ class Block:
     """Standard deviation of an unknown by errors of surface, map and masks, which noise does not show."""
     sigma: ClassVar[float] = 1.0
     """Standard deviation of the prior of an unknown."""
-    surroundings_columns: ClassVar[slice | None] = None
-    """Its columns of `Surroundings.rows`; None: it is no part of the surroundings."""
     moves_silhouettes: ClassVar[bool] = False
     """Whether its numbers are pixels by which silhouettes of masks lie outside of those of the object."""
     values: Float[np.ndarray, "B M"]
     precision: Float[np.ndarray, "B M M"]
     """Inverse covariances of the prior."""
+
+    @property
+    def surroundings_columns(self) -> slice | None:
+        """Its columns of `Surroundings.rows`; None: it is no part of the surroundings."""
+        return None
 
     @property
     def least_resolution(self) -> int | None:
@@ -278,7 +281,7 @@ class Walls(Block):
         return SURROUNDINGS_RESOLUTION if self.values.any() else None
 
     @property
-    def surroundings_columns(self) -> slice:  # type: ignore[override]
+    def surroundings_columns(self) -> slice:
         """The first."""
         return slice(self.size)
 
@@ -303,7 +306,6 @@ class Ground(Block):
     unit = "radii"
     model_error = 0.01
     sigma = 0.1
-    surroundings_columns = slice(-FLOOR_UNKNOWNS, None)
     floor_now: Floor
 
     @classmethod
@@ -312,6 +314,11 @@ class Ground(Block):
         if around.floor is None:
             return None
         return cls(np.zeros((1, cls.count)), np.eye(cls.count)[None] / cls.sigma**2, around.floor)
+
+    @property
+    def surroundings_columns(self) -> slice:
+        """The last."""
+        return slice(-FLOOR_UNKNOWNS, None)
 
     @property
     def least_resolution(self) -> int:
