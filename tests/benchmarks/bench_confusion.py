@@ -38,7 +38,7 @@ EXPLAINED = {
     "focal length": {"focal length"},
     "distortion": {"distortion"},
     "exposures": {"exposures"},
-    "white balances": {"white balances"},
+    "white balances": {"white balances", "exposures"},
     "larger masks": {"mask offset"},
     "masks of views": {"mask offsets"},
     "near room": {"walls"},
@@ -47,7 +47,7 @@ EXPLAINED = {
     "noise": set[str](),
     "JPEG": set[str](),
 }
-"""What each should be explained by."""
+"""What each should be explained by. Gains of channels that are drawn one by one change the exposure, too."""
 
 
 @dataclass(frozen=True)
