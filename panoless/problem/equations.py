@@ -189,6 +189,7 @@ class Photographs:
         by_turn = np.cross(directions[:, None], by_ray + hits.distance[:, None, None] * by_shift)
         return np.concatenate([by_turn, by_shift], 2)
 
+    @cached_property
     def surroundings_rows(self) -> Float[np.ndarray, "Q 3 D"]:
         """Of the light, by the unknowns of the surroundings."""
         slopes = slopes_of(self.environment, self.mirrored.looked_up)
@@ -240,7 +241,7 @@ class Equations:
         def beside(rays: PixelRays, by_motion: np.ndarray, seen: Photographs | None) -> tuple[np.ndarray, ...]:
             light = None if seen is None else seen.light
             rows = [
-                seen.surroundings_rows()[..., each.surroundings_columns]
+                seen.surroundings_rows[..., each.surroundings_columns]
                 if seen is not None and each.surroundings_columns is not None
                 else rows_of(each, rays, data.cameras, by_motion, light)
                 for each in (*by_view, *shared)

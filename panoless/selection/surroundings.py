@@ -88,22 +88,11 @@ def _up(views: Views) -> Float[np.ndarray, "3"]:
     return upward(rotations[:, 0], -rotations[:, 1])
 
 
-def _few_rays(views: Views, geometry: Geometry) -> LeavingRays:
-    """Of some of the views: those that tell whether to look closer."""
-    some = replace(views, train=views.train[:: -(-len(views.train) // CHECKED_VIEWS)])
-    return joined(leaving_rays(some, geometry, CHECKED_RAYS))
-
-
-def _is_pulled(rays: LeavingRays) -> bool:
-    """Whether a step toward near surroundings, under a coarse map, promises enough."""
-    step = Linearized.at(rays, FAR.with_degree(0), CHECKED_RESOLUTION)
-    return step.pull() >= LEAST_PULL
-
-
 def _asks_for_near(views: Views, geometry: Geometry, *, floor: bool) -> bool:
-    """Whether a step toward a sphere promises enough, or a floor leaves little enough."""
-    rays = _few_rays(views, geometry)
-    if _is_pulled(rays):
+    """Whether a step toward a sphere promises enough under a coarse map, or a floor leaves little enough."""
+    some = replace(views, train=views.train[:: -(-len(views.train) // CHECKED_VIEWS)])
+    rays = joined(leaving_rays(some, geometry, CHECKED_RAYS))
+    if Linearized.at(rays, FAR.with_degree(0), CHECKED_RESOLUTION).pull() >= LEAST_PULL:
         return True
     return floor and with_floor(rays, _up(views))[1] < LARGEST_FLOOR_COST
 

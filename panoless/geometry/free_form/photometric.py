@@ -325,11 +325,15 @@ class Solution:
         """Of photographs and of silhouettes, by the unknowns of a block."""
         cameras = self.task.cameras
         if block.surroundings_columns is not None:
-            rows = self.surface.surroundings.rows(self.slopes, self.points, self.sights.mirrored)
-            seen = rows[..., block.surroundings_columns]
+            seen = self._surroundings_rows[..., block.surroundings_columns]
         else:
             seen = rows_of(block, self.rays, cameras, self._motion_rows, self._light)
         return seen, rows_of(block, self._outlined, cameras, self._silhouettes[1])
+
+    @cached_property
+    def _surroundings_rows(self) -> Float[np.ndarray, "P 3 D"]:
+        """Of photographs, by the unknowns of the surroundings."""
+        return self.surface.surroundings.rows(self.slopes, self.points, self.sights.mirrored)
 
     @cached_property
     def _outlined(self) -> PixelRays:

@@ -143,8 +143,7 @@ def _propose(
     surface = refine_outer(rays, start if lid >= base else start.turned_over(), extent)
     if surface is None:
         return None
-    settled = by_outlines_alone(views, RevolutionUnknowns(surface, rays.pixel))
-    surface = resample_profile(settled.surface, rays.pixel)
+    surface = by_outlines_alone(views, RevolutionUnknowns(surface, rays.pixel)).settled().surface
     found = silhouette_residuals(rays, surface, rays.pixel)
     distance = np.where(found.side >= 0, np.abs(found.pixels), np.inf)
     medians = np.array([np.median(distance[rays.view == view]) for view in np.unique(rays.view)])

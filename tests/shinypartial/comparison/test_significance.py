@@ -59,10 +59,11 @@ def test_differences_of_one_sign_have_the_smallest_p_value(count: int) -> None:
 
 
 @pytest.mark.parametrize("kind", SYMMETRIC)
-def test_small_p_values_are_as_rare_as_they_say(kind: str) -> None:
+@pytest.mark.parametrize("count", [6, pytest.param(8, marks=pytest.mark.slow)])
+def test_small_p_values_are_as_rare_as_they_say(kind: str, count: int) -> None:
     """P(p ≤ α) ≤ α under symmetry, at each α; 500 trials spread by 1 % at α = 5 %."""
-    random = np.random.default_rng(6)
-    p_values = np.array([sign_flip_test(SYMMETRIC[kind](random, 6)) for _ in range(500)])
+    random = np.random.default_rng(count)
+    p_values = np.array([sign_flip_test(SYMMETRIC[kind](random, count)) for _ in range(500)])
     for level in (0.05, 0.1, 0.25):
         assert (p_values <= level).mean() <= level + 3 * np.sqrt(level * (1 - level) / 500)
 
@@ -84,7 +85,7 @@ def test_many_differences_are_drawn_with_the_seed_and_nearly_exact() -> None:
     assert drawn == pytest.approx(np.mean(sums >= abs(values.sum()) - 1e-12), abs=0.012)
 
 
-@pytest.mark.parametrize("count", [2, 5])
+@pytest.mark.parametrize("count", [2, 5, *(pytest.param(each, marks=pytest.mark.slow) for each in (3, 10))])
 def test_the_interval_covers_a_normal_mean_as_often_as_it_says(count: int) -> None:
     """Exactly 95 %; 2,000 trials spread by 0.5 %."""
     samples = np.random.default_rng(count).normal(size=(2000, count))

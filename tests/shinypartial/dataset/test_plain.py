@@ -152,7 +152,7 @@ def test_each_quirk_of_the_layout_is_lawful(source: Dataset, tmp_path: Path, qui
     assert validate(original) == []
 
 
-@pytest.mark.parametrize("quirks", TOGETHER, ids=lambda names: names[0])
+@pytest.mark.parametrize("quirks", [(), *TOGETHER], ids=lambda names: (*names, "as it is")[0])
 def test_quirks_are_lawful_together_and_in_a_subset(source: Dataset, tmp_path: Path, quirks: tuple[str, ...]) -> None:
     original = Path(shutil.copytree(source.root, tmp_path / "ball"))
     for name in quirks:
