@@ -18,6 +18,7 @@ from panoless.problem.observations import outline_rays
 from panoless.problem.parametric import LEAST_COSINE, MirrorHits, ParametricSurface, Silhouette, motion_rows
 from panoless.problem.rays import PixelRays
 from panoless.problem.solve import by_outlines_alone
+from shinypartial.core.camera import Similarity
 from shinypartial.core.errors import InputError
 
 Vectors = Float[np.ndarray, "P 3"]
@@ -37,9 +38,8 @@ class Ellipsoid:
     def chords(self, origins: Vectors, directions: Vectors) -> Float[np.ndarray, "2 P"]:
         """Along rays o + t d: t where (x − c)ᵀ Q (x − c) is least, and the squared half chord, negative for a miss."""
         away, image = origins - self.center, directions @ self.matrix
-        square = (image * directions).sum(1)
-        middle = -(image * away).sum(1) / square
-        return np.stack([middle, middle**2 - ((away @ self.matrix * away).sum(1) - 1) / square])
+        square, along = (image * directions).sum(1), (image * away).sum(1)
+        return np.stack([-along / square, (along / square) ** 2 - ((away @ self.matrix * away).sum(1) - 1) / square])
 
     def hits(self, origins: Vectors, directions: Vectors) -> RayHits:
         """Where chords begin."""
@@ -60,11 +60,6 @@ class EllipsoidUnknowns(ParametricSurface):
 
     surface: Ellipsoid
     count: ClassVar[int] = 9
-
-    @property
-    def surroundings(self) -> Surroundings:
-        """Of the ellipsoid."""
-        return self.surface.surroundings
 
     def hits(self, rays: PixelRays) -> MirrorHits:
         """Where p moves by V, a fixed ray has δx = d (n·V)/(n·d), δg = Q (δx − V) − S g and δn = (1 − n nᵀ) δg/‖g‖."""
@@ -101,6 +96,11 @@ class EllipsoidUnknowns(ParametricSurface):
         """c + δ and e⁻ˢ Q e⁻ˢ, which stays positive."""
         center, back = self.surface.center + step[:3], expm(-np.tensordot(step[3:], STRAINS, 1))
         return replace(self, surface=replace(self.surface, center=center, matrix=back @ self.surface.matrix @ back))
+
+    def taken_back(self, common: Similarity) -> "EllipsoidUnknowns":
+        """As p = s R p′ has it."""
+        center, turn = common.undone(self.surface.center[None])[0], common.scale * common.rotation
+        return replace(self, surface=replace(self.surface, center=center, matrix=turn.T @ self.surface.matrix @ turn))
 
     @property
     def shape(self) -> Ellipsoid:

@@ -1,10 +1,13 @@
 """Least squares of what rays see under a map that follows whatever else moves them.
 
 A step at a fixed map gets nowhere where the map can follow: turning a mirror and turning the map after it changes
-little. So each texel takes the weighted mean Π e of what its rays ask for, and only the rest moves other unknowns
-(variable projection, Golub and Pereyra 1973):
+little. So what a change e of the map takes over of the rays' residuals is left out, and only the rest moves other
+unknowns (variable projection, Golub and Pereyra 1973):
 
-½ Σ w ‖(1 − Π) e‖², g = Jᵀ W (1 − Π) e, H = Jᵀ W (1 − Π) J.
+½ Σ w ‖(1 − Π) e‖², g = Jᵀ W (1 − Π) e, H = Jᵀ W (1 − Π) J, Π = B Bᵀ W.
+
+The map's changes B are a constant for each texel and a slope for each block of 2 × 2 texels, orthonormal under W. With
+constants alone, what varies within a texel would be left to the other unknowns, which then move too little.
 """
 
 from collections.abc import Iterator
@@ -15,35 +18,47 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int
 
-from panoless.environment.cubemap import flat_texels
 from panoless.numeric.gauss_newton import jacobian_of_rows, normal_equations
+from shinypartial.core.sphere import directions_to_cube
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-TEXELS_AT_ONCE = 4096
+CHANGES_AT_ONCE = 4096
 """For memory."""
+SLOPE_WEIGHT = 1.0
+"""Pull of a slope to zero: that of a ray so many texels (root mean square) beside the middle."""
 
 
 @dataclass(frozen=True)
 class FollowingMap:
-    """Which texel each ray falls into, and how much it counts there. Rays without weight ask for nothing."""
+    """What rays count, and how a map that follows can change what they see."""
 
     weights: Float[np.ndarray, "P"]
-    texels: Int[np.ndarray, "P"]
-    """Numbered from zero: only those that are seen."""
+    basis: "csr_matrix"
+    """B, a row for each ray. Rays without weight ask for nothing."""
 
     @classmethod
     def of(
         cls, directions: Float[np.ndarray, "P 3"], weights: Float[np.ndarray, "P"], resolution: int
     ) -> "FollowingMap":
         """Of rays into a map of so many texels along a face side."""
-        return cls(weights, np.unique(flat_texels(directions, resolution), return_inverse=True)[1].reshape(-1))
+        from scipy.sparse import hstack
 
-    @property
-    def count(self) -> int:
-        """How many texels are seen."""
-        return int(self.texels.max(initial=-1)) + 1
+        face, st = directions_to_cube(directions)
+        places = (st + 1) * resolution / 2
+        cells = np.clip(places, 0, resolution - 1).astype(np.int64)
+        texels, blocks = (
+            _numbered((face * side + part[:, 1]) * side + part[:, 0])
+            for part, side in ((cells, resolution), (cells // 2, -(-resolution // 2)))
+        )
+        constants = _constants(texels, weights)
+        return cls(weights, hstack([constants, _slopes(places, constants, blocks, weights)]).tocsr())
+
+    @classmethod
+    def of_texels(cls, texels: Int[np.ndarray, "P"], weights: Float[np.ndarray, "P"]) -> "FollowingMap":
+        """Of constants alone, by the numbers of texels."""
+        return cls(weights, _constants(_numbered(texels), weights))
 
     def cost(self, residual: Float[np.ndarray, "P C"]) -> float:
         """½ Σ w ‖(1 − Π) e‖²."""
@@ -51,8 +66,7 @@ class FollowingMap:
 
     def beyond(self, values: Float[np.ndarray, "P K"]) -> Float[np.ndarray, "P K"]:
         """(1 − Π) v of each column."""
-        means = np.stack([np.bincount(self.texels, self.weights * column) for column in values.T], 1)
-        return values - (means / self._totals[:, None])[self.texels]
+        return np.asarray(values - self.basis @ (self._gather @ values))
 
     def equations(
         self, rows: Float[np.ndarray, "P C D"], residual: Float[np.ndarray, "P C"]
@@ -60,10 +74,9 @@ class FollowingMap:
         """Gradient and matrix over few unknowns, on which all rays depend by their rows."""
         gradient, matrix = np.zeros(rows.shape[2]), np.zeros((rows.shape[2], rows.shape[2]))
         for channel, asked in enumerate(residual.T):
-            left = self.beyond(rows[:, channel])
-            weighted = left.T * self.weights
+            weighted = self.beyond(rows[:, channel]).T * self.weights
             gradient += weighted @ asked
-            matrix += weighted @ left
+            matrix += weighted @ rows[:, channel]
         return gradient, matrix
 
     def sparse_equations(
@@ -79,28 +92,57 @@ class FollowingMap:
             jacobian = jacobian_of_rows(rows[:, channel], columns, unknowns)
             by_rays, of_rays = normal_equations(jacobian, asked, self.weights)
             gradient, matrix = gradient + by_rays, matrix + of_rays
-            for means, wanted in self._means(jacobian, asked):
+            for means, wanted in self._taken(jacobian, asked):
                 gradient -= means.T @ wanted
                 matrix -= means.T @ means
         return gradient, matrix
 
-    def _means(
+    def _taken(
         self, jacobian: "csr_matrix", residual: Float[np.ndarray, "P"]
     ) -> Iterator[tuple[Float[np.ndarray, "T D"], Float[np.ndarray, "T"]]]:
-        """Σ w J/√Σw and Σ w e/√Σw over texels, some of them at a time."""
-        means, wanted = self._gather @ jacobian, self._gather @ residual
-        for first in range(0, len(wanted), TEXELS_AT_ONCE):
-            part = slice(first, first + TEXELS_AT_ONCE)
-            yield means[part].toarray(), wanted[part]
-
-    @cached_property
-    def _totals(self) -> Float[np.ndarray, "T"]:
-        return np.maximum(np.bincount(self.texels, self.weights), 1e-12)
+        """Bᵀ W J and Bᵀ W e, some of the map's changes at a time."""
+        taken, wanted = self._gather @ jacobian, self._gather @ residual
+        for first in range(0, len(wanted), CHANGES_AT_ONCE):
+            part = slice(first, first + CHANGES_AT_ONCE)
+            yield taken[part].toarray(), wanted[part]
 
     @cached_property
     def _gather(self) -> "csr_matrix":
-        """G with ‖G v‖² = Σ (Σ w v)²/Σ w, sums over a texel: what the map takes over of Σ w v²."""
-        from scipy.sparse import csr_matrix
+        """Bᵀ W."""
+        return self.basis.multiply(self.weights[:, None]).T.tocsr()
 
-        entries = self.weights / np.sqrt(self._totals)[self.texels], (self.texels, np.arange(len(self.texels)))
-        return csr_matrix(entries, (len(self._totals), len(self.texels)))
+
+def _numbered(groups: Int[np.ndarray, "P"]) -> Int[np.ndarray, "P"]:
+    """Groups numbered from zero: only those that are seen."""
+    return np.unique(groups, return_inverse=True)[1].reshape(-1)
+
+
+def _constants(texels: Int[np.ndarray, "P"], weights: Float[np.ndarray, "P"]) -> "csr_matrix":
+    """A constant for each texel."""
+    from scipy.sparse import csr_matrix
+
+    length = np.sqrt(np.maximum(np.bincount(texels, weights), 1e-12))
+    return csr_matrix((1 / length[texels], (np.arange(len(texels)), texels)), (len(texels), len(length)))
+
+
+def _slopes(
+    places: Float[np.ndarray, "P 2"],
+    constants: "csr_matrix",
+    blocks: Int[np.ndarray, "P"],
+    weights: Float[np.ndarray, "P"],
+) -> "csr_matrix":
+    """Two slopes for each block (texels), beside the constants."""
+    from scipy.sparse import csr_matrix
+
+    within = places - constants @ (constants.T @ (weights[:, None] * places))
+    pull = SLOPE_WEIGHT * np.median(weights)
+    products = ((i, j, np.bincount(blocks, weights * within[:, i] * within[:, j])) for i, j in ((0, 0), (0, 1), (1, 1)))
+    gram = np.zeros((blocks.max(initial=-1) + 1, 2, 2))
+    for i, j, product in products:
+        gram[:, i, j] = gram[:, j, i] = product + pull * (i == j)
+    # (Gram)⁻¹ = L⁻ᵀ L⁻¹ with the Cholesky factor L.
+    across = np.linalg.inv(np.linalg.cholesky(gram)).transpose(0, 2, 1)
+    values = np.matmul(within[:, None], across[blocks])[:, 0]
+    columns = 2 * blocks[:, None] + np.arange(2)
+    starts = 2 * np.arange(len(blocks) + 1)
+    return csr_matrix((values.ravel(), columns.ravel(), starts), (len(blocks), 2 * len(gram)))

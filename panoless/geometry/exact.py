@@ -11,7 +11,7 @@ from torch import Tensor
 
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
 from panoless.capture.encoding import encoding_of
-from panoless.capture.poses import Poses, StatedCameras
+from panoless.capture.poses import Poses
 from panoless.capture.rays import pixel_rays, reflect, unit_rays_camera
 from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
@@ -211,7 +211,7 @@ class ExactFamily:
             )
         if not found.state.nuisance.blocks:
             return _fitted(family, views, proposal, config), NO_CORRECTIONS, list(found.decisions)
-        nuisance = found.state.nuisance.without_common(StatedCameras.of(views))
+        nuisance = found.state.nuisance
         by = Corrected.by(nuisance, found.variances)
         corrected = by.applied(views, config)
         around = nuisance.around(proposal.shape.surroundings).scaled(by.scale)

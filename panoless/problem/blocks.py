@@ -76,6 +76,10 @@ class Block:
         """`model_error` in the units of the unknowns of a group."""
         return np.full(self.size, self.model_error)
 
+    def with_model_errors(self, variances: Float[np.ndarray, "B M"]) -> Float[np.ndarray, "B M"]:
+        """Posterior variances with those of model errors."""
+        return np.asarray(variances + self.floor**2)
+
     @property
     def measured(self) -> slice:
         """Those of a group that have the unit."""
@@ -148,7 +152,7 @@ class FocalLength(Lens):
 
     name = "focal length"
     unit, scale = "%", 100.0
-    model_error = 0.001
+    model_error = 0.002
     sigma = 0.02
 
     @property
@@ -161,7 +165,7 @@ class Distortion(Lens):
     """k₁ of the radial distortion of all views."""
 
     name = "distortion"
-    model_error = 0.005
+    model_error = 0.01
     sigma = 0.1
 
     @property
@@ -177,7 +181,7 @@ class CameraPoses(Block):
     name = "poses"
     count = 6
     unit, scale = "°", 180 / math.pi
-    model_error = 0.15
+    model_error = 0.2
     """In pixels: the standard deviation of contours, whose errors in a view are alike."""
     pixel: tuple[float, float] = (0.0, 0.0)
     """Turn (rad) and shift (normalized frame) by which the object moves by a pixel: medians over views."""

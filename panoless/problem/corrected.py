@@ -32,7 +32,7 @@ class Corrected:
 
     @classmethod
     def by(cls, nuisance: Nuisance, variances: Mapping[str, Float[np.ndarray, "B M"]] | None = None) -> "Corrected":
-        """With the standard deviations of cameras and lens by the variances, where these are known.
+        """With the standard deviations of cameras and lens by the variances, where these are known, and model errors.
 
         Cameras that are eˢ as far away see the same as those where they are stated of a world that is e⁻ˢ as large.
         """
@@ -43,7 +43,11 @@ class Corrected:
         found = Corrections(
             focal_factor=float(np.exp(change)), mask_offset_px=0.0 if offset is None else -float(offset.values[0, 0])
         )
-        sigmas = {name: np.sqrt(each) for name, each in (variances or {}).items()}
+        sigmas = {
+            each.name: np.sqrt(each.with_model_errors(variances[each.name]))
+            for each in nuisance.blocks
+            if variances is not None and each.name in variances
+        }
         if focal is not None and focal.name in sigmas:
             found = replace(found, focal_uncertainty=found.focal_factor * float(sigmas[focal.name][0, 0]))
         if bent is not None:

@@ -77,6 +77,11 @@ class State:
         """What is mirrored."""
         return self.nuisance.around(self.surface.surroundings)
 
+    def without_common(self, cameras: StatedCameras) -> "State":
+        """In a world without what moves all cameras alike."""
+        common, nuisance = self.nuisance.without_common(cameras)
+        return State(self.surface if common is None else self.surface.taken_back(common), nuisance)
+
     def stepped(self, step: Float[np.ndarray, "D"]) -> "State":
         """Changed: the surface's numbers, those of views, and those that all views share."""
         of_views, shared = (self.nuisance.free_blocks(by_view=each) for each in (True, False))

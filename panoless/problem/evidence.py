@@ -38,7 +38,7 @@ class Decision:
     """(1 − 2/9n + z √(2/9n))³."""
     value: float
     sigma: float
-    """Standard deviation of a number of the block."""
+    """Standard deviation of a number of the block, model errors included."""
     unit: str
 
 
@@ -60,10 +60,11 @@ def scored(
     """The score of a block that is kept, by the posterior variances of its unknowns or by their covariance, to both of
     which what model errors amount to is added.
     """
-    value, floor = block.values.ravel(), np.tile(block.floor**2, len(block.values))
+    value, variances = block.values.ravel(), block.with_model_errors(variances)
     if covariance is None:
-        score = float((value**2 / (variances.ravel() + floor)).mean())
+        score = float((value**2 / variances.ravel()).mean())
     else:
+        floor = block.with_model_errors(np.zeros_like(block.values)).ravel()
         score = float(value @ np.linalg.solve(covariance + np.diag(floor), value)) / value.size
     share = 2 / (9 * value.size)
     bound = (1 - share + DEVIATIONS * math.sqrt(share)) ** 3

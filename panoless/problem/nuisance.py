@@ -11,6 +11,7 @@ from panoless.capture.views import Views
 from panoless.environment.surroundings import FAR, Surroundings
 from panoless.problem.blocks import BLOCKS, AnyBlock, Block, CameraPoses
 from panoless.problem.rays import PixelRays
+from shinypartial.core.camera import Similarity
 
 
 @dataclass(frozen=True)
@@ -46,13 +47,13 @@ class Nuisance:
         left = Nuisance(tuple(each for each in self.blocks if each.name not in names))
         return left.freed(self.free)
 
-    def without_common(self, cameras: StatedCameras) -> "Nuisance":
-        """With poses in a world without what moves all cameras alike, of which damped steps leave some."""
+    def without_common(self, cameras: StatedCameras) -> tuple[Similarity | None, "Nuisance"]:
+        """What moves all cameras alike, of which damped steps leave some, and poses in a world without it."""
         found = self.get(CameraPoses)
         if found is None:
-            return self
-        _, poses = found.poses.without_common(cameras, found.precision)
-        return self.replaced([replace(found, values=poses.stacked)])
+            return None, self
+        common, poses = found.poses.without_common(cameras, found.precision)
+        return common, self.replaced([replace(found, values=poses.stacked)])
 
     def of_views(self, numbers: Sequence[int]) -> "Nuisance":
         """Of some of the views."""

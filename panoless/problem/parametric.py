@@ -1,13 +1,14 @@
 """What a surface of few numbers states of rays: where they meet it, where they touch it, and all first derivatives."""
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from panoless.environment.surroundings import Surroundings
 from panoless.problem.rays import PixelRays
+from shinypartial.core.camera import Similarity
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -80,7 +81,7 @@ class ParametricSurface(Protocol):
     @property
     def surroundings(self) -> Surroundings:
         """What it mirrors."""
-        ...
+        return cast(Surroundings, self.shape.surroundings)
 
     @property
     def count(self) -> int:
@@ -111,6 +112,10 @@ class ParametricSurface(Protocol):
 
     def stepped(self, step: Float[np.ndarray, "D"]) -> "ParametricSurface":
         """After a step of its numbers."""
+        ...
+
+    def taken_back(self, common: Similarity) -> "ParametricSurface":
+        """As it is in the world from which that motion of all cameras was taken back."""
         ...
 
     def settled(self) -> "ParametricSurface":

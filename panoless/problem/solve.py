@@ -16,6 +16,7 @@ from typing import TypeVar, cast
 import numpy as np
 from jaxtyping import Float
 
+from panoless.capture.poses import StatedCameras
 from panoless.capture.views import Views
 from panoless.deadline import improving, is_past_limit
 from panoless.environment.surroundings import FAR, Surroundings
@@ -133,6 +134,7 @@ def solve(
             progress.advance()
     gone, settings = list[Decision](), last
     while True:
+        state = state.without_common(StatedCameras.of(views))
         decisions, known = judged(state, settings)
         needless = [each for each in decisions if not each.kept]
         gone += needless

@@ -304,12 +304,10 @@ def take_round(
         settings=settings,
         nuisance=solution.nuisance.freed(nuisance.free),
     )
-    cameras = solution.nuisance.get(CameraPoses)
-    if cameras is None or cameras.name not in solution.nuisance.free:
+    common, moved = found.nuisance.without_common(task.cameras)
+    if common is None or CameraPoses.name not in solution.nuisance.free:
         return found
     # The next round solves its map from nothing.
-    common, poses = cameras.poses.without_common(task.cameras, cameras.precision)
-    moved = found.nuisance.replaced([replace(cameras, values=poses.stacked)])
     return replace(found, surface=solution.surface.taken_back(common), nuisance=moved, environment=None)
 
 

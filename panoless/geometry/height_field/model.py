@@ -15,6 +15,7 @@ from panoless.kernels.camera import RasterCamera
 from panoless.kernels.height_field import first_hits
 from panoless.numeric.bspline import cubic_bsplines_at, with_halved_knots
 from panoless.numeric.polygon import depth_inside, projected_coverage, with_cut_sides
+from shinypartial.core.camera import Similarity
 
 CLEAR_PX = 1.0
 """A mirrored ray has to pass the frame at least this far away (px): pixels are no points."""
@@ -72,6 +73,19 @@ class HeightField:
     """Mirrored rays have to pass the boundary at this height over the plane, if it is above that of the frame: a round
     rim is higher than outlines tell.
     """
+
+    def taken_back(self, common: Similarity) -> "HeightField":
+        """As it is in the world from which a motion was taken back."""
+        plane = self.plane.taken_back(common)
+        shift = plane.boundary[0] - self.plane.boundary[0] / common.scale
+        return replace(
+            self,
+            plane=plane,
+            low=self.low / common.scale + shift,
+            spacing=self.spacing / common.scale,
+            coefficients=self.coefficients / common.scale,
+            clearance=self.clearance / common.scale,
+        )
 
     @property
     def num_parameters(self) -> int:

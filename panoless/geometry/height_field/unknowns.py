@@ -26,6 +26,7 @@ from panoless.problem.parametric import (
     StepLimit,
 )
 from panoless.problem.rays import PixelRays
+from shinypartial.core.camera import Similarity
 
 BENDING = 1e-4
 """Weight of the bending energy beside photographs."""
@@ -110,6 +111,10 @@ class HeightFieldUnknowns(ParametricSurface):
         plane = apply_plane_step(field.plane, of_plane)
         coefficients = field.coefficients + of_heights.reshape(field.coefficients.shape)
         return replace(self, height_field=replace(field, plane=plane, coefficients=coefficients))
+
+    def taken_back(self, common: Similarity) -> "HeightFieldUnknowns":
+        """Moved and scaled."""
+        return replace(self, height_field=self.height_field.taken_back(common))
 
     def refined(self) -> "HeightFieldUnknowns":
         """With half as large cells."""

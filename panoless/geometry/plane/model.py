@@ -3,7 +3,7 @@
 A surface of one normal needs no blending: coverage and depth are exact.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import SurfaceBuffers, buffers_from_arrays
 from panoless.kernels.camera import RasterCamera
 from panoless.numeric.polygon import depth_inside, projected_coverage
+from shinypartial.core.camera import Similarity
 from shinypartial.core.conventions import PIXEL_CENTER
 
 
@@ -42,6 +43,20 @@ class Plane:
     def num_parameters(self) -> int:
         """How many numbers it is made of: normal and offset; the boundary's vertices; the frame."""
         return 3 + self.boundary.size + (self.frame_height > 0)
+
+    def taken_back(self, common: Similarity) -> "Plane":
+        """As it is in the world from which a motion was taken back."""
+        origin = common.undone(self.offset * self.normal[None])[0]
+        normal, *tangents = np.stack([self.normal, self.tangent_u, self.tangent_v]) @ common.rotation
+        return replace(
+            self,
+            normal=normal,
+            offset=float(normal @ origin),
+            tangent_u=tangents[0],
+            tangent_v=tangents[1],
+            boundary=self.boundary / common.scale + np.stack(tangents) @ origin,
+            frame_height=self.frame_height / common.scale,
+        )
 
     def points(self, coordinates: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P 3"]:
         """Plane coordinates to points in space."""

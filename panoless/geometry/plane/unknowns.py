@@ -27,6 +27,7 @@ from panoless.problem.parametric import (
     StepLimit,
 )
 from panoless.problem.rays import PixelRays
+from shinypartial.core.camera import Similarity
 
 PLANE_NUMBERS = 4
 LIMIT = StepLimit(0.2, slice(PLANE_NUMBERS))
@@ -82,6 +83,10 @@ class PlaneUnknowns(ParametricSurface):
     def stepped(self, step: Float[np.ndarray, "D"]) -> "PlaneUnknowns":
         """Turned and shifted, with another boundary."""
         return PlaneUnknowns(apply_plane_step(self.plane, step))
+
+    def taken_back(self, common: Similarity) -> "PlaneUnknowns":
+        """Moved and scaled."""
+        return PlaneUnknowns(self.plane.taken_back(common))
 
 
 def vertices_kept(matrix: Float[np.ndarray, "D D"], plane: Plane) -> Float[np.ndarray, "D D"]:

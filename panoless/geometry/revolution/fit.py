@@ -1,7 +1,7 @@
 """A surface of revolution from photographs: outside by silhouettes, then all by what it mirrors.
 
-Every profile goes through the same steps. Which end is open and what is inside, and then each refinement, is decided by
-held-out views: every fifth view takes no part in what it judges.
+Every profile goes through the same steps. Which end is open and what is inside is decided by held-out views: every
+fifth view takes no part in what it judges.
 """
 
 from collections.abc import Iterator
@@ -12,14 +12,12 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from panoless.capture.views import TrainView, Views, split_held_out
 from panoless.geometry.base import overlap
-from panoless.geometry.revolution.floor import fit_floor, floor_pixels
-from panoless.geometry.revolution.footprints import ROUNDS, has_edges, informative_pixels, refine_by_footprints
+from panoless.geometry.revolution.footprints import ROUNDS, has_edges, refine_by_footprints
 from panoless.geometry.revolution.interior import end_pixels, search_interior
-from panoless.geometry.revolution.lip import LENGTH_PX, clear_of_lip, lip_pixels, open_at_lip, place_lip, refine_lip
+from panoless.geometry.revolution.lip import clear_of_lip, open_at_lip, place_lip
 from panoless.geometry.revolution.model import FITTED_BOUNCES, MAX_BOUNCES, SurfaceOfRevolution, revolution_buffers
 from panoless.geometry.revolution.photometric import Round, refine_round, solve_map
 from panoless.geometry.revolution.pixels import CENTER, JUDGED_SCALE, PixelBundles, evenly
@@ -68,8 +66,6 @@ UNCLEAR_SHARE = 0.1
 """Both ends are tried if the one that fewer pixels see is seen by more than this share of the other's."""
 JUDGED_PIXELS = 120_000
 """Pixels of the held-out views among which those that see an end judge what is inside."""
-SEARCHED_RESOLUTION = 128
-"""Texels along a face side of the map under which an interior is searched again."""
 SETTLED_SHARE = 0.05
 """Share of all pixels that the ends may leave unexplained before candidates descend under coarse maps."""
 DESCENDING = 1.25
@@ -81,20 +77,10 @@ DESCENT = (
     Round(64, 0.3, 2.0, 4),
 )
 """Rounds of that descent."""
-LEAST_FLOOR_PIXELS = 200
-"""Fewer pixels whose paths meet the floor tell nothing."""
-LIP_PIXELS = 8_000
-"""Mixed pixels that refine the lip."""
-LEAST_LIP_PIXELS = 500
-"""Fewer tell nothing."""
-WHOLE_PIXELS = 30_000
-"""Pixels of the held-out views, all over the vessel, that a moved lip must not explain worse."""
 FINEST_MAP_RAYS = 2_000_000
 """Rays of the map that has the resolution of the last round."""
 LEAST_GAIN = 0.02
-"""Share of the held-out error by which a refinement has to be better to be kept."""
-Refined = tuple[SurfaceOfRevolution, PixelBundles, Float[Tensor, "6 3 L L"]]
-"""A surface, and held-out pixels and the map by which it is judged."""
+"""Share of the held-out error by which what is inside has to be better."""
 
 
 @dataclass(frozen=True)
@@ -161,8 +147,8 @@ def _count(chosen: list[tuple[TrainView, Int[np.ndarray, "_"]]]) -> int:
 def refine_revolution(views: Views, start: SurfaceOfRevolution, *, rounds: int = MOST_ROUNDS) -> SurfaceOfRevolution:
     """Profile and axis by what is mirrored, from the closed surface of the silhouettes.
 
-    The outside gives a map, under which the mouth is opened. Rounds on single rays follow, and after them the
-    refinements for which pixels are found: areas of pixels, the interior anew, the floor and the lip.
+    The outside gives a map, under which the mouth is opened. Rounds on single rays follow, and after them one on areas
+    of pixels where there are edges.
     """
     with torch.no_grad():
         return Refinement(views, start, rounds=rounds).run()
@@ -207,36 +193,16 @@ class Refinement:
     def run(self) -> SurfaceOfRevolution:
         """All of them, in order."""
         fine = FINE[: self.rounds]
-        progress = Progress("fitting a surface of revolution", 5 + len(fine))
+        progress = Progress("fitting a surface of revolution", 2 + len(fine))
         surface, environment = self.open_mouth()
         progress.advance()
         for each in fine:
             surface, environment = self.refine_by_centers(surface, each, environment)
             progress.advance()
         assert environment is not None, "there is a fine round"
-        mapped, refinements = None, [self.by_areas, self.by_interior, self.by_floor, self.by_lip]
-        while refinements:
-            if surface is not mapped:
-                environment, mapped = self.solve_finest_map(surface, environment), surface
-            refine = refinements.pop(0)
-            proposed = refine(surface, environment)
-            if proposed is not None:
-                surface = self.keep_if_better(surface, *proposed)
-            if surface is not mapped and refine == self.by_interior:
-                refinements.insert(0, self.by_areas)
-            else:
-                progress.advance()
+        surface = self.by_areas(surface, environment)
+        progress.advance()
         return surface
-
-    def keep_if_better(
-        self,
-        surface: SurfaceOfRevolution,
-        candidate: SurfaceOfRevolution,
-        held_out: PixelBundles,
-        environment: Float[Tensor, "6 3 L L"],
-    ) -> SurfaceOfRevolution:
-        """The candidate, if it explains pixels of held-out views better than the surface does."""
-        return keep_if_better((surface, candidate), lambda each: self._error(held_out, each, environment), LEAST_GAIN)
 
     def _error(self, pixels: PixelBundles, surface: SurfaceOfRevolution, environment: Tensor) -> float:
         return pixels.error(surface, environment, MAX_BOUNCES, JUDGED_SCALE)
@@ -333,61 +299,13 @@ class Refinement:
         return surface, environment
 
     @remembered()
-    def solve_finest_map(self, surface: SurfaceOfRevolution, environment: Tensor) -> Float[Tensor, "6 3 L L"]:
-        """The map of many rays in the resolution of the last round on areas."""
+    def by_areas(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
+        """With grooves and edges of the outside by pixels as areas, where there are any; else itself."""
         views = clear_of_lip(self.views, surface)
-        return solve_map(views, surface, FINEST_MAP_RAYS, ROUNDS[: self.rounds][-1].resolution, environment)
-
-    @remembered()
-    def by_areas(self, surface: SurfaceOfRevolution, environment: Tensor) -> Refined | None:
-        """Grooves and edges of the outside, by pixels as areas, where there are any."""
-        views = clear_of_lip(self.kept, surface)
         if not has_edges(views, surface, self.pixel):
-            return None
-        candidate = refine_by_footprints(
-            views.train,
-            self.contours,
-            surface,
-            environment,
-            pixels=self.pixels // 2,
-            rounds=ROUNDS[: self.rounds],
+            return surface
+        rounds = ROUNDS[: self.rounds]
+        environment = solve_map(views, surface, FINEST_MAP_RAYS, rounds[-1].resolution, environment)
+        return refine_by_footprints(
+            views.train, self.contours, surface, environment, pixels=self.pixels // 2, rounds=rounds
         )
-        held_out = informative_pixels(self.held_out.train, surface, self.pixels // 8, self.pixel)
-        return candidate, PixelBundles.of(held_out), environment
-
-    @remembered()
-    def by_interior(self, surface: SurfaceOfRevolution, environment: Tensor) -> Refined | None:
-        """An interior searched again under a better map."""
-        blurred = avg_pool2d(environment, max(environment.shape[-1] // SEARCHED_RESOLUTION, 1))
-        outer = surface.profile[: surface.lip + 1]
-        closed = replace(surface, profile=np.concatenate([outer, [[0.0, outer[-1, 1]]]]))
-        found = search_interior(self.kept, closed, blurred, self.pixel)
-        # The search samples the outside again, too, which would blunt its edges.
-        candidate = replace(surface, profile=np.concatenate([outer, found.profile[found.lip + 1 :]]))
-        return candidate, self._held_out_ends(closed), blurred
-
-    @remembered()
-    def by_floor(self, surface: SurfaceOfRevolution, environment: Tensor) -> Refined | None:
-        """The floor, where enough pixels see it by way of the walls or from below."""
-        seen, judging = (floor_pixels(part, surface) for part in (self.kept, self.held_out))
-        if len(seen.radiance) < LEAST_FLOOR_PIXELS or not len(judging.radiance):
-            return None
-        return fit_floor(seen, surface, environment, self.pixel), judging, environment
-
-    @remembered()
-    def by_lip(self, surface: SurfaceOfRevolution, environment: Tensor) -> Refined | None:
-        """The lip, where the wall is long enough and pixels mix it with what lies around it.
-
-        It moves more of the wall than these pixels see, so the vessel as a whole must not be explained worse.
-        """
-        if surface.arc_lengths[surface.lip] < 2 * LENGTH_PX * self.pixel:
-            return None
-        parts = ((self.kept, LIP_PIXELS), (self.held_out, LIP_PIXELS // 2))
-        seen, judging = (lip_pixels(part.train, surface, count) for part, count in parts)
-        if min(len(seen.radiance), len(judging.radiance)) < LEAST_LIP_PIXELS:
-            return None
-        candidate = refine_lip(seen, surface, environment, self.pixel)
-        whole = PixelBundles.of(evenly(self.held_out, WHOLE_PIXELS), CENTER)
-        if self._error(whole, candidate, environment) > self._error(whole, surface, environment):
-            return None
-        return candidate, judging, environment

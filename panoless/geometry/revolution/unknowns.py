@@ -37,6 +37,7 @@ from panoless.problem.parametric import (
 )
 from panoless.problem.rays import PixelRays
 from panoless.problem.rows import CONTOUR_SIGMA_PX
+from shinypartial.core.camera import Similarity
 
 AXIS_NUMBERS = 4
 KNOT_PX, STIFF_PX = 3.0, 8.0
@@ -158,6 +159,12 @@ class RevolutionUnknowns(ParametricSurface):
     def stepped(self, step: Float[np.ndarray, "D"]) -> "RevolutionUnknowns":
         """Moved."""
         return replace(self, surface=apply_step(self.surface, self.splines, step))
+
+    def taken_back(self, common: Similarity) -> "RevolutionUnknowns":
+        """Moved and scaled."""
+        origin, axis = common.undone(self.surface.origin[None])[0], self.surface.axis @ common.rotation
+        profile = self.surface.profile / common.scale
+        return replace(self, surface=replace(self.surface, origin=origin, axis=axis, profile=profile))
 
     def settled(self) -> "RevolutionUnknowns":
         """With vertices about a pixel apart."""

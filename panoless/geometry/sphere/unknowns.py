@@ -1,6 +1,6 @@
 """A sphere as a surface of few numbers: center and radius."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -10,6 +10,7 @@ from panoless.geometry.sphere.model import Sphere
 from panoless.numeric.gauss_newton import jacobian_of_rows
 from panoless.problem.parametric import LEAST_COSINE, MirrorHits, ParametricSurface, Regularization, Silhouette
 from panoless.problem.rays import PixelRays
+from shinypartial.core.camera import Similarity
 
 
 @dataclass(frozen=True)
@@ -76,3 +77,8 @@ class SphereUnknowns(ParametricSurface):
     def stepped(self, step: Float[np.ndarray, "4"]) -> "SphereUnknowns":
         """Moved."""
         return SphereUnknowns(self.sphere.moved(step), self.radius_known)
+
+    def taken_back(self, common: Similarity) -> "SphereUnknowns":
+        """Moved and scaled; a radius that is known stays."""
+        center, scale = common.undone(self.sphere.center[None])[0], 1.0 if self.radius_known else common.scale
+        return SphereUnknowns(replace(self.sphere, center=center, radius=self.sphere.radius / scale), self.radius_known)

@@ -7,7 +7,7 @@ import pytest
 from jaxtyping import Float, Int
 
 from panoless.environment.following import FollowingMap
-from shinypartial.core.sphere import cube_directions
+from shinypartial.core.sphere import cube_directions, cube_to_directions
 
 
 @dataclass(frozen=True)
@@ -21,12 +21,12 @@ class Problem:
     @classmethod
     def random(cls, rays: int = 60, texels: int = 7, unknowns: int = 4) -> "Problem":
         generator = np.random.default_rng(5)
-        following = FollowingMap(generator.uniform(0.1, 1, rays), generator.integers(0, texels, rays))
+        following = FollowingMap.of_texels(generator.integers(0, texels, rays), generator.uniform(0.1, 1, rays))
         return cls(following, generator.normal(size=(rays, 3, unknowns)), generator.normal(size=(rays, 3)))
 
     def together(self) -> tuple[Float[np.ndarray, "D"], float]:
         """The unknowns and the cost at them of min ½ Σ w ‖J x + e + m‖² over x and the texels' changes m."""
-        texels, unknowns = np.eye(self.following.count)[self.following.texels], self.rows.shape[2]
+        texels, unknowns = self.following.basis.toarray(), self.rows.shape[2]
         root = np.sqrt(self.following.weights)[:, None]
         zero = np.zeros_like(texels)
         columns, right = [], []
@@ -66,7 +66,7 @@ def test_equations_are_the_derivatives_of_the_cost(problem: Problem) -> None:
 
 def test_sparse_equations_are_those_of_full_rows(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each ray depends on three of ten unknowns; the texels come in parts."""
-    monkeypatch.setattr("panoless.environment.following.TEXELS_AT_ONCE", 3)
+    monkeypatch.setattr("panoless.environment.following.CHANGES_AT_ONCE", 3)
     rays, unknowns = len(problem.residual), 10
     columns: Int[np.ndarray, "P 3"] = np.argsort(np.random.default_rng(7).random((rays, unknowns)), 1)[:, :3]
     full = np.zeros((rays, 3, unknowns))
@@ -78,7 +78,8 @@ def test_sparse_equations_are_those_of_full_rows(problem: Problem, monkeypatch: 
 
 
 def test_what_all_rays_of_a_texel_ask_for_moves_nothing_else(problem: Problem) -> None:
-    asked = np.random.default_rng(8).normal(size=(problem.following.count, 3))[problem.following.texels]
+    basis = problem.following.basis
+    asked = basis @ np.random.default_rng(8).normal(size=(basis.shape[1], 3))
     gradient, _ = problem.following.equations(problem.rows, asked)
     np.testing.assert_allclose(gradient, 0, atol=1e-12)
     assert problem.following.cost(asked) == pytest.approx(0, abs=1e-12)
@@ -89,5 +90,17 @@ def test_rays_of_one_texel_are_together() -> None:
     """And texels that nobody sees are no unknowns."""
     directions = cube_directions(4).reshape(-1, 3)[[5, 17, 40]]
     following = FollowingMap.of(np.repeat(directions, 2, 0), np.ones(6), 4)
-    assert following.texels.tolist() == [0, 0, 1, 1, 2, 2]
-    assert following.count == 3
+    constants = following.basis.toarray()[:, :3] > 0
+    np.testing.assert_array_equal(constants, np.repeat(np.eye(3, dtype=bool), 2, 0))
+
+
+def test_a_map_follows_what_varies_evenly_across_a_block_of_texels() -> None:
+    """Rays of blocks of 2 × 2 texels see a slope of their own in each: next to nothing is left of it."""
+    side, generator = 8, np.random.default_rng(9)
+    face, st = np.zeros(4000, np.int64), generator.uniform(-1, 1, (4000, 2))
+    following = FollowingMap.of(cube_to_directions(face, st), generator.uniform(0.5, 1, 4000), side)
+    blocks = np.floor((st + 1) * side / 4).astype(np.int64) @ [4, 1]
+    slopes = (generator.normal(size=(16, 2))[blocks] * st).sum(1, keepdims=True)
+    assert np.abs(following.beyond(slopes)).max() < 0.02 * np.abs(slopes - slopes.mean()).max()
+    bent = st[:, :1] ** 2 * side**2
+    assert np.abs(following.beyond(bent)).max() > 0.1

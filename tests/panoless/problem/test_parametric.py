@@ -17,6 +17,7 @@ from panoless.geometry.sphere.model import Sphere
 from panoless.geometry.sphere.unknowns import SphereUnknowns
 from panoless.problem.parametric import ParametricSurface
 from panoless.problem.rays import PixelRays
+from shinypartial.core.camera import Similarity
 
 PIXEL = 2e-3
 
@@ -170,3 +171,22 @@ def test_silhouettes_change_with_motions_of_their_rays(name: str) -> None:
         kept = (found.weights > 0) & (ahead.weights > 0) & (behind.weights > 0)
         difference = (ahead.pixels - behind.pixels)[kept] / 2
         assert np.median(np.abs(difference - found.by_motion[kept, axis] * 1e-5)) < 0.02 * scale
+
+
+@EVERY
+def test_a_motion_of_all_cameras_is_taken_back(name: str) -> None:
+    """Rays from cameras that went back meet a surface that went back where they did."""
+    common = Similarity(1.03, Rotation.from_rotvec([0.02, -0.03, 0.05]).as_matrix(), np.array([0.02, 0.01, -0.03]))
+    surface, rays = SURFACES[name](), inner()
+    back = replace(
+        rays,
+        origins=common.undone(rays.origins),
+        directions=rays.directions @ common.rotation,
+        steps=rays.steps @ common.rotation,
+    )
+    before, after = surface.hits(rays), surface.taken_back(common).hits(back)
+    np.testing.assert_array_equal(after.clear, before.clear)
+    np.testing.assert_allclose(common(after.points)[before.clear], before.points[before.clear], atol=1e-9)
+    np.testing.assert_allclose(
+        (after.normals @ common.rotation.T)[before.clear], before.normals[before.clear], atol=1e-9
+    )
