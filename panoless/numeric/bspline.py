@@ -18,6 +18,12 @@ def cubic_bspline_basis(t: Float[np.ndarray, "P"], derivatives: int = 2) -> Floa
     return np.stack([np.stack(order, 1) for order in (values, slopes, bends)[: derivatives + 1]])
 
 
+def cubic_bspline(place: Float[np.ndarray, "*P"]) -> Float[np.ndarray, "*P"]:
+    """One B-spline at places about its peak."""
+    away = np.abs(place)
+    return np.where(away < 1, 2 / 3 - away**2 + away**3 / 2, np.clip(2 - away, 0, None) ** 3 / 6)
+
+
 def cubic_bsplines_at(
     place: Float[np.ndarray, "P"], count: int | Int[np.ndarray, "P"], derivatives: int = 0
 ) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "K P 4"]]:

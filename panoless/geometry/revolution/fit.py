@@ -17,7 +17,7 @@ from panoless.capture.views import TrainView, Views, split_held_out
 from panoless.geometry.base import overlap
 from panoless.geometry.revolution.footprints import ROUNDS, has_edges, refine_by_footprints
 from panoless.geometry.revolution.interior import end_pixels, search_interior
-from panoless.geometry.revolution.lip import clear_of_lip, open_at_lip, place_lip
+from panoless.geometry.revolution.lip import LENGTH_PX, clear_of_lip, lip_pixels, open_at_lip, place_lip, refine_lip
 from panoless.geometry.revolution.model import FITTED_BOUNCES, MAX_BOUNCES, SurfaceOfRevolution, revolution_buffers
 from panoless.geometry.revolution.photometric import Round, refine_round, solve_map
 from panoless.geometry.revolution.pixels import CENTER, JUDGED_SCALE, PixelBundles, evenly
@@ -77,6 +77,10 @@ DESCENT = (
     Round(64, 0.3, 2.0, 4),
 )
 """Rounds of that descent."""
+LIP_PIXELS = 8_000
+"""Mixed pixels that refine the lip."""
+LEAST_LIP_PIXELS = 500
+"""Fewer tell nothing."""
 FINEST_MAP_RAYS = 2_000_000
 """Rays of the map that has the resolution of the last round."""
 LEAST_GAIN = 0.02
@@ -147,8 +151,8 @@ def _count(chosen: list[tuple[TrainView, Int[np.ndarray, "_"]]]) -> int:
 def refine_revolution(views: Views, start: SurfaceOfRevolution, *, rounds: int = MOST_ROUNDS) -> SurfaceOfRevolution:
     """Profile and axis by what is mirrored, from the closed surface of the silhouettes.
 
-    The outside gives a map, under which the mouth is opened. Rounds on single rays follow, and after them one on areas
-    of pixels where there are edges.
+    The outside gives a map, under which the mouth is opened. Rounds on single rays follow, and after them areas of
+    pixels, where there are edges, and the lip.
     """
     with torch.no_grad():
         return Refinement(views, start, rounds=rounds).run()
@@ -193,15 +197,16 @@ class Refinement:
     def run(self) -> SurfaceOfRevolution:
         """All of them, in order."""
         fine = FINE[: self.rounds]
-        progress = Progress("fitting a surface of revolution", 2 + len(fine))
+        progress = Progress("fitting a surface of revolution", 3 + len(fine))
         surface, environment = self.open_mouth()
         progress.advance()
         for each in fine:
             surface, environment = self.refine_by_centers(surface, each, environment)
             progress.advance()
         assert environment is not None, "there is a fine round"
-        surface = self.by_areas(surface, environment)
-        progress.advance()
+        for refine in (self.by_areas, self.by_lip):
+            surface = refine(surface, environment)
+            progress.advance()
         return surface
 
     def _error(self, pixels: PixelBundles, surface: SurfaceOfRevolution, environment: Tensor) -> float:
@@ -304,8 +309,22 @@ class Refinement:
         views = clear_of_lip(self.views, surface)
         if not has_edges(views, surface, self.pixel):
             return surface
-        rounds = ROUNDS[: self.rounds]
-        environment = solve_map(views, surface, FINEST_MAP_RAYS, rounds[-1].resolution, environment)
+        environment, rounds = self._finest_map(surface, environment), ROUNDS[: self.rounds]
         return refine_by_footprints(
             views.train, self.contours, surface, environment, pixels=self.pixels // 2, rounds=rounds
         )
+
+    @remembered()
+    def by_lip(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
+        """With its lip by pixels that mix it with what lies around it, where the wall is long enough."""
+        if surface.arc_lengths[surface.lip] < 2 * LENGTH_PX * self.pixel:
+            return surface
+        mixed = lip_pixels(self.views.train, surface, LIP_PIXELS)
+        if len(mixed.radiance) < LEAST_LIP_PIXELS:
+            return surface
+        return refine_lip(mixed, surface, self._finest_map(surface, environment), self.pixel)
+
+    def _finest_map(self, surface: SurfaceOfRevolution, environment: Tensor) -> Float[Tensor, "6 3 L L"]:
+        """The map of many rays in the resolution of the last round on areas."""
+        views = clear_of_lip(self.views, surface)
+        return solve_map(views, surface, FINEST_MAP_RAYS, ROUNDS[: self.rounds][-1].resolution, environment)

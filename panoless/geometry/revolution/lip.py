@@ -1,23 +1,36 @@
-"""The lip of a vessel: where silhouettes put it, and how the profile gets there.
+"""The lip of a vessel: where silhouettes put it, how the profile gets there, and what photographs add.
 
 A contour ray that passes over the lip of a wall without thickness touches that circle alone. In the half-plane of
 radius ρ and height h it is a hyperbola through the tip q of the profile, with unit normal m where it comes nearest, so
 m·q is known; rays of several elevations and both sides of the lip have different m, and q is their common point.
+
+Silhouettes place the lip to a twentieth of a pixel, but over the last pixels of the wall that is a degree, and rays
+that leave a vessel pass them twice or more. So pixels that mix the lip with what lies around it refine it: each is the
+mean of some rays, followed as deep as they go. How that changes with a few numbers, shifts of the profile near the lip
+along its normals and an extension of a thin wall, is found by differences. Pixels that are very sensitive to these
+numbers count less, because they are as sensitive to what is not fitted:
+
+w = (1 + ‖e‖²/9v)⁻²/v, v = σ² + τ² mean_c ‖∂c/∂θ‖².
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from torch import Tensor
 
-from panoless.capture.rays import pose_of, project
+from panoless.capture.rays import pixel_rays, pose_of, project
 from panoless.capture.views import TrainView, Views
-from panoless.geometry.revolution.model import SurfaceOfRevolution
+from panoless.geometry.revolution.model import MAX_BOUNCES, SurfaceOfRevolution, trace_reflections
+from panoless.geometry.revolution.photometric import RADIANCE_SIGMA
+from panoless.geometry.revolution.pixels import JUDGED_SCALE, PixelBundles
 from panoless.geometry.revolution.profile import resample_profile
 from panoless.geometry.revolution.silhouette import ContourRays, adapted_scale, in_axis_frame, silhouette_residuals
 from panoless.kernels.camera import RasterCamera
-from panoless.numeric.gauss_newton import damped_step
+from panoless.numeric.bspline import cubic_bspline
+from panoless.numeric.gauss_newton import accept_step, damped_step
 from panoless.numeric.robust import robust_weight
 from shinypartial.core.conventions import PIXEL_CENTER
 
@@ -39,6 +52,24 @@ END_PX = 4.0
 """Length of a thin wall below its lip (px) that no pixel sees alone."""
 CLEARANCE_PX = 2
 """Pixels nearer to the image of a thin wall's lip may show what lies before and behind it."""
+LENGTH_PX = 20.0
+"""Length of the wall (px) that is refined by mixed pixels."""
+KNOT_PX = 3.0
+"""Spacing of its B-splines (px)."""
+REACH_PX = 5
+"""Mixed pixels are nearer to the image of the lip than this, or mirrored more than once."""
+REFINED_STEPS = 3
+"""Most Gauss–Newton steps of the refinement."""
+LENGTHS = (4.0, 2.0, 1.0, 0.5)
+"""Of a step, tried in turn: radiance that changes by leaps makes steps too short."""
+DIFFERENCE_PX = 0.05
+"""Of the derivatives (px)."""
+LARGEST_STEP_PX = 0.5
+"""Most that a parameter changes in a step of length one (px)."""
+PARAMETER_SIGMA_PX = 0.05
+"""Standard deviation of what is not fitted (px): pixels that change much with the parameters count less."""
+DAMPING = 1e-3
+"""Of the refinement, in mean diagonals."""
 
 RING_POINTS = 2000
 """Around the lip's image: more than its pixels."""
@@ -166,3 +197,89 @@ def beside_lip(camera: RasterCamera, surface: SurfaceOfRevolution, reach_px: int
     beside = np.zeros(camera.height * camera.width, bool)
     beside[(row * camera.width + column)[near].astype(np.int64)] = True
     return beside.reshape(camera.height, camera.width)
+
+
+def refine_lip(
+    pixels: PixelBundles,
+    surface: SurfaceOfRevolution,
+    environment: Float[Tensor, "6 3 L L"],
+    pixel: float,
+) -> SurfaceOfRevolution:
+    """The surface with its profile near the lip where `lip_pixels` put it under a map, by Gauss–Newton."""
+    for _ in range(REFINED_STEPS):
+        moved = _lip_step(pixels, surface, environment, pixel)
+        if moved is surface:
+            break
+        surface = moved
+    return surface
+
+
+def _lip_step(
+    pixels: PixelBundles,
+    surface: SurfaceOfRevolution,
+    environment: Float[Tensor, "6 3 L L"],
+    pixel: float,
+) -> SurfaceOfRevolution:
+    shifts = _shifts(surface, pixel)
+
+    def shown(shift: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "P 3"]:
+        return pixels.shown(_shifted(surface, shift), environment, MAX_BOUNCES)
+
+    residual = shown(np.zeros_like(surface.profile)) - pixels.radiance
+    small = DIFFERENCE_PX * pixel * shifts
+    jacobian = np.stack([shown(shift) - shown(-shift) for shift in small], -1) / (2 * DIFFERENCE_PX)
+    variance = RADIANCE_SIGMA**2 + PARAMETER_SIGMA_PX**2 * (jacobian**2).sum(-1).mean(1)
+    weighted = jacobian * (robust_weight(residual, 3 * variance**0.5) / variance)[:, None, None]
+    matrix = np.tensordot(weighted, jacobian, ((0, 1), (0, 1)))
+    gradient = np.tensordot(weighted, residual, ((0, 1), (0, 1)))
+    return accept_step(
+        surface,
+        damped_step(gradient, matrix, DAMPING, LARGEST_STEP_PX),
+        lambda each, step: _shifted(each, pixel * np.tensordot(step, shifts, 1)),
+        lambda each: pixels.error(each, environment, MAX_BOUNCES, JUDGED_SCALE),
+        LENGTHS,
+    )
+
+
+def _shifts(surface: SurfaceOfRevolution, pixel: float) -> Float[np.ndarray, "D N 2"]:
+    """Unit shifts of the profile's vertices: cubic B-splines along the normals on both sides of the lip, and an
+    extension along a thin wall.
+    """
+    place = (surface.arc_lengths - surface.arc_lengths[surface.lip]) / pixel
+    last = min(float(place[-1]), LENGTH_PX)
+    places = place - np.arange(-LENGTH_PX, last + KNOT_PX + 1, KNOT_PX)[:, None]
+    splines = cubic_bspline(places / KNOT_PX)
+    along = np.gradient(surface.profile, axis=0)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    shifts = splines[..., None] * np.stack([along[:, 1], -along[:, 0]], 1)
+    if surface.is_open:
+        extension = np.clip(1 + place / LENGTH_PX, 0, 1)[:, None] ** 2 * along
+        shifts = np.concatenate([shifts, extension[None]])
+    # The ends stay on the axis.
+    shifts[:, surface.profile[:, 0] < 1e-9] = 0
+    return shifts
+
+
+def _shifted(surface: SurfaceOfRevolution, shift: Float[np.ndarray, "N 2"]) -> SurfaceOfRevolution:
+    return replace(surface, profile=surface.profile + shift)
+
+
+def lip_pixels(
+    views: Sequence[TrainView],
+    surface: SurfaceOfRevolution,
+    count: int,
+) -> PixelBundles:
+    """About `count` pixels: half of them near the lip, half mirrored more than once."""
+    generator = np.random.default_rng(0)
+    near = [np.flatnonzero(beside_lip(view.camera, surface, REACH_PX)) for view in views]
+    deep = []
+    for view in views:
+        pixels = view.solid.cpu().numpy()
+        paths = trace_reflections(surface, *pixel_rays(view.camera, pixels), max_bounces=MAX_BOUNCES)
+        deep.append(pixels[paths.bounces != 1])
+    shares = [count / 2 / max(sum(map(len, group)), 1) for group in (near, deep)]
+    chosen = []
+    for view, *groups in zip(views, near, deep, strict=True):
+        drawn = [group[generator.random(len(group)) < share] for group, share in zip(groups, shares, strict=True)]
+        chosen.append((view, np.unique(np.concatenate(drawn))))
+    return PixelBundles.of(chosen)

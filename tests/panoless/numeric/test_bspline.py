@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.interpolate import BSpline
 
-from panoless.numeric.bspline import cubic_bspline_basis, cubic_bsplines_at, with_halved_knots
+from panoless.numeric.bspline import cubic_bspline, cubic_bspline_basis, cubic_bsplines_at, with_halved_knots
 
 COUNT = 9
 PLACES = np.random.default_rng(0).uniform(0, COUNT - 3, 200)
@@ -16,6 +16,12 @@ def test_values_and_derivatives_are_those_of_scipy() -> None:
     own = (basis * coefficients[first[:, None] + np.arange(4)]).sum(2)
     for order in range(3):
         np.testing.assert_allclose(own[order], spline(PLACES, nu=order), atol=1e-12)
+
+
+def test_one_spline_about_its_peak_is_that_of_scipy() -> None:
+    places = np.linspace(-3, 3, 61)
+    expected = np.nan_to_num(BSpline.basis_element(np.arange(-2.0, 3), extrapolate=False)(places))
+    np.testing.assert_allclose(cubic_bspline(places), expected, atol=1e-12)
 
 
 def test_the_basis_is_a_partition_of_unity_and_reproduces_lines() -> None:
