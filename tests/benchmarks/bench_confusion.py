@@ -63,6 +63,8 @@ class Options:
     """Errors that take part, alone and in pairs."""
     pairs: bool = True
     """Whether pairs follow the single ones."""
+    run: bool = True
+    """Whether cases that are not complete are run, or left out."""
     page: Path | None = None
     """Also write the table into this page, and what was found beside it as JSON."""
 
@@ -74,6 +76,8 @@ def main() -> None:
     cases += [*combinations(options.errors, 2)] if options.pairs else []
     results = []
     for case in cases:
+        if not options.run and not (_folder(case, options) / "scores.json").exists():
+            continue
         results.append(_found(case, options))
         print(_row(results[-1]), flush=True)
         if options.page:
@@ -82,12 +86,16 @@ def main() -> None:
             write_between(options.page, "confusion", _table(results))
 
 
+def _folder(case: tuple[str, ...], options: Options) -> Path:
+    """Of the fit."""
+    return options.output / ("-".join(each.replace(" ", "_") for each in case or ("clean",)) + "-fit")
+
+
 def _found(case: tuple[str, ...], options: Options) -> dict[str, Any]:
-    name = "-".join(each.replace(" ", "_") for each in case) or "clean"
-    fit = options.output / f"{name}-fit"
+    fit = _folder(case, options)
     if not (fit / "scores.json").exists():
         clean = _rendered(case, options)
-        dataset = options.output / name
+        dataset = fit.with_name(fit.name.removesuffix("-fit"))
         spoiled = [option for each in case for option in PERTURBED.get(each, [])]
         if not spoiled:
             dataset = clean

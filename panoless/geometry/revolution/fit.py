@@ -1,7 +1,7 @@
 """A surface of revolution from photographs: outside by silhouettes, then all by what it mirrors.
 
-Every profile goes through the same steps. Which end is open and what is inside is decided by held-out views: every
-fifth view takes no part in what it judges.
+Every profile goes through the same steps. Which end is open, what is inside, and whether areas of
+pixels help is decided by held-out views: every fifth view takes no part in what it judges.
 """
 
 from collections.abc import Iterator
@@ -15,7 +15,8 @@ from torch import Tensor
 
 from panoless.capture.views import TrainView, Views, split_held_out
 from panoless.geometry.base import overlap
-from panoless.geometry.revolution.footprints import ROUNDS, has_edges, refine_by_footprints
+from panoless.geometry.revolution.floor import fit_floor, floor_pixels
+from panoless.geometry.revolution.footprints import ROUNDS, has_edges, informative_pixels, refine_by_footprints
 from panoless.geometry.revolution.interior import end_pixels, search_interior
 from panoless.geometry.revolution.lip import LENGTH_PX, clear_of_lip, lip_pixels, open_at_lip, place_lip, refine_lip
 from panoless.geometry.revolution.model import FITTED_BOUNCES, MAX_BOUNCES, SurfaceOfRevolution, revolution_buffers
@@ -77,6 +78,8 @@ DESCENT = (
     Round(64, 0.3, 2.0, 4),
 )
 """Rounds of that descent."""
+LEAST_FLOOR_PIXELS = 200
+"""Fewer pixels whose paths meet the floor tell nothing."""
 LIP_PIXELS = 8_000
 """Mixed pixels that refine the lip."""
 LEAST_LIP_PIXELS = 500
@@ -84,7 +87,7 @@ LEAST_LIP_PIXELS = 500
 FINEST_MAP_RAYS = 2_000_000
 """Rays of the map that has the resolution of the last round."""
 LEAST_GAIN = 0.02
-"""Share of the held-out error by which what is inside has to be better."""
+"""Share of the held-out error by which what is inside has to be better, and areas of pixels."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +155,7 @@ def refine_revolution(views: Views, start: SurfaceOfRevolution, *, rounds: int =
     """Profile and axis by what is mirrored, from the closed surface of the silhouettes.
 
     The outside gives a map, under which the mouth is opened. Rounds on single rays follow, and after them areas of
-    pixels, where there are edges, and the lip.
+    pixels, where there are edges, the floor and the lip.
     """
     with torch.no_grad():
         return Refinement(views, start, rounds=rounds).run()
@@ -197,14 +200,14 @@ class Refinement:
     def run(self) -> SurfaceOfRevolution:
         """All of them, in order."""
         fine = FINE[: self.rounds]
-        progress = Progress("fitting a surface of revolution", 3 + len(fine))
+        progress = Progress("fitting a surface of revolution", 4 + len(fine))
         surface, environment = self.open_mouth()
         progress.advance()
         for each in fine:
             surface, environment = self.refine_by_centers(surface, each, environment)
             progress.advance()
         assert environment is not None, "there is a fine round"
-        for refine in (self.by_areas, self.by_lip):
+        for refine in (self.by_areas, self.by_floor, self.by_lip):
             surface = refine(surface, environment)
             progress.advance()
         return surface
@@ -305,14 +308,31 @@ class Refinement:
 
     @remembered()
     def by_areas(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
-        """With grooves and edges of the outside by pixels as areas, where there are any; else itself."""
-        views = clear_of_lip(self.views, surface)
+        """With grooves and edges of the outside by pixels as areas, where there are any and held-out views gain; else
+        itself.
+        """
+        views = clear_of_lip(self.kept, surface)
         if not has_edges(views, surface, self.pixel):
             return surface
-        environment, rounds = self._finest_map(surface, environment), ROUNDS[: self.rounds]
-        return refine_by_footprints(
-            views.train, self.contours, surface, environment, pixels=self.pixels // 2, rounds=rounds
-        )
+        known, rounds = self._finest_map(surface, environment), ROUNDS[: self.rounds]
+        areas = refine_by_footprints(views.train, self.contours, surface, known, pixels=self.pixels // 2, rounds=rounds)
+        held_out = informative_pixels(self.held_out.train, surface, self.pixels // 8, self.pixel)
+        return self._kept(surface, areas, PixelBundles.of(held_out), known)
+
+    @remembered()
+    def by_floor(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
+        """With its floor, where enough pixels see it by way of the walls or from below and held-out views gain."""
+        seen, judging = (floor_pixels(part, surface) for part in (self.kept, self.held_out))
+        if len(seen.radiance) < LEAST_FLOOR_PIXELS or not len(judging.radiance):
+            return surface
+        known = self._finest_map(surface, environment)
+        return self._kept(surface, fit_floor(seen, surface, known, self.pixel), judging, known)
+
+    def _kept(
+        self, surface: SurfaceOfRevolution, refined: SurfaceOfRevolution, judging: PixelBundles, environment: Tensor
+    ) -> SurfaceOfRevolution:
+        """The refined surface, if it explains pixels of held-out views better."""
+        return keep_if_better((surface, refined), lambda each: self._error(judging, each, environment), LEAST_GAIN)
 
     @remembered()
     def by_lip(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
