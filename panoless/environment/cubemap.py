@@ -55,6 +55,10 @@ def by_face(texels: Float[Tensor, "T C"], resolution: int) -> Float[Tensor, "6 C
 
 def flat_texels(directions: Float[np.ndarray, "*P 3"], resolution: int) -> Int[np.ndarray, "*P"]:
     """The flat index of the texel that each direction falls into."""
-    face, st = directions_to_cube(directions)
+    return texels_at(*directions_to_cube(directions), resolution)
+
+
+def texels_at(face: Int[np.ndarray, "*P"], st: Float[np.ndarray, "*P 2"], resolution: int) -> Int[np.ndarray, "*P"]:
+    """The flat index of the texel at each place of a face."""
     column, row = np.moveaxis(np.clip((st + 1) * resolution / 2, 0, resolution - 1).astype(np.int64), -1, 0)
     return (face * resolution + row) * resolution + column

@@ -1,8 +1,8 @@
 """Least squares of what rays see under a map that follows whatever else moves them.
 
 A step at a fixed map gets nowhere where the map can follow: turning a mirror and turning the map after it changes
-little. So what a change e of the map takes over of the rays' residuals is left out, and only the rest moves other
-unknowns (variable projection, Golub and Pereyra 1973):
+little. So the part Π e of the residuals e that a change of the map takes over is left out, and only the rest moves
+other unknowns (variable projection, Golub and Pereyra 1973):
 
 ½ Σ w ‖(1 − Π) e‖², g = Jᵀ W (1 − Π) e, H = Jᵀ W (1 − Π) J, Π = B Bᵀ W.
 
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int
 
+from panoless.environment.cubemap import texels_at
 from panoless.numeric.gauss_newton import jacobian_of_rows, normal_equations
 from shinypartial.core.sphere import directions_to_cube
 
@@ -46,19 +47,12 @@ class FollowingMap:
         from scipy.sparse import hstack
 
         face, st = directions_to_cube(directions)
-        places = (st + 1) * resolution / 2
-        cells = np.clip(places, 0, resolution - 1).astype(np.int64)
-        texels, blocks = (
-            _numbered((face * side + part[:, 1]) * side + part[:, 0])
-            for part, side in ((cells, resolution), (cells // 2, -(-resolution // 2)))
-        )
-        constants = _constants(texels, weights)
-        return cls(weights, hstack([constants, _slopes(places, constants, blocks, weights)]).tocsr())
-
-    @classmethod
-    def of_texels(cls, texels: Int[np.ndarray, "P"], weights: Float[np.ndarray, "P"]) -> "FollowingMap":
-        """Of constants alone, by the numbers of texels."""
-        return cls(weights, _constants(_numbered(texels), weights))
+        texels, side = texels_at(face, st, resolution), -(-resolution // 2)
+        _, row, column = np.unravel_index(texels, (6, resolution, resolution))
+        blocks = np.ravel_multi_index((face, row // 2, column // 2), (6, side, side))
+        constants = _constants(_numbered(texels), weights)
+        slopes = _slopes((st + 1) * resolution / 2, constants, _numbered(blocks), weights)
+        return cls(weights, hstack([constants, slopes]).tocsr())
 
     def cost(self, residual: Float[np.ndarray, "P C"]) -> float:
         """½ Σ w ‖(1 − Π) e‖²."""

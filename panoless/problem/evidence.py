@@ -64,8 +64,8 @@ def scored(
     if covariance is None:
         score = float((value**2 / variances.ravel()).mean())
     else:
-        floor = block.with_model_errors(np.zeros_like(block.values)).ravel()
-        score = float(value @ np.linalg.solve(covariance + np.diag(floor), value)) / value.size
+        floor = np.diag(np.tile(block.floor**2, len(block.values)))
+        score = float(value @ np.linalg.solve(covariance + floor, value)) / value.size
     share = 2 / (9 * value.size)
     bound = (1 - share + DEVIATIONS * math.sqrt(share)) ** 3
     sigma = block.scale * math.sqrt(float(variances[:, block.measured].mean()))

@@ -132,9 +132,9 @@ def solve(
         for each in rounds:
             state = take_round(views, state, each, FINISH.resolution)
             progress.advance()
-    gone, settings = list[Decision](), last
+    gone, settings, cameras = list[Decision](), last, StatedCameras.of(views)
     while True:
-        state = state.without_common(StatedCameras.of(views))
+        state = state.without_common(cameras)
         decisions, known = judged(state, settings)
         needless = [each for each in decisions if not each.kept]
         gone += needless

@@ -76,7 +76,7 @@ def main() -> None:
     cases += [*combinations(options.errors, 2)] if options.pairs else []
     results = []
     for case in cases:
-        if not options.run and not (_folder(case, options) / "scores.json").exists():
+        if not options.run and not (options.output / f"{_name(case)}-fit" / "scores.json").exists():
             continue
         results.append(_found(case, options))
         print(_row(results[-1]), flush=True)
@@ -86,16 +86,16 @@ def main() -> None:
             write_between(options.page, "confusion", _table(results))
 
 
-def _folder(case: tuple[str, ...], options: Options) -> Path:
-    """Of the fit."""
-    return options.output / ("-".join(each.replace(" ", "_") for each in case or ("clean",)) + "-fit")
+def _name(case: tuple[str, ...]) -> str:
+    """Of the dataset; that of the fit ends with -fit."""
+    return "-".join(each.replace(" ", "_") for each in case or ("clean",))
 
 
 def _found(case: tuple[str, ...], options: Options) -> dict[str, Any]:
-    fit = _folder(case, options)
+    fit = options.output / f"{_name(case)}-fit"
     if not (fit / "scores.json").exists():
         clean = _rendered(case, options)
-        dataset = fit.with_name(fit.name.removesuffix("-fit"))
+        dataset = options.output / _name(case)
         spoiled = [option for each in case for option in PERTURBED.get(each, [])]
         if not spoiled:
             dataset = clean

@@ -1,7 +1,7 @@
 """A surface of revolution from photographs: outside by silhouettes, then all by what it mirrors.
 
-Every profile goes through the same steps. Which end is open, what is inside, and whether areas of
-pixels help is decided by held-out views: every fifth view takes no part in what it judges.
+Every profile goes through the same steps. Which end is open, what is inside, and whether areas of pixels and a floor
+help is decided by held-out views: every fifth view takes no part in what it judges.
 """
 
 from collections.abc import Iterator
@@ -87,7 +87,7 @@ LEAST_LIP_PIXELS = 500
 FINEST_MAP_RAYS = 2_000_000
 """Rays of the map that has the resolution of the last round."""
 LEAST_GAIN = 0.02
-"""Share of the held-out error by which what is inside has to be better, and areas of pixels."""
+"""Share of the held-out error by which what is inside has to be better, and areas of pixels and a floor."""
 
 
 @dataclass(frozen=True)
@@ -207,8 +207,11 @@ class Refinement:
             surface, environment = self.refine_by_centers(surface, each, environment)
             progress.advance()
         assert environment is not None, "there is a fine round"
+        known, mapped = environment, None
         for refine in (self.by_areas, self.by_floor, self.by_lip):
-            surface = refine(surface, environment)
+            if surface is not mapped:
+                known, mapped = self._finest_map(surface, environment), surface
+            surface = refine(surface, known)
             progress.advance()
         return surface
 
@@ -314,10 +317,10 @@ class Refinement:
         views = clear_of_lip(self.kept, surface)
         if not has_edges(views, surface, self.pixel):
             return surface
-        known, rounds = self._finest_map(surface, environment), ROUNDS[: self.rounds]
-        areas = refine_by_footprints(views.train, self.contours, surface, known, pixels=self.pixels // 2, rounds=rounds)
+        pixels, rounds = self.pixels // 2, ROUNDS[: self.rounds]
+        areas = refine_by_footprints(views.train, self.contours, surface, environment, pixels=pixels, rounds=rounds)
         held_out = informative_pixels(self.held_out.train, surface, self.pixels // 8, self.pixel)
-        return self._kept(surface, areas, PixelBundles.of(held_out), known)
+        return self._kept(surface, areas, PixelBundles.of(held_out), environment)
 
     @remembered()
     def by_floor(self, surface: SurfaceOfRevolution, environment: Tensor) -> SurfaceOfRevolution:
@@ -325,8 +328,7 @@ class Refinement:
         seen, judging = (floor_pixels(part, surface) for part in (self.kept, self.held_out))
         if len(seen.radiance) < LEAST_FLOOR_PIXELS or not len(judging.radiance):
             return surface
-        known = self._finest_map(surface, environment)
-        return self._kept(surface, fit_floor(seen, surface, known, self.pixel), judging, known)
+        return self._kept(surface, fit_floor(seen, surface, environment, self.pixel), judging, environment)
 
     def _kept(
         self, surface: SurfaceOfRevolution, refined: SurfaceOfRevolution, judging: PixelBundles, environment: Tensor
@@ -342,7 +344,7 @@ class Refinement:
         mixed = lip_pixels(self.views.train, surface, LIP_PIXELS)
         if len(mixed.radiance) < LEAST_LIP_PIXELS:
             return surface
-        return refine_lip(mixed, surface, self._finest_map(surface, environment), self.pixel)
+        return refine_lip(mixed, surface, environment, self.pixel)
 
     def _finest_map(self, surface: SurfaceOfRevolution, environment: Tensor) -> Float[Tensor, "6 3 L L"]:
         """The map of many rays in the resolution of the last round on areas."""

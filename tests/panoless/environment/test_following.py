@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from jaxtyping import Float, Int
+from scipy.sparse import csr_matrix
 
 from panoless.environment.following import FollowingMap
 from shinypartial.core.sphere import cube_directions, cube_to_directions
@@ -21,7 +22,8 @@ class Problem:
     @classmethod
     def random(cls, rays: int = 60, texels: int = 7, unknowns: int = 4) -> "Problem":
         generator = np.random.default_rng(5)
-        following = FollowingMap.of_texels(generator.integers(0, texels, rays), generator.uniform(0.1, 1, rays))
+        of, weights = np.eye(texels)[generator.integers(0, texels, rays)], generator.uniform(0.1, 1, rays)
+        following = FollowingMap(weights, csr_matrix(of / np.sqrt(weights @ of)))
         return cls(following, generator.normal(size=(rays, 3, unknowns)), generator.normal(size=(rays, 3)))
 
     def together(self) -> tuple[Float[np.ndarray, "D"], float]:

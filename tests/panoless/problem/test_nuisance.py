@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from panoless.environment.surroundings import Floor, Surroundings
-from panoless.problem.blocks import BLOCKS, Block
+from panoless.problem.blocks import BLOCKS, Block, FocalLength
 from panoless.problem.corrected import Corrected
 from panoless.problem.evidence import decided
 from panoless.problem.nuisance import Nuisance, nuisance_of
@@ -126,8 +126,8 @@ def test_cameras_farther_away_are_those_of_a_smaller_world(nuisance: Nuisance) -
     found = Corrected.by(
         nuisance.replaced(blocks), {name: np.full((1, 1), 1e-6) for name in ("focal length", "distortion")}
     )
-    focal = next(each for each in nuisance.blocks if each.name == "focal length")
-    assert found.corrections.focal_uncertainty == pytest.approx(np.hypot(0.001, focal.model_error) * np.exp(0.01))
+    sigma = np.hypot(0.001, FocalLength.model_error)
+    assert found.corrections.focal_uncertainty == pytest.approx(sigma * np.exp(0.01))
     assert found.scale == pytest.approx(np.exp(-0.01))
     assert found.corrections.focal_factor == pytest.approx(np.exp(0.01))
     assert found.poses is not None
