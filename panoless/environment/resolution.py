@@ -6,11 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from panoless.capture.views import split_held_out
 from panoless.environment.rays import Rays
-from panoless.environment.solve import solve_environment
 from panoless.kernels.cubemap import sample_cubemap, scatter_cubemap
-from panoless.numeric.gauss_newton import LEAST_GAIN, keep_if_better
 from panoless.numeric.robust import bounded_error
 
 ERROR_SCALE = 0.1
@@ -19,24 +16,6 @@ RESOLUTIONS = (64, 128, 256)
 RAYS_PER_TEXEL = 4
 """Fewest in the median observed texel of a map. Chosen on Vase at 160 px, where 64, 128 and 256 texels with 18, 4.6
 and 1.1 rays give 28.0, 28.7 and 28.4 dB."""
-
-
-def finest_resolution(
-    rays: Sequence[Rays], start: Float[Tensor, "6 3 L L"] | None = None, least_gain: float = LEAST_GAIN
-) -> int:
-    """Texels along a face side: the first of 64, 128, 256 that held-out views explain as well as the next.
-
-    Every fifth view is held out. Their error is the mean of ‖e‖²/(‖e‖² + s²), s = `ERROR_SCALE`, weighted by trust:
-    rays that see the object itself count alike for all resolutions. The next has to lower it by the share `least_gain`.
-    """
-    solved, held_out = split_held_out(rays)
-    if not held_out or not solved:
-        return RESOLUTIONS[0]
-    return keep_if_better(
-        RESOLUTIONS,
-        lambda resolution: prediction_error(held_out, solve_environment(solved, resolution, start)),
-        least_gain,
-    )
 
 
 def densest_resolution(rays: Sequence[Rays]) -> int:

@@ -277,14 +277,10 @@ class Proposal:
     """Distance of the mask's contour from that of the shape; infinite where no view sees it."""
     overlap: float
     """Intersection of shape and mask over their union, in [0, 1]."""
-    fitted: Any = None
-    """The geometry of an earlier fit to almost the same views. A kind whose fit is long goes on from it, in few steps.
-    """
 
     def in_surroundings(self, surroundings: Surroundings) -> "Proposal":
         """The same shape there, for a kind that knows near surroundings."""
-        fitted = None if self.fitted is None else self.fitted.in_surroundings(surroundings)
-        return replace(self, shape=replace(self.shape, surroundings=surroundings), fitted=fitted)
+        return replace(self, shape=replace(self.shape, surroundings=surroundings))
 
     @classmethod
     def of(cls, views: Views, shape: ClosedForm, unknowns: ParametricSurface) -> "Proposal":
@@ -331,8 +327,8 @@ class Family(Protocol):
         """The shape that a fit takes its first step from, which tells how near the surroundings are."""
         ...
 
-    def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
-        """The geometry that explains silhouettes and photographs best."""
+    def refitted(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:
+        """A geometry of the kind after few more steps, in other surroundings or with views that changed a little."""
         ...
 
     def solve(

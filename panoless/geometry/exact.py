@@ -43,7 +43,8 @@ from panoless.problem.corrected import Corrected
 from panoless.problem.evidence import Decision
 from panoless.problem.nuisance import nuisance_of
 from panoless.problem.parametric import ParametricSurface
-from panoless.problem.solve import FINISH, LEAST_VIEWS, MOST_VIEWS, ROUNDS, after_round, by_outlines, solve
+from panoless.problem.solve import FINISH, LEAST_VIEWS, MOST_VIEWS, after_round, by_outlines, solve
+from shinypartial.core.camera import Similarity
 
 PROPOSALS = 3
 """Most by corrected silhouettes."""
@@ -76,9 +77,13 @@ class ExactGeometry:
         """Surroundings of the surface."""
         return cast(Surroundings, self.shape.surroundings)
 
+    def with_shape(self, shape: Any) -> Any:
+        """Another surface."""
+        return replace(self, **{fields(self)[1].name: shape})
+
     def in_surroundings(self, surroundings: Surroundings) -> Any:
         """The same surface in other surroundings."""
-        return replace(self, **{fields(self)[1].name: replace(self.shape, surroundings=surroundings)})
+        return self.with_shape(replace(self.shape, surroundings=surroundings))
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
         """See `buffers_by_hits`."""
@@ -154,6 +159,8 @@ class ExactFamily:
     refines: ClassVar[str | None] = None
     needs_depth: ClassVar[bool] = True
     told_by_outlines: ClassVar[bool] = False
+    by_silhouettes: ClassVar[bool] = False
+    """Whether silhouettes determine the shape to the end, so that photographs do not refine it."""
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The geometry of the shape."""
@@ -163,17 +170,14 @@ class ExactFamily:
         """The proposal itself."""
         return self.as_proposed(proposal, config)
 
-    def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
-        """The shape after rounds of the joint solve in which nothing else is free: all of `ROUNDS` and `FINISH`, or the
-        last from an earlier fit. The unknowns need `shape`.
-        """
-        fitted = proposal.fitted
-        start = proposal if fitted is None else replace(proposal, shape=fitted.shape)
-        surface = self.unknowns(views, start, config)
+    def refitted(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:
+        """By silhouettes once more, or after the last round of the joint solve."""
+        if self.by_silhouettes:
+            again = cast(Family, self).propose(views, config, asked=False)
+            return fitted if again is None else fitted.with_shape(again.shape).in_surroundings(fitted.surroundings)
         with torch.no_grad():
-            for settings in (*(ROUNDS if fitted is None else ()), FINISH):
-                surface = after_round(views, surface, settings, FINISH.resolution)
-        return self.as_proposed(replace(start, shape=surface.shape), config)
+            surface = self.unknowns(views, Proposal(fitted.shape, 0.0, 1.0), config)
+            return fitted.with_shape(after_round(views, surface, FINISH, FINISH.resolution).shape)
 
     def unknowns(self, views: Views, proposal: Proposal, config: FitConfig) -> ParametricSurface:
         """A proposal as a surface of few numbers."""
@@ -195,12 +199,15 @@ class ExactFamily:
         """The fit to photographs as they are stated where the scene needs none of the blocks; else that to photographs
         which are corrected by what a surface of few numbers leaves to the blocks.
         """
-        family, around = cast(Family, self), proposal.shape.surroundings
-        if not kinds or not LEAST_VIEWS <= len(views.train) <= MOST_VIEWS:
-            return _fitted(family, views, proposal, config), NO_CORRECTIONS, []
-        proposal = proposal.in_surroundings(around.without_walls)
+        around = proposal.shape.surroundings
+        if not LEAST_VIEWS <= len(views.train) <= MOST_VIEWS:
+            kinds = ()
+        if self.by_silhouettes and not kinds:
+            return self.finished(views, self.as_proposed(proposal, config), config), NO_CORRECTIONS, []
+        start = proposal.in_surroundings(around.without_walls)
         with torch.no_grad():
-            start = self._proposed_again(views, proposal, kinds, config, propose)
+            if kinds:
+                start = self._proposed_again(views, start, kinds, config, propose)
             found = solve(
                 views,
                 self.unknowns(views, start, config),
@@ -209,14 +216,24 @@ class ExactFamily:
                 lambda state: self.begun(Corrected.by(state.nuisance).applied(views, config), state.surface, config),
                 around=around,
             )
-        if not found.state.nuisance.blocks:
-            return _fitted(family, views, proposal, config), NO_CORRECTIONS, list(found.decisions)
         nuisance = found.state.nuisance
         by = Corrected.by(nuisance, found.variances)
-        corrected = by.applied(views, config)
-        around = nuisance.around(proposal.shape.surroundings).scaled(by.scale)
-        geometry = _fitted(family, corrected, (propose(corrected) or start).in_surroundings(around), config)
+        corrected = by.applied(views, config) if nuisance.blocks else views
+        around = nuisance.around(start.shape.surroundings).scaled(by.scale)
+        if self.by_silhouettes:
+            again = propose(corrected) if nuisance.blocks else None
+            geometry = self.as_proposed(again or start, config)
+        else:
+            scaled = found.state.surface.taken_back(Similarity(1 / by.scale, np.eye(3), np.zeros(3)))
+            geometry = self.as_proposed(replace(start, shape=scaled.shape), config)
+        geometry = cast(Any, geometry).in_surroundings(around)
+        with improving():
+            geometry = self.finished(corrected, geometry, config)
         return geometry.with_poses(by.poses), by.corrections, list(found.decisions)
+
+    def finished(self, views: Views, solved: Any, config: FitConfig) -> Any:
+        """What steps of the kind alone make of the solved geometry: itself."""
+        return solved
 
     def _proposed_again(
         self, views: Views, proposal: Proposal, kinds: Collection[type[Block]], config: FitConfig, propose: Propose
@@ -240,13 +257,6 @@ class ExactFamily:
         found = Corrected.by(state.nuisance).poses
         assert found is not None, "cameras are unknowns"
         return found
-
-
-def _fitted(family: Family, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
-    """The fit of a kind; the proposal where the time limit ends it."""
-    with improving():
-        return family.fit(views, proposal, config)
-    return family.as_proposed(proposal, config)
 
 
 class SeenByCenters(ExactGeometry):

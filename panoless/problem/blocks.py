@@ -265,7 +265,7 @@ class Walls(Block):
     name = "walls"
     by_view = False
     unit = "1/radius"
-    model_error = 0.001
+    model_error = 0.0015
     sigma = 0.1
 
     @classmethod

@@ -15,12 +15,14 @@ pose that makes up for such a surface explains views that took no part better, t
 """
 
 import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from panoless.problem.blocks import Block
+from panoless.problem.nuisance import Nuisance
 
 DEVIATIONS = 2.78
 """z: standard deviations of a normal number that are exceeded as seldom."""
@@ -52,6 +54,20 @@ def decided(
     """Whether a block is needed; one that is `required` is kept."""
     found = scored(block, variances, covariance)
     return replace(found, kept=required or found.score > found.bound)
+
+
+def needed(
+    nuisance: Nuisance,
+    variances: Mapping[str, Float[np.ndarray, "B M"]],
+    covariances: Mapping[str, Float[np.ndarray, "N N"]],
+    required: Collection[str],
+) -> tuple[Nuisance, list[Decision]]:
+    """Without those of the free blocks that the scene does not need, and what was decided of each."""
+    free = [each for each in nuisance.blocks if each.name in nuisance.free]
+    decisions = [
+        decided(each, variances[each.name], covariances.get(each.name), required=each.name in required) for each in free
+    ]
+    return nuisance.without([each.name for each in decisions if not each.kept]), decisions
 
 
 def scored(

@@ -128,5 +128,5 @@ class ParametricSurface(Protocol):
 
     @property
     def shape(self) -> Any:
-        """As proposals of the kind have it, for the default `fit`; None where a kind has its own."""
-        return None
+        """As proposals of the kind have it."""
+        ...

@@ -23,7 +23,7 @@ from panoless.environment.surroundings import FAR, Surroundings
 from panoless.journal import remembered
 from panoless.problem.blocks import Block, CameraPoses, Distortion
 from panoless.problem.equations import Data, Equations, Round, State
-from panoless.problem.evidence import Decision, decided
+from panoless.problem.evidence import Decision, needed
 from panoless.problem.nuisance import NO_NUISANCE, Nuisance, nuisance_of
 from panoless.problem.parametric import ParametricSurface
 from shinypartial.io.progress import Progress
@@ -113,15 +113,6 @@ def solve(
     """
     last = rounds[-1]
 
-    def judged(state: State, settings: Round) -> tuple[list[Decision], dict[str, np.ndarray]]:
-        data = Data.of(views, settings, FINISH.resolution, state.nuisance.free)
-        covariances, decisions, known = Equations.at(data, state).covariances(), [], {}
-        for block in state.nuisance.blocks:
-            covariance = covariances[block.name]
-            known[block.name] = np.diag(covariance).reshape(block.values.shape)
-            decisions.append(decided(block, known[block.name], covariance, required=block.name in required))
-        return decisions, known
-
     progress = Progress("solving for cameras, exposures and masks", len(rounds) + 2)
     usual = [kind for kind in kinds if kind is not Distortion]
     state = by_outlines(views, surface, nuisance_of(views, usual, around))
@@ -135,16 +126,20 @@ def solve(
     gone, settings, cameras = list[Decision](), last, StatedCameras.of(views)
     while True:
         state = state.without_common(cameras)
-        decisions, known = judged(state, settings)
+        data = Data.of(views, settings, FINISH.resolution, state.nuisance.free)
+        covariances = Equations.at(data, state).covariances()
+        known = {
+            each.name: np.diag(covariances[each.name]).reshape(each.values.shape) for each in state.nuisance.blocks
+        }
+        left, decisions = needed(state.nuisance, known, covariances, required)
         needless = [each for each in decisions if not each.kept]
         gone += needless
-        left = state.nuisance.without([each.name for each in needless])
-        more = [Distortion] if settings is last and Distortion in kinds else []
-        if not (left.blocks or more) or (not needless and settings is DISTORTED) or is_past_limit():
+        if (not needless and settings is not last) or is_past_limit():
             progress.advance(steps=progress.total - progress.done)
             return Solved(replace(state, nuisance=left), (*gone, *(each for each in decisions if each.kept)), known)
         if settings is last:
+            more = [Distortion] if Distortion in kinds else []
             left = nuisance_of(views, [*more, *(type(each) for each in left.blocks)], around).replaced(left.blocks)
             state = replace(state, surface=state.surface.refined())
-        settings = DISTORTED
+        settings = DISTORTED if left.blocks else FINISH
         state = take_round(views, replace(state, nuisance=left), settings, settings.resolution)

@@ -25,7 +25,7 @@ from panoless.problem.blocks import SHIFT, STATED_FLOOR, TURN_DEG
 from panoless.selection.candidates import MATTE, Candidate, Selection, Verdict, describe
 from panoless.selection.fitted import Fitted, is_refined, missed_share
 from panoless.selection.held_out import LEAST_GAIN, held_out_errors, held_out_parts, is_matte
-from panoless.selection.joint import fit_jointly, followed, nuisance_kinds, proposed
+from panoless.selection.joint import fit_jointly, nuisance_kinds, proposed, refitted
 from panoless.selection.surroundings import explains_clearly_more
 from shinypartial.core.errors import InputError
 
@@ -245,7 +245,7 @@ def _bent(other: Family, geometry: Geometry, start: Start | None, views: Views, 
         if proposal is None:
             return None
         begin = other.before_steps(posed, proposal, config)
-        return followed(other, posed, proposal, begin, begin.surroundings, config).with_poses(geometry.poses)
+        return refitted(other, posed, begin, begin.surroundings, config).with_poses(geometry.poses)
     if start is None or not is_near(start, views, config, bent=True):
         return None
     far = replace(config, surroundings=replace(config.surroundings, mode="off"))

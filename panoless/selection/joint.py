@@ -1,7 +1,5 @@
 """The fit of a kind with cameras, exposures and masks as unknowns beside its shape."""
 
-from dataclasses import replace
-
 from panoless.capture.encoding import encoding_of
 from panoless.capture.views import Views
 from panoless.config import FitConfig
@@ -52,12 +50,10 @@ def proposed(source: Family, views: Views, config: FitConfig, *, asked: bool = F
 
 
 @remembered()
-def followed(
-    family: Family, views: Views, start: Proposal, fitted: Geometry, around: Surroundings, config: FitConfig
-) -> Geometry:
-    """A fit that goes on from an earlier one in other surroundings, with cameras where that has them."""
-    proposal = replace(start, fitted=fitted.with_poses(None)).in_surroundings(around)
-    return family.fit(fitted.corrected(views), proposal, config).with_poses(fitted.poses)
+def refitted(family: Family, views: Views, fitted: Geometry, around: Surroundings, config: FitConfig) -> Geometry:
+    """A geometry after few more steps in other surroundings, with cameras where it has them."""
+    start = fitted.with_poses(None).in_surroundings(around)
+    return family.refitted(fitted.corrected(views), start, config).with_poses(fitted.poses)
 
 
 def fit_jointly(family: Family, source: Family, views: Views, start: Proposal, config: FitConfig) -> Fitted:
@@ -80,5 +76,5 @@ def fit_jointly(family: Family, source: Family, views: Views, start: Proposal, c
     if around.floor is None or config.surroundings.mode == "on":
         return found
     corrected = found.corrections.applied(views, config)
-    far = followed(family, corrected, start, found.geometry, FAR, config)
+    far = refitted(family, corrected, found.geometry, FAR, config)
     return found if explains_clearly_more(corrected, found.geometry, far) else solved(FAR)

@@ -39,7 +39,7 @@ from panoless.numeric.robust import bounded_error
 from panoless.selection.held_out import held_out_parts, is_clearly_lower
 
 RAYS = 100_000
-"""About so many pixels of all views determine an even reflectance."""
+"""About so many pixels of all views determine an even reflectance, and whether places differ."""
 RESOLUTION = 64
 """Most texels along a face side of the maps under which reflectances are judged."""
 LARGEST_REFLECTANCE = 0.97
@@ -107,7 +107,8 @@ def earned_reflectance(views: Views, geometry: Geometry, config: FitConfig) -> R
             even = find_reflectance(joined_rays(seen), resolution, lamps if earned is matte else None)
         if _differs(views, geometry, earned, config):
             finest = config.environment.trial_resolution(FIELD_RESOLUTION)
-            return SeenSurface.of(views, geometry, encoding.saturation).with_field(even, finest)
+            seen_surface = SeenSurface.of(views, geometry, encoding.saturation, PIXELS)
+            return seen_surface.with_field(even, finest, rounds=FIELD_ROUNDS)
         return None if earned is perfect else even
 
 
@@ -116,11 +117,11 @@ def _differs(views: Views, geometry: Geometry, even: Reflectance, config: FitCon
     parts, resolution = held_out_parts(views), config.environment.trial_resolution(FIELD_RESOLUTION)
     if parts is None:
         return False
-    known, tested = (SeenSurface.of(part, geometry, encoding_of(config).saturation) for part in parts)
+    known, tested = (SeenSurface.of(part, geometry, encoding_of(config).saturation, RAYS) for part in parts)
     errors = tested.errors(even, known, resolution)
     if errors.mean() < LEAST_FIELD_ERROR:
         return False
-    return is_clearly_lower(tested.errors(known.with_field(even, resolution), known, resolution), errors)
+    return is_clearly_lower(tested.errors(known.with_field(even, resolution, rounds=1), known, resolution), errors)
 
 
 def _errors(
@@ -145,9 +146,9 @@ class SeenSurface:
     saturation: Float[Tensor, "3"]
 
     @classmethod
-    def of(cls, views: Views, geometry: Geometry, saturation: Float[Tensor, "3"]) -> "SeenSurface":
-        """Of usable pixels."""
-        seen = observe_views(views, geometry, PIXELS)
+    def of(cls, views: Views, geometry: Geometry, saturation: Float[Tensor, "3"], count: int) -> "SeenSurface":
+        """Of about so many usable pixels at most."""
+        seen = observe_views(views, geometry, count)
         parts = tuple(replace(each, radiance=each.radiance.to(each.directions)) for each in seen)
         return cls(views, geometry, parts, saturation.to(parts[0].directions))
 
@@ -185,14 +186,14 @@ class SeenSurface:
         found: np.ndarray = np.bincount(view, bounded * counted) / np.maximum(np.bincount(view, counted), 1)
         return found
 
-    def with_field(self, even: Reflectance, resolution: int) -> Reflectance:
+    def with_field(self, even: Reflectance, resolution: int, *, rounds: int) -> Reflectance:
         """The reflectance with places that differ from it: these and the map are determined in turn."""
         size_px = np.median([_size_px(view) for view in self.views.train])
         cells = int(np.clip(size_px / PIXELS_A_CELL, LEAST_CELLS, MOST_CELLS))
         found, pixels = even, MaterialPixels.of(self.points.double().cpu().numpy(), cells)
         share, scattered = self._shown(even)
         pale = 1 - grazing(cosines_of_incidence(self.rays))[:, None]
-        for _ in range(FIELD_ROUNDS):
+        for _ in range(rounds):
             light = sample_cubemap(self.map_under(found, resolution), self.rays.directions)
             left = self.rays.radiance - share * light - scattered
             slopes, residual = (each.double().cpu().numpy() for each in (light * pale, left))

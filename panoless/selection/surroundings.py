@@ -33,7 +33,7 @@ LEAST_PULL = 0.0003
 LARGEST_FLOOR_COST = 0.99
 """Share of the cost in a far world that a floor may leave where it is looked at closer."""
 LEAST_FLOOR_GAIN = 0.02
-"""Share by which a floor has to lower the held-out error of a shape from silhouettes."""
+"""Share of the cost of walls alone by which a floor before walls has to be below it."""
 JUDGED_RAYS = 400_000
 """About so many pixels of all views tell whether a fit in near surroundings explains more than a far one."""
 JUDGED_RESOLUTION = 64
@@ -47,38 +47,33 @@ NEARER = 1e-2
 def proposed_surroundings(
     family: Family, views: Views, proposal: Proposal, config: FitConfig, *, rays_taken: int = RAYS
 ) -> Surroundings:
-    """A sphere around the proposed shape, or a floor below it before a sphere, if held-out views ask for one clearly;
-    else a far world.
+    """A sphere around the proposed shape, or a floor below it before a sphere, where one lowers the cost; else a far
+    world.
 
-    Far worlds pay for one linearized step and a few floors under coarse maps. A wrong shape may ask for either, too,
-    so a fit in them has to prove itself (see `explains_clearly_more`).
+    Far worlds pay for one linearized step and a few floors under coarse maps. A wrong shape may show either, too: walls
+    are a block that is removed where it is not needed, and a fit above a floor is compared with one in a far world.
     """
     options = config.surroundings
     if options.mode == "off" or not np.isfinite(proposal.silhouette_px):
         return FAR
     with torch.no_grad():
         geometry = family.before_steps(views, proposal, config)
-        if options.mode == "auto" and not _asks_for_near(views, geometry, floor=options.floor == "auto"):
+        some = replace(views, train=views.train[:: -(-len(views.train) // CHECKED_VIEWS)])
+        few = joined(leaving_rays(some, geometry, CHECKED_RAYS))
+        near = Linearized.at(few, FAR.with_degree(0), CHECKED_RESOLUTION).pull() >= LEAST_PULL
+        floored = options.floor == "auto" and with_floor(few, _up(views))[1] < LARGEST_FLOOR_COST
+        if options.mode == "auto" and not near and not floored:
             return FAR
-        seen = leaving_rays(views, geometry, rays_taken)
-        kept, held_out = split_held_out(seen)
-        if not kept or not held_out:
-            return FAR
-        rays = joined(kept)
-        sphere = found_surroundings(rays, FAR.with_degree(0))
+        rays = joined(leaving_rays(views, geometry, rays_taken))
+        best = found_surroundings(rays, FAR.with_degree(0))
         if options.degree > 0:
-            sphere = found_surroundings(rays, sphere.with_degree(options.degree))
-        tried = [sphere] if sphere.coefficients[0] > 0 else []
-        if options.floor == "auto":
+            best = found_surroundings(rays, best.with_degree(options.degree))
+        best = best if best.coefficients[0] > 0 else FAR
+        if floored:
             level, _ = with_floor(rays, _up(views))
-            tried.append(found_surroundings(rays, level.with_degree(options.degree)))
-        best, of_best = FAR, _errors(kept, held_out, FAR)
-        for each in tried:
-            errors = _errors(kept, held_out, each)
-            always = options.mode == "on" and best.is_far
-            least = LEAST_GAIN if each.floor is None else LEAST_FLOOR_GAIN
-            if always or is_clearly_lower(errors, of_best, least):
-                best, of_best = each, errors
+            above = found_surroundings(rays, level.with_degree(options.degree))
+            costs = [Linearized.at(rays, each, JUDGED_RESOLUTION).cost for each in (above, best)]
+            best = above if costs[0] < (1 - LEAST_FLOOR_GAIN) * costs[1] else best
     return best
 
 
@@ -86,15 +81,6 @@ def _up(views: Views) -> Float[np.ndarray, "3"]:
     """Where up is, if cameras were held level."""
     rotations = np.stack([view.camera.world_to_camera[:3, :3].cpu().numpy().astype(np.float64) for view in views.train])
     return upward(rotations[:, 0], -rotations[:, 1])
-
-
-def _asks_for_near(views: Views, geometry: Geometry, *, floor: bool) -> bool:
-    """Whether a step toward a sphere promises enough under a coarse map, or a floor leaves little enough."""
-    some = replace(views, train=views.train[:: -(-len(views.train) // CHECKED_VIEWS)])
-    rays = joined(leaving_rays(some, geometry, CHECKED_RAYS))
-    if Linearized.at(rays, FAR.with_degree(0), CHECKED_RESOLUTION).pull() >= LEAST_PULL:
-        return True
-    return floor and with_floor(rays, _up(views))[1] < LARGEST_FLOOR_COST
 
 
 def explains_clearly_more(views: Views, near: Geometry, far: Geometry, least_gain: float = LEAST_GAIN) -> bool:
@@ -139,9 +125,3 @@ def joined(parts: list[LeavingRays]) -> LeavingRays:
         np.concatenate([getattr(part, name) for part in parts]) for name in ("points", "directions", "radiance")
     )
     return LeavingRays(points, directions, radiance)
-
-
-def _errors(kept: list[LeavingRays], held_out: list[LeavingRays], surroundings: Surroundings) -> Float[np.ndarray, "V"]:
-    """Mean ‖e‖²/(‖e‖² + s²) of each held-out view under the map of the others."""
-    environment = solve_environment([each.rays(surroundings) for each in kept], JUDGED_RESOLUTION)
-    return np.array([prediction_error([each.rays(surroundings)], environment) for each in held_out])

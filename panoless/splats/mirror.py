@@ -12,17 +12,18 @@ from torch.nn.functional import normalize
 
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.poses import Poses
-from panoless.capture.views import TrainView, Views, at_most_pixels
+from panoless.capture.views import TrainView, Views, at_most_pixels, split_held_out
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, thinned
 from panoless.environment.rays import Rays
-from panoless.environment.resolution import finest_resolution
+from panoless.environment.resolution import RESOLUTIONS, prediction_error
 from panoless.environment.solve import solve_environment
 from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import SOLID_SURFACE_ALPHA, Mesh, SurfaceBuffers, from_plain
 from panoless.geometry.exact import mirrored_directions, shade_centers
 from panoless.kernels.camera import RasterCamera
 from panoless.kernels.cubemap import sample_cubemap
+from panoless.numeric.gauss_newton import LEAST_GAIN, keep_if_better
 from panoless.numeric.robust import robust_weight
 from panoless.splats.kernels.rasterize import Channels, RasterBuffers
 from panoless.splats.model import ShadedSurfels, Surfels
@@ -245,4 +246,22 @@ def rasterize_attribute(view: TrainView, surfels: Surfels, attribute: Float[Tens
         attribute=attribute,
         channels=Channels(depth=False, distortion=False),
         active_tiles=tiles_of(view.mask > SOLID_ALPHA),
+    )
+
+
+def finest_resolution(
+    rays: Sequence[Rays], start: Float[Tensor, "6 3 L L"] | None = None, least_gain: float = LEAST_GAIN
+) -> int:
+    """Texels along a face side: the first of 64, 128, 256 that held-out views explain as well as the next.
+
+    Every fifth view is held out. Their error is the mean of ‖e‖²/(‖e‖² + s²), s = `ERROR_SCALE`, weighted by trust:
+    rays that see the object itself count alike for all resolutions. The next has to lower it by the share `least_gain`.
+    """
+    solved, held_out = split_held_out(rays)
+    if not held_out or not solved:
+        return RESOLUTIONS[0]
+    return keep_if_better(
+        RESOLUTIONS,
+        lambda resolution: prediction_error(held_out, solve_environment(solved, resolution, start)),
+        least_gain,
     )

@@ -63,6 +63,7 @@ from shinypartial.io.threads import in_threads
 from shinypartial.metrics import coverage as coverage_metrics
 from shinypartial.metrics import environment as environment_metrics
 from shinypartial.metrics import perceptual
+from shinypartial.metrics.balls import ball_scores
 from shinypartial.metrics.calibration import CalibrationScores, calibration_scores
 from shinypartial.metrics.paper import (
     PAPER_PROTOCOL,
@@ -295,6 +296,7 @@ def _score_maps(
         perceptual=PerceptualScores(
             networks.alex(*srgb) if networks.alex else None, networks.vgg(*srgb) if networks.vgg else None
         ),
+        balls=ball_scores(predicted, truth, np.mean([each.camera.camera_to_world[:3, 2] for each in data.train], 0)),
     )
     paper = _score_paper(predicted, truth, networks) if with_paper else None
     return _MapScores(scores, _score_calibration(prediction, pictures, error, left_out), paper)

@@ -13,6 +13,7 @@ from shinypartial.core.errors import InputError
 from shinypartial.io.files import read_json, write_json
 from shinypartial.io.records import read_record, write_record
 from shinypartial.metrics.angular import AngularStatistics
+from shinypartial.metrics.balls import BallScores
 from shinypartial.metrics.calibration import CalibrationScores
 from shinypartial.metrics.environment import Regions, UnweightedScores
 from shinypartial.metrics.paper import PaperScores
@@ -41,6 +42,8 @@ class EnvironmentScores:
     best_exposure: Regions
     unweighted: UnweightedScores
     perceptual: PerceptualScores
+    balls: BallScores | None = None
+    """None where another version evaluated."""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ REINHARD = "Reinhard et al., Photographic tone reproduction, SIGGRAPH 2002, doi:
 ILG = "Ilg et al., Uncertainty estimates for optical flow, ECCV 2018, arXiv:1802.07095"
 HANLEY = "Hanley and McNeil, Radiology 143, 1982, doi:10.1148/radiology.143.1.7063747"
 SPEARMAN = "Spearman, American Journal of Psychology 15, 1904, doi:10.2307/1412159"
+GARDNER = "Gardner et al., Deep parametric indoor lighting estimation, ICCV 2019, arXiv:1910.08812"
+LEGENDRE = "LeGendre et al., DeepLight, CVPR 2019, arXiv:1904.01175"
 DEFINED_HERE = "docs/reference/metrics.md"
 
 
@@ -57,6 +59,10 @@ METRICS = (
     Metric("psnr_linear_unweighted", "PSNR of linear radiance, every texel equal", "dB", _HIGHER, ".2f", DEFINED_HERE),
     Metric("ssim_srgb_unweighted", "SSIM of the sRGB map, every texel equal", "", _HIGHER, ".4f", WANG),
     Metric("l1_srgb_unweighted", "Mean absolute difference, sRGB, every texel equal", "", _LOWER, ".4f", DEFINED_HERE),
+    Metric("si_rmse", "RMSE after the best factor", "", _LOWER, ".3f", GARDNER),
+    Metric("color_error_deg", "Mean angle between colors", "°", _LOWER, ".2f", LEGENDRE),
+    Metric("normalized_rmse", "RMSE between percentiles 0.1 and 99.9", "", _LOWER, ".3f", DEFINED_HERE),
+    Metric("peak_error_deg", "Brightest light off by", "°", _LOWER, ".1f", DEFINED_HERE),
     Metric("psnr_reinhard", "PSNR of the tone-mapped 8-bit map, every texel equal", "dB", _HIGHER, ".2f", REINHARD),
     Metric("ssim_reinhard", "SSIM of the tone-mapped 8-bit map, every texel equal", "", _HIGHER, ".4f", WANG),
     Metric("l1_reinhard", "Mean absolute difference, tone-mapped 8-bit", "", _LOWER, ".4f", REINHARD),

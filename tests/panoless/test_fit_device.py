@@ -32,7 +32,7 @@ def definition_only(monkeypatch: pytest.MonkeyPatch, often: None) -> None:
     monkeypatch.setattr(cubemap, "REFINING_SCALES", (0.05,))
     monkeypatch.setattr(fill, "RELAXED_TEXELS", 16)
     monkeypatch.setattr(train, "grow_and_prune", partial(grow_and_prune, threshold=0.0))
-    take_few_rounds(monkeypatch, heights=1, revolutions=1)
+    take_few_rounds(monkeypatch, joint=1, revolutions=1)
 
 
 def shortest_config(preset: str) -> FitConfig:

@@ -26,7 +26,7 @@ from panoless.journal import remembered
 from panoless.numeric.factorize import regularize
 from panoless.numeric.gauss_newton import keep_if_better
 from panoless.problem.blocks import CameraPoses, Distortion, Walls
-from panoless.problem.evidence import Decision, decided
+from panoless.problem.evidence import Decision, needed
 from panoless.problem.nuisance import NO_NUISANCE, Nuisance, nuisance_of
 from panoless.problem.observations import solid_pixels
 from shinypartial.io.progress import Progress
@@ -172,15 +172,12 @@ def _hollowed_start(views: Views, lids: Sequence[LevelSet], surface: LevelSet) -
 
 def _needed(views: Views, stage: FitStage, required: Collection[str]) -> tuple[FitStage, dict[str, Decision]]:
     """A stage without the free blocks that the scene does not need, and what was decided of each."""
-    known = variances(views, stage)
-    blocks = [each for each in stage.nuisance.blocks if each.name in stage.nuisance.free]
-    decisions = {each.name: decided(each, known[each.name], required=each.name in required) for each in blocks}
-    needless = [each.name for each in decisions.values() if not each.kept]
-    left = replace(stage, nuisance=stage.nuisance.without(needless))
-    if Walls.name not in needless:
-        return left, decisions
+    left, decisions = needed(stage.nuisance, variances(views, stage), {}, required)
+    by_name, found = {each.name: each for each in decisions}, replace(stage, nuisance=left)
+    if Walls.name not in by_name or by_name[Walls.name].kept:
+        return found, by_name
     surface = replace(stage.surface, surroundings=stage.surface.surroundings.without_walls)
-    return replace(left, surface=surface, environment=None), decisions
+    return replace(found, surface=surface, environment=None), by_name
 
 
 def _with_distortion(views: Views, stage: FitStage) -> FitStage:

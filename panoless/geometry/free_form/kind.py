@@ -205,11 +205,9 @@ class FreeFormFamily(ExactFamily):
         surface = proposal.shape.surface
         return _mirror(surface, full_trust(surface), None, config)
 
-    def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
-        """On from an earlier fit to almost the same views."""
-        before = proposal.fitted
-        assert before is not None, "a fit begins with its nuisance blocks"
-        found = continued_fit(views, FitStage(before.surface, before.trust), Schedule.of(config.free_form))
+    def refitted(self, views: Views, fitted: FreeFormMirror, config: FitConfig) -> Geometry:
+        """After its last round once more."""
+        found = continued_fit(views, FitStage(fitted.surface, fitted.trust), Schedule.of(config.free_form))
         return _mirror(found.surface, found.trust, None, config)
 
     def solve(

@@ -20,7 +20,6 @@ from panoless.geometry.free_form.fit import FitStage, coarse_stage
 from panoless.geometry.free_form.photometric import INNER_PX
 from panoless.geometry.free_form.schedule import Round, Schedule
 from panoless.geometry.free_form.surface import LevelSet, level_set_of
-from panoless.numeric.gauss_newton import keep_if_better
 from panoless.problem.nuisance import NO_NUISANCE, Nuisance
 from panoless.problem.observations import solid_pixels
 from shinypartial.io.progress import Progress
@@ -41,8 +40,6 @@ DESCENTS = 3
 LEAST_DISAGREEMENT = 0.15
 """Of pixels under the plain surface, after the first round of the fit, from which all first surfaces descend; below it
 the plain one does."""
-LEAST_GAIN = 0.02
-"""Share of the disagreement, after the first round of the fit, by which what descended has to lower it."""
 
 
 @dataclass(frozen=True)
@@ -124,8 +121,8 @@ def started(
             ]
             tried.sort(key=lambda way: disagreement(way[1]))
             ended = [taken(stage, ways[dominated][1:], progress) for dominated, stage in tried[:DESCENTS]]
-        best = min(((each, judged(settled(each, progress))) for each in ended), key=lambda each: each[1])
-        found = keep_if_better(((begun, judged(known)), best), lambda each: each[1], LEAST_GAIN)[0]
+        compared = [(begun, judged(known)), *((each, judged(settled(each, progress))) for each in ended)]
+        found = min(compared, key=lambda each: each[1])[0]
         return found.surface, found.nuisance
     return plain, nuisance
 

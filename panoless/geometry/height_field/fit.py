@@ -1,8 +1,6 @@
-"""A bent mirror from photographs: edge and frame by silhouettes, then all heights by what is mirrored, on a grid as
-fine as held-out views ask for.
-"""
+"""A bent mirror beside its joint solve: the dome that it starts from, and what its rim hides."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 
 import torch
@@ -11,80 +9,26 @@ from panoless.capture.views import Views, every_kth_pixel, split_held_out
 from panoless.environment.rays import Rays
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
-from panoless.geometry.height_field.model import HeightField, flat_height_field, visible_reflections
+from panoless.geometry.height_field.model import HeightField, visible_reflections
 from panoless.geometry.height_field.unknowns import HeightFieldUnknowns
-from panoless.geometry.plane.model import Plane
 from panoless.journal import remembered
-from panoless.numeric.gauss_newton import keep_if_better
 from panoless.problem.equations import Round
-from panoless.problem.solve import FINISH, after_round, by_outlines_alone
-from panoless.problem.solve import ROUNDS as JOINT_ROUNDS
-from shinypartial.io.progress import Progress
+from panoless.problem.solve import FINISH, after_round
 
 CELLS = 16
 """Cells of the spline along the longer side of the boundary, to begin with."""
-HALVINGS = 1
-"""How often they may be halved, where held-out views gain by it."""
-JUDGED_STEPS = 2
-"""Steps on a finer grid after which it is judged."""
 START_SLOPES = (0.0, 0.2, 0.4, 0.6, -0.2, -0.4, -0.6)
 """Domes and bowls, by their slope at the edge, of which the one that photographs agree on best is the start."""
 SLOPE_STEPS = (0.1, 0.05, 0.025)
 """By these the best of them is made steeper or flatter, unless it is flat."""
-EDGE_BENDING = 1e-2
-"""Weight of the bending energy in the first steps, against the mean diagonal of the data."""
-ROUNDS = (*JOINT_ROUNDS, replace(FINISH, rays=200_000))
-"""From coarse to fine; known cameras need fewer pixels. Only in the last do photographs determine the tilt of the
-whole."""
+LAST = replace(FINISH, rays=200_000)
+"""The round of known cameras, which need fewer pixels."""
 DOMES = Round(16, 0.5, 60_000, 0)
 """The map under which domes are compared."""
 CLEARANCES = (0.03, 0.06, 0.12)
 """Heights over the plane, in radii of the object, that mirrored rays may have to pass at the rim, tried in turn."""
 LEAST_CLEARED = 0.1
 """Share of the held-out error by which one has to lower it."""
-
-
-def fit_height_field(
-    views: Views,
-    plane: Plane,
-    fitted: HeightField | None = None,
-    *,
-    cells: int = CELLS,
-    halvings: int = HALVINGS,
-    rounds: Sequence[Round] = ROUNDS,
-) -> HeightField:
-    """The heights over a plane, and the plane itself, that explain silhouettes and photographs best.
-
-    The silhouettes alone give the plane of a frame that stands out, and the heights along the mirror's edge. Then come
-    rounds of silhouettes and photographs together, with the map eliminated (see `panoless.problem.solve`).
-    One that was `fitted` to almost the same views goes on in the last round, on its grid.
-    """
-    last = rounds[-1]
-    with torch.no_grad():
-        if fitted is not None:
-            return _refine(views, fitted, last, last)
-        flat = HeightFieldUnknowns(flat_height_field(plane, cells), EDGE_BENDING)
-        height_field = by_outlines_alone(views, flat).height_field
-        progress = Progress("fitting a bent mirror", len(rounds) + 3)
-        height_field = best_dome(views, height_field)
-        progress.advance()
-        for each in rounds:
-            height_field = _refine(views, height_field, each, last)
-            progress.advance()
-        kept, held_out = (replace(views, train=tuple(part)) for part in split_held_out(views.train))
-
-        def error(each: HeightField) -> float:
-            return _unexplained(kept, held_out, each, last)
-
-        if held_out.train:
-            height_field = _refine_grid(views, kept, height_field, error, halvings, last)
-        progress.advance()
-        if held_out.train:
-            cleared = _cleared(height_field, error)
-            if cleared is not height_field:
-                height_field = _refine(views, cleared, last, last)
-        progress.advance()
-    return height_field
 
 
 @remembered()
@@ -106,41 +50,28 @@ def best_dome(views: Views, height_field: HeightField) -> HeightField:
     return height_field.domed(slope)
 
 
-def _cleared(height_field: HeightField, error: Callable[[HeightField], float]) -> HeightField:
-    """With the height that mirrored rays have to pass, as long as what is left out was clearly worse explained."""
-    least = error(height_field)
-    for height in CLEARANCES:
-        higher = replace(height_field, clearance=height)
-        left = error(higher)
-        if left > (1 - LEAST_CLEARED) * least:
-            break
-        height_field, least = higher, left
-    return height_field
-
-
-def _refine_grid(
-    views: Views,
-    kept: Views,
-    height_field: HeightField,
-    error: Callable[[HeightField], float],
-    halvings: int,
-    last: Round,
-) -> HeightField:
-    """The height field on finer grids, as long as held-out views gain by them.
-
-    The coarser one was fitted to all views, so a finer grid has to gain a little more than that.
+def cleared(views: Views, height_field: HeightField) -> HeightField:
+    """With the height that mirrored rays have to pass, as long as what is left out was clearly worse explained, and
+    after one more round if there is any.
     """
-    for _ in range(halvings):
-        candidate = _refine(kept, height_field.with_halved_cells(), replace(last, steps=JUDGED_STEPS), last)
-        if keep_if_better((height_field, candidate), error) is height_field:
-            return height_field
-        height_field = _refine(views, candidate, last, last)
-    return height_field
+    kept, held_out = (replace(views, train=tuple(part)) for part in split_held_out(views.train))
+    if not held_out.train:
+        return height_field
+    with torch.no_grad():
+        found, least = height_field, _unexplained(kept, held_out, height_field, LAST)
+        for height in CLEARANCES:
+            higher = replace(height_field, clearance=height)
+            left = _unexplained(kept, held_out, higher, LAST)
+            if left > (1 - LEAST_CLEARED) * least:
+                break
+            found, least = higher, left
+        return found if found is height_field else refined(views, found)
 
 
-def _refine(views: Views, height_field: HeightField, each: Round, last: Round) -> HeightField:
-    """After one round; under the maps of the last one photographs determine the tilt."""
-    return after_round(views, HeightFieldUnknowns(height_field), each, last.resolution).height_field
+def refined(views: Views, height_field: HeightField) -> HeightField:
+    """After the last round in which nothing else is unknown."""
+    with torch.no_grad():
+        return after_round(views, HeightFieldUnknowns(height_field), LAST, LAST.resolution).height_field
 
 
 def _unexplained(solved: Views, tested: Views, height_field: HeightField, each: Round) -> float:

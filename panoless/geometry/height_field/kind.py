@@ -13,14 +13,14 @@ from panoless.config import FitConfig
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers
 from panoless.geometry.exact import ExactFamily, SeenByCenters
-from panoless.geometry.height_field.fit import CELLS, best_dome, fit_height_field
+from panoless.geometry.height_field.fit import CELLS, best_dome, cleared, refined
 from panoless.geometry.height_field.model import (
     HeightField,
     flat_height_field,
     height_field_buffers,
     visible_reflections,
 )
-from panoless.geometry.height_field.unknowns import HeightFieldUnknowns
+from panoless.geometry.height_field.unknowns import STIFF, HeightFieldUnknowns
 from panoless.kernels.camera import RasterCamera
 from shinypartial.core.errors import InputError
 
@@ -77,7 +77,8 @@ class HeightFieldFamily(ExactFamily):
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The plane that it bends, flat as yet."""
-        return HeightFieldMirror(flat_height_field(proposal.shape, CELLS))
+        shape = proposal.shape
+        return HeightFieldMirror(shape if isinstance(shape, HeightField) else flat_height_field(shape, CELLS))
 
     def before_steps(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """The dome or bowl over the plane that photographs agree on best, or the plane."""
@@ -85,14 +86,17 @@ class HeightFieldFamily(ExactFamily):
         return HeightFieldMirror(best_dome(views, flat))
 
     def unknowns(self, views: Views, proposal: Proposal, config: FitConfig) -> HeightFieldUnknowns:
-        """See there."""
-        return HeightFieldUnknowns(flat_height_field(proposal.shape, CELLS))
+        """A stiff one, for silhouettes."""
+        return HeightFieldUnknowns(flat_height_field(proposal.shape, CELLS), STIFF)
 
     def begun(self, views: Views, surface: HeightFieldUnknowns, config: FitConfig) -> HeightFieldUnknowns:
         """With the dome or bowl more that photographs agree on best."""
         return HeightFieldUnknowns(best_dome(views, surface.height_field))
 
-    def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
-        """Heights, plane and boundary by silhouettes and photographs together."""
-        fitted = None if proposal.fitted is None else proposal.fitted.height_field
-        return HeightFieldMirror(fit_height_field(views, proposal.shape, fitted))
+    def refitted(self, views: Views, fitted: HeightFieldMirror, config: FitConfig) -> Geometry:
+        """Heights, plane and boundary after one more round."""
+        return fitted.with_shape(refined(views, fitted.height_field))
+
+    def finished(self, views: Views, solved: HeightFieldMirror, config: FitConfig) -> HeightFieldMirror:
+        """With the height that reflected rays have to pass at the rim."""
+        return solved.with_shape(cleared(views, solved.height_field))

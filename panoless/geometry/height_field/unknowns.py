@@ -28,8 +28,8 @@ from panoless.problem.parametric import (
 from panoless.problem.rays import PixelRays
 from shinypartial.core.camera import Similarity
 
-BENDING = 1e-4
-"""Weight of the bending energy beside photographs."""
+BENDING, STIFF = 1e-4, 1e-2
+"""Weights of the bending energy beside photographs, and of silhouettes alone."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,11 @@ class HeightFieldUnknowns(ParametricSurface):
     height_field: HeightField
     bending: float = BENDING
     """Weight of the bending energy, a share of the mean diagonal of the data."""
+
+    @property
+    def shape(self) -> HeightField:
+        """The height field."""
+        return self.height_field
 
     @property
     def surroundings(self) -> Surroundings:

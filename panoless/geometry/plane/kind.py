@@ -60,6 +60,7 @@ class PlaneFamily(ExactFamily):
     kind: ClassVar[str] = "plane"
     geometry: ClassVar[type[Geometry]] = PlaneMirror
     label: ClassVar[str] = "a plane"
+    by_silhouettes: ClassVar[bool] = True
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """Plane, boundary and frame by silhouettes."""
@@ -78,11 +79,3 @@ class PlaneFamily(ExactFamily):
     def unknowns(self, views: Views, proposal: Proposal, config: FitConfig) -> PlaneUnknowns:
         """See there."""
         return PlaneUnknowns(proposal.shape)
-
-    def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
-        """The proposal itself: silhouettes tell a plane to the end. After an earlier fit, they are asked again."""
-        if proposal.fitted is None:
-            return self.as_proposed(proposal, config)
-        again = self.propose(views, config, asked=False)
-        there = proposal.fitted.surroundings
-        return proposal.fitted if again is None else self.as_proposed(again.in_surroundings(there), config)

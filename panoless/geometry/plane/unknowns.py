@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from panoless.environment.surroundings import Surroundings
 from panoless.geometry.plane.model import Plane, passes_frame
 from panoless.geometry.plane.silhouette import (
     VERTEX_PULL,
@@ -41,9 +40,9 @@ class PlaneUnknowns(ParametricSurface):
     plane: Plane
 
     @property
-    def surroundings(self) -> Surroundings:
-        """Of the plane."""
-        return self.plane.surroundings
+    def shape(self) -> Plane:
+        """The plane."""
+        return self.plane
 
     @property
     def count(self) -> int:

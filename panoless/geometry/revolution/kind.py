@@ -124,10 +124,10 @@ class RevolutionFamily(ExactFamily):
         """With a stiff profile."""
         return replace(surface, knot_px=STIFF_PX)
 
-    def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
-        """Profile and axis by what is reflected."""
-        if proposal.fitted is None:
-            surface = refine_revolution(views, proposal.shape)
-        else:
-            surface = follow_views(views, proposal.fitted.surface)
-        return RevolutionMirror(surface, config.environment.trace)
+    def finished(self, views: Views, solved: RevolutionMirror, config: FitConfig) -> RevolutionMirror:
+        """With what is inside, and finer than the joint solve has it."""
+        return solved.with_shape(refine_revolution(views, solved.surface))
+
+    def refitted(self, views: Views, fitted: RevolutionMirror, config: FitConfig) -> Geometry:
+        """Profile and axis after one more round."""
+        return fitted.with_shape(follow_views(views, fitted.surface))

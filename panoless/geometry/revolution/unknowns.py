@@ -6,7 +6,6 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float
 
-from panoless.environment.surroundings import Surroundings
 from panoless.geometry.revolution.lip import SPOILED_PX
 from panoless.geometry.revolution.model import Hits, SurfaceOfRevolution, trace_reflections
 from panoless.geometry.revolution.photometric import normal_motion
@@ -41,7 +40,8 @@ from shinypartial.core.camera import Similarity
 
 AXIS_NUMBERS = 4
 KNOT_PX, STIFF_PX = 3.0, 8.0
-"""Spacing of the splines (px): for silhouettes, and for photographs, under which a proposal changes smoothly."""
+"""Spacing of the splines (px): for silhouettes and the last rounds, and for photographs under coarse maps, under which
+a proposal changes smoothly."""
 END_PX, END_SIGMA_PX = 4.0, 0.3
 """Silhouettes so near to an end (px) have this standard deviation (px): edges are round, corners are not."""
 BENDING = 1e-3
@@ -58,9 +58,9 @@ class RevolutionUnknowns(ParametricSurface):
     knot_px: float = KNOT_PX
 
     @property
-    def surroundings(self) -> Surroundings:
-        """Of the surface."""
-        return self.surface.surroundings
+    def shape(self) -> SurfaceOfRevolution:
+        """The surface."""
+        return self.surface
 
     @cached_property
     def splines(self) -> ProfileSplines:
@@ -165,6 +165,10 @@ class RevolutionUnknowns(ParametricSurface):
         origin, axis = common.undone(self.surface.origin[None])[0], self.surface.axis @ common.rotation
         profile = self.surface.profile / common.scale
         return replace(self, surface=replace(self.surface, origin=origin, axis=axis, profile=profile))
+
+    def refined(self) -> "RevolutionUnknowns":
+        """With a finer profile."""
+        return replace(self, knot_px=KNOT_PX)
 
     def settled(self) -> "RevolutionUnknowns":
         """With vertices about a pixel apart."""

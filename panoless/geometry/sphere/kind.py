@@ -117,6 +117,7 @@ class SphereFamily(ExactFamily):
     label: ClassVar[str] = "a sphere"
     needs_depth: ClassVar[bool] = False
     told_by_outlines: ClassVar[bool] = True
+    by_silhouettes: ClassVar[bool] = True
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """Center and radius by outlines."""
@@ -133,10 +134,6 @@ class SphereFamily(ExactFamily):
         """See there."""
         return SphereUnknowns(proposal.shape, config.sphere.radius > 0)
 
-    def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
-        """The proposal itself: outlines tell a sphere to the end. After an earlier fit, they are asked again."""
-        shape = proposal.shape
-        again = None if proposal.fitted is None else self.propose(views, config, asked=False)
-        if again is not None:
-            shape = replace(again.shape, surroundings=proposal.fitted.surroundings)
-        return SphereMirror(shape, config.sphere.operator_deg if len(views.train) > 1 else 0.0)
+    def finished(self, views: Views, solved: SphereMirror, config: FitConfig) -> SphereMirror:
+        """With how little rays count that come back to their camera, where there are several."""
+        return replace(solved, operator_deg=config.sphere.operator_deg if len(views.train) > 1 else 0.0)

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from panoless.environment.surroundings import Surroundings
 from panoless.geometry.sphere.model import Sphere
 from panoless.numeric.gauss_newton import jacobian_of_rows
 from panoless.problem.parametric import LEAST_COSINE, MirrorHits, ParametricSurface, Regularization, Silhouette
@@ -21,9 +20,9 @@ class SphereUnknowns(ParametricSurface):
     radius_known: bool = False
 
     @property
-    def surroundings(self) -> Surroundings:
-        """Of the sphere."""
-        return self.sphere.surroundings
+    def shape(self) -> Sphere:
+        """The sphere."""
+        return self.sphere
 
     @property
     def count(self) -> int:

@@ -59,7 +59,7 @@ CONFIG = coarse_config()
 @pytest.fixture(autouse=True)
 def few_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
     """Enough to tell kinds apart."""
-    take_few_rounds(monkeypatch, heights=3, revolutions=1)
+    take_few_rounds(monkeypatch, joint=3, revolutions=1)
 
 
 def framed(frame_height: float, bend: float = 0.0) -> Views:
@@ -205,7 +205,7 @@ def test_silhouettes_turn_cameras_where_that_brings_a_shape_near() -> None:
 
 def test_a_goblet_takes_the_surface_of_revolution(monkeypatch: pytest.MonkeyPatch) -> None:
     """After a second round it leaves next to nothing of held-out views unexplained."""
-    take_few_rounds(monkeypatch, heights=3, revolutions=2)
+    take_few_rounds(monkeypatch, joint=3, revolutions=2)
     geometry, selection = choose_geometry(revolution_views(goblet(), around(12, SIZE_PX)), CONFIG)
     assert geometry.kind == "revolution"
     assert selection.candidates[-1].held_out_error < 0.03

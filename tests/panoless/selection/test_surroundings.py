@@ -57,7 +57,7 @@ def test_a_flat_mirror_in_a_room_tells_how_near_it_is() -> None:
     proposal = Proposal(plane_of(RECTANGLE), 0.1, 1.0)
     found = proposed_surroundings(family, views, proposal, CONFIG, rays_taken=RAYS)
     assert found.coefficients == pytest.approx([0.25], rel=0.05)
-    near, far = (family.fit(views, each, CONFIG) for each in (proposal.in_surroundings(found), proposal))
+    near, far = (family.as_proposed(each, CONFIG) for each in (proposal.in_surroundings(found), proposal))
     assert near.surroundings is found
     assert explains_clearly_more(views, near, far)
     assert not explains_clearly_more(views, far, near)

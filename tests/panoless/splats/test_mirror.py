@@ -11,14 +11,14 @@ from torch import Tensor
 from panoless.capture.rays import pixel_rays, reflect
 from panoless.capture.views import Views
 from panoless.environment.rays import Rays, normalize_confidence
-from panoless.environment.resolution import finest_resolution, prediction_error
+from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
 from panoless.geometry.base import observe_views
 from panoless.geometry.plane.kind import PlaneMirror
 from panoless.geometry.revolution.kind import RevolutionMirror
 from panoless.geometry.revolution.model import trace_reflections
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap
-from panoless.splats.mirror import PRIOR_TRUST, SurfelMirror, surfel_trust
+from panoless.splats.mirror import PRIOR_TRUST, SurfelMirror, finest_resolution, surfel_trust
 from panoless.splats.model import Surfels
 from tests.support.mirror_plane import RECTANGLE, arc, plane_of, reflecting_views
 from tests.support.mirror_revolution import around, funnel, revolution_views

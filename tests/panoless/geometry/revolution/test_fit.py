@@ -8,11 +8,15 @@ import pytest
 import torch
 
 from panoless.capture.rays import pixel_rays
+from panoless.capture.views import Views
 from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
 from panoless.geometry.revolution.fit import Refinement, propose_revolution, refine_revolution
 from panoless.geometry.revolution.model import SurfaceOfRevolution, revolution_rays
+from panoless.geometry.revolution.silhouette import contour_rays
+from panoless.geometry.revolution.unknowns import STIFF_PX, RevolutionUnknowns
 from panoless.kernels.cubemap import sample_cubemap
+from panoless.problem.solve import solve
 from tests.support.traced_vessel import Photographs, Vessel, cut_bowl, deep_cup, dished_jar, photograph, plate, stripes
 
 SIZE, VIEWS = 72, 14
@@ -27,9 +31,16 @@ def random_turn(seed: int) -> np.ndarray:
 
 def fit(photographs: Photographs) -> SurfaceOfRevolution:
     """Silhouettes, then all that is mirrored."""
-    proposal = propose_revolution(photographs.views)
+    return refine_revolution(photographs.views, outside(photographs.views))
+
+
+def outside(views: Views) -> SurfaceOfRevolution:
+    """What the joint solve makes of silhouettes and photographs without nuisance blocks: closed at both ends."""
+    proposal, pixel = propose_revolution(views), contour_rays(views).pixel
     assert proposal is not None
-    return refine_revolution(photographs.views, proposal.surface)
+    found = solve(views, RevolutionUnknowns(proposal.surface, pixel, STIFF_PX), (), ()).state.surface
+    assert isinstance(found, RevolutionUnknowns)
+    return found.surface
 
 
 @cache
@@ -95,10 +106,8 @@ def test_a_closed_vessel_is_found_with_the_dish_in_its_lid() -> None:
 def test_a_deep_cup_is_open_though_no_ray_leaves_it_at_once() -> None:
     """What is inside is judged by rays that are mirrored often, before the rounds that refine it."""
     views = photograph(deep_cup(), VIEWS, SIZE).views
-    proposal = propose_revolution(views)
-    assert proposal is not None
     with torch.no_grad():
-        opened, _ = Refinement(views, proposal.surface, map_rays=100_000).open_mouth()
+        opened, _ = Refinement(views, outside(views), map_rays=100_000).open_mouth()
     assert opened.is_open
 
 
@@ -106,10 +115,9 @@ def test_a_deep_cup_is_open_though_no_ray_leaves_it_at_once() -> None:
 def test_the_inside_of_a_plate_is_found_by_steps_under_coarse_maps() -> None:
     """No outline shows it. Measured: 1.0° in the median; 11° without these steps."""
     photographs = photograph(plate(), VIEWS, 96, elevations_deg=(20.0, 35.0, 50.0, 60.0))
-    proposal = propose_revolution(photographs.views)
-    assert proposal is not None
+    closed = outside(photographs.views)
     with torch.no_grad():
-        opened, _ = Refinement(photographs.views, proposal.surface, map_rays=240_000, pixels=60_000).open_mouth()
+        opened, _ = Refinement(photographs.views, closed, map_rays=240_000, pixels=60_000).open_mouth()
     assert np.median(normal_errors_deg(photographs, opened)) < 2
 
 
@@ -149,9 +157,8 @@ def test_no_rotation_of_the_world_changes_the_fit(seed: int) -> None:
 def test_both_ends_are_tried_where_cameras_see_both() -> None:
     """From a start that is upside down, with cameras that see both ends, the pictures find the mouth."""
     photographs = photograph(cut_bowl(), VIEWS, SIZE, elevations_deg=(-40.0, 8.0, 25.0, 45.0))
-    proposal = propose_revolution(photographs.views)
-    assert proposal is not None
-    for start in (proposal.surface, proposal.surface.turned_over()):
+    closed = outside(photographs.views)
+    for start in (closed, closed.turned_over()):
         # The first rounds decide; those that follow refine what they found.
         surface = refine_revolution(photographs.views, start, rounds=1)
         assert surface.is_open

@@ -58,7 +58,9 @@ def fitted(views: Views, config: FitConfig = CONFIG) -> SphereMirror:
     family = SphereFamily()
     proposal = family.propose(views, config, asked=False)
     assert proposal is not None
-    return family.fit(views, proposal, config)
+    geometry, _, _ = family.solve(views, proposal, (), (), config, lambda _: None)
+    assert isinstance(geometry, SphereMirror)
+    return geometry
 
 
 def tangent_rays(
