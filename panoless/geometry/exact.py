@@ -204,7 +204,7 @@ class ExactFamily:
             kinds = ()
         if self.by_silhouettes and not kinds:
             return self.finished(views, self.as_proposed(proposal, config), config), NO_CORRECTIONS, []
-        start = proposal.in_surroundings(around.without_walls)
+        start = proposal.in_surroundings(around.without_walls) if kinds else proposal
         with torch.no_grad():
             if kinds:
                 start = self._proposed_again(views, start, kinds, config, propose)
@@ -221,7 +221,7 @@ class ExactFamily:
         corrected = by.applied(views, config) if nuisance.blocks else views
         around = nuisance.around(start.shape.surroundings).scaled(by.scale)
         if self.by_silhouettes:
-            again = propose(corrected) if nuisance.blocks else None
+            again = propose(corrected) if nuisance.blocks else proposal
             geometry = self.as_proposed(again or start, config)
         else:
             scaled = found.state.surface.taken_back(Similarity(1 / by.scale, np.eye(3), np.zeros(3)))
