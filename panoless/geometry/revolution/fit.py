@@ -49,10 +49,10 @@ SUFFICIENT_OVERLAP = 0.98
 """Intersection over union of the closed body with the masks from which no stem is looked for."""
 SCORED_VIEWS = 16
 """Most views over which the overlap of a proposal is measured."""
-MOUTH_RESOLUTION = 128
-"""Texels along a face side of the maps under which the mouth is opened."""
-FINE = (Round(128, 0.2, 1.5, 2), Round(256, 0.2, 1.5, 2), Round(256, 0.1, 1.0, 2), Round(256, 0.1, 1.0, 2))
-"""Rounds on single rays."""
+COARSE = Round(128, 0.3, 2.0, 2)
+"""The round on single rays before the mouth is opened."""
+FINE = (Round(128, 0.2, 1.5, 2), Round(256, 0.2, 1.5, 2), Round(256, 0.1, 1.0, 2))
+"""Rounds after."""
 MOST_ROUNDS = 4
 """Rounds of each series."""
 PIXELS = 120_000
@@ -219,8 +219,8 @@ class Refinement:
         return pixels.error(surface, environment, MAX_BOUNCES, JUDGED_SCALE)
 
     def open_mouth(self) -> tuple[SurfaceOfRevolution, Tensor | None]:
-        """The outside with what is inside its lid, or inside its base if that is unclear; and the map of the outside,
-        unless what is inside shows more: a thin wall, or what its map or a descent led to.
+        """The outside after a round, with what is inside its lid, or inside its base if that is unclear; and the map of
+        the outside, unless what is inside shows more: a thin wall, or what its map or a descent led to.
 
         Every candidate is judged under a map of its own: that of a wide bowl's flat lid says nothing of its inside.
         """
@@ -230,7 +230,7 @@ class Refinement:
         seen = self._held_out_ends(self.start)
         opened = []
         for surface in starts:
-            environment = solve_map(self.views, surface, self.map_rays, MOUTH_RESOLUTION)
+            surface, environment = self.refine_by_centers(surface, COARSE, None)
             flat = self._judged(surface, seen, environment)
             within = list(self._walls(surface, environment, flat, seen))
             best = self._best(flat, *within)
@@ -269,7 +269,7 @@ class Refinement:
         """A surface under its own map of the views that are not held out, from nothing, since others' leave traces;
         with rays that are mirrored often, since some directions are seen by way of the walls only.
         """
-        environment = solve_map(self.kept, surface, self.map_rays, MOUTH_RESOLUTION, max_bounces=FITTED_BOUNCES)
+        environment = solve_map(self.kept, surface, self.map_rays, COARSE.resolution, max_bounces=FITTED_BOUNCES)
         return _Judged(surface, environment, self._error(seen, surface, environment), going_on)
 
     def _best(self, *candidates: _Judged) -> _Judged:
