@@ -310,6 +310,8 @@ class Family(Protocol):
     """With its article, as sentences name it."""
     refines: ClassVar[str | None]
     """The kind whose proposal it takes on where that one is not chosen; None: it makes its own."""
+    in_few_steps: ClassVar[bool]
+    """Whether the kind that it refines is compared with it, fitted in few steps."""
     needs_depth: ClassVar[bool]
     """Whether views have to come from different directions, which tell how far away the object is."""
     told_by_outlines: ClassVar[bool]
@@ -321,6 +323,12 @@ class Family(Protocol):
 
         Raises InputError in that case when the kind was `asked` for.
         """
+        ...
+
+    def proposed_over(
+        self, views: Views, proposal: Proposal, config: FitConfig, *, asked: bool = False
+    ) -> Proposal | None:
+        """Of a kind that refines another, the proposal that starts from the other's; None where there is none."""
         ...
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:

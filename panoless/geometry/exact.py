@@ -152,8 +152,15 @@ class ExactFamily:
 
     geometry: ClassVar[type[Geometry]]
     refines: ClassVar[str | None] = None
+    in_few_steps: ClassVar[bool] = True
     needs_depth: ClassVar[bool] = True
     told_by_outlines: ClassVar[bool] = False
+
+    def proposed_over(
+        self, views: Views, proposal: Proposal, config: FitConfig, *, asked: bool = False
+    ) -> Proposal | None:
+        """The proposal itself."""
+        return proposal
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The geometry of the shape."""

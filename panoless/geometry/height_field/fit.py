@@ -4,6 +4,7 @@ fine as held-out views ask for.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from typing import TypeVar, cast
 
 import torch
 
@@ -21,6 +22,7 @@ from panoless.problem.solve import FINISH, after_round, by_outlines_alone
 from panoless.problem.solve import ROUNDS as JOINT_ROUNDS
 from shinypartial.io.progress import Progress
 
+Bent = TypeVar("Bent", bound=HeightField)
 CELLS = 16
 """Cells of the spline along the longer side of the boundary, to begin with."""
 HALVINGS = 1
@@ -62,27 +64,22 @@ def fit_height_field(
     last = rounds[-1]
     with torch.no_grad():
         if fitted is not None:
-            return _refine(views, fitted, last, last)
+            return refine(views, fitted, last, last)
         flat = HeightFieldUnknowns(flat_height_field(plane, cells), EDGE_BENDING)
         height_field = by_outlines_alone(views, flat).height_field
         progress = Progress("fitting a bent mirror", len(rounds) + 3)
         height_field = best_dome(views, height_field)
         progress.advance()
         for each in rounds:
-            height_field = _refine(views, height_field, each, last)
+            height_field = refine(views, height_field, each, last)
             progress.advance()
-        kept, held_out = (replace(views, train=tuple(part)) for part in split_held_out(views.train))
-
-        def error(each: HeightField) -> float:
-            return _unexplained(kept, held_out, each, last)
-
-        if held_out.train:
-            height_field = _refine_grid(views, kept, height_field, error, halvings, last)
+        height_field = on_finer_grids(views, height_field, halvings, last)
         progress.advance()
-        if held_out.train:
+        error = held_out_error(views, last)
+        if error is not None:
             cleared = _cleared(height_field, error)
             if cleared is not height_field:
-                height_field = _refine(views, cleared, last, last)
+                height_field = refine(views, cleared, last, last)
         progress.advance()
     return height_field
 
@@ -118,29 +115,31 @@ def _cleared(height_field: HeightField, error: Callable[[HeightField], float]) -
     return height_field
 
 
-def _refine_grid(
-    views: Views,
-    kept: Views,
-    height_field: HeightField,
-    error: Callable[[HeightField], float],
-    halvings: int,
-    last: Round,
-) -> HeightField:
+def held_out_error(views: Views, last: Round) -> Callable[[HeightField], float] | None:
+    """What a height field leaves unexplained of held-out views; None where there are none."""
+    kept, held_out = (replace(views, train=tuple(part)) for part in split_held_out(views.train))
+    return (lambda each: _unexplained(kept, held_out, each, last)) if held_out.train else None
+
+
+def on_finer_grids(views: Views, height_field: Bent, halvings: int, last: Round) -> Bent:
     """The height field on finer grids, as long as held-out views gain by them.
 
     The coarser one was fitted to all views, so a finer grid has to gain a little more than that.
     """
-    for _ in range(halvings):
-        candidate = _refine(kept, height_field.with_halved_cells(), replace(last, steps=JUDGED_STEPS), last)
+    error, kept = held_out_error(views, last), replace(views, train=tuple(split_held_out(views.train)[0]))
+    for _ in range(halvings if error is not None else 0):
+        assert error is not None, "views are held out"
+        finer = cast(Bent, height_field.with_halved_cells())
+        candidate = refine(kept, finer, replace(last, steps=JUDGED_STEPS), last)
         if keep_if_better((height_field, candidate), error) is height_field:
             return height_field
-        height_field = _refine(views, candidate, last, last)
+        height_field = refine(views, candidate, last, last)
     return height_field
 
 
-def _refine(views: Views, height_field: HeightField, each: Round, last: Round) -> HeightField:
+def refine(views: Views, height_field: Bent, each: Round, last: Round = FINISH) -> Bent:
     """After one round; under the maps of the last one photographs determine the tilt."""
-    return after_round(views, HeightFieldUnknowns(height_field), each, last.resolution).height_field
+    return cast(Bent, after_round(views, HeightFieldUnknowns(height_field), each, last.resolution).height_field)
 
 
 def _unexplained(solved: Views, tested: Views, height_field: HeightField, each: Round) -> float:

@@ -8,11 +8,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.object_frame import ObjectFrame
+from panoless.capture.silhouettes import without_gaps
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers
-from panoless.geometry.exact import ExactFamily, SeenByCenters
+from panoless.geometry.exact import SeenByCenters
 from panoless.geometry.height_field.fit import CELLS, best_dome, fit_height_field
 from panoless.geometry.height_field.model import (
     HeightField,
@@ -21,6 +22,7 @@ from panoless.geometry.height_field.model import (
     visible_reflections,
 )
 from panoless.geometry.height_field.unknowns import HeightFieldUnknowns
+from panoless.geometry.plane.kind import WithinOneBoundary
 from panoless.kernels.camera import RasterCamera
 from shinypartial.core.errors import InputError
 
@@ -57,7 +59,7 @@ class HeightFieldMirror(SeenByCenters):
         return Mesh.smooth(frame.to_world(points), faces, self.height_field.normals_at(points))
 
 
-class HeightFieldFamily(ExactFamily):
+class HeightFieldFamily(WithinOneBoundary):
     """Heights over a plane that explains the silhouettes, but not what it mirrors."""
 
     kind: ClassVar[str] = "height_field"
@@ -95,4 +97,4 @@ class HeightFieldFamily(ExactFamily):
     def fit(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """Heights, plane and boundary by silhouettes and photographs together."""
         fitted = None if proposal.fitted is None else proposal.fitted.height_field
-        return HeightFieldMirror(fit_height_field(views, proposal.shape, fitted))
+        return HeightFieldMirror(fit_height_field(without_gaps(views), proposal.shape, fitted))

@@ -79,6 +79,7 @@ class HeightFieldUnknowns(ParametricSurface):
         height = max(plane.frame_height, field.clearance)
         met = met & (facing < -LEAST_COSINE)
         met &= passes_frame(plane, points, outgoing, height, distance * rays.size)
+        met &= field.joint_distance(found.places) > distance * rays.size / np.maximum(-directions[:, 2], LEAST_COSINE)
         index, basis = field.basis(found.places)
         _, _, _, h_uu, h_uv, h_vv = (basis * field.coefficients.ravel()[index]).sum(2)
         second = np.stack([h_uu, h_uv, h_uv, h_vv], 1).reshape(-1, 2, 2)

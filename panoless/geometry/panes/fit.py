@@ -1,0 +1,29 @@
+"""Panes from photographs: heights in rounds from coarse maps to fine ones, joints between the rounds."""
+
+from dataclasses import replace
+
+from panoless.capture.views import Views
+from panoless.geometry.height_field.fit import on_finer_grids, refine
+from panoless.geometry.panes.joints import located
+from panoless.geometry.panes.model import Panes
+from panoless.problem.equations import Round
+from panoless.problem.solve import FINISH
+from shinypartial.io.progress import Progress
+
+REACH = 0.1
+"""Joints move by at most this share of the narrowest pane between rounds."""
+RISES = 1
+"""How often the degree may rise by two, where held-out views gain."""
+ROUNDS = (Round(64, 0.15, 120_000, 4), replace(FINISH, rays=120_000), FINISH)
+"""Panes are few numbers, so that few pixels determine them under coarse maps."""
+
+
+def fit_panes(views: Views, panes: Panes) -> Panes:
+    """Heights and joints that explain silhouettes and photographs best, from a start that is near."""
+    progress = Progress("fitting panes", len(ROUNDS) + 1)
+    for each in ROUNDS:
+        panes = located(views, refine(views, panes, each), each, REACH * panes.narrowest)
+        progress.advance()
+    panes = on_finer_grids(views, panes, RISES, FINISH)
+    progress.advance()
+    return panes
