@@ -35,7 +35,7 @@ def slopes_at(
     return tilts[i, j] + bends[i, j][:, None] * (places - middles)
 
 
-def panes_views(plane: CutPlane, cameras: list[RasterCamera], **bent: float) -> Views:
+def panes_views(plane: CutPlane, cameras: list[RasterCamera]) -> Views:
     """Views of such panes, whose heights do not move the points that rays meet: normals over the plane."""
     train = []
     for camera in cameras:
@@ -45,9 +45,10 @@ def panes_views(plane: CutPlane, cameras: list[RasterCamera], **bent: float) -> 
         distance = (plane.offset - origins @ plane.normal) / (directions @ plane.normal)
         points = origins + distance[:, None] * directions
         places = points @ np.stack([plane.tangent_u, plane.tangent_v], 1)
-        beside = np.stack([np.abs(line[:, None] - cuts[1:-1]).min(1) for line, cuts in zip(places.T, plane.cuts)], 1)
+        joints = zip(places.T, plane.cuts, strict=True)
+        beside = np.stack([np.abs(line[:, None] - cuts[1:-1]).min(1) for line, cuts in joints], 1)
         alpha = np.where((beside.min(1) < plane.width / 2).reshape(alpha.shape), 0.0, alpha)
-        slopes = slopes_at(plane, places, **bent)
+        slopes = slopes_at(plane, places)
         normals = plane.normal - slopes @ np.stack([plane.tangent_u, plane.tangent_v])
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)

@@ -1,21 +1,23 @@
 """Panes from photographs: heights in rounds from coarse maps to fine ones, joints between the rounds."""
 
-from dataclasses import replace
-
 from panoless.capture.views import Views
 from panoless.geometry.height_field.fit import on_finer_grids, refine
 from panoless.geometry.panes.joints import located
 from panoless.geometry.panes.model import Panes
 from panoless.problem.equations import Round
-from panoless.problem.solve import FINISH
 from shinypartial.io.progress import Progress
 
 REACH = 0.1
 """Joints move by at most this share of the narrowest pane between rounds."""
 RISES = 1
 """How often the degree may rise by two, where held-out views gain."""
-ROUNDS = (Round(64, 0.15, 120_000, 4), replace(FINISH, rays=120_000), FINISH)
-"""Panes are few numbers, so that few pixels determine them under coarse maps."""
+ROUNDS = (
+    Round(64, 0.15, 120_000, 4),
+    Round(128, 0.1, 120_000, 3),
+    *(Round(256, 0.1, count, 4) for count in (250_000, 500_000, 1_000_000)),
+)
+"""Panes are few numbers, so that few pixels determine them under coarse maps. Coarser maps than the last flatten panes
+that alone see a part of the surroundings."""
 
 
 def fit_panes(views: Views, panes: Panes) -> Panes:
@@ -24,6 +26,6 @@ def fit_panes(views: Views, panes: Panes) -> Panes:
     for each in ROUNDS:
         panes = located(views, refine(views, panes, each), each, REACH * panes.narrowest)
         progress.advance()
-    panes = on_finer_grids(views, panes, RISES, FINISH)
+    panes = on_finer_grids(views, panes, RISES, ROUNDS[2])
     progress.advance()
     return panes

@@ -34,6 +34,8 @@ LEAST_TILES = 3
 """A pane is so many tiles wide at least."""
 LARGEST_LEFT = 0.7
 """Share of the squared error of slopes that a further joint leaves at most."""
+EXPLAINED = 0.02
+"""Share of the squared error of one line that counts as explained."""
 LARGEST_SHARE = 0.5
 """Panes leave at most this share of the variance of the tiles' slopes that a spline of as many numbers leaves."""
 
@@ -138,8 +140,8 @@ def _fitted(
 def jumps(values: Float[np.ndarray, "K C"]) -> list[int]:
     """Where K values in a row, of C channels, jump: ends of the segments on which they are linear.
 
-    Segments have the least squared error R among those of their number S (dynamic programming), and S the least
-    R cˢ, where 1/c is the share that a further jump may leave.
+    Segments have the least squared error R among those of their number S (dynamic programming). S has the least
+    (R + ε R₁) / cˢ, R₁ that of one line: a jump leaves the share c at most, and less than ε R₁ is explained.
     """
     count = len(values)
     costs = np.full((count + 1, count + 1), np.inf)
@@ -150,12 +152,13 @@ def jumps(values: Float[np.ndarray, "K C"]) -> list[int]:
             part = values[first:last]
             costs[first, last] = ((part - projected @ part) ** 2).sum()
     least, before = costs[0], list[np.ndarray]()
-    best, found = float(least[count]), list[int]()
+    explained = EXPLAINED * float(least[count])
+    best, found = float(least[count]) + explained, list[int]()
     for number in range(2, count // LEAST_TILES + 1):
         through = least[:, None] + costs
         before.append(through.argmin(0))
         least = through.min(0)
-        score = float(least[count]) / LARGEST_LEFT ** (number - 1)
+        score = (float(least[count]) + explained) / LARGEST_LEFT ** (number - 1)
         if score < best:
             best, found, end = score, [], count
             for ends in reversed(before):

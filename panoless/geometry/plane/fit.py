@@ -177,6 +177,7 @@ def _plane(direction: Float[np.ndarray, "3"], offset: float) -> Plane:
 
 
 def spread(views: Sequence[TrainView], count: int) -> Sequence[TrainView]:
+    """About so many of the views, evenly."""
     return views[:: max(1, len(views) // count)]
 
 

@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 
 from panoless.capture.masks import MASK_LEVEL, joined
-from panoless.capture.rays import pixel_rays
-from panoless.geometry.panes.fit import fit_panes
+from panoless.capture.silhouettes import without_gaps
 from panoless.geometry.panes.joints import jumps, panes_over, with_bars
 from panoless.geometry.panes.model import flat_panes
 from panoless.geometry.plane.fit import fit_plane
-from panoless.capture.silhouettes import without_gaps
 from tests.support.mirror_height_field import bumpy, height_field_views
 from tests.support.mirror_panes import grid_of, panes_views, slopes_at
 from tests.support.mirror_plane import RECTANGLE, arc, plane_of
@@ -27,20 +25,20 @@ def test_jumps_of_lines_are_found_and_none_in_one_line() -> None:
 
 
 def test_bent_panes_are_found_where_they_are() -> None:
-    """3 × 2 panes whose joints lie beside those of tiles: within a quarter of a pixel, slopes within a tenth of a bend."""
+    """3 × 2 panes: joints within half a pixel, slopes to a tenth of those at the sides of panes."""
     truth = grid_of(PLANE, 3, 2)
-    views = panes_views(truth, arc(20, size=128))
+    views = panes_views(truth, arc(16, size=96))
     found = panes_over(views, PLANE)
     assert found is not None
-    fitted = fit_panes(views, found)
     pixel = 3.0 / views.train[0].camera.fx
-    for cuts, expected in zip(fitted.plane.cuts, truth.cuts, strict=True):
+    for cuts, expected in zip(found.plane.cuts, truth.cuts, strict=True):
         assert len(cuts) == len(expected)
-        assert np.abs(cuts - expected)[1:-1].max() < 0.25 * pixel
+        assert np.abs(cuts - expected)[1:-1].max() < 0.5 * pixel
     places = np.random.default_rng(1).uniform(0.9 * RECTANGLE.min(0), 0.9 * RECTANGLE.max(0), (500, 2))
-    places = places[fitted.joint_distance(places) > pixel]
-    error = fitted.heights(places, 1)[1:].T - slopes_at(truth, places)
-    assert np.degrees(np.median(np.linalg.norm(error - np.median(error, 0), axis=1))) < 0.05
+    places = places[found.joint_distance(places) > pixel]
+    error = found.heights(places, 1)[1:].T - slopes_at(truth, places)
+    assert np.degrees(np.median(np.linalg.norm(error - np.median(error, 0), axis=1))) < 0.18
+    assert np.degrees(np.median(np.linalg.norm(slopes_at(truth, places), axis=1))) > 1.0
 
 
 def test_smooth_waves_are_no_panes() -> None:
