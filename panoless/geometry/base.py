@@ -328,7 +328,7 @@ class Family(Protocol):
     def proposed_over(
         self, views: Views, proposal: Proposal, config: FitConfig, *, asked: bool = False
     ) -> Proposal | None:
-        """Of a kind that refines another, the proposal that starts from the other's; None where there is none."""
+        """Of a kind that refines another, the proposal that starts from the other's; None without one."""
         ...
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:

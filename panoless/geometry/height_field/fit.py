@@ -116,7 +116,7 @@ def _cleared(height_field: HeightField, error: Callable[[HeightField], float]) -
 
 
 def held_out_error(views: Views, last: Round) -> Callable[[HeightField], float] | None:
-    """What a height field leaves unexplained of held-out views; None where there are none."""
+    """What a height field leaves unexplained of held-out views; None without such views."""
     kept, held_out = (replace(views, train=tuple(part)) for part in split_held_out(views.train))
     return (lambda each: _unexplained(kept, held_out, each, last)) if held_out.train else None
 

@@ -99,7 +99,7 @@ def _tiled(plane: Plane) -> CutPlane:
 
 
 def _panes_of(tiles: Panes, plane: Plane) -> Panes | None:
-    """Panes by the slopes of tiles; None where there is one, or where a spline explains the slopes as well.
+    """Panes by the slopes of tiles; None of one pane, or where a spline explains the slopes as well.
 
     Of the panes the least squares solution of the slopes is taken. Half a tile on both sides of joints is left out.
     """

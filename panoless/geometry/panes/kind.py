@@ -48,18 +48,18 @@ class PanesFamily(HeightFieldFamily):
     def proposed_over(
         self, views: Views, proposal: Proposal, config: FitConfig, *, asked: bool = False
     ) -> Proposal | None:
-        """Panes by the slopes that photographs show over tiles; where those are smooth None, one pane if `asked`."""
+        """Panes by the slopes of tiles. Of smooth slopes None, or one pane for a user who wants panes."""
         panes = panes_over(without_gaps(views), proposal.shape)
         if panes is None and asked:
             panes = one_pane(views, proposal.shape)
         return None if panes is None else replace(proposal, shape=panes.plane, fitted=PanesMirror(panes))
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
-        """As they were found."""
+        """The panes of the proposal."""
         return cast(Geometry, proposal.fitted)
 
     def before_steps(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
-        """As they were found."""
+        """The panes of the proposal."""
         return self.as_proposed(proposal, config)
 
     def unknowns(self, views: Views, proposal: Proposal, config: FitConfig) -> PanesUnknowns:

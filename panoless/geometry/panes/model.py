@@ -1,4 +1,4 @@
-"""A mirror in panes, such as a front of glass: a plane that lines cut, and a polynomial height over each cell."""
+"""A mirror in panes, such as a front of glass: a plane that lines cut, and polynomial heights over its cells."""
 
 from dataclasses import dataclass, field, replace
 from typing import cast
@@ -114,7 +114,7 @@ class Panes(HeightField):
         return self._row(pane)[:, None] * terms + np.arange(terms), np.stack(self._terms(places, pane, derivatives))
 
     def _row(self, pane: Int[np.ndarray, "P 2"]) -> Int[np.ndarray, "P"]:
-        """Of the coefficients."""
+        """Rows of the coefficients."""
         return pane[:, 0] * (len(self.plane.cuts_v) - 1) + pane[:, 1]
 
     def _terms(
