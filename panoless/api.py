@@ -55,7 +55,7 @@ class Reconstruction:
 
     @property
     def model(self) -> str:
-        """The kind of geometry taken: `sphere`, `plane`, `height_field`, `revolution`, `free_form`, `surfels`."""
+        """The kind of geometry: `sphere`, `plane`, `panes`, `height_field`, `revolution`, `free_form`, `surfels`."""
         return self.info.model_selection.chosen if self.info.model_selection else ""
 
     @property

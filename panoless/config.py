@@ -40,7 +40,7 @@ Tuned = Annotated[Options, tyro.conf.Suppress]
 """Options of a stage, which `--set` changes: too many for the help of a command."""
 SPLIT_SUM = ("gaussian-shader", "ref-gaussian", "material-refgs")
 """The shadings that blur the map for rough parts."""
-Model = Literal["auto", "sphere", "plane", "height_field", "revolution", "free_form", "surfels"]
+Model = Literal["auto", "sphere", "plane", "panes", "height_field", "revolution", "free_form", "surfels"]
 #: Values of --model that an earlier version had, and today's.
 RENAMED_MODELS = {"bent": "height_field"}
 
@@ -85,8 +85,8 @@ class FitConfig:
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     """Seed of the initial surfels and of the order of views."""
     model: Annotated[Model, tyro.conf.arg(prefix_name=False)] = "auto"
-    """`auto`: the simplest that explains held-out views; `sphere`, `plane`, `height_field` over a plane, `revolution`,
-    `free_form`: a closed smooth surface; `surfels`."""
+    """`auto`: the simplest that explains held-out views; `sphere`, `plane`, `panes` of it or a `height_field` over it,
+    `revolution`, `free_form`: a closed smooth surface; `surfels`."""
     tint: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
     """Known reflectance of the mirror in red, green and blue (linear): what it shows is tint · environment."""
     exposure: NonNegative = 0.0

@@ -6,6 +6,7 @@ from functools import wraps
 from typing import TypeVar
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
@@ -29,6 +30,8 @@ SPARE = 1.1
 REACH_QUANTILE = 0.95
 #: Least eigenvalue, a view, of the equations of a center.
 LEAST_SPREAD = 1e-4
+#: Gaps of up to twice so many pixels between pieces of a mask are closed, in turn.
+GAPS_PX = (1, 2, 4, 8)
 #: Where views leave the depth of the object open, it is at least this, in units of the world.
 LEAST_DEPTH = 1.0
 
@@ -157,3 +160,21 @@ def _mask_radius(camera: Camera, inside: Bool[np.ndarray, "H W"], center: Float[
     rows, columns = np.nonzero(inside)
     across = np.hypot((columns + PIXEL_CENTER - x) / camera.fx, (rows + PIXEL_CENTER - y) / camera.fy).max()
     return distance * math.sin(math.atan(across))
+
+
+@remembered
+def joined(mask: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+    """A mask without the gaps between its pieces, such as bars between panes.
+
+    It is the grey closing by a square twice as wide as joins them. A mask of one piece is returned as it is, and so is
+    one that none of the squares joins.
+    """
+    from scipy.ndimage import grey_closing, label
+
+    alpha = mask.cpu().numpy()
+    if label(alpha >= MASK_LEVEL)[1] == 1:
+        return mask
+    for gap_px in GAPS_PX:
+        if label(grey_closing(alpha, 2 * gap_px + 1) >= MASK_LEVEL)[1] == 1:
+            return torch.from_numpy(grey_closing(alpha, 4 * gap_px + 1)).to(mask)
+    return mask

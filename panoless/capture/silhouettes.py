@@ -5,14 +5,14 @@ what lies beyond it is unknown. Beyond the other borders there is no object.
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from panoless.capture.masks import MASK_LEVEL, cut_sides, remembered
+from panoless.capture.masks import MASK_LEVEL, cut_sides, joined, remembered
 from panoless.capture.rays import camera_rays, in_camera, pose_of, project
 from panoless.capture.views import TrainView, Views, concatenated
 from panoless.kernels.camera import RasterCamera
@@ -135,6 +135,14 @@ def _contours(mask: Float[Tensor, "H W"]) -> list[Float[np.ndarray, "_ 2"]]:
 
     found: list[np.ndarray] = find_contours(mask.cpu().numpy().astype(np.float64), MASK_LEVEL)
     return found
+
+
+def without_gaps(views: Views) -> Views:
+    """With masks that are `joined`, where they come in pieces."""
+    masks = [joined(view.mask) for view in views.train]
+    if all(mask is view.mask for mask, view in zip(masks, views.train, strict=True)):
+        return views
+    return replace(views, train=tuple(replace(view, mask=mask) for mask, view in zip(masks, views.train, strict=True)))
 
 
 def mask_contours(views: Views, *, longest_only: bool = True) -> MaskContours:

@@ -280,7 +280,7 @@ class Proposal:
 
     def in_surroundings(self, surroundings: Surroundings) -> "Proposal":
         """The same shape there, for a kind that knows near surroundings."""
-        return replace(self, shape=replace(self.shape, surroundings=surroundings))
+        return replace(self, shape=placed(self.shape, surroundings))
 
     @classmethod
     def of(cls, views: Views, shape: ClosedForm, unknowns: ParametricSurface) -> "Proposal":
@@ -290,6 +290,13 @@ class Proposal:
         medians = [np.median(away[rays.view == view]) for view in np.unique(rays.view)]
         overlaps = [overlap(buffers_by_hits(shape, view.camera).alpha.to(view.mask), view.mask) for view in views.train]
         return cls(shape, float(np.median(medians)), float(np.median(overlaps)))
+
+
+def placed(shape: Any, surroundings: Surroundings) -> Any:
+    """A shape in other surroundings, of its own or of the plane that it lies over."""
+    if hasattr(shape, "plane"):
+        return replace(shape, plane=placed(shape.plane, surroundings))
+    return replace(shape, surroundings=surroundings)
 
 
 Propose = Callable[[Views], Proposal | None]
@@ -306,6 +313,8 @@ class Family(Protocol):
     """With its article, as sentences name it."""
     refines: ClassVar[str | None]
     """The kind whose proposal it takes on where that one is not chosen; None: it makes its own."""
+    in_few_steps: ClassVar[bool]
+    """Whether the kind that it refines is compared with it, fitted in few steps."""
     needs_depth: ClassVar[bool]
     """Whether views have to come from different directions, which tell how far away the object is."""
     told_by_outlines: ClassVar[bool]
@@ -317,6 +326,12 @@ class Family(Protocol):
 
         Raises InputError in that case when the kind was `asked` for.
         """
+        ...
+
+    def proposed_over(
+        self, views: Views, proposal: Proposal, config: FitConfig, *, asked: bool = False
+    ) -> Proposal | None:
+        """Of a kind that refines another, the proposal that starts from the other's; None without one."""
         ...
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:

@@ -33,6 +33,7 @@ from panoless.geometry.base import (
     buffers_by_hits,
     from_plain,
     observe_views,
+    placed,
     to_plain,
 )
 from panoless.kernels.camera import RasterCamera, reflection_directions_world
@@ -83,7 +84,7 @@ class ExactGeometry:
 
     def in_surroundings(self, surroundings: Surroundings) -> Any:
         """The same surface in other surroundings."""
-        return self.with_shape(replace(self.shape, surroundings=surroundings))
+        return self.with_shape(placed(self.shape, surroundings))
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
         """See `buffers_by_hits`."""
@@ -157,10 +158,17 @@ class ExactFamily:
 
     geometry: ClassVar[type[Geometry]]
     refines: ClassVar[str | None] = None
+    in_few_steps: ClassVar[bool] = True
     needs_depth: ClassVar[bool] = True
     told_by_outlines: ClassVar[bool] = False
     by_silhouettes: ClassVar[bool] = False
     """Whether silhouettes determine the shape to the end, so that photographs do not refine it."""
+
+    def proposed_over(
+        self, views: Views, proposal: Proposal, config: FitConfig, *, asked: bool = False
+    ) -> Proposal | None:
+        """The proposal itself."""
+        return proposal
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The geometry of the shape."""

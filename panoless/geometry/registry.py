@@ -3,6 +3,7 @@
 from panoless.geometry.base import Family
 from panoless.geometry.free_form.kind import FreeFormFamily
 from panoless.geometry.height_field.kind import HeightFieldFamily
+from panoless.geometry.panes.kind import PanesFamily
 from panoless.geometry.plane.kind import PlaneFamily
 from panoless.geometry.revolution.kind import RevolutionFamily
 from panoless.geometry.sphere.kind import SphereFamily
@@ -12,6 +13,7 @@ FAMILIES: dict[str, Family] = {
     for family in (
         SphereFamily(),
         PlaneFamily(),
+        PanesFamily(),
         HeightFieldFamily(),
         RevolutionFamily(),
         FreeFormFamily(),

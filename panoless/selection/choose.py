@@ -79,7 +79,10 @@ def choose_geometry(views: Views, config: FitConfig) -> tuple[Geometry, Selectio
         if fitted and is_past_limit():
             break
         source = _source(family)
-        start = refused.get(source.kind) if family.refines else begun(source, views, config, asked=False)
+        if family.refines is None:
+            start = begun(family, views, config, asked=False)
+        else:
+            start = begun_over(family, refused.get(source.kind), views, config)
         candidate, geometry = _examine(family, start, views, config)
         table.append(candidate)
         refused[family.kind] = start if start is not None and is_near(start, views, config, bent=True) else None
@@ -185,6 +188,18 @@ def begun(source: Family, views: Views, config: FitConfig, *, asked: bool) -> St
     return _turned(source, views, first, config) or start
 
 
+@remembered()
+def begun_over(
+    family: Family, start: Start | None, views: Views, config: FitConfig, *, asked: bool = False
+) -> Start | None:
+    """What a kind that refines another starts from, by the start of that one."""
+    if start is None:
+        return None
+    posed = views if start.poses is None else start.poses.moved(views)
+    found = family.proposed_over(posed, start.proposal, config, asked=asked)
+    return None if found is None else replace(start, proposal=found)
+
+
 def _turned(source: Family, views: Views, first: Proposal, config: FitConfig) -> Start | None:
     """A proposal under cameras that are turned by silhouettes; None where it is hardly nearer to the masks."""
     poses = source.by_outlines(views, first, nuisance_kinds(config)[0], config)
@@ -222,12 +237,14 @@ def _outline_share(views: Views) -> float:
 
 
 def _bends_rather(family: Family, geometry: Geometry, start: Start | None, views: Views, config: FitConfig) -> bool:
-    """Whether a kind that refines this one explains held-out views clearly better in a far world.
+    """Whether a kind that refines this one, or the same, explains held-out views clearly better in a far world.
 
     In few steps where this one is in a far world, too. In near surroundings wholly fitted: a slight bend of a flat
     mirror shows much of what a near room shows.
     """
-    others = [other for other in FAMILIES.values() if other.refines == family.kind]
+    over = {family.kind, family.refines} - {None}
+    others = [other for other in FAMILIES.values() if other.refines in over and other.in_few_steps]
+    others = [other for other in others if other is not family]
     if held_out_parts(views) is None:
         return False
     with improving():
@@ -258,6 +275,8 @@ def _fit_asked(views: Views, config: FitConfig) -> tuple[Geometry, Selection]:
     if views.object_frame.depth_is_open and family.needs_depth:
         raise along_one_line()
     start = begun(_source(family), views, config, asked=True)
+    if family.refines is not None:
+        start = begun_over(family, start, views, config, asked=True)
     assert start is not None, "a kind that is asked for is proposed"
     fitted = fit_jointly(family, _source(family), views, start.proposal, config)
     asked_for = Candidate(

@@ -61,13 +61,17 @@ def fit_jointly(family: Family, source: Family, views: Views, start: Proposal, c
     clearly better explained than without one. `source` makes the proposals of the kind.
     """
 
+    def again(corrected: Views) -> Proposal | None:
+        found = proposed(source, corrected, config)
+        return None if found is None else family.proposed_over(corrected, found, config)
+
     def solved(around: Surroundings) -> Fitted:
         geometry, corrections, decisions = family.solve(
             views,
             start.in_surroundings(around),
             *nuisance_kinds(config),
             config,
-            lambda corrected: proposed(source, corrected, config),
+            again,
         )
         return Fitted(geometry, start, corrections, tuple(decisions))
 

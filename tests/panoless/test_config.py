@@ -205,7 +205,7 @@ def test_a_stored_value_out_of_range_is_refused() -> None:
         config_from_dict(content)
     with pytest.raises(
         InputError,
-        match=r"`model`.*one of auto, sphere, plane, height_field, revolution, free_form, surfels; found 'ball'",
+        match=r"`model`.*one of auto, sphere, plane, panes, height_field, revolution, free_form, surfels; found 'ball'",
     ):
         config_from_dict(write_record(PRESETS["default"]) | {"model": "ball"})
 
@@ -236,7 +236,7 @@ def test_the_command_line_is_derived_from_the_same_fields(capsys: pytest.Capture
     assert main(["fit", "--help-all"]) == 0
     text = capsys.readouterr().out
     for name in (
-        "--model {auto,sphere,plane,height_field,revolution,free_form,surfels}",
+        "--model {auto,sphere,plane,panes,height_field,revolution,free_form,surfels}",
         "--config.surfels.count",
         "--config.tint",
     ):

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import TypeVar, cast
 
 import torch
 
@@ -15,6 +16,7 @@ from panoless.journal import remembered
 from panoless.problem.equations import Round
 from panoless.problem.solve import FINISH, after_round
 
+Bent = TypeVar("Bent", bound=HeightField)
 CELLS = 16
 """Cells of the spline along the longer side of the boundary, to begin with."""
 START_SLOPES = (0.0, 0.2, 0.4, 0.6, -0.2, -0.4, -0.6)
@@ -68,10 +70,11 @@ def cleared(views: Views, height_field: HeightField) -> HeightField:
         return found if found is height_field else refined(views, found)
 
 
-def refined(views: Views, height_field: HeightField) -> HeightField:
-    """After the last round in which nothing else is unknown."""
+def refined(views: Views, height_field: Bent, settings: Round = LAST) -> Bent:
+    """After a round in which nothing else is unknown."""
     with torch.no_grad():
-        return after_round(views, HeightFieldUnknowns(height_field), LAST, LAST.resolution).height_field
+        found = after_round(views, HeightFieldUnknowns(height_field), settings, FINISH.resolution)
+    return cast(Bent, found.height_field)
 
 
 def _unexplained(solved: Views, tested: Views, height_field: HeightField, each: Round) -> float:

@@ -1,6 +1,6 @@
 """The height field as a kind of geometry."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -8,11 +8,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.object_frame import ObjectFrame
+from panoless.capture.silhouettes import without_gaps
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
-from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers
-from panoless.geometry.exact import ExactFamily, SeenByCenters
+from panoless.geometry.exact import SeenByCenters
 from panoless.geometry.height_field.fit import CELLS, best_dome, cleared, refined
 from panoless.geometry.height_field.model import (
     HeightField,
@@ -21,6 +21,7 @@ from panoless.geometry.height_field.model import (
     visible_reflections,
 )
 from panoless.geometry.height_field.unknowns import STIFF, HeightFieldUnknowns
+from panoless.geometry.plane.kind import WithinOneBoundary
 from panoless.kernels.camera import RasterCamera
 from shinypartial.core.errors import InputError
 
@@ -31,16 +32,6 @@ class HeightFieldMirror(SeenByCenters):
 
     kind: ClassVar[str] = "height_field"
     height_field: HeightField
-
-    @property
-    def surroundings(self) -> Surroundings:
-        """Those of the plane below it."""
-        return self.height_field.plane.surroundings
-
-    def in_surroundings(self, surroundings: Surroundings) -> "HeightFieldMirror":
-        """The same heights there."""
-        plane = replace(self.height_field.plane, surroundings=surroundings)
-        return replace(self, height_field=replace(self.height_field, plane=plane))
 
     def seen(self, view: TrainView, pixels: Int[Tensor, "P"]) -> tuple[Int[Tensor, "Q"], Float[Tensor, "Q 3"]]:
         """Those of the pixels whose reflected rays pass the frame."""
@@ -57,7 +48,7 @@ class HeightFieldMirror(SeenByCenters):
         return Mesh.smooth(frame.to_world(points), faces, self.height_field.normals_at(points))
 
 
-class HeightFieldFamily(ExactFamily):
+class HeightFieldFamily(WithinOneBoundary):
     """Heights over a plane that explains the silhouettes, but not what it mirrors."""
 
     kind: ClassVar[str] = "height_field"
@@ -95,7 +86,7 @@ class HeightFieldFamily(ExactFamily):
 
     def refitted(self, views: Views, fitted: HeightFieldMirror, config: FitConfig) -> Geometry:
         """Heights, plane and boundary after one more round."""
-        return fitted.with_shape(refined(views, fitted.height_field))
+        return fitted.with_shape(refined(without_gaps(views), fitted.height_field))
 
     def finished(self, views: Views, solved: HeightFieldMirror, config: FitConfig) -> HeightFieldMirror:
         """With the height that reflected rays have to pass at the rim."""

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from panoless.capture.rays import pixel_rays, pose_of, reflect
 from panoless.capture.views import TrainView
+from panoless.environment.surroundings import Surroundings
 from panoless.geometry.base import SurfaceBuffers, buffers_from_arrays
 from panoless.geometry.plane.model import Plane
 from panoless.kernels.camera import RasterCamera
@@ -74,6 +75,11 @@ class HeightField:
     rim is higher than outlines tell.
     """
 
+    @property
+    def surroundings(self) -> Surroundings:
+        """What the plane stands in."""
+        return self.plane.surroundings
+
     def taken_back(self, common: Similarity) -> "HeightField":
         """As it is in the world from which a motion was taken back."""
         plane = self.plane.taken_back(common)
@@ -118,6 +124,22 @@ class HeightField:
         """h, h_u, h_v, h_uu, h_uv and h_vv at plane coordinates, or h and the slopes, or h alone."""
         index, weights = self.basis(places, derivatives)
         return (weights * self.coefficients.ravel()[index]).sum(2)
+
+    def edge_basis(
+        self, side: Int[np.ndarray, "P"], along: Float[np.ndarray, "P"]
+    ) -> tuple[Int[np.ndarray, "P C"], Float[np.ndarray, "P C"]]:
+        """Which coefficients act on the height of the mirror's edge over places on sides of the boundary, and by how
+        much. The edge is straight between vertices.
+        """
+        index, basis = self.basis(self.plane.boundary, 0)
+        ends = np.stack([side, (side + 1) % len(self.plane.boundary)], 1)
+        weights = np.stack([1 - along, along], 1)[:, :, None] * basis[0][ends]
+        shape = len(side), 2 * index.shape[1]
+        return index[ends].reshape(shape), weights.reshape(shape)
+
+    def joint_distance(self, places: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P"]:
+        """From the nearest line across which the surface jumps: infinite."""
+        return np.full(len(places), np.inf)
 
     def with_halved_cells(self) -> "HeightField":
         """The same surface with twice as many cells along either side."""
@@ -217,6 +239,9 @@ def visible_reflections(
     directions_local = directions @ height_field.frame.T
     outgoing = reflect(directions_local, hits.normals)
     kept = hits.met & (outgoing[:, 2] > 0)
+    stretch = np.linalg.norm(directions_local, axis=1) / np.maximum(-directions_local[:, 2], 1e-9)
+    pixel_along = np.where(kept, hits.distance, 0.0) * stretch / view.camera.fx
+    kept &= height_field.joint_distance(hits.places) > clear_px * pixel_along
     if passed_height > 0:
         distance = np.where(kept, hits.distance, 0.0)
         height = origins @ plane.normal - plane.offset + distance * directions_local[:, 2]
@@ -235,8 +260,8 @@ def visible_reflections(
 
 
 def height_field_buffers(height_field: HeightField, camera: RasterCamera) -> SurfaceBuffers:
-    """What a camera sees of a height field: alpha is the area of each pixel within the mirror's edge and the frame,
-    depth and normal those of the ray through its center.
+    """What a camera sees of a height field: alpha is the area of each pixel within the mirror's edge and the frame
+    and beside bars, depth and normal those of the ray through its center.
     """
     shape, plane, (rotation, center) = (camera.height, camera.width), height_field.plane, pose_of(camera)
     alpha = np.zeros(shape)
@@ -246,6 +271,8 @@ def height_field_buffers(height_field: HeightField, camera: RasterCamera) -> Sur
         if 0 < plane.frame_height < height_above:
             frame = plane.points(plane.boundary) + plane.frame_height * plane.normal
             alpha = np.minimum(alpha, projected_coverage((frame - center) @ rotation.T, camera))
+        for bar in plane.bars:
+            alpha = np.maximum(alpha - projected_coverage((plane.points(bar) - center) @ rotation.T, camera), 0.0)
     pixels = np.flatnonzero(alpha)
     hits = height_field.hits(*pixel_rays(camera, pixels))
     alpha.ravel()[pixels[~hits.met]] = 0

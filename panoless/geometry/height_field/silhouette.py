@@ -7,6 +7,7 @@ from either side. A frame in front of it is flat and says how the plane of the f
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from panoless.capture.silhouettes import MaskContours
 from panoless.geometry.height_field.model import HeightField
@@ -19,8 +20,13 @@ if TYPE_CHECKING:
 
 def edge_residuals(contours: MaskContours, height_field: HeightField) -> BoundaryResiduals:
     """Distances of the contours from the mirror's edge or its frame, whichever hides the other."""
-    plane = height_field.plane
-    return boundary_residuals(contours, plane, height_field.heights(plane.boundary, 0)[0])
+
+    def heights(side: Int[np.ndarray, "P"], along: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
+        index, weights = height_field.edge_basis(side, along)
+        found: np.ndarray = (weights * height_field.coefficients.ravel()[index]).sum(1)
+        return found
+
+    return boundary_residuals(contours, height_field.plane, heights)
 
 
 def edge_jacobian(residuals: BoundaryResiduals, height_field: HeightField) -> "csr_matrix":
@@ -31,13 +37,7 @@ def edge_jacobian(residuals: BoundaryResiduals, height_field: HeightField) -> "c
     from scipy import sparse
 
     boundary, framed = height_field.plane.boundary, height_field.plane.frame_height > 0
-    index, basis = height_field.basis(boundary, 0)
-    ends = residuals.ends(len(boundary))
-    shares = residuals.by_height[:, None] * np.stack([1 - residuals.along, residuals.along], 1)
-    by_height = jacobian_of_rows(
-        (shares[:, :, None] * basis[0][ends]).reshape(-1, 32),
-        index[ends].reshape(-1, 32),
-        height_field.coefficients.size,
-    )
+    index, weights = height_field.edge_basis(residuals.side, residuals.along)
+    by_height = jacobian_of_rows(residuals.by_height[:, None] * weights, index, height_field.coefficients.size)
     known = sparse.diags(np.append([framed, framed, 0.0, framed], np.ones(boundary.size)))
     return sparse.hstack([boundary_jacobian(residuals, len(boundary)) @ known, by_height]).tocsr()

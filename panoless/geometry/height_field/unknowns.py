@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from panoless.environment.surroundings import Surroundings
 from panoless.geometry.height_field.model import HeightField
 from panoless.geometry.height_field.silhouette import edge_jacobian, edge_residuals
 from panoless.geometry.plane.model import passes_frame
@@ -46,11 +45,6 @@ class HeightFieldUnknowns(ParametricSurface):
         return self.height_field
 
     @property
-    def surroundings(self) -> Surroundings:
-        """Of the plane."""
-        return self.height_field.plane.surroundings
-
-    @property
     def first(self) -> int:
         """The number of the first coefficient."""
         return 4 + self.height_field.plane.boundary.size
@@ -84,6 +78,7 @@ class HeightFieldUnknowns(ParametricSurface):
         height = max(plane.frame_height, field.clearance)
         met = met & (facing < -LEAST_COSINE)
         met &= passes_frame(plane, points, outgoing, height, distance * rays.size)
+        met &= field.joint_distance(found.places) > distance * rays.size / np.maximum(-directions[:, 2], LEAST_COSINE)
         index, basis = field.basis(found.places)
         _, _, _, h_uu, h_uv, h_vv = (basis * field.coefficients.ravel()[index]).sum(2)
         second = np.stack([h_uu, h_uv, h_uv, h_vv], 1).reshape(-1, 2, 2)

@@ -163,7 +163,7 @@ def _starts(views: Views) -> list[Plane]:
     # The mean view direction joins the lattice: with few cameras it can be the only one that all of them face.
     directions = np.concatenate([centers.mean(0, keepdims=True), fibonacci_directions(START_DIRECTIONS)])
     facing = (directions @ centers.T > START_COSINE).sum(1)
-    voters = _spread(views.train, START_VIEWS)
+    voters = spread(views.train, START_VIEWS)
     planes = [_plane(n, offset) for n in directions[facing == facing.max()] for offset in START_OFFSETS]
     planes.sort(key=lambda plane: -_agreement(plane, voters))
     return planes[:STARTS]
@@ -176,19 +176,20 @@ def _plane(direction: Float[np.ndarray, "3"], offset: float) -> Plane:
     return Plane(normal, offset, tangent_u, np.cross(normal, tangent_u), np.zeros((0, 2)))
 
 
-def _spread(views: Sequence[TrainView], count: int) -> Sequence[TrainView]:
+def spread(views: Sequence[TrainView], count: int) -> Sequence[TrainView]:
+    """About so many of the views, evenly."""
     return views[:: max(1, len(views) // count)]
 
 
 def _agreement(plane: Plane, voters: Sequence[TrainView]) -> float:
     """Mean intersection over union, on the plane, of each mask with the majority of all."""
     line = np.linspace(-START_HALF_SIDE, START_HALF_SIDE, START_GRID)
-    votes = _votes(plane, line, line, voters).reshape(len(voters), -1) > 0.5
+    votes = votes_on(plane, line, line, voters).reshape(len(voters), -1) > 0.5
     majority = votes.mean(0) > 0.5
     return float(((votes & majority).sum(1) / np.maximum((votes | majority).sum(1), 1)).mean())
 
 
-def _votes(
+def votes_on(
     plane: Plane, u: Float[np.ndarray, "A"], v: Float[np.ndarray, "B"], voters: Sequence[TrainView]
 ) -> Float[np.ndarray, "V A B"]:
     """Each mask at the grid points of the plane; zero outside a picture and behind a camera."""
@@ -221,7 +222,7 @@ def _vote_boundary(
     low, high = np.percentile(coordinates[valid], (2, 98), axis=0) if valid.any() else (-np.ones(2), np.ones(2))
     low, high = (low - 0.1 * (high - low), high + 0.1 * (high - low)) if (high > low).all() else (low - 1, high + 1)
     u, v = (np.linspace(low[axis], high[axis], settings.grid) for axis in (0, 1))
-    votes = _votes(plane, u, v, _spread(views.train, VOTING_VIEWS)).mean(0)
+    votes = votes_on(plane, u, v, spread(views.train, VOTING_VIEWS)).mean(0)
     votes[[0, -1]], votes[:, [0, -1]] = 0, 0
     curves = find_contours(votes, settings.level * votes.max()) if votes.max() > 0 else []
     if not curves:

@@ -44,6 +44,11 @@ class Plane:
         """How many numbers it is made of: normal and offset; the boundary's vertices; the frame."""
         return 3 + self.boundary.size + (self.frame_height > 0)
 
+    @property
+    def bars(self) -> list[Float[np.ndarray, "4 2"]]:
+        """Corners of the bars that hide parts of the mirror: none."""
+        return []
+
     def taken_back(self, common: Similarity) -> "Plane":
         """As it is in the world from which a motion was taken back."""
         origin = common.undone(self.offset * self.normal[None])[0]

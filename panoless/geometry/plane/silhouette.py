@@ -2,6 +2,7 @@
 and the boundary's vertices.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -90,7 +91,7 @@ def back_project(contours: MaskContours, plane: Plane) -> tuple[Float[np.ndarray
 def boundary_residuals(
     contours: MaskContours,
     plane: Plane,
-    heights: Float[np.ndarray, "N"] | None = None,
+    heights: Callable[[Int[np.ndarray, "P"], Float[np.ndarray, "P"]], Float[np.ndarray, "P"]] | None = None,
 ) -> BoundaryResiduals:
     """First-order pixel distances: the plane distance from a side times |det J|/‖J τ‖, J = ∂pixel/∂coordinates.
 
@@ -98,7 +99,7 @@ def boundary_residuals(
     along its ray r. What stands at height z over a side is seen (ν·v) z/(H − z) inside of it, ν the outward normal,
     v = camera − side and H = n·v. The same turn and shift change ν·v by −H ν·(a, b) and H by
     a (v₁ + p₁) + b (v₂ + p₂) − c. What stands there is the frame where the camera stands beyond the side, and elsewhere
-    the edge of the mirror itself, at height zero unless vertices have `heights`, between which it is straight.
+    the edge of the mirror itself, at the `heights` over sides and places on them, or at zero.
     """
     coordinates, valid = back_project(contours, plane)
     corners, tangent_u, tangent_v = plane.boundary, plane.tangent_u, plane.tangent_v
@@ -119,8 +120,7 @@ def boundary_residuals(
     foot = corners[side] + along[:, None] * sides[side]
     camera = np.stack([contours.centers @ tangent_u, contours.centers @ tangent_v], 1)
     beyond = (outward * (camera - foot)).sum(1)
-    lifted = np.zeros(len(corners)) if heights is None else heights
-    own_height = (1 - along) * lifted[side] + along * np.roll(lifted, -1)[side]
+    own_height = np.zeros(len(side)) if heights is None else heights(side, along)
     framed = plane.frame_height > 0 or heights is None
     by_frame = (beyond > 0) & (own_height <= plane.frame_height) & framed
     level = np.where(by_frame, plane.frame_height, own_height)
@@ -190,4 +190,12 @@ def apply_plane_step(plane: Plane, step: Float[np.ndarray, "D"]) -> Plane:
     boundary = np.stack([points @ tangent_u, points @ tangent_v], 1)
     frame_height = max(plane.frame_height + float(step[3]), 0.0)
     offset = float((plane.offset + step[2]) / length)
-    return Plane(normal, offset, tangent_u, tangent_v, boundary, frame_height, plane.surroundings)
+    return replace(
+        plane,
+        normal=normal,
+        offset=offset,
+        tangent_u=tangent_u,
+        tangent_v=tangent_v,
+        boundary=boundary,
+        frame_height=frame_height,
+    )

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from panoless.geometry.height_field.model import flat_height_field
 from panoless.geometry.height_field.unknowns import HeightFieldUnknowns
+from panoless.geometry.panes.model import CutPlane, flat_panes
 from panoless.geometry.plane.model import Plane
 from panoless.geometry.plane.unknowns import PlaneUnknowns
 from panoless.geometry.revolution.model import SurfaceOfRevolution, closed_profile
@@ -44,6 +45,14 @@ def bent(frame_height: float = 0.0) -> ParametricSurface:
     return HeightFieldUnknowns(replace(flat, coefficients=flat.coefficients + waves))
 
 
+def cut() -> ParametricSurface:
+    """That pentagon in 3 × 2 panes, each with slopes and bends."""
+    plane = CutPlane(**vars(pane()), cuts_u=np.array([-0.7, -0.2, 0.3, 0.7]), cuts_v=np.array([-0.5, 0.1, 0.6]))
+    flat = flat_panes(plane)
+    heights = 0.002 * np.random.default_rng(0).normal(size=flat.coefficients.shape)
+    return HeightFieldUnknowns(replace(flat, coefficients=heights))
+
+
 def vase() -> ParametricSurface:
     """A smooth profile around a tilted axis."""
     height = np.linspace(-0.7, 0.7, 300)
@@ -60,11 +69,12 @@ SURFACES: dict[str, Callable[[], ParametricSurface]] = {
     "plane": lambda: PlaneUnknowns(pane()),
     "framed plane": lambda: PlaneUnknowns(pane(0.1)),
     "height field": bent,
+    "panes": cut,
     "revolution": vase,
 }
-OPEN = {"plane": slice(3, 4), "height field": slice(4)}
+OPEN = {"plane": slice(3, 4), "height field": slice(4), "panes": slice(4)}
 """Numbers that silhouettes leave open: the height of a frame that there is not, and what coefficients do as well."""
-PHOTOGRAPHS_LEAVE = {"plane": None, "framed plane": None, "height field": 4}
+PHOTOGRAPHS_LEAVE = {"plane": None, "framed plane": None, "height field": 4, "panes": 4}
 """So many of the first numbers photographs do not determine, or all."""
 
 
