@@ -40,15 +40,16 @@ from panoless.selection.held_out import held_out_parts, is_clearly_lower
 
 RAYS = 100_000
 """About so many pixels of all views determine an even reflectance, and whether places differ."""
-RESOLUTION = 64
-"""Most texels along a face side of the maps under which reflectances are judged."""
+RESOLUTION, FIELD_JUDGED = 32, 64
+"""Most texels along a face side of the maps under which even reflectances and places are judged. Where few rays fall into
+a texel, a scattered share explains noise: it draws what is predicted toward the mean."""
 LARGEST_REFLECTANCE = 0.97
 """Of the channel that is mirrored least, above which held-out views do not decide."""
 LEAST_GAIN = 0.02
 """Share by which a reflectance has to lower the held-out error."""
 LEAST_ALBEDO = 0.02
 """Share of scattered light, in the channel that has most of it, from which held-out views decide."""
-LEAST_SCATTERING_GAIN = 0.1
+LEAST_SCATTERING_GAIN = 0.07
 """Share by which scattered light has to lower the held-out error."""
 LEAST_SCATTERING_ERROR = 0.05
 """Held-out error of a fit from which the shape is looked for again without scattered light, where there is some."""
@@ -114,7 +115,7 @@ def earned_reflectance(views: Views, geometry: Geometry, config: FitConfig) -> R
 
 def _differs(views: Views, geometry: Geometry, even: Reflectance, config: FitConfig) -> bool:
     """Whether places that differ explain held-out views clearly better than an even reflectance."""
-    parts, resolution = held_out_parts(views), config.environment.trial_resolution(FIELD_RESOLUTION)
+    parts, resolution = held_out_parts(views), config.environment.trial_resolution(FIELD_JUDGED)
     if parts is None:
         return False
     known, tested = (SeenSurface.of(part, geometry, encoding_of(config).saturation, RAYS) for part in parts)

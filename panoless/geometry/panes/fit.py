@@ -9,6 +9,8 @@ from shinypartial.io.progress import Progress
 
 REACH = 0.1
 """Joints move by at most this share of the narrowest pane between rounds."""
+FINER = 2
+"""The round from which heights have two degrees more."""
 ROUNDS = (
     Round(64, 0.15, 120_000, 4),
     Round(128, 0.1, 120_000, 3),
@@ -22,6 +24,8 @@ def fit_panes(views: Views, panes: Panes) -> Panes:
     """Heights and joints that explain silhouettes and photographs best, from a start that is near."""
     progress = Progress("fitting panes", len(ROUNDS))
     for each in ROUNDS:
+        if each is ROUNDS[FINER]:
+            panes = panes.with_halved_cells()
         panes = located(views, refined(views, panes, each), each, REACH * panes.narrowest)
         progress.advance()
     return panes
