@@ -41,8 +41,8 @@ from panoless.selection.held_out import held_out_parts, is_clearly_lower
 RAYS = 100_000
 """About so many pixels of all views determine an even reflectance, and whether places differ."""
 RESOLUTION, FIELD_JUDGED = 32, 64
-"""Most texels along a face side of the maps under which even reflectances and places are judged. Where few rays fall into
-a texel, a scattered share explains noise: it draws what is predicted toward the mean."""
+"""Most texels along a face side of the maps under which even reflectances and places are judged. Where few rays fall
+into a texel, a scattered share explains noise: it draws what is predicted toward the mean."""
 LARGEST_REFLECTANCE = 0.97
 """Of the channel that is mirrored least, above which held-out views do not decide."""
 LEAST_GAIN = 0.02
