@@ -82,9 +82,9 @@ def ball_normals(view: Float[np.ndarray, "3"]) -> Float[np.ndarray, "P 3"]:
     line = (np.arange(BALL_PX) + 0.5) / BALL_PX * 2 - 1
     right, up = np.meshgrid(line, line)
     inside: Bool[np.ndarray, "S S"] = right**2 + up**2 < 1
-    across = np.stack([right[inside], up[inside]], 1)
-    toward = np.sqrt(1 - (across**2).sum(1, keepdims=True))
-    normals: np.ndarray = across @ np.stack(tangents(view)) - toward * view
+    right, up = right[inside, None], up[inside, None]
+    first, second = tangents(view)
+    normals: np.ndarray = right * first + up * second - np.sqrt(1 - right**2 - up**2) * view
     return normals
 
 
