@@ -12,6 +12,7 @@ from shinypartial.core.mesh import Mesh
 from shinypartial.scene import (
     Blob,
     Frame,
+    Panes,
     Part,
     Plane,
     RadialHarmonics,
@@ -26,6 +27,8 @@ from shinypartial.scene import (
 
 #: Squares per side of a plane that is to be deformed: bumps of a tenth of its width take 25 of them.
 DEFORMED_PLANE_DIVISIONS = 256
+#: Squares per side of a pane.
+PANE_DIVISIONS = 16
 
 
 def make_part(part: Part, *, fine: bool = False) -> Mesh:
@@ -37,6 +40,8 @@ def make_mesh(shape: Shape, *, fine: bool = False) -> Mesh:
     """Mesh of any shape that a recipe may name; `fine` divides flat faces too, so that they can be deformed."""
     if isinstance(shape, Plane):
         return _plane(shape, DEFORMED_PLANE_DIVISIONS if fine else 1)
+    if isinstance(shape, Panes):
+        return _panes(shape)
     if isinstance(shape, Frame):
         return _frame(shape)
     if isinstance(shape, Tube):
@@ -144,6 +149,25 @@ def _plane(plane: Plane, divisions: int) -> Mesh:
     vertices = np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3) @ axes
     faces = grid_faces(divisions + 1, divisions + 1)
     return Mesh(vertices, np.tile(axes[2], (len(vertices), 1)), faces)
+
+
+def _panes(panes: Panes) -> Mesh:
+    """Over each pane h(x, y) = a x + b y + s (1 − x²/X² − y²/Y²), with the half sides X and Y; normals (−∇h, 1)."""
+    axes, random, pieces = _upright_axes(panes.normal), np.random.default_rng(panes.seed), list[Mesh]()
+    size, count = np.array(panes.size), np.array(panes.count)
+    half = (size / count - panes.gap) / 2
+    x, y = (each.ravel() for each in np.meshgrid(*(side * np.linspace(-1, 1, PANE_DIVISIONS + 1) for side in half)))
+    for column, row in np.ndindex(*panes.count):
+        middle = ((np.array([column, row]) + 0.5) / count - 0.5) * size
+        a, b = np.tan(np.radians(random.uniform(-panes.tilt_deg, panes.tilt_deg, 2)))
+        rise = panes.bulge * random.choice([-1.0, 1.0])
+        height = a * x + b * y + rise * (1 - (x / half[0]) ** 2 - (y / half[1]) ** 2)
+        slopes = a - 2 * rise * x / half[0] ** 2, b - 2 * rise * y / half[1] ** 2
+        normals = np.stack([-slopes[0], -slopes[1], np.ones_like(x)], 1)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        vertices = np.stack([middle[0] + x, middle[1] + y, height], 1)
+        pieces.append(Mesh(vertices @ axes, normals @ axes, grid_faces(PANE_DIVISIONS + 1, PANE_DIVISIONS + 1)))
+    return joined(pieces)
 
 
 def _frame(frame: Frame) -> Mesh:

@@ -8,7 +8,17 @@ import numpy as np
 
 from shinypartial.core.errors import InputError
 from shinypartial.core.trajectory import path_offsets
-from shinypartial.scene.shapes import Assembly, BlendFile, Frame, Part, Plane, SoftBalls, SurfaceOfRevolution, Tube
+from shinypartial.scene.shapes import (
+    Assembly,
+    BlendFile,
+    Frame,
+    Panes,
+    Part,
+    Plane,
+    SoftBalls,
+    SurfaceOfRevolution,
+    Tube,
+)
 from shinypartial.scene.spec import Operator, SceneSpec, World
 
 
@@ -95,13 +105,21 @@ def _check_object(spec: SceneSpec, place: Place) -> None:
         raise place.below("material").error("a material, unless the object comes from a Blender file", "none")
 
 
+def _check_gap(panes: Panes, place: Place) -> None:
+    narrowest = min(side / number for side, number in zip(panes.size, panes.count, strict=True))
+    if panes.gap >= narrowest:
+        raise place.error(f"a gap below the width of a pane, {narrowest:g}", f"{panes.gap:g}")
+
+
 def _check_parts(parts: tuple[Part, ...], place: Place, numbered: bool = True) -> None:
     for i, part in enumerate(parts):
         at = place.below(str(i)).below("shape") if numbered else place
         if isinstance(part.shape, SurfaceOfRevolution):
             _check_profile(part.shape, at)
-        if isinstance(part.shape, Plane | Frame) and math.hypot(*part.shape.normal) < 1e-6:
+        if isinstance(part.shape, Plane | Panes | Frame) and math.hypot(*part.shape.normal) < 1e-6:
             raise at.below("normal").error("a direction", "a vector of length zero")
+        if isinstance(part.shape, Panes):
+            _check_gap(part.shape, at.below("gap"))
         if isinstance(part.shape, Frame):
             _check_distinct(part.shape.profile, 2, at.below("profile"))
         if isinstance(part.shape, SoftBalls):

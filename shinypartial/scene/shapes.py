@@ -76,6 +76,33 @@ class Plane:
 
 
 @dataclass(frozen=True)
+class Panes:
+    """Panes side by side in a rectangle about the origin, each tilted by chance and bulged as a paraboloid."""
+
+    kind: str = "panes"
+    size: tuple[Length, Length] = (1.6, 1.2)
+    """Width (horizontal) and height of the rectangle."""
+    normal: tuple[Component, Component, Component] = (0.0, -1.0, 0.0)
+    """Direction that the front faces; need not be unit."""
+    count: tuple[Annotated[int, limits(1, 100)], Annotated[int, limits(1, 100)]] = (4, 3)
+    """Panes along width and height."""
+    gap: Annotated[float, limits(0.0, 1e3)] = 0.0
+    """Width of the bars that are left free between panes."""
+    tilt_deg: Annotated[float, limits(0.0, 30.0)] = 0.5
+    """Largest tilt about either side, drawn evenly from both signs."""
+    bulge: Annotated[float, limits(0.0, 1.0)] = 0.004
+    """How far the middle of a pane stands out over the middles of its sides."""
+    seed: Seed = 0
+    """Of the tilts, and of which panes bulge inward."""
+
+    @property
+    def extent(self) -> float:
+        """Half the diagonal, and what tilts and bulges add to it at most."""
+        largest = max(side / number for side, number in zip(self.size, self.count, strict=True))
+        return math.hypot(*self.size) / 2 + self.bulge + largest * math.tan(math.radians(self.tilt_deg))
+
+
+@dataclass(frozen=True)
 class Frame:
     """A molding with flat faces around a rectangle about the origin, with mitered corners."""
 
@@ -247,7 +274,19 @@ class SoftBalls:
         return self.radius
 
 
-Shape = SurfaceOfRevolution | Sphere | Plane | Frame | Tube | Blob | RadialHarmonics | Superquadric | Ring | SoftBalls
+Shape = (
+    SurfaceOfRevolution
+    | Sphere
+    | Plane
+    | Panes
+    | Frame
+    | Tube
+    | Blob
+    | RadialHarmonics
+    | Superquadric
+    | Ring
+    | SoftBalls
+)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from shinypartial.scene import (
     Blob,
     Deformation,
     Frame,
+    Panes,
     Part,
     Plane,
     RadialHarmonics,
@@ -287,3 +288,28 @@ def test_a_plane_has_its_size_and_a_level_side() -> None:
     sides = np.diff(mesh.vertices[list(mesh.faces[0])], axis=0)
     np.testing.assert_allclose(np.linalg.norm(sides, axis=-1), [2, 3, 2])
     assert sides[0, 2] == pytest.approx(0)
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.02])
+def test_panes_are_tilted_within_bounds_and_bulge_alike(gap: float) -> None:
+    """Least squares over the vertices of each pane: slopes, curvature and place; normals are those of the faces."""
+    panes = Panes(size=(1.6, 1.2), count=(4, 3), gap=gap, tilt_deg=0.5, bulge=0.002, seed=5)
+    mesh = make_mesh(panes)
+    slopes = []
+    for points, normals in zip(np.split(mesh.vertices, 12), np.split(mesh.normals, 12), strict=True):
+        x, z, out = points[:, 0], points[:, 2], -points[:, 1]
+        half = np.ptp(x) / 2, np.ptp(z) / 2
+        assert half == pytest.approx(((0.4 - gap) / 2, (0.4 - gap) / 2), rel=1e-6)
+        u, v = x - (x.max() + x.min()) / 2, z - (z.max() + z.min()) / 2
+        terms = np.stack([np.ones_like(u), u, v, (u / half[0]) ** 2, (v / half[1]) ** 2], 1)
+        found, left, *_ = np.linalg.lstsq(terms, out, rcond=None)
+        assert left.sum() < 1e-12
+        assert abs(found[3]) == pytest.approx(0.002, rel=1e-6)
+        assert found[4] == pytest.approx(found[3], rel=1e-6)
+        slopes.append(np.degrees(np.arctan(found[1:3])))
+        expected = np.stack(
+            [-found[1] - 2 * found[3] * u / half[0] ** 2, -found[2] - 2 * found[4] * v / half[1] ** 2], 1
+        )
+        np.testing.assert_allclose(normals[:, [0, 2]] / -normals[:, 1:2], expected, atol=1e-7)
+    assert np.abs(slopes).max() <= 0.5
+    assert np.std(slopes) > 0.2
