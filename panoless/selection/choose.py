@@ -80,9 +80,10 @@ def choose_geometry(views: Views, config: FitConfig) -> tuple[Geometry, Selectio
             break
         source = _source(family)
         if family.refines is None:
-            start = begun(family, views, config, asked=False)
+            before = start = begun(family, views, config, asked=False)
         else:
-            start = begun_over(family, refused.get(source.kind), views, config)
+            before = refused.get(source.kind)
+            start = begun_over(family, before, views, config)
         candidate, geometry = _examine(family, start, views, config)
         table.append(candidate)
         refused[family.kind] = start if start is not None and is_near(start, views, config, bent=True) else None
@@ -92,7 +93,7 @@ def choose_geometry(views: Views, config: FitConfig) -> tuple[Geometry, Selectio
             return _chosen(candidate, geometry, table)
         explains = candidate.verdict == Verdict.CHOSEN
         corrected = candidate.corrections.applied(views, config)
-        if explains and _bends_rather(family, geometry, start, corrected, config):
+        if explains and _bends_rather(family, geometry, before, corrected, config):
             table[-1] = candidate = replace(candidate, verdict=Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason=BENT)
             explains = False
         fitted.append((candidate, geometry))

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ from shinypartial.core.errors import InputError
 from shinypartial.dataset.perturb.masks import wobbling
 from shinypartial.dataset.schema import Dataset
 from tests.support.few_rounds import take_few_rounds
+from tests.support.mirror_panes import grid_of, panes_views
 from tests.support.mirror_plane import NORMAL, RECTANGLE, arc, make_plane_dataset, plane_of, reflecting_views
 from tests.support.mirror_revolution import around, goblet, pillar_views, revolution_views
 from tests.support.mirror_sphere import tiny_config
@@ -270,3 +272,14 @@ def test_a_plane_has_a_solved_map_whatever_the_preset(tmp_path: Path, plane_data
     assert 0.05 < float(state.environment.permute(0, 2, 3, 1)[seen].mean()) < 0.95
     again = fit(plane_dataset, config, tmp_path / "run", SnapshotSchedule(iterations=frozenset({2})))
     assert again.geometry.kind == "plane"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["off", "on"])
+def test_panes_are_compared_with_a_bent_mirror_in_any_surroundings(mode: Literal["off", "on"]) -> None:
+    """In near surroundings the bent mirror starts from the plane, too."""
+    config = replace(CONFIG, surroundings=replace(CONFIG.surroundings, mode=mode))
+    views = panes_views(grid_of(plane_of(RECTANGLE), 3, 2), arc(16, size=96))
+    geometry, selection = choose_geometry(views, config)
+    assert geometry.kind == "panes"
+    assert verdicts(selection)["plane"] != Verdict.CHOSEN
