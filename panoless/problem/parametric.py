@@ -98,6 +98,11 @@ class ParametricSurface(Protocol):
         """Orthonormal changes that photographs under a coarse map do not determine; None where there are none."""
         return None
 
+    @property
+    def walls_error(self) -> float:
+        """Standard deviation of 1/D of walls (inverse radii) that errors of its bend amount to: none."""
+        return 0.0
+
     def hits(self, rays: PixelRays) -> MirrorHits:
         """Where rays meet it."""
         ...

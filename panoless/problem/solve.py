@@ -21,7 +21,7 @@ from panoless.capture.views import Views
 from panoless.deadline import improving, is_past_limit
 from panoless.environment.surroundings import FAR, Surroundings
 from panoless.journal import remembered
-from panoless.problem.blocks import Block, CameraPoses, Distortion
+from panoless.problem.blocks import Block, CameraPoses, Distortion, Walls
 from panoless.problem.equations import Data, Equations, Round, State
 from panoless.problem.evidence import Decision, needed
 from panoless.problem.nuisance import NO_NUISANCE, Nuisance, nuisance_of
@@ -128,6 +128,8 @@ def solve(
         state = state.without_common(cameras)
         data = Data.of(views, settings, FINISH.resolution, state.nuisance.free)
         covariances = Equations.at(data, state).covariances()
+        if Walls.name in covariances:
+            covariances[Walls.name] += state.surface.walls_error**2 * np.eye(len(covariances[Walls.name]))
         known = {
             each.name: np.diag(covariances[each.name]).reshape(each.values.shape) for each in state.nuisance.blocks
         }

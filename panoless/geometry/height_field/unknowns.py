@@ -30,6 +30,9 @@ from shinypartial.core.camera import Similarity
 BENDING, STIFF = 1e-4, 1e-2
 """Weights of the bending energy beside photographs, and of silhouettes alone."""
 
+WALLS_ERROR = 0.01
+"""Of 1/D (inverse radii): walls at D radii bend mirrored rays as a dome does that is steeper by 1/2D at a radius."""
+
 
 @dataclass(frozen=True)
 class HeightFieldUnknowns(ParametricSurface):
@@ -64,6 +67,11 @@ class HeightFieldUnknowns(ParametricSurface):
         """A shift and the tilts of the whole."""
         tilts = self.height_field.tilts()
         return np.concatenate([np.zeros((self.first, tilts.shape[1])), tilts])
+
+    @property
+    def walls_error(self) -> float:
+        """A dome over a plane shows what near walls show."""
+        return WALLS_ERROR
 
     def hits(self, rays: PixelRays) -> MirrorHits:
         """Where rays meet the front and their reflections pass the rim."""
