@@ -37,7 +37,7 @@ LEAST_FLOOR_GAIN = 0.02
 JUDGED_RAYS = 400_000
 """About so many pixels of all views tell whether a fit in near surroundings explains more than a far one."""
 JUDGED_RESOLUTION = 64
-"""Texels along a face side of the map that predicts held-out views."""
+"""Texels along a face side of the map that predicts held-out views, and under which a floor is compared."""
 
 NEARER = 1e-2
 """By which 1/D is changed to tell where a ray leaves the object; not tuned."""
