@@ -30,7 +30,7 @@ from shinypartial.core.camera import Similarity
 BENDING, STIFF = 1e-4, 1e-2
 """Weights of the bending energy beside photographs, and of silhouettes alone."""
 
-WALLS_ERROR = 0.01
+WALLS_ERROR = 0.015
 """Of 1/D (inverse radii): walls at D radii bend mirrored rays as a dome does that is steeper by 1/2D at a radius."""
 
 
