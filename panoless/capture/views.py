@@ -208,6 +208,14 @@ def split_held_out(views: Sequence[Item]) -> tuple[list[Item], list[Item]]:
     return [view for i, view in enumerate(views) if i % HELD_OUT_EVERY != phase], list(views[phase::HELD_OUT_EVERY])
 
 
+def held_out_parts(views: Views) -> tuple[Views, Views] | None:
+    """Four fifths of the views, and the others; None where there are too few."""
+    kept, held_out = split_held_out(views.train)
+    if not kept or not held_out:
+        return None
+    return replace(views, train=tuple(kept)), replace(views, train=tuple(held_out))
+
+
 def every_kth_pixel(views: Views, most: int) -> Iterator[tuple[TrainView, Int[Tensor, "P"]]]:
     """About `most` pixels of all views that lie wholly on the object, and less than twice as many."""
     return _pixels_at(views, views.num_solid // most)

@@ -170,6 +170,10 @@ class ExactFamily:
         """The proposal itself."""
         return proposal
 
+    def outlined(self, views: Views) -> Views:
+        """Views with masks whose contours are silhouettes of the kind: themselves."""
+        return views
+
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The geometry of the shape."""
         return cast(Any, self.geometry)(proposal.shape)
@@ -207,14 +211,15 @@ class ExactFamily:
         """The fit to photographs as they are stated where the scene needs none of the blocks; else that to photographs
         which are corrected by what a surface of few numbers leaves to the blocks.
         """
-        around = proposal.shape.surroundings
+        views, around = self.outlined(views), proposal.shape.surroundings
         if not LEAST_VIEWS <= len(views.train) <= MOST_VIEWS:
             kinds = ()
         if self.by_silhouettes and not kinds:
             return self.finished(views, self.as_proposed(proposal, config), config), NO_CORRECTIONS, []
-        start = proposal.in_surroundings(around.without_walls) if kinds else proposal
+        start = proposal
         with torch.no_grad():
             if kinds:
+                start = proposal.in_surroundings(around.without_walls)
                 start = self._proposed_again(views, start, kinds, config, propose)
             found = solve(
                 views,
@@ -226,15 +231,15 @@ class ExactFamily:
             )
         nuisance = found.state.nuisance
         by = Corrected.by(nuisance, found.variances)
-        corrected = by.applied(views, config) if nuisance.blocks else views
+        corrected = by.applied(views, config)
         around = nuisance.around(start.shape.surroundings).scaled(by.scale)
         if self.by_silhouettes:
             again = propose(corrected) if nuisance.blocks else proposal
-            geometry = self.as_proposed(again or start, config)
+            geometry = cast(Any, self.as_proposed(again or start, config))
         else:
             scaled = found.state.surface.taken_back(Similarity(1 / by.scale, np.eye(3), np.zeros(3)))
-            geometry = self.as_proposed(replace(start, shape=scaled.shape), config)
-        geometry = cast(Any, geometry).in_surroundings(around)
+            geometry = cast(Any, self.as_proposed(start, config)).with_shape(scaled.shape)
+        geometry = geometry.in_surroundings(around)
         with improving():
             geometry = self.finished(corrected, geometry, config)
         return geometry.with_poses(by.poses), by.corrections, list(found.decisions)
@@ -260,6 +265,7 @@ class ExactFamily:
 
     def by_outlines(self, views: Views, proposal: Proposal, kinds: Collection[type[Block]], config: FitConfig) -> Poses:
         """See `panoless.problem.solve.by_outlines`."""
+        views = self.outlined(views)
         with torch.no_grad():
             state = by_outlines(views, self.unknowns(views, proposal, config), nuisance_of(views, kinds))
         found = Corrected.by(state.nuisance).poses

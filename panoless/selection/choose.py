@@ -13,7 +13,7 @@ import numpy as np
 
 from panoless.capture.poses import Poses, StatedCameras
 from panoless.capture.silhouettes import silhouette_distance_px
-from panoless.capture.views import Views
+from panoless.capture.views import Views, held_out_parts
 from panoless.config import FitConfig
 from panoless.deadline import improving, is_past_limit
 from panoless.first_surface.visual_hull import contradiction_px
@@ -24,7 +24,7 @@ from panoless.journal import remembered
 from panoless.problem.blocks import SHIFT, STATED_FLOOR, TURN_DEG
 from panoless.selection.candidates import MATTE, Candidate, Selection, Verdict, describe
 from panoless.selection.fitted import Fitted, is_refined, missed_share
-from panoless.selection.held_out import LEAST_GAIN, held_out_errors, held_out_parts, is_matte
+from panoless.selection.held_out import LEAST_GAIN, held_out_errors, is_matte
 from panoless.selection.joint import fit_jointly, nuisance_kinds, proposed, refitted
 from panoless.selection.surroundings import explains_clearly_more
 from shinypartial.core.errors import InputError
@@ -244,8 +244,8 @@ def _bends_rather(family: Family, geometry: Geometry, start: Start | None, views
     mirror shows much of what a near room shows.
     """
     over = {family.kind, family.refines} - {None}
-    others = [other for other in FAMILIES.values() if other.refines in over and other.in_few_steps]
-    others = [other for other in others if other is not family]
+    rivals = [other for other in FAMILIES.values() if other.refines in over and other is not family]
+    others = [other for other in rivals if other.in_few_steps]
     if held_out_parts(views) is None:
         return False
     with improving():

@@ -1,13 +1,11 @@
 """Held-out views: how much of them a geometry explains, and whether another explains more."""
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from panoless.capture.contrast import Contrast
-from panoless.capture.views import Views, split_held_out
+from panoless.capture.views import Views, held_out_parts
 from panoless.config import FitConfig
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
@@ -38,14 +36,6 @@ def held_out_errors(views: Views, config: FitConfig, geometry: Geometry) -> Floa
     """
     parts, resolution = held_out_parts(views), config.environment.trial_resolution(COMPARED_RESOLUTION)
     return None if parts is None else unexplained(*parts, geometry, COMPARED_RAYS, resolution)
-
-
-def held_out_parts(views: Views) -> tuple[Views, Views] | None:
-    """Four fifths of the views, and the others; None where there are too few."""
-    kept, held_out = split_held_out(views.train)
-    if not kept or not held_out:
-        return None
-    return replace(views, train=tuple(kept)), replace(views, train=tuple(held_out))
 
 
 def unexplained(solved: Views, tested: Views, geometry: Geometry, rays: int, resolution: int) -> Float[np.ndarray, "V"]:

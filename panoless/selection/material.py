@@ -16,7 +16,7 @@ from torch.nn.functional import max_pool2d
 
 from panoless.capture.encoding import NO_TINT, SATURATED, RadianceEncoding, encoding_of
 from panoless.capture.rays import project
-from panoless.capture.views import TrainView, Views, split_held_out
+from panoless.capture.views import TrainView, Views, held_out_parts, split_held_out
 from panoless.config import FitConfig
 from panoless.environment.material_field import MaterialPixels
 from panoless.environment.rays import Rays, joined_rays
@@ -36,7 +36,7 @@ from panoless.geometry.base import Geometry, SurfaceBuffers, observe_views, usab
 from panoless.journal import remembered
 from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.robust import bounded_error
-from panoless.selection.held_out import held_out_parts, is_clearly_lower
+from panoless.selection.held_out import is_clearly_lower
 
 RAYS = 100_000
 """About so many pixels of all views determine an even reflectance, and whether places differ."""

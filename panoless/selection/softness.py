@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from panoless.capture.encoding import encoding_of
-from panoless.capture.views import Views
+from panoless.capture.views import Views, held_out_parts
 from panoless.config import FitConfig
 from panoless.environment.footprints import PixelFootprints, thinned
 from panoless.environment.lobe import Lobe
@@ -23,7 +23,7 @@ from panoless.environment.solve import solve_environment
 from panoless.geometry.base import Geometry, pixel_areas
 from panoless.journal import remembered
 from panoless.numeric.robust import bounded_error
-from panoless.selection.held_out import held_out_parts, is_clearly_lower
+from panoless.selection.held_out import is_clearly_lower
 
 RESOLUTION = 64
 """Most texels along a face side of the maps under which roughness and blur are judged."""

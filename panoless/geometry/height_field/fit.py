@@ -6,7 +6,7 @@ from typing import TypeVar, cast
 
 import torch
 
-from panoless.capture.views import Views, every_kth_pixel, split_held_out
+from panoless.capture.views import Views, every_kth_pixel, held_out_parts
 from panoless.environment.rays import Rays
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
@@ -56,14 +56,14 @@ def cleared(views: Views, height_field: HeightField) -> HeightField:
     """With the height that mirrored rays have to pass, as long as what is left out was clearly worse explained, and
     after one more round if there is any.
     """
-    kept, held_out = (replace(views, train=tuple(part)) for part in split_held_out(views.train))
-    if not held_out.train:
+    parts = held_out_parts(views)
+    if parts is None:
         return height_field
     with torch.no_grad():
-        found, least = height_field, _unexplained(kept, held_out, height_field, LAST)
+        found, least = height_field, _unexplained(*parts, height_field, LAST)
         for height in CLEARANCES:
             higher = replace(height_field, clearance=height)
-            left = _unexplained(kept, held_out, higher, LAST)
+            left = _unexplained(*parts, higher, LAST)
             if left > (1 - LEAST_CLEARED) * least:
                 break
             found, least = higher, left

@@ -8,7 +8,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.object_frame import ObjectFrame
-from panoless.capture.silhouettes import without_gaps
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.geometry.base import Geometry, Mesh, Proposal, SurfaceBuffers
@@ -68,8 +67,7 @@ class HeightFieldFamily(WithinOneBoundary):
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
         """The plane that it bends, flat as yet."""
-        shape = proposal.shape
-        return HeightFieldMirror(shape if isinstance(shape, HeightField) else flat_height_field(shape, CELLS))
+        return HeightFieldMirror(flat_height_field(proposal.shape, CELLS))
 
     def before_steps(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
         """The dome or bowl over the plane that photographs agree on best, or the plane."""
@@ -86,7 +84,7 @@ class HeightFieldFamily(WithinOneBoundary):
 
     def refitted(self, views: Views, fitted: HeightFieldMirror, config: FitConfig) -> Geometry:
         """Heights, plane and boundary after one more round."""
-        return fitted.with_shape(refined(without_gaps(views), fitted.height_field))
+        return fitted.with_shape(refined(self.outlined(views), fitted.height_field))
 
     def finished(self, views: Views, solved: HeightFieldMirror, config: FitConfig) -> HeightFieldMirror:
         """With the height that reflected rays have to pass at the rim."""

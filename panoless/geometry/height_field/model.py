@@ -167,9 +167,16 @@ class HeightField:
         low, high = self.plane.boundary.min(0), self.plane.boundary.max(0)
         steps = np.ceil(STEPS_A_CELL * (high - low) / self.spacing).astype(np.int64)
         u, v = (np.linspace(low[axis], high[axis], steps[axis] + 1) for axis in (0, 1))
-        places = np.stack(np.meshgrid(u, v, indexing="ij"), -1).reshape(-1, 2)
-        index = np.arange(len(places)).reshape(steps + 1)
-        faces = np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]], -1).reshape(-1, 4)
+        return self.faces_over(np.stack(np.meshgrid(u, v, indexing="ij"), -1))
+
+    def faces_over(
+        self, grids: Float[np.ndarray, "*G A B 2"]
+    ) -> tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, "F 4"]]:
+        """Points in the normalized frame over grids of plane coordinates, and their faces within the boundary."""
+        places, index = grids.reshape(-1, 2), np.arange(grids[..., 0].size).reshape(grids.shape[:-1])
+        low, high = slice(None, -1), slice(1, None)
+        corners = [index[..., a, b] for a, b in ((low, low), (high, low), (high, high), (low, high))]
+        faces = np.stack(corners, -1).reshape(-1, 4)
         within = depth_inside(places[faces].mean(1), self.plane.boundary) > 0
         return self.plane.points(places) + self.heights(places, 0)[0][:, None] * self.plane.normal, faces[within]
 

@@ -195,15 +195,17 @@ def located(views: Views, panes: Panes, settings: Round, reach: float) -> Panes:
                 errors.append(bounded_error(mirrored.light(seen.environment) - radiance[near], settings.robust_scale))
                 at.append(hits.places[:, axis])
             line = np.mean(at, 0)
-            order = np.argsort(line)
-            gain = np.append(0.0, np.cumsum((errors[0] - errors[1])[order]))
-            split, padded = (
-                int(gain.argmin()),
-                np.concatenate([[cuts[joint] - reach], line[order], [cuts[joint] + reach]]),
-            )
-            found[axis][joint] = (padded[split] + padded[split + 1]) / 2
+            found[axis][joint] = _change(line, errors[0] - errors[1], cuts[joint] - reach, cuts[joint] + reach)
     plane = replace(panes.plane, cuts_u=found[0], cuts_v=found[1], width=0.0)
     return replace(panes, plane=plane)
+
+
+def _change(line: Float[np.ndarray, "P"], difference: Float[np.ndarray, "P"], low: float, high: float) -> float:
+    """The t between two ends with the least Σ_{u<t} of a difference, in the middle between two places."""
+    order = np.argsort(line)
+    split = int(np.append(0.0, np.cumsum(difference[order])).argmin())
+    places = np.concatenate([[low], line[order], [high]])
+    return float(places[split] + places[split + 1]) / 2
 
 
 def with_bars(views: Views, panes: Panes) -> Panes:

@@ -7,7 +7,6 @@ from typing import ClassVar, cast
 import torch
 
 from panoless.capture.corrections import Corrections
-from panoless.capture.silhouettes import without_gaps
 from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.geometry.base import Geometry, Proposal, Propose
@@ -49,7 +48,7 @@ class PanesFamily(HeightFieldFamily):
         self, views: Views, proposal: Proposal, config: FitConfig, *, asked: bool = False
     ) -> Proposal | None:
         """Panes by the slopes of tiles. Of smooth slopes None, or one pane for a user who wants panes."""
-        panes = panes_over(without_gaps(views), proposal.shape)
+        panes = panes_over(self.outlined(views), proposal.shape)
         if panes is None and asked:
             panes = one_pane(views, proposal.shape)
         return None if panes is None else replace(proposal, shape=panes)
@@ -93,4 +92,4 @@ class PanesFamily(HeightFieldFamily):
         """Heights and joints by silhouettes and photographs together."""
         panes = cast(Panes, fitted.height_field)
         with torch.no_grad():
-            return cast(Geometry, fitted.with_shape(fit_panes(without_gaps(views), panes)))
+            return cast(Geometry, fitted.with_shape(fit_panes(self.outlined(views), panes)))

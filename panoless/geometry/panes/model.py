@@ -9,7 +9,6 @@ from numpy.polynomial import legendre
 
 from panoless.geometry.height_field.model import ORDERS, STEPS_A_CELL, HeightField, HeightFieldHits
 from panoless.geometry.plane.model import Plane
-from panoless.numeric.polygon import depth_inside
 from shinypartial.core.camera import Similarity
 
 DEGREE = 2
@@ -199,13 +198,7 @@ class Panes(HeightField):
             for each in self.plane.cuts
         ]
         u, v = np.broadcast_arrays(lines[0][:, None, :, None], lines[1][None, :, None, :])
-        places = np.stack([u, v], -1).reshape(-1, 2)
-        index = np.arange(len(places)).reshape(u.shape)
-        low, high = slice(None, -1), slice(1, None)
-        corners = [index[:, :, a, b] for a, b in ((low, low), (high, low), (high, high), (low, high))]
-        faces = np.stack(corners, -1).reshape(-1, 4)
-        within = depth_inside(places[faces].mean(1), self.plane.boundary) > 0
-        return self.plane.points(places) + self.heights(places, 0)[0][:, None] * self.plane.normal, faces[within]
+        return self.faces_over(np.stack([u, v], -1))
 
 
 def _halves(cuts: Float[np.ndarray, "M"]) -> Float[np.ndarray, "M-1"]:

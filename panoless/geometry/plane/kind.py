@@ -1,6 +1,5 @@
 """The plane as a kind of geometry."""
 
-from collections.abc import Collection
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -8,20 +7,16 @@ import numpy as np
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from panoless.capture.corrections import Corrections
 from panoless.capture.object_frame import ObjectFrame
-from panoless.capture.poses import Poses
 from panoless.capture.silhouettes import without_gaps
 from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
-from panoless.geometry.base import SOLID_SURFACE_ALPHA, Geometry, Mesh, Proposal, Propose, SurfaceBuffers
+from panoless.geometry.base import SOLID_SURFACE_ALPHA, Geometry, Mesh, Proposal, SurfaceBuffers
 from panoless.geometry.exact import ExactFamily, SeenByCenters, looked_up, mirrored_directions
 from panoless.geometry.plane.fit import fit_plane
 from panoless.geometry.plane.model import Plane, plane_buffers, unoccluded_share
 from panoless.geometry.plane.unknowns import PlaneUnknowns
 from panoless.kernels.camera import RasterCamera
-from panoless.problem.blocks import Block
-from panoless.problem.evidence import Decision
 from shinypartial.core.errors import InputError
 
 UNOCCLUDED_SHARE = 0.99
@@ -63,21 +58,9 @@ class PlaneMirror(SeenByCenters):
 class WithinOneBoundary(ExactFamily):
     """A kind whose silhouette is one polygon: gaps between pieces of masks, such as bars, are closed."""
 
-    def solve(
-        self,
-        views: Views,
-        proposal: Proposal,
-        kinds: Collection[type[Block]],
-        required: Collection[str],
-        config: FitConfig,
-        propose: Propose,
-    ) -> tuple[Geometry, Corrections, list[Decision]]:
-        """Of masks without gaps."""
-        return super().solve(without_gaps(views), proposal, kinds, required, config, propose)
-
-    def by_outlines(self, views: Views, proposal: Proposal, kinds: Collection[type[Block]], config: FitConfig) -> Poses:
-        """Of masks without gaps."""
-        return super().by_outlines(without_gaps(views), proposal, kinds, config)
+    def outlined(self, views: Views) -> Views:
+        """With masks without gaps."""
+        return without_gaps(views)
 
 
 class PlaneFamily(WithinOneBoundary):
@@ -91,7 +74,7 @@ class PlaneFamily(WithinOneBoundary):
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
         """Plane, boundary and frame by silhouettes."""
         try:
-            found = fit_plane(without_gaps(views), thorough=asked)
+            found = fit_plane(self.outlined(views), thorough=asked)
         except InputError:
             if asked:
                 raise
