@@ -30,7 +30,8 @@ def latlong_to_directions(uv: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "
 
 def directions_to_latlong(directions: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 2"]:
     """Inverse of `latlong_to_directions`; directions need not be unit. At the poles u is ½."""
-    x, y, z = np.moveaxis(directions, -1, 0)
+    # Of strided arrays, numpy rounds the last bit by where they lie in memory.
+    x, y, z = np.ascontiguousarray(np.moveaxis(directions, -1, 0))
     u = 0.5 - np.arctan2(y, x) / (2 * np.pi)
     v = np.arctan2(np.hypot(x, y), z) / np.pi
     return np.stack([u, v], -1)
