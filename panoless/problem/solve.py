@@ -109,7 +109,8 @@ def solve(
 
     All are free from the first round on. Those that are not needed are fixed before the others go on under a finer map.
     After silhouettes alone, `begin` may choose another surface for photographs to start from. Walls start as they are
-    `around` it; the surface itself knows of none.
+    `around` it; the surface itself knows of none. Where such walls are not needed, all is solved once more without
+    them: what they bent comes back slowly.
     """
     last = rounds[-1]
 
@@ -135,6 +136,10 @@ def solve(
         }
         left, decisions = needed(state.nuisance, known, covariances, required)
         needless = [each for each in decisions if not each.kept]
+        if around.coefficients.any() and (walls := [each for each in needless if each.name == Walls.name]):
+            fewer = [kind for kind in kinds if kind is not Walls]
+            found = solve(views, surface, fewer, required, begin, rounds, around.without_walls)
+            return replace(found, decisions=(*walls, *found.decisions))
         gone += needless
         if (not needless and settings is not last) or is_past_limit():
             progress.advance(steps=progress.total - progress.done)

@@ -1,5 +1,6 @@
 """Surfaces of few numbers with cameras, exposures and masks: what is wrong is found, all at once, and only that."""
 
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -11,12 +12,13 @@ from panoless.capture.lens import with_focal_factor
 from panoless.capture.poses import Poses
 from panoless.capture.views import Views
 from panoless.config import FitConfig
+from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.height_field.model import flat_height_field
 from panoless.geometry.registry import FAMILIES
 from panoless.geometry.revolution.model import closed_profile
 from panoless.geometry.revolution.silhouette import contour_rays
 from panoless.geometry.revolution.unknowns import RevolutionUnknowns
-from panoless.problem.blocks import CameraPoses, Exposures, FocalLength, MaskOffsets
+from panoless.problem.blocks import Block, CameraPoses, Exposures, FocalLength, MaskOffsets, Walls
 from panoless.problem.corrected import Corrected
 from panoless.problem.solve import Solved, by_outlines_alone, solve
 from panoless.selection.joint import nuisance_kinds
@@ -41,18 +43,21 @@ def views_of(kind: str, count: int, size: int) -> Views:
     return replace(views, train=tuple(replace(view, radiance=view.radiance * 0.6) for view in views.train))
 
 
-def solved(kind: str, views: Views) -> Solved:
-    """By a kind, from its own proposal."""
+def solved(kind: str, views: Views, left: Collection[type[Block]] = (), around_it: Surroundings = FAR) -> Solved:
+    """By a kind, from its own proposal, without the blocks that are `left` out."""
     family = FAMILIES[kind]
     source = family if family.refines is None else FAMILIES[family.refines]
     proposal = source.propose(views, CONFIG, asked=True)
     assert proposal is not None
+    kinds, required = nuisance_kinds(CONFIG)
     with torch.no_grad():
         return solve(
             views,
             family.unknowns(views, proposal, CONFIG),
-            *nuisance_kinds(CONFIG),
+            [each for each in kinds if each not in left],
+            required,
             lambda state: family.begun(Corrected.by(state.nuisance).applied(views, CONFIG), state.surface, CONFIG),
+            around=around_it,
         )
 
 
@@ -67,6 +72,15 @@ def test_right_photographs_need_no_block(kind: str, count: int, size: int) -> No
     found = solved(kind, views_of(kind, count, size))
     assert not [each.name for each in found.decisions if each.kept]
     assert not found.state.nuisance.blocks
+
+
+def test_proposed_walls_that_are_not_needed_leave_no_trace() -> None:
+    views = views_of("sphere", 14, 80)
+    found = solved("sphere", views, around_it=Surroundings(np.array([0.05])))
+    without = solved("sphere", views, left=[Walls])
+    assert [each.kept for each in found.decisions if each.name == Walls.name] == [False]
+    np.testing.assert_array_equal(found.state.surface.shape.center, without.state.surface.shape.center)
+    assert found.state.surface.shape.radius == without.state.surface.shape.radius
 
 
 @pytest.mark.parametrize(("kind", "count", "size"), KINDS[:3])
