@@ -15,7 +15,11 @@ class Axis:
     clean: float
     levels: tuple[float, ...]
     options: str
-    """Of `shinypartial perturb`, or of `generate` where `rendered`; {level} is the level, {factor} 1 + level / 100."""
+    """Of `shinypartial perturb`, or of `generate` where `rendered`; {level} is the level, {factor} 1 + level / 100, and
+    {0}, {1}, … are its products with `sizes`."""
+    sizes: tuple[float, ...] = ()
+    around: str = ""
+    """Options of `shinypartial generate` for what is perturbed; none: that of the clean dataset."""
     rendered: bool = False
     own_truth: bool = False
     """Whether the copy is scored on itself, because its ground truth differs from that of the clean dataset."""
@@ -23,7 +27,8 @@ class Axis:
 
     def arguments(self, level: float) -> list[str]:
         """The options at a level, as words."""
-        return self.options.format(level=f"{level:g}", factor=f"{1 + level / 100:g}").split()
+        sizes = (f"{level * each:g}" for each in self.sizes)
+        return self.options.format(*sizes, level=f"{level:g}", factor=f"{1 + level / 100:g}").split()
 
     def position(self, level: float | None) -> float:
         """Where a level lies for interpolation, growing as data get worse; None is the clean dataset."""
@@ -39,7 +44,28 @@ class Axis:
         return f"{self.clean + math.copysign(position, self.levels[-1] - self.clean):.3g}{self.unit}"
 
 
+CAPTURE = (
+    "--cameras.rotation-deg {0} --cameras.focal-factor {factor} --masks.offset-px {level} --masks.wobble-px {1} "
+    "--sensor.k1 {2} --sensor.exposure-sigma-stops {3} --sensor.white-balance-sigma-stops {4} --sensor.shot-noise {5} "
+    "--sensor.read-noise {6} --sensor.jpeg-quality 90"
+)
+"""Everything that a capture by hand gets wrong, at once: at level 1, cameras turned by 0.3°, a focal length 1 % too
+long, masks off by up to 1 px, …"""
+SIZES = (0.3, 0.3, 0.02, 0.1, 0.05, 0.01, 0.005)
+"""…that wander by 0.3 px, k₁ of 0.02, exposures by 0.1 stops, gains of channels by 0.05 stops, and noise."""
 AXES = (
+    Axis("capture", "Realistic capture, all errors at once", "", 0, (0.5, 1, 2), CAPTURE, SIZES),
+    Axis(
+        "capture-room",
+        "Realistic capture in a room 8 radii away",
+        "",
+        0,
+        (0.5, 1, 2),
+        CAPTURE,
+        SIZES,
+        "--surroundings-radii 8 --surroundings-room box",
+        kind="further",
+    ),
     Axis("rotation", "Camera rotation", "°", 0, (0.1, 0.25, 0.5, 1, 2), "--cameras.rotation-deg {level}"),
     Axis("masks-eroded", "Masks eroded", " px", 0, (1, 2, 4), "--masks.erode-px {level}"),
     Axis("masks-dilated", "Masks dilated", " px", 0, (1, 2, 4), "--masks.dilate-px {level}"),

@@ -144,15 +144,19 @@ def _dataset_jobs(scene: str, axis: Axis | None, level: float | None, seed: int,
     name, options = f"{scene}.{axis.name}-{level:g}", shlex.join(axis.arguments(level))
     if axis.rendered:
         return [clean, Job(f"render/{name}", f"{render} {options} --output datasets/{name}")]
-    name = f"{name}.{seed}"
-    copy = f"shinypartial perturb datasets/{scene} --output datasets/{name} --link --seed {seed} {options}"
-    return [clean, Job(f"perturb/{name}", copy, (clean.name,))]
+    before = [clean]
+    if axis.around:
+        source = f"{scene}.{axis.name}"
+        before.append(Job(f"render/{source}", f"{render} {axis.around} --output datasets/{source}"))
+    source, name = before[-1].name.partition("/")[2], f"{name}.{seed}"
+    copy = f"shinypartial perturb datasets/{source} --output datasets/{name} --link --seed {seed} {options}"
+    return [*before, Job(f"perturb/{name}", copy, (before[-1].name,))]
 
 
 def _fit_jobs(cell: Cell, template: str, data: Sequence[Job]) -> Iterator[Job]:
     axis = BY_NAME.get(cell.axis or "")
     folders = [f"datasets/{job.name.partition('/')[2]}" for job in data]
-    truth = folders[-1] if axis and (axis.rendered or axis.own_truth) else folders[0]
+    truth = folders[-1] if axis is None or axis.rendered or axis.own_truth else folders[-2]
     prediction = f"predictions/{cell.name}"
     command = template.format(dataset=folders[-1], prediction=prediction, seed=cell.seed)
     yield Job(f"fit/{cell.name}", command, (data[-1].name,))

@@ -60,6 +60,16 @@ def test_rendered_levels_are_scored_on_themselves_and_made_once() -> None:
     assert commands(plan)["score/vase.room-5.1.copy"].endswith("--dataset datasets/vase.room-5")
 
 
+def test_errors_in_a_room_are_scored_on_that_room() -> None:
+    plan = commands(make_plan("core", COPY, [0], scenes=["vase"], axes=["capture-room"]))
+    assert plan["render/vase.capture-room"].endswith(
+        "--surroundings-radii 8 --surroundings-room box --output datasets/vase.capture-room"
+    )
+    assert plan["perturb/vase.capture-room-1.0"].startswith("shinypartial perturb datasets/vase.capture-room --output ")
+    assert plan["score/vase.capture-room-1.0.copy"].endswith("--dataset datasets/vase.capture-room")
+    assert plan["score/vase.0.copy"].endswith("--dataset datasets/vase")
+
+
 def test_core_has_the_levels_of_the_table_and_the_anchors_once() -> None:
     core = list(conditions("core"))
     assert len(core) == len(set(core)) == 1 + sum(len(axis.levels) for axis in AXES if axis.kind == "core") + 1
@@ -75,6 +85,7 @@ def test_core_has_the_levels_of_the_table_and_the_anchors_once() -> None:
 
 def test_levels_become_options_and_positions() -> None:
     assert BY_NAME["focal"].arguments(4) == ["--cameras.focal-factor", "1.04"]
+    assert BY_NAME["capture"].arguments(2)[:4] == ["--cameras.rotation-deg", "0.6", "--cameras.focal-factor", "1.02"]
     assert [BY_NAME["views"].position(level) for level in (None, 10)] == [0, 40]
     assert BY_NAME["views"].text(40) == "10 views"
     assert [BY_NAME["room"].position(level) for level in (None, 5)] == [0, 0.2]
