@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from panoless.environment.following import FollowingMap
 from panoless.environment.mirrored import radiance_of, slopes_of
 from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
 from panoless.environment.surroundings import FAR, Floor, Surroundings
+from panoless.environment.variable_projection import VariableProjection
 from panoless.numeric.gauss_newton import damped_step
 from panoless.numeric.robust import bounded_error, robust_weight
 
@@ -72,8 +72,8 @@ class Linearized:
         directions, environment = rays.directions.numpy().astype(np.float64), solve_environment([rays], resolution)
         residual = radiance_of(environment, directions) - seen.radiance
         rows = surroundings.rows(slopes_of(environment, directions), seen.points, seen.directions)[..., free]
-        following = FollowingMap.of(directions, robust_weight(residual, ROBUST_SCALE), resolution)
-        gradient, matrix = following.equations(rows, residual)
+        projection = VariableProjection.of(directions, robust_weight(residual, ROBUST_SCALE), resolution)
+        gradient, matrix = projection.equations(rows, residual)
         return cls(_cost(residual), gradient, matrix)
 
     def step(self) -> Float[np.ndarray, "D"]:

@@ -317,7 +317,7 @@ class Family(Protocol):
     """Whether the kind that it refines is compared with it, fitted in few steps."""
     needs_depth: ClassVar[bool]
     """Whether views have to come from different directions, which tell how far away the object is."""
-    told_by_outlines: ClassVar[bool]
+    silhouettes_suffice: ClassVar[bool]
     """Whether outlines tell the whole shape, so that what photographs leave unexplained is no doubt of it but noise, or
     who holds the camera."""
 

@@ -160,7 +160,7 @@ class ExactFamily:
     refines: ClassVar[str | None] = None
     in_few_steps: ClassVar[bool] = True
     needs_depth: ClassVar[bool] = True
-    told_by_outlines: ClassVar[bool] = False
+    silhouettes_suffice: ClassVar[bool] = False
     by_silhouettes: ClassVar[bool] = False
     """Whether silhouettes determine the shape to the end, so that photographs do not refine it."""
 

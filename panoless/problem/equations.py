@@ -12,11 +12,11 @@ from torch import Tensor
 
 from panoless.capture.poses import StatedCameras
 from panoless.capture.views import Views
-from panoless.environment.following import FollowingMap
 from panoless.environment.mirrored import MirroredRays, slopes_of
 from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
 from panoless.environment.surroundings import Surroundings
+from panoless.environment.variable_projection import VariableProjection
 from panoless.numeric.factorize import regularize
 from panoless.numeric.gauss_newton import damped_step, normal_equations
 from panoless.numeric.robust import bounded_error, robust_scale, robust_weight
@@ -148,7 +148,7 @@ class Photographs:
     light: Float[np.ndarray, "Q 3"]
     residual: Float[np.ndarray, "Q 3"]
     sigma: float
-    following: FollowingMap
+    projection: VariableProjection
 
     @classmethod
     def at(cls, data: Data, state: State, traced: Traced, *, estimated: bool) -> "Photographs | None":
@@ -170,8 +170,8 @@ class Photographs:
         weights = robust_weight(residual, data.settings.robust_scale) / sigma**2
         if estimated:
             weights *= min(COUNTED_RAYS / len(chosen), 1.0)
-        following = FollowingMap.of(mirrored.looked_up, weights, data.settings.resolution)
-        return cls(chosen, rays, hits, mirrored, environment, light, residual, sigma, following)
+        projection = VariableProjection.of(mirrored.looked_up, weights, data.settings.resolution)
+        return cls(chosen, rays, hits, mirrored, environment, light, residual, sigma, projection)
 
     @cached_property
     def by_normal(self) -> Float[np.ndarray, "Q 3 3"]:
@@ -209,7 +209,7 @@ class Photographs:
         mirrored = MirroredRays(rays.directions, hits.normals[chosen], hits.points[chosen], state.around)
         radiance = state.nuisance.equalized(data.pixels.radiance[chosen], rays.view)
         residual = mirrored.light(self.environment) - radiance
-        return self.following.cost(np.where(hits.clear[chosen, None], residual, self.residual))
+        return self.projection.cost(np.where(hits.clear[chosen, None], residual, self.residual))
 
 
 def chosen_hits(hits: MirrorHits, chosen: Int[np.ndarray, "Q"]) -> MirrorHits:
@@ -262,7 +262,7 @@ class Equations:
             hits, rays = photographs.hits, photographs.rays
             by_motion = photographs.motion_rows() if free else np.zeros((len(rays.view), 3, 6))
             rows, columns = beside(rays, by_motion, photographs)
-            gradient, matrix = photographs.following.sparse_equations(
+            gradient, matrix = photographs.projection.sparse_equations(
                 np.concatenate([np.matmul(photographs.by_normal, hits.rows), rows], 2),
                 np.concatenate([hits.columns, columns], 1),
                 unknowns,
@@ -323,7 +323,7 @@ class Equations:
             total += float(value @ self.regularizing @ value) / 2
         seen, found, distance = self.photographs, self.silhouette, self.distance_px
         if state is self.state:
-            total += 0.0 if seen is None else seen.following.cost(seen.residual)
+            total += 0.0 if seen is None else seen.projection.cost(seen.residual)
         else:
             total += 0.0 if seen is None or traced is None else seen.cost(self.data, state, traced)
             rays = state.nuisance.moved(self.data.outlines, self.data.cameras)

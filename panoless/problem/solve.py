@@ -1,7 +1,7 @@
 """A surface of few numbers solved with nuisance blocks: dense Gauss–Newton steps, the map eliminated.
 
 With x all free unknowns, e the residuals of photographs under the map that follows them (variable projection, see
-`panoless.environment.following`), δ those of silhouettes and P the precisions of the priors, a round lowers
+`panoless.environment.variable_projection`), δ those of silhouettes and P the precisions of the priors, a round lowers
 
 ½ Σ ρ(e)/σ² + ½ Σ ρ(δ)/σ_δ² + ½ C xᵀ P x,
 

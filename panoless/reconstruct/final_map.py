@@ -19,8 +19,8 @@ from panoless.environment.visibility import agreement, visibility_from_agreement
 from panoless.geometry.base import Geometry, observe_views, pixel_areas, usable_views
 from panoless.journal import remembered
 from panoless.reconstruct.state import FitState
+from panoless.selection.blur import Blur, needed_blur
 from panoless.selection.material import as_perfect_mirror, earned_reflectance
-from panoless.selection.softness import Softness, earned_softness
 from panoless.splats.training import Training
 from shinypartial.io.events import note
 
@@ -47,11 +47,11 @@ def complete(state: FitState, views: Views, config: FitConfig) -> tuple[Views, F
         usable = usable_views(views, state.geometry)
         config = replace(config, tint=state.reflectance.tint)
         state.reflectance = state.reflectance.exposed(1 / exposure)
-    softness = Softness()
+    blur = Blur()
     if state.training is None:
         with improving():
-            softness = earned_softness(usable, state.geometry, config)
-    state.roughness, state.blur_px = softness.roughness, softness.blur_px
+            blur = needed_blur(usable, state.geometry, config)
+    state.roughness, state.blur_px = blur.roughness, blur.blur_px
     taken = exposed(usable if state.blur_px is None else replace(usable, blur_px=state.blur_px), 1 / exposure)
     state.environment, state.visibility = _solved(
         taken, state.geometry, state.training, state.roughness, replace(config, exposure=1.0)

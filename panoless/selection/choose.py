@@ -97,7 +97,7 @@ def choose_geometry(views: Views, config: FitConfig) -> tuple[Geometry, Selectio
             table[-1] = candidate = replace(candidate, verdict=Verdict.REFUSED_BY_HELD_OUT_VIEWS, reason=BENT)
             explains = False
         fitted.append((candidate, geometry))
-        if explains and (family.told_by_outlines or error_of(fitted[-1]) <= DOUBTED_ERROR):
+        if explains and (family.silhouettes_suffice or error_of(fitted[-1]) <= DOUBTED_ERROR):
             break
     chosen = [each for each in fitted if each[0].verdict == Verdict.CHOSEN]
     if chosen:

@@ -192,7 +192,7 @@ def _rim_px(
     if ball is not None:
         return ball.rim_px
     family = FAMILIES.get(geometry.kind)
-    by_outlines = family is not None and family.told_by_outlines
+    by_outlines = family is not None and family.silhouettes_suffice
     return silhouette_px if by_outlines and light["unexplained"] is None else None
 
 

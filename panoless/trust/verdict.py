@@ -42,7 +42,7 @@ POSES = "Refine the camera poses and the focal length, or take them from a board
 MASKS = "Look at the masks, and at the poses of the views whose silhouettes disagree."
 MATTER = "Photograph a shinier object: this one shows its own color."
 SHAPE = "Look at poses, masks and exposure first; parts that are concave or see themselves may be wrong as well."
-PART = "See where that is: a part may be matte, or a hollow may have been missed. A mesh tells by its confidence."
+PART = "See where that is: a part may be matte, or a concavity may have been missed. A mesh tells by its confidence."
 SURPLUS = (
     "If --model asked for this kind, the object may be of another; else look at the masks, which may lack a part of "
     "it, or the shape has grown one that isn't there."

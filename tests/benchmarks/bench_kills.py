@@ -48,7 +48,7 @@ SMALL = shlex.split("""
     --set corrections.masks=off corrections.exposure=off corrections.lens=off corrections.poses=off
     surroundings.mode=off
 """)
-FREE_FORM = shlex.split("--set free_form.hollows=false free_form.starts=false free_form.finest_cells=20")
+FREE_FORM = shlex.split("--set free_form.concavities=false free_form.starts=false free_form.finest_cells=20")
 
 
 @dataclass(frozen=True)

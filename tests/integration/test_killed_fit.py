@@ -116,7 +116,7 @@ def test_kinds_that_were_examined_before_a_kill_are_not_fitted_again(
         assert (first / name).read_bytes() == (second / name).read_bytes(), name
 
 
-SHORT = {"free_form": ("free_form.hollows=false", "free_form.starts=false", "free_form.finest_cells=20")}
+SHORT = {"free_form": ("free_form.concavities=false", "free_form.starts=false", "free_form.finest_cells=20")}
 BELIEVED = "corrections.masks=off", "corrections.exposure=off", "corrections.lens=off", "corrections.poses=off"
 
 

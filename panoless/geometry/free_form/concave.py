@@ -1,4 +1,4 @@
-"""Concave starts: hollows under patches of the first surface that make pixels agree on what they mirror.
+"""Concave starts: concavities under patches of the first surface that make pixels agree on what they mirror.
 
 Silhouettes do not show the inside of a dish. It is searched by a few numbers: each candidate is traced, and its score
 is the spread of colors among the rays that leave in the same direction, so no map is needed.
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from panoless.capture.views import Views
-from panoless.geometry.free_form.hollows import HALF_SIDE, SIDE, Chart, Hollow, Relief
+from panoless.geometry.free_form.concavities import HALF_SIDE, SIDE, Chart, Concavity, Relief
 from panoless.geometry.free_form.spread import FinalRays, disagreement
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.journal import remembered
@@ -24,7 +24,7 @@ from shinypartial.io.progress import Progress
 RAYS = 40_000
 """About so many pixels of all views are traced against the surface that is searched."""
 PIXELS = 2_500
-"""Most of them under one hollow that score a candidate."""
+"""Most of them under one concavity that score a candidate."""
 LEAST_PIXELS = 300
 """Patches that fewer pixels see are left alone."""
 CELLS = 40
@@ -40,12 +40,12 @@ NEIGHBORHOOD = 0.12
 LEAST_DISAGREEMENT = 0.95
 """…and from which they are unexplained, in what pixels of any direction have."""
 SETTLED_DISAGREEMENT = 0.35
-"""Mean disagreement of a patch, after the coarse rounds, from which it may be a lid though no part of it is
+"""Mean disagreement of a patch, after the coarse rounds, from which it may be a cap though no part of it is
 unexplained: under a bright sky, pixels of a shallow dish agree with most others."""
 LEAST_PART = 60
 """Parts of fewer unexplained pixels are left alone."""
 WHOLE_SHARE = 0.6
-"""A patch of which at least this share is unexplained is the lid of one hollow; else each part of it may be."""
+"""A patch of which at least this share is unexplained is the cap of one concavity; else each part of it may be."""
 SEEDS = 8
 """Points from which patches are grown."""
 LID_ANGLE_DEG = 40.0
@@ -66,10 +66,10 @@ EVALUATIONS = (160, 200, 260)
 """…and candidates of a descent at each of them."""
 DESCENTS = 3
 """From so many of the best first guesses at the first resolution."""
-FIRST_STEPS = Hollow(np.full(2, 0.08), 0.06, np.full(4, 0.05), 0.08, np.full(3, 0.08), np.full(2, 0.08)).vector
-"""First standard deviations of a hollow's numbers in a descent."""
+FIRST_STEPS = Concavity(np.full(2, 0.08), 0.06, np.full(4, 0.05), 0.08, np.full(3, 0.08), np.full(2, 0.08)).vector
+"""First standard deviations of a concavity's numbers in a descent."""
 LEAST_GAIN = 0.1
-"""A hollow is kept if it lowers the disagreement under it by this share…"""
+"""A concavity is kept if it lowers the disagreement under it by this share…"""
 STANDARD_ERRORS = 4.0
 """…and by so many standard errors of the views' differences."""
 
@@ -94,7 +94,7 @@ class Scored:
 
 @dataclass(frozen=True)
 class Patch:
-    """A part of a surface under which a hollow may lie: its relief, an outline, and the pixels that see it."""
+    """A part of a surface under which a concavity may lie: its relief, an outline, and the pixels that see it."""
 
     relief: Relief
     size: float
@@ -105,11 +105,11 @@ class Patch:
 
 
 def concave_start(views: Views, surface: LevelSet, settled: LevelSet) -> LevelSet | None:
-    """The surface with the hollows that make pixels agree better; None where there is none, or where the same surface
-    explains all pixels once it is `settled` by steps.
+    """The surface with the concavities that make pixels agree better; None where there is none, or where the same
+    surface explains all pixels once it is `settled` by steps.
 
-    Hollows are looked for under one patch after the other, each on the surface that those before it left. Where pixels
-    disagree under the settled surface only in the mean, hollows have to explain more than that one, too.
+    Concavities are searched under one patch after the other, on the surface that those before it left. Where pixels
+    disagree under the settled surface only in the mean, concavities have to explain more than that one, too.
     """
     pixels = solid_pixels(views, RAYS)
     settled = settled.resampled(CELLS)
@@ -124,10 +124,10 @@ def concave_start(views: Views, surface: LevelSet, settled: LevelSet) -> LevelSe
     coarse, found = surface.resampled(CELLS), False
     for chart in charts(coarse, pixels.rays):
         for patch in unexplained(chart, coarse):
-            hollow = searched(patch)
-            carved = coarse if hollow is None else patch.relief.carved(hollow)
+            concavity = searched(patch)
+            carved = coarse if concavity is None else patch.relief.carved(concavity)
             rivals = [settled, coarse] if in_the_mean else [coarse]
-            if hollow is not None and all(explains_better(carved, each, patch.scored) for each in rivals):
+            if concavity is not None and all(explains_better(carved, each, patch.scored) for each in rivals):
                 coarse, found = carved, True
     return coarse if found else None
 
@@ -236,7 +236,7 @@ def patch_inside(relief: Relief, size: float, waves: Float[np.ndarray, "4"], pix
     """The part inside an outline that faces the chart; None where too few pixels see it."""
     final = FinalRays.of(relief.surface, pixels.rays, 0)
     place = relief.chart.coordinates(final.points)
-    share = Hollow.bowl(size, waves, 1.0).share(place[:, 0], place[:, 1])
+    share = Concavity.bowl(size, waves, 1.0).share(place[:, 0], place[:, 1])
     facing = final.normals @ relief.chart.axes[2] > LEAST_FACING
     inside = np.flatnonzero((share < 1) & facing & (np.abs(place[:, 2]) < HALF_SIDE))
     if len(inside) < LEAST_PIXELS:
@@ -263,22 +263,22 @@ def outline_of(relief: Relief) -> tuple[float, Float[np.ndarray, "4"]]:
 
 
 @remembered()
-def searched(patch: Patch) -> Hollow | None:
-    """The hollow under which pixels agree best: first guesses of many depths, then descents from the best of them.
+def searched(patch: Patch) -> Concavity | None:
+    """The concavity under which pixels agree best: first guesses of many depths, then descents from the best of them.
 
     None where no guess makes them agree better, or the first descents gain too little.
     """
     first, before = RESOLUTIONS[0], patch.scored(patch.relief.surface, RESOLUTIONS[0])
     guesses = first_guesses(patch)
     evaluations = DESCENTS * EVALUATIONS[0] + sum(EVALUATIONS[1:])
-    progress = Progress("searching a hollow", len(guesses) + evaluations)
+    progress = Progress("searching a concavity", len(guesses) + evaluations)
 
     def cost(values: Float[np.ndarray, "13"], resolution: int) -> float:
         if progress.done < progress.total - 1:
             progress.advance()
-        return patch.scored(patch.relief.carved(Hollow.from_vector(values)), resolution)
+        return patch.scored(patch.relief.carved(Concavity.from_vector(values)), resolution)
 
-    def ended(found: Hollow | None) -> Hollow | None:
+    def ended(found: Concavity | None) -> Concavity | None:
         progress.advance(steps=progress.total - progress.done)
         return found
 
@@ -298,13 +298,13 @@ def searched(patch: Patch) -> Hollow | None:
     for number, (resolution, evaluations) in enumerate(later, 1):
         steps = FIRST_STEPS * 0.5**number
         best, _ = evolve(lambda x, r=resolution: cost(x, r), best, steps, evaluations, number)  # type: ignore[misc]
-    return ended(Hollow.from_vector(best))
+    return ended(Concavity.from_vector(best))
 
 
 def first_guesses(patch: Patch) -> list[Float[np.ndarray, "13"]]:
-    """Hollows of several sizes, depths and exponents under a patch."""
+    """Concavities of several sizes, depths and exponents under a patch."""
     return [
-        Hollow.bowl(patch.size + np.log(inset), patch.waves, depth * np.exp(patch.size), exponent).vector
+        Concavity.bowl(patch.size + np.log(inset), patch.waves, depth * np.exp(patch.size), exponent).vector
         for inset in INSETS
         for depth in DEPTHS
         for exponent in EXPONENTS

@@ -16,7 +16,7 @@ from panoless.environment.rays import Rays
 from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
 from panoless.geometry.free_form.concave import concave_start
-from panoless.geometry.free_form.photometric import INNER_PX, LEAST_COSINE, Sights, Solution
+from panoless.geometry.free_form.photometric import INNER_PX, LEAST_COSINE, Linearization, ReflectedRays
 from panoless.geometry.free_form.schedule import OUTLINE_GAIN, Round, Schedule
 from panoless.geometry.free_form.steps import DAMPING, solved_equations, take_steps, with_noise
 from panoless.geometry.free_form.surface import LevelSet
@@ -52,7 +52,7 @@ HELD_OUT_RESOLUTION = 128
 LEAST_FINER_GAIN = 0.002
 """Share of the held-out error by which a finer round has to lower it."""
 LEAST_GAIN = 0.02
-"""Share of the held-out error by which hollows, a refit and details have to lower it."""
+"""Share of the held-out error by which concavities, a refit and details have to lower it."""
 DETAILED_ERROR = 0.11
 """Held-out error from which details are looked for."""
 MOST_REFITS = 3
@@ -93,7 +93,7 @@ def fit_free_form(
     start: LevelSet,
     schedule: Schedule,
     *,
-    lids: Sequence[LevelSet] = (),
+    caps: Sequence[LevelSet] = (),
     nuisance: Nuisance = NO_NUISANCE,
     required: Collection[str] = (),
 ) -> tuple[FitStage, list[Decision]]:
@@ -102,9 +102,9 @@ def fit_free_form(
 
     Rounds are taken with four fifths of the views as long as the others gain by them, and the last of those once more
     with all, in which outlines count more where photographs agree with them. After the rounds that are always taken,
-    hollows are searched, blocks that are not `required` are removed unless they are needed, parts that pixels distrust
-    are refitted, and details are looked for where much is left. Hollows are searched under the start, and if there is
-    none, under the `lids`, other first surfaces.
+    concavities are searched, blocks that are not `required` are removed unless they are needed, parts that pixels
+    distrust are refitted, and details are searched where much is left. Concavities are searched under the start, and if
+    it has none, under the `caps`, other first surfaces.
     """
     kept, others = split_held_out(range(len(views.train)))
     if not kept or not others:
@@ -131,16 +131,16 @@ def fit_free_form(
         with improving():
             check_time()
             begun = start
-            hollowed = _hollowed_start(solved, (start, *lids) if schedule.hollowed and others else (), stage.surface)
-            if hollowed is not None:
-                plain, deeper = stage, coarse_stage(solved, hollowed, schedule.hollowed, nuisance=stage.nuisance)
+            concave = _concave_start(solved, (start, *caps) if schedule.concave and others else (), stage.surface)
+            if concave is not None:
+                plain, deeper = stage, coarse_stage(solved, concave, schedule.concave, nuisance=stage.nuisance)
                 stage = best((plain, deeper))
-                begun = start if stage is plain else hollowed
+                begun = start if stage is plain else concave
             stage, decisions = _needed(solved, stage, required)
             if not all(each.kept for each in decisions.values()):
                 # A surface that gave way to blocks does not come back from them by further steps.
                 check_time()
-                rounds = schedule.coarse if begun is start else schedule.hollowed
+                rounds = schedule.coarse if begun is start else schedule.concave
                 begun = replace(begun, surroundings=stage.surface.surroundings)
                 stage = coarse_stage(solved, begun, rounds, nuisance=stage.nuisance)
             stage = best(refitted_stages(solved, stage, schedule.refit))
@@ -164,9 +164,9 @@ def fit_free_form(
         return stage, list(decisions.values())
 
 
-def _hollowed_start(views: Views, lids: Sequence[LevelSet], surface: LevelSet) -> LevelSet | None:
-    """A start with hollows under the first of the lids that has any."""
-    found = (concave_start(views, lid, surface) for lid in lids)
+def _concave_start(views: Views, caps: Sequence[LevelSet], surface: LevelSet) -> LevelSet | None:
+    """A start with concavities under the first of the caps that has any."""
+    found = (concave_start(views, cap, surface) for cap in caps)
     return next((each for each in found if each is not None), None)
 
 
@@ -228,11 +228,11 @@ def predicted(solved: Views, views: Views, stage: FitStage) -> Nuisance:
         return nuisance
     settings = replace(stage.last, rays=min(stage.last.rays, JUDGED_RAYS))
     known = make_task(solved, settings, stage.nuisance)
-    under = Solution.at(known, stage.surface, stage.trust, None, FIRST_MAP_ROUNDS, stage.nuisance)
+    under = Linearization.at(known, stage.surface, stage.trust, None, FIRST_MAP_ROUNDS, stage.nuisance)
     settings = replace(settings, rays=JUDGED_RAYS // 4, steps=POSE_STEPS, under_known_map=True)
     task = make_task(views, settings, nuisance)
-    solution = Solution.at(task, stage.surface, stage.trust, under.environment, 0, nuisance)
-    return take_steps(with_noise(solution), stage.damping, still=True)[0].nuisance
+    linearization = Linearization.at(task, stage.surface, stage.trust, under.environment, 0, nuisance)
+    return take_steps(with_noise(linearization), stage.damping, still=True)[0].nuisance
 
 
 def _stages(views: Views, stage: FitStage, finer: Sequence[Round], progress: Progress) -> Iterator[FitStage]:
@@ -263,8 +263,8 @@ def refitted_stages(views: Views, stage: FitStage, rounds: Sequence[Round]) -> I
 def distrusted_share(views: Views, stage: FitStage) -> float:
     """Of the pixels that see the surroundings: how many lie where trust is low."""
     surface, rays = stage.surface, solid_pixels(views, HELD_OUT_RAYS).rays
-    sights = Sights.of(surface, rays, 1, LEAST_COSINE)
-    trust = stage.trust.at(surface.points(sights.hits.places[sights.clear]))
+    reflected = ReflectedRays.of(surface, rays, 1, LEAST_COSINE)
+    trust = stage.trust.at(surface.points(reflected.hits.places[reflected.clear]))
     return float((trust < DISTRUSTED).mean()) if len(trust) else 0.0
 
 
@@ -286,26 +286,26 @@ def take_round(
     task = make_task(views, settings, stage.nuisance)
     if settings.increment_prior:
         task = replace(task, reference=surface.coefficients)
-    solution = Solution.at(task, surface, stage.trust, stage.environment, FIRST_MAP_ROUNDS, stage.nuisance)
+    linearization = Linearization.at(task, surface, stage.trust, stage.environment, FIRST_MAP_ROUNDS, stage.nuisance)
     if stage.nuisance.free:
-        solution = with_noise(solution)
-    elif last and solution.outlines_agree:
-        solution = replace(solution, task=task.outlined(OUTLINE_GAIN))
-    solution, damping = take_steps(solution, stage.damping, progress)
+        linearization = with_noise(linearization)
+    elif last and linearization.outlines_agree:
+        linearization = replace(linearization, task=task.outlined(OUTLINE_GAIN))
+    linearization, damping = take_steps(linearization, stage.damping, progress)
     found = replace(
         stage,
-        surface=solution.surface,
-        trust=solution.trust,
-        environment=solution.environment,
+        surface=linearization.surface,
+        trust=linearization.trust,
+        environment=linearization.environment,
         damping=damping,
         settings=settings,
-        nuisance=solution.nuisance.freed(nuisance.free),
+        nuisance=linearization.nuisance.freed(nuisance.free),
     )
     common, moved = found.nuisance.without_common(task.cameras)
-    if common is None or CameraPoses.name not in solution.nuisance.free:
+    if common is None or CameraPoses.name not in linearization.nuisance.free:
         return found
     # The next round solves its map from nothing.
-    return replace(found, surface=solution.surface.taken_back(common), nuisance=moved, environment=None)
+    return replace(found, surface=linearization.surface.taken_back(common), nuisance=moved, environment=None)
 
 
 def variances(views: Views, stage: FitStage) -> dict[str, Float[np.ndarray, "B M"]]:
@@ -319,21 +319,21 @@ def variances(views: Views, stage: FitStage) -> dict[str, Float[np.ndarray, "B M
     if not by_view and not shared:
         return found
     task = make_task(views, stage.last, stage.nuisance)
-    solution = Solution.at(task, stage.surface, stage.trust, None, FIRST_MAP_ROUNDS, stage.nuisance)
-    solution = with_noise(solution)
-    converged = replace(solution.task, settings=replace(stage.last, solver_steps=VARIANCE_STEPS))
-    solution = replace(solution, task=converged)
-    factor, start = solution.task.prior_factor, 0
+    linearization = Linearization.at(task, stage.surface, stage.trust, None, FIRST_MAP_ROUNDS, stage.nuisance)
+    linearization = with_noise(linearization)
+    converged = replace(linearization.task, settings=replace(stage.last, solver_steps=VARIANCE_STEPS))
+    linearization = replace(linearization, task=converged)
+    factor, start = linearization.task.prior_factor, 0
     if by_view:
-        of_views = np.einsum("bmm->bm", np.linalg.inv(regularize(solution.beside[0].matrix, "cameras")))
+        of_views = np.einsum("bmm->bm", np.linalg.inv(regularize(linearization.beside[0].matrix, "cameras")))
     for block in by_view:
         found[block.name], start = factor * of_views[:, start : start + block.size], start + block.size
     start, size = 0, sum(each.size for each in shared)
     of_all = np.zeros(size)
     for index in range(size):
-        unit = [np.zeros_like(each.value) for each in solution.beside]
+        unit = [np.zeros_like(each.value) for each in linearization.beside]
         unit[-1][0, index] = 1.0
-        column = solved_equations(solution, (np.zeros(stage.surface.shape), unit), stage.damping)
+        column = solved_equations(linearization, (np.zeros(stage.surface.shape), unit), stage.damping)
         of_all[index] = factor * max(float(column.beside[-1][0, index]), 1e-30)
     for block in shared:
         found[block.name], start = of_all[None, start : start + block.size], start + block.size
@@ -354,7 +354,7 @@ def _rays(views: Views, surface: LevelSet, nuisance: Nuisance) -> tuple[Rays, in
     """Of pixels well inside the masks: those that see the surroundings, and how many miss the surface."""
     pixels, cameras = solid_pixels(views, HELD_OUT_RAYS), StatedCameras.of(views)
     rays = nuisance.moved(pixels.rays, cameras)
-    sights, inner = Sights.of(surface, rays, 1, LEAST_COSINE), pixels.inner_px > INNER_PX
-    radiance, clear = nuisance.equalized(pixels.radiance, rays.view), sights.clear & inner
-    outgoing, seen = (torch.from_numpy(values[clear]).float() for values in (sights.outgoing[:, 0], radiance))
-    return Rays(outgoing, seen), int((inner & ~sights.hits.met).sum())
+    reflected, inner = ReflectedRays.of(surface, rays, 1, LEAST_COSINE), pixels.inner_px > INNER_PX
+    radiance, clear = nuisance.equalized(pixels.radiance, rays.view), reflected.clear & inner
+    outgoing, seen = (torch.from_numpy(values[clear]).float() for values in (reflected.outgoing[:, 0], radiance))
+    return Rays(outgoing, seen), int((inner & ~reflected.hits.met).sum())

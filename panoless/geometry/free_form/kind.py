@@ -30,7 +30,7 @@ from panoless.geometry.base import (
 )
 from panoless.geometry.exact import ExactFamily, ExactGeometry
 from panoless.geometry.free_form.fit import FitStage, continued_fit, fit_free_form, variances
-from panoless.geometry.free_form.photometric import BAND_CELLS, Sights
+from panoless.geometry.free_form.photometric import BAND_CELLS, ReflectedRays
 from panoless.geometry.free_form.rendering import free_form_buffers, free_form_light
 from panoless.geometry.free_form.schedule import Schedule
 from panoless.geometry.free_form.start import first_surfaces, started
@@ -103,11 +103,11 @@ class FreeFormMirror(ExactGeometry):
 
     def observe(self, view: TrainView, pixels: Int[Tensor, "P"]) -> Rays:
         """The rays of those of the pixels that see the surroundings, with the trust of the surface there."""
-        sights = self._sights(view, pixels, 1)
-        seeing = self._seeing(view, pixels, sights.clear)
+        reflected = self._reflected(view, pixels, 1)
+        seeing = self._seeing(view, pixels, reflected.clear)
         chosen = pixels[torch.from_numpy(seeing).to(pixels.device)]
-        trust = self.trust.at(self.surface.points(sights.hits.places[seeing]))
-        outgoing, trusted = (torch.from_numpy(each).float() for each in (sights.outgoing[seeing, 0], trust))
+        trust = self.trust.at(self.surface.points(reflected.hits.places[seeing]))
+        outgoing, trusted = (torch.from_numpy(each).float() for each in (reflected.outgoing[seeing, 0], trust))
         radiance = view.radiance_at(chosen)
         incoming = view.directions_world(chosen)
         return Rays(outgoing.to(radiance.device), radiance, trusted.to(radiance.device), incoming)
@@ -116,12 +116,12 @@ class FreeFormMirror(ExactGeometry):
         """Which of the pixels that are `clear` lie well inside the mask."""
         return clear & (inner_distance_px(view.mask)[pixels.cpu().numpy()] > MAP_INNER_PX)
 
-    def _sights(self, view: TrainView, pixels: Int[Tensor, "P"], samples: int) -> Sights:
+    def _reflected(self, view: TrainView, pixels: Int[Tensor, "P"], samples: int) -> ReflectedRays:
         """What pixels of a view see."""
         rays, traces = self._traced(view, pixels)
         index = pixels.cpu().numpy()
         hits = self.surface.hits_at(rays.origins, rays.directions, traces.distance[index])
-        return Sights.along(self.surface, rays, samples, hits, traces.clear[index])
+        return ReflectedRays.along(self.surface, rays, samples, hits, traces.clear[index])
 
     def _traced(self, view: TrainView, pixels: Int[Tensor, "P"]) -> "tuple[PixelRays, _Traces]":
         """Rays of pixels of a view, and its traces, once for selection, map and verdict."""
@@ -130,7 +130,9 @@ class FreeFormMirror(ExactGeometry):
             self._traces[view.mask] = known = _Traces.none(view.camera)
         rays, new = PixelRays.centers(view.camera, index), np.isnan(known.distance[index])
         if new.any():
-            found = Sights.of(self.surface, rays.chosen(new), 1, LEAST_MAP_COSINE, occlusion_test=self.occlusion_test)
+            found = ReflectedRays.of(
+                self.surface, rays.chosen(new), 1, LEAST_MAP_COSINE, occlusion_test=self.occlusion_test
+            )
             known.distance[index[new]], known.clear[index[new]] = found.hits.distance, found.clear
         return rays, known
 
@@ -146,10 +148,10 @@ class FreeFormMirror(ExactGeometry):
 
     def _footprints(self, view: TrainView, pixels: Int[Tensor, "P"]) -> PixelFootprints:
         """Those of the pixels of one view."""
-        sights = self._sights(view, pixels, 4)
-        trusted = self.trust.at(self.surface.points(sights.hits.places)) > LEAST_FOOTPRINT_TRUST
-        kept = sights.clear & trusted & (sights.turn < WIDEST_FOOTPRINT_RAD)
-        directions = torch.from_numpy(sights.outgoing[kept]).float().to(view.radiance.device)
+        reflected = self._reflected(view, pixels, 4)
+        trusted = self.trust.at(self.surface.points(reflected.hits.places)) > LEAST_FOOTPRINT_TRUST
+        kept = reflected.clear & trusted & (reflected.turn < WIDEST_FOOTPRINT_RAD)
+        directions = torch.from_numpy(reflected.outgoing[kept]).float().to(view.radiance.device)
         return PixelFootprints(directions, view.radiance_at(pixels[torch.from_numpy(kept).to(pixels.device)]))
 
     def shade(
@@ -221,13 +223,13 @@ class FreeFormFamily(ExactFamily):
     ) -> tuple[Geometry, Corrections, list[Decision]]:
         """All coefficients by silhouettes and photographs, with nuisance blocks of those kinds.
 
-        A start that has descended may have bent a lid until pixels agree a little: then hollows are looked for under
+        A start that has descended may have bent a cap until pixels agree a little: then concavities are searched under
         the plain surface.
         """
         schedule, first = Schedule.of(config.free_form), proposal.shape
         start, nuisance = started(views, first, schedule, nuisance_of(views, kinds, first.surroundings))
-        lids = () if np.array_equal(start.coefficients, first.plain.coefficients) else (first.surface,)
-        stage, decisions = fit_free_form(views, start, schedule, lids=lids, nuisance=nuisance, required=required)
+        caps = () if np.array_equal(start.coefficients, first.plain.coefficients) else (first.surface,)
+        stage, decisions = fit_free_form(views, start, schedule, caps=caps, nuisance=nuisance, required=required)
         if stage.settings is None:  # The time limit came before the first round.
             return _mirror(stage.surface, stage.trust, None, config), NO_CORRECTIONS, []
         with torch.no_grad():

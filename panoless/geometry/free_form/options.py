@@ -9,8 +9,8 @@ from shinypartial.io.records import Count
 class FreeFormOptions:
     """How much a level set's fit tries; its schedule and its numbers are constants beside their formulas."""
 
-    hollows: bool = True
-    """Whether hollows that no silhouette shows are looked for."""
+    concavities: bool = True
+    """Whether concavities that no silhouette shows are looked for."""
     starts: bool = True
     """Whether several first surfaces descend under coarse maps, and fine grids are tried from the first one on where
     much stays unexplained. Else the usual rounds begin at the surface whose pixels disagree least."""

@@ -53,7 +53,7 @@ AGREED_PULL_PX = 0.01
 
 
 @dataclass(frozen=True)
-class Sights:
+class ReflectedRays:
     """Where rays of pixels meet a surface and what they mirror: the mean mirrored direction, not of unit length, K
     directions over each pixel in which they look into the map, how far they turn over it (rad), and whether it sees the
     surroundings at a useful angle.
@@ -68,7 +68,7 @@ class Sights:
     @classmethod
     def of(
         cls, surface: LevelSet, rays: PixelRays, samples: int, least_cosine: float, *, occlusion_test: bool = True
-    ) -> "Sights":
+    ) -> "ReflectedRays":
         """By tracing the rays, and, but without an occlusion test, their mirrored rays against the surface itself."""
         hits = surface.hits(rays.origins, rays.directions)
         normals = hits.normals
@@ -82,7 +82,7 @@ class Sights:
     @classmethod
     def along(
         cls, surface: LevelSet, rays: PixelRays, samples: int, hits: Hits, clear: Bool[np.ndarray, "P"]
-    ) -> "Sights":
+    ) -> "ReflectedRays":
         """Of rays that were traced already."""
         distance = np.where(hits.met, hits.distance, 0.0) / surface.spacing
         _, outgoing, turn = mirrored(hits.derivatives, rays.directions, distance, rays.steps, samples)
@@ -103,12 +103,12 @@ def photon_gain(seen: Float[np.ndarray, "P 3"], brightness: float) -> Float[np.n
 
 
 @dataclass(frozen=True)
-class Solution:
+class Linearization:
     """A surface, the map that explains the pixels best with it, and what both cost."""
 
     task: Task
     surface: LevelSet
-    sights: Sights
+    reflected: ReflectedRays
     trust: Trust
     environment: Float[Tensor, "6 3 L L"]
     gain: Float[np.ndarray, "P"]
@@ -131,17 +131,17 @@ class Solution:
         start: Float[Tensor, "6 3 M M"] | None,
         rounds: int,
         nuisance: Nuisance = NO_NUISANCE,
-    ) -> "Solution":
+    ) -> "Linearization":
         """With the map solved in so many robust rounds from another one, or from nothing."""
         settings, surface = task.settings, replace(surface, surroundings=nuisance.around(surface.surroundings))
         rays = nuisance.moved(task.pixels.rays, task.cameras)
         radiance = nuisance.equalized(task.pixels.radiance, rays.view)
-        sights = Sights.of(surface, rays, settings.samples, LEAST_COSINE)
-        clear = sights.clear & (task.pixels.inner_px > INNER_PX)
+        reflected = ReflectedRays.of(surface, rays, settings.samples, LEAST_COSINE)
+        clear = reflected.clear & (task.pixels.inner_px > INNER_PX)
         texel = np.pi / 2 / settings.resolution
-        free = clear / (1 + (sights.turn / (WIDE_TEXELS * texel)) ** 2)
-        weights = free * trust.at(surface.points(sights.hits.places))
-        areas = PixelFootprints(torch.from_numpy(sights.outgoing).float(), torch.from_numpy(radiance).float())
+        free = clear / (1 + (reflected.turn / (WIDE_TEXELS * texel)) ** 2)
+        weights = free * trust.at(surface.points(reflected.hits.places))
+        areas = PixelFootprints(torch.from_numpy(reflected.outgoing).float(), torch.from_numpy(radiance).float())
         if start is None:
             environment = splatted_map(areas, torch.from_numpy(weights).float(), settings.resolution)
         else:
@@ -155,10 +155,10 @@ class Solution:
             environment = smoothed_map(environment, areas, votes)
         length = settings.resolution + 2
         padded = padded_texels(environment).reshape(6, length, length, 3).double().numpy()
-        light, slopes, texels = seen_with_slopes(padded, sights.outgoing)
+        light, slopes, texels = seen_with_slopes(padded, reflected.outgoing)
         counted = photon_gain(light, task.brightness)
         residual, slopes = (light - radiance) * counted[:, None], slopes * counted[:, None, None]
-        return cls(task, surface, sights, trust, environment, counted, residual, slopes, texels, free, nuisance)
+        return cls(task, surface, reflected, trust, environment, counted, residual, slopes, texels, free, nuisance)
 
     @cached_property
     def rays(self) -> PixelRays:
@@ -168,25 +168,25 @@ class Solution:
     @cached_property
     def weights(self) -> Float[np.ndarray, "P"]:
         """Of the pixels, with trust, but without robust weights; in units of 1/σ²."""
-        trusted = self.trust.at(self.surface.points(self.sights.hits.places))
+        trusted = self.trust.at(self.surface.points(self.reflected.hits.places))
         return self.task.photograph_weight * self.free * trusted
 
     @cached_property
     def points(self) -> Float[np.ndarray, "P 3"]:
         """Where the pixels see the surface."""
-        return self.surface.points(self.sights.hits.places)
+        return self.surface.points(self.reflected.hits.places)
 
     @cached_property
     def mirrored_slopes(self) -> Float[np.ndarray, "P 3 3"]:
         """Of what is seen, by the mirrored direction."""
-        return self.surface.surroundings.slopes_by_mirrored(self.slopes, self.points, self.sights.mirrored)
+        return self.surface.surroundings.slopes_by_mirrored(self.slopes, self.points, self.reflected.mirrored)
 
     @cached_property
     def photographs(self) -> Rows:
         """Pixels under the map."""
-        rows = mirror_rows(self.sights.hits.derivatives, self.rays.directions, self.mirrored_slopes)
+        rows = mirror_rows(self.reflected.hits.derivatives, self.rays.directions, self.mirrored_slopes)
         weights = self.weights * robust_weight(self.residual, self.task.settings.robust_scale)
-        return Rows(self.sights.hits.places, rows, self.residual, weights)
+        return Rows(self.reflected.hits.places, rows, self.residual, weights)
 
     @property
     def silhouettes(self) -> Rows:
@@ -196,7 +196,7 @@ class Solution:
     @cached_property
     def _motion_rows(self) -> Float[np.ndarray, "P 3 6"]:
         """Of photographs, by the motions of their rays."""
-        hits = self.sights.hits
+        hits = self.reflected.hits
         distance = np.where(hits.met, hits.distance, 0.0) / self.surface.spacing
         rows = pixel_motion_rows(
             hits.derivatives, self.rays.directions, distance, self.mirrored_slopes, self.photographs.rows[..., 1:]
@@ -208,7 +208,7 @@ class Solution:
     def _silhouette_rays(self) -> tuple[PixelRays, PixelRays]:
         """Of outlines, and of pixels that miss the surface."""
         outlines = self.nuisance.moved(self.task.outlines, self.task.cameras)
-        return outlines, self.rays.chosen(~self.sights.hits.met)
+        return outlines, self.rays.chosen(~self.reflected.hits.met)
 
     @cached_property
     def _silhouettes(self) -> tuple[Rows, Float[np.ndarray, "S 1 6"]]:
@@ -263,9 +263,9 @@ class Solution:
         """The gradient of the prior."""
         return self.smoothing * third_differences(self._rough, self.active, whole=self._whole)
 
-    def prior(self, before: "Solution") -> float:
-        """λ/2 ∫ |D³φ|² over the unknowns of a solution `before`: coefficients that come near the surface by a step have
-        never been smoothed, and would count against it.
+    def prior(self, before: "Linearization") -> float:
+        """λ/2 ∫ |D³φ|² over the unknowns of a linearization `before`: coefficients that come near the surface by a step
+        have never been smoothed, and would count against it.
         """
         if before is self:
             return float((self.bent * self._rough).sum()) / 2
@@ -282,14 +282,14 @@ class Solution:
         reference, coefficients = self.task.reference, self.surface.coefficients
         return coefficients if reference is None else coefficients - reference
 
-    def cost(self, before: "Solution") -> float:
-        """Half the sum of all robust squares, pixels weighed as in a solution `before`, and with its gain and unknowns.
+    def cost(self, before: "Linearization") -> float:
+        """Half the sum of all robust squares, with weights, gain and unknowns of a linearization `before`.
 
         A pixel that no longer sees the surroundings costs what it did before, so it is not lost for gain.
         """
         scale = self.task.settings.robust_scale
         residual = self.residual * (before.gain / self.gain)[:, None]
-        residual = np.where(self.sights.clear[:, None], residual, before.residual)
+        residual = np.where(self.reflected.clear[:, None], residual, before.residual)
         photographs = scale**2 * float((before.weights * bounded_error(residual, scale)).sum()) / 2
         prior = self.prior(before)
         prior += self.task.prior_factor * self.nuisance.prior_cost
@@ -333,7 +333,7 @@ class Solution:
     @cached_property
     def _surroundings_rows(self) -> Float[np.ndarray, "P 3 D"]:
         """Of photographs, by the unknowns of the surroundings."""
-        return self.surface.surroundings.rows(self.slopes, self.points, self.sights.mirrored)
+        return self.surface.surroundings.rows(self.slopes, self.points, self.reflected.mirrored)
 
     @cached_property
     def _outlined(self) -> PixelRays:
@@ -398,13 +398,13 @@ class Solution:
         pulled = zip(self.beside, beside, strict=True)
         return total * self.active, [each.backward(seen, constrained[:count], moved) for each, moved in pulled]
 
-    def after(self, change: Float[np.ndarray, "A B C"], beside: Sequence[Float[np.ndarray, "_ _"]]) -> "Solution":
+    def after(self, change: Float[np.ndarray, "A B C"], beside: Sequence[Float[np.ndarray, "_ _"]]) -> "Linearization":
         """Moved by a step, with hits, visibility and map computed again."""
         moved = list(beside)
         surface = replace(self.surface, coefficients=self.surface.coefficients + change)
         by_view = moved.pop(0) if self.nuisance.free_blocks(by_view=True) else None
         nuisance = self.nuisance.stepped(by_view, moved[0][0] if moved else None)
-        return Solution.at(self.task, surface, self.trust, self.environment, self.task.map_rounds, nuisance)
+        return Linearization.at(self.task, surface, self.trust, self.environment, self.task.map_rounds, nuisance)
 
     def diagonal(self, smoothing_diagonal: float) -> Float[np.ndarray, "A B C"]:
         """The matrix's diagonal, but for what the map takes over; at least a millionth of its largest."""

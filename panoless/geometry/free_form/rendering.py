@@ -10,7 +10,7 @@ from torch import Tensor
 from panoless.capture.rays import pose_of
 from panoless.geometry.base import SurfaceBuffers, beside_outline, buffers_from_arrays
 from panoless.geometry.exact import shade_centers
-from panoless.geometry.free_form.photometric import Sights
+from panoless.geometry.free_form.photometric import ReflectedRays
 from panoless.geometry.free_form.spread import FinalRays
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.kernels.camera import RasterCamera
@@ -77,10 +77,10 @@ def free_form_light(
     Pixels that none of these hit are shaded by the given normals.
     """
     index = pixels.cpu().numpy()
-    sights = Sights.of(surface, PixelRays.centers(camera, index), DIRECTIONS, 0.0)
+    reflected = ReflectedRays.of(surface, PixelRays.centers(camera, index), DIRECTIONS, 0.0)
     light = shade_centers(environment, camera, pixels, normals_camera)
-    narrow = sights.clear & (sights.turn < WIDEST_TURN_RAD)
-    mean = sample_cubemap(environment, torch.from_numpy(sights.outgoing[narrow]).to(environment))
+    narrow = reflected.clear & (reflected.turn < WIDEST_TURN_RAD)
+    mean = sample_cubemap(environment, torch.from_numpy(reflected.outgoing[narrow]).to(environment))
     light[torch.from_numpy(np.flatnonzero(narrow)).to(light.device)] = mean
     row, column = np.divmod(index[~narrow], camera.width)
     total, count = torch.zeros(len(row), 3).to(light), torch.zeros(len(row)).to(light)

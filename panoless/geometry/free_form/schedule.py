@@ -63,13 +63,13 @@ FINER = (
     Round(60, 128, 0.10, 4, 52_000, 3.0, 4, solver_steps=20),
 )
 """Each taken if held-out views gain by the one before it. The last one that was is taken again with all views."""
-HOLLOWED = (
+CONCAVE = (
     Round(28, 16, 0.30, 1, 40_000, 30.0, 5),
     Round(28, 32, 0.20, 1, 40_000, 30.0, 5),
     Round(36, 32, 0.20, 1, 60_000, 30.0, 3),
     Round(36, 64, 0.15, 4, 80_000, 30.0, 4),
 )
-"""From a surface with hollows, in place of the coarse rounds: these would smooth a socket away."""
+"""From a surface with concavities, in place of the coarse rounds: these would smooth a socket away."""
 REFIT = (
     Round(28, 16, 0.80, 4, 40_000, 30.0, 6, under_known_map=True),
     Round(28, 16, 0.80, 4, 40_000, 30.0, 6, under_known_map=True),
@@ -99,7 +99,7 @@ class Schedule:
     descent: tuple[Round, ...] = DESCENT
     coarse: tuple[Round, ...] = COARSE
     finer: tuple[Round, ...] = FINER
-    hollowed: tuple[Round, ...] = HOLLOWED
+    concave: tuple[Round, ...] = CONCAVE
     refit: tuple[Round, ...] = REFIT
     detailed: tuple[Round, ...] = DETAILED
 
@@ -113,7 +113,7 @@ class Schedule:
             DESCENT if options.starts else (),
             _up_to(options.finest_cells, coarse) or coarse[:1],
             finer,
-            HOLLOWED if options.hollows else (),
+            CONCAVE if options.concavities else (),
             _up_to(options.finest_cells, REFIT),
             DETAILED if options.starts else (),
         )

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from panoless.geometry.free_form.photometric import Solution
+from panoless.geometry.free_form.photometric import Linearization
 from panoless.geometry.free_form.schedule import OUTLINE_GAIN
 from panoless.geometry.free_form.task import RADIANCE_SIGMA
 from panoless.geometry.free_form.trust import Trust
@@ -41,67 +41,67 @@ class Change:
     beside: list[Float[np.ndarray, "_ _"]]
 
 
-def with_noise(solution: Solution) -> Solution:
+def with_noise(linearization: Linearization) -> Linearization:
     """With priors and silhouettes in the units of the noise that residuals show, in place of the nominal one.
 
     A pixel of variance σ² where e has σₑ² counts (σₑ/σ)² too much; errors of a map and of a surface are alike in about
     `CORRELATED` pixels.
     """
-    task, clear = solution.task, solution.free > 0
-    size = np.linalg.norm(solution.residual[clear], axis=1)
+    task, clear = linearization.task, linearization.free > 0
+    size = np.linalg.norm(linearization.residual[clear], axis=1)
     sigma = float(np.median(size)) / CHI_MEDIAN if len(size) else 0.0
     factor = max(sigma / RADIANCE_SIGMA, 1.0) ** 2
     weight = task.outline_weight / task.settings.outline_gain * OUTLINE_GAIN * factor
-    return replace(solution, task=replace(task, prior_factor=CORRELATED * factor, outline_weight=weight))
+    return replace(linearization, task=replace(task, prior_factor=CORRELATED * factor, outline_weight=weight))
 
 
 def take_steps(
-    solution: Solution, damping: float, progress: Progress | None = None, *, still: bool = False
-) -> tuple[Solution, float]:
+    linearization: Linearization, damping: float, progress: Progress | None = None, *, still: bool = False
+) -> tuple[Linearization, float]:
     """The steps of a round, each of which lowers the cost with hits, visibility and map computed again; the last
     damping.
     """
-    settings = solution.task.settings
+    settings = linearization.task.settings
     for index in range(settings.steps):
         if not still:
-            solution = replace(solution, trust=measured_trust(solution))
-        before = solution
-        solution, shortened = _accepted(solution, gauss_newton_step(solution, damping, still=still))
+            linearization = replace(linearization, trust=measured_trust(linearization))
+        before = linearization
+        linearization, shortened = _accepted(linearization, gauss_newton_step(linearization, damping, still=still))
         stiffest = damping >= DAMPING_RANGE[1]
         factor = DAMPING_MORE**shortened if shortened else DAMPING_LESS
         damping = float(np.clip(damping * factor, *DAMPING_RANGE))
-        gain = 1 - solution.cost(before) / before.cost(before)
+        gain = 1 - linearization.cost(before) / before.cost(before)
         last = gain < settings.least_gain and (shortened < TRIALS or stiffest)
         if progress is not None:
             progress.advance(steps=settings.steps - index if last else 1)
         if last:
             break
-    return solution, damping
+    return linearization, damping
 
 
-def _accepted(solution: Solution, step: Change) -> tuple[Solution, int]:
-    """The solution after the longest of the tried lengths of a step that lowers the cost, and how many times it was
-    shortened; the same solution after none, and the number of trials.
+def _accepted(linearization: Linearization, step: Change) -> tuple[Linearization, int]:
+    """The linearization after the longest of the tried lengths of a step that lowers the cost, and how many times it
+    was shortened; the same one after none, and the number of trials.
     """
-    before = solution.cost(solution)
+    before = linearization.cost(linearization)
     for shortened in range(TRIALS):
         length = SHORTENING**shortened
-        moved = solution.after(length * step.coefficients, [length * each for each in step.beside])
-        if moved.cost(solution) < before:
+        moved = linearization.after(length * step.coefficients, [length * each for each in step.beside])
+        if moved.cost(linearization) < before:
             return moved, shortened
-    return solution, TRIALS
+    return linearization, TRIALS
 
 
-def gauss_newton_step(solution: Solution, damping: float, *, still: bool = False) -> Change:
+def gauss_newton_step(linearization: Linearization, damping: float, *, still: bool = False) -> Change:
     """−(H + μ diag H)⁻¹ g, nowhere longer than the longest step; in a `still` scene only blocks of views move."""
-    gradient, beside = solution.gradient()
-    change = solved_equations(solution, (-gradient, [-each for each in beside]), damping, still=still)
+    gradient, beside = linearization.gradient()
+    change = solved_equations(linearization, (-gradient, [-each for each in beside]), damping, still=still)
     coefficients = np.clip(change.coefficients, -LONGEST_STEP_CELLS, LONGEST_STEP_CELLS)
     return replace(change, coefficients=coefficients)
 
 
 def solved_equations(
-    solution: Solution,
+    linearization: Linearization,
     right_side: tuple[Float[np.ndarray, "A B C"], list[Float[np.ndarray, "_ _"]]],
     damping: float,
     *,
@@ -111,14 +111,14 @@ def solved_equations(
 
     That is preconditioned by its blocks: with H = L Lᵀ of a block its unknowns are y = Lᵀ x.
     """
-    shape, size = solution.surface.shape, solution.surface.coefficients.size
-    diagonal = solution.diagonal(THIRD_DIFFERENCE_DIAGONAL)
-    damped = [each.matrix * (1 + damping * np.eye(each.matrix.shape[1])) for each in solution.beside]
+    shape, size = linearization.surface.shape, linearization.surface.coefficients.size
+    diagonal = linearization.diagonal(THIRD_DIFFERENCE_DIAGONAL)
+    damped = [each.matrix * (1 + damping * np.eye(each.matrix.shape[1])) for each in linearization.beside]
     back = [
         np.linalg.inv(np.linalg.cholesky(regularize(blocks, "cameras and exposures"))).transpose(0, 2, 1)
         for blocks in damped
     ]
-    ends = np.cumsum([size, *(each.value.size for each in solution.beside)])
+    ends = np.cumsum([size, *(each.value.size for each in linearization.beside)])
 
     def unpacked(values: Float[np.ndarray, "N"]) -> Change:
         parts = zip(back, ends[:-1], ends[1:], strict=True)
@@ -133,25 +133,25 @@ def solved_equations(
 
     def product(values: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
         change = unpacked(values)
-        by_change, by_others = solution.product(change.coefficients, change.beside)
-        for each, moved, by_moved in zip(solution.beside, change.beside, by_others, strict=True):
+        by_change, by_others = linearization.product(change.coefficients, change.beside)
+        for each, moved, by_moved in zip(linearization.beside, change.beside, by_others, strict=True):
             by_moved += damping * np.einsum("bmm->bm", each.matrix) * moved
         return packed(by_change + damping * diagonal * change.coefficients, by_others)
 
-    moving = [np.full(each.value.size, not still or index == 0) for index, each in enumerate(solution.beside)]
-    free = np.zeros(shape) if still else solution.active / (diagonal * (1 + damping))
+    moving = [np.full(each.value.size, not still or index == 0) for index, each in enumerate(linearization.beside)]
+    free = np.zeros(shape) if still else linearization.active / (diagonal * (1 + damping))
     return unpacked(
         solve_by_products(
             product,
             packed(*right_side),
             np.concatenate([free.ravel(), *moving]),
-            solution.task.settings.solver_steps,
+            linearization.task.settings.solver_steps,
             SOLVER_TOLERANCE,
         )
     )
 
 
-def measured_trust(solution: Solution) -> Trust:
-    """Trust by the residuals of a solution."""
-    points, clear = solution.surface.points(solution.sights.hits.places), solution.free > 0
-    return solution.trust.measured(points, solution.residual, solution.free, clear)
+def measured_trust(linearization: Linearization) -> Trust:
+    """Trust by the residuals of a linearization."""
+    points, clear = linearization.surface.points(linearization.reflected.hits.places), linearization.free > 0
+    return linearization.trust.measured(points, linearization.residual, linearization.free, clear)

@@ -116,7 +116,7 @@ class SphereFamily(ExactFamily):
     geometry: ClassVar[type[Geometry]] = SphereMirror
     label: ClassVar[str] = "a sphere"
     needs_depth: ClassVar[bool] = False
-    told_by_outlines: ClassVar[bool] = True
+    silhouettes_suffice: ClassVar[bool] = True
     by_silhouettes: ClassVar[bool] = True
 
     def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:

@@ -51,7 +51,7 @@ def coarse_config() -> FitConfig:
         # The traced dome has flat edges, so it looks like a flat mirror in a near room.
         surroundings=replace(config.surroundings, mode="off"),
         corrections=CorrectionOptions(poses="off", masks="off", exposure="off", lens="off"),
-        free_form=FreeFormOptions(hollows=False, starts=False, finest_cells=20),
+        free_form=FreeFormOptions(concavities=False, starts=False, finest_cells=20),
     )
 
 

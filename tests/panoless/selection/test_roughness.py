@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -12,16 +13,16 @@ from panoless.capture.views import TrainView, Views
 from panoless.config import FitConfig
 from panoless.environment.options import MaterialOptions
 from panoless.geometry.revolution.kind import RevolutionMirror
-from panoless.selection.softness import Softness, _SoftnessTrial, earned_softness
+from panoless.selection.blur import Blur, BlurTrial, judged_blur, needed_blur
 from tests.support.mirror_revolution import around, goblet, rays_of, revolution_views
 
 ROUGHNESS = 0.3
 MIRROR = RevolutionMirror(goblet(), occlusion_test=False)
 
 
-def found_softness(views: Views) -> Softness:
+def found_blur(views: Views) -> Blur:
     """With texels as wide as the views are coarse, and rougher than slightly, so that they show it."""
-    return earned_softness(views, MIRROR, FitConfig(), first_roughness=0.15, roughnesses=(0.05, 0.5), trials=4)
+    return needed_blur(views, MIRROR, FitConfig(), first_roughness=0.15, roughnesses=(0.05, 0.5), trials=4)
 
 
 def checkered(directions: Float[np.ndarray, "*P 3"]) -> Float[np.ndarray, "*P 3"]:
@@ -58,11 +59,11 @@ def views_of(roughness: float) -> Views:
 @pytest.mark.slow
 def test_a_rough_mirror_is_found_and_a_smooth_one_stays_smooth() -> None:
     """It comes out too low, as steps end before edges are sharp."""
-    found = found_softness(views_of(ROUGHNESS))
+    found = found_blur(views_of(ROUGHNESS))
     assert found.blur_px is None
     assert found.roughness is not None
     assert 0.4 * ROUGHNESS < found.roughness < 1.2 * ROUGHNESS
-    assert found_softness(views_of(1e-3)) == Softness()
+    assert found_blur(views_of(1e-3)) == Blur()
 
 
 @pytest.mark.slow
@@ -70,7 +71,7 @@ def test_blurred_pictures_are_told_from_a_rough_mirror() -> None:
     """It comes out too low: fields of the checkered world are narrower than such a pixel in these views."""
     plain = views_of(1e-3)
     soft = tuple(replace(view, radiance=_blurred(view, 1.0)) for view in plain.train)
-    found = found_softness(replace(plain, train=soft))
+    found = found_blur(replace(plain, train=soft))
     assert found.roughness is None
     assert found.blur_px is not None
     assert 0.3 < found.blur_px < 1.2
@@ -91,27 +92,24 @@ def _blurred(view: TrainView, sigma_px: float) -> torch.Tensor:
         (MaterialOptions(known_roughness=0.2), 0.2),
     ],
 )
-def test_nobody_asks_where_roughness_is_off_or_known(options: MaterialOptions, expected: float | None) -> None:
+def test_a_roughness_that_is_off_or_known_is_not_searched(options: MaterialOptions, expected: float | None) -> None:
     views = revolution_views(MIRROR.surface, around(5, size=16))
-    assert earned_softness(views, MIRROR, FitConfig(material=options)) == Softness(roughness=expected)
+    assert needed_blur(views, MIRROR, FitConfig(material=options)) == Blur(roughness=expected)
 
 
 @pytest.mark.parametrize(("sharp", "asked"), [(0.004, 1), (0.04, 4)])
-def test_nothing_softer_is_asked_for_where_a_sharp_map_explains_all(
-    monkeypatch: pytest.MonkeyPatch, sharp: float, asked: int
-) -> None:
+def test_nothing_else_is_tried_where_a_sharp_map_explains_all(sharp: float, asked: int) -> None:
     """Though a rough mirror would explain half of what little is left."""
-    found: list[Softness] = []
+    found: list[Blur] = []
 
     class Trial:
-        def errors(self, softness: Softness, *_: object) -> np.ndarray:
-            found.append(softness)
-            return np.full(5, sharp if softness.roughness is None else sharp / 2) + np.linspace(0, 1e-6, 5)
+        def errors(self, blur: Blur, *_: object) -> np.ndarray:
+            found.append(blur)
+            return np.full(5, sharp if blur.roughness is None else sharp / 2) + np.linspace(0, 1e-6, 5)
 
-        def searched(self, softness: Callable[[float], Softness], bounds: tuple[float, float], trials: int) -> float:
+        def searched(self, blur: Callable[[float], Blur], bounds: tuple[float, float], trials: int) -> float:
             return 0.1
 
-    monkeypatch.setattr(_SoftnessTrial, "of", lambda *_: Trial())
-    taken = earned_softness(views_of(0.0), MIRROR, FitConfig())
-    assert taken == (Softness() if asked == 1 else Softness(roughness=0.1))
+    taken = judged_blur(cast(BlurTrial, Trial()), MaterialOptions())
+    assert taken == (Blur() if asked == 1 else Blur(roughness=0.1))
     assert len(found) == asked

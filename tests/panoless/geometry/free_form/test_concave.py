@@ -1,4 +1,4 @@
-"""Concave starts: what the score measures, what a hollow is, and that hollows are found where they are."""
+"""Concave starts: what the score measures, what a concavity is, and that concavities are found where they are."""
 
 from dataclasses import replace
 
@@ -9,8 +9,8 @@ from panoless.capture.views import Views
 from panoless.config import FitConfig
 from panoless.geometry.free_form import concave, fit
 from panoless.geometry.free_form.concave import concave_start, unexplained_parts, unexplained_patches
+from panoless.geometry.free_form.concavities import Chart, Concavity, Relief, smooth_maximum
 from panoless.geometry.free_form.fit import fit_free_form
-from panoless.geometry.free_form.hollows import Chart, Hollow, Relief, smooth_maximum
 from panoless.geometry.free_form.kind import FreeFormFamily
 from panoless.geometry.free_form.schedule import COARSE, Schedule
 from panoless.geometry.free_form.spread import FinalRays, cells_of, disagreement
@@ -26,9 +26,9 @@ from tests.support.mirror_body import (
     pattern,
 )
 
-OUTER, HOLLOW_MIDDLE, HOLLOW_AXES = (0.8, 1.0, 0.9), (0.75, 0.1, -0.05), (0.7, 0.7, 0.55)
+OUTER, CONCAVITY_MIDDLE, CONCAVITY_AXES = (0.8, 1.0, 0.9), (0.75, 0.1, -0.05), (0.7, 0.7, 0.55)
 RIM = 0.57
-"""Height along x at which the two ellipsoids meet, about: the lid that outlines see."""
+"""Height along x at which the two ellipsoids meet, about: the cap that outlines see."""
 QUICK = {
     "RAYS": 12_000,
     "PIXELS": 1_000,
@@ -107,9 +107,9 @@ def test_a_smooth_maximum_is_one_but_near_the_crossing() -> None:
     assert found.max() - largest.max() <= 0.125
 
 
-def test_numbers_of_a_hollow_come_back() -> None:
-    hollow = Hollow.from_vector(np.linspace(0.1, 0.9, 13))
-    np.testing.assert_array_equal(Hollow.from_vector(hollow.vector).vector, hollow.vector)
+def test_numbers_of_a_concavity_come_back() -> None:
+    concavity = Concavity.from_vector(np.linspace(0.1, 0.9, 13))
+    np.testing.assert_array_equal(Concavity.from_vector(concavity.vector).vector, concavity.vector)
 
 
 def test_a_chart_and_its_inverse() -> None:
@@ -129,9 +129,9 @@ def flat_block() -> LevelSet:
 def test_a_bowl_of_reach_one_is_an_ellipsoid() -> None:
     """Cut into a flat block, half as deep as wide; points of its mesh lie on it."""
     chart = Chart.about(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.8)
-    hollow = Hollow.bowl(0.0, np.zeros(4), 0.5)
-    np.testing.assert_allclose(hollow.reach, 1)
-    mesh, _ = Relief(flat_block(), chart).carved(hollow, 0.3).mesh(1)
+    concavity = Concavity.bowl(0.0, np.zeros(4), 0.5)
+    np.testing.assert_allclose(concavity.reach, 1)
+    mesh, _ = Relief(flat_block(), chart).carved(concavity, 0.3).mesh(1)
     inside = mesh.vertices[(mesh.vertices[:, 2] < -0.1)]
     level = np.sqrt((inside[:, :2] ** 2).sum(1) / 0.8**2 + inside[:, 2] ** 2 / 0.4**2)
     assert len(inside) > 200
@@ -140,7 +140,7 @@ def test_a_bowl_of_reach_one_is_an_ellipsoid() -> None:
 
 def test_nothing_is_carved_beyond_the_rim() -> None:
     chart = Chart.about(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.6)
-    mesh, _ = Relief(flat_block(), chart).carved(Hollow.bowl(0.0, np.zeros(4), 0.5), 0.3).mesh(1)
+    mesh, _ = Relief(flat_block(), chart).carved(Concavity.bowl(0.0, np.zeros(4), 0.5), 0.3).mesh(1)
     beyond = np.hypot(*mesh.vertices[:, :2].T) > 0.7
     np.testing.assert_allclose(mesh.vertices[beyond, 2], 0, atol=0.005)
 
@@ -155,19 +155,19 @@ def test_unexplained_points_are_gathered_by_where_they_are() -> None:
 
 @pytest.fixture(scope="module")
 def dish() -> tuple[Body, Views]:
-    """An ellipsoid with a hollow off its middle."""
-    body = dented(OUTER, HOLLOW_MIDDLE, HOLLOW_AXES)
+    """An ellipsoid with a concavity off its middle."""
+    body = dented(OUTER, CONCAVITY_MIDDLE, CONCAVITY_AXES)
     return body, body_views(body, 20, 56)
 
 
 def test_the_score_is_least_at_the_true_depth(dish: tuple[Body, Views]) -> None:
-    """Among bodies whose hollows are shallower or deeper."""
+    """Among bodies whose concavities are shallower or deeper."""
     views = dish[1]
     pixels, scores = solid_pixels(views, 4000), []
     factors = (0.6, 0.8, 1.0, 1.2, 1.4)
     for factor in factors:
-        axes = (factor * HOLLOW_AXES[0], *HOLLOW_AXES[1:])
-        final = FinalRays.of(level_set_of(dented(OUTER, HOLLOW_MIDDLE, axes), views), pixels.rays, 3)
+        axes = (factor * CONCAVITY_AXES[0], *CONCAVITY_AXES[1:])
+        final = FinalRays.of(level_set_of(dented(OUTER, CONCAVITY_MIDDLE, axes), views), pixels.rays, 3)
         known = final.directions, final.left, pixels.radiance, pixels.rays.view
         scores.append(float(disagreement(*known, 8, 0.3).mean()))
     assert factors[int(np.argmin(scores))] == 1.0
@@ -178,7 +178,7 @@ def hollow_errors_deg(surface: LevelSet, body: Body, views: Views) -> np.ndarray
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_hollow_that_no_outline_shows_is_found(dish: tuple[Body, Views]) -> None:
+def test_a_concavity_that_no_outline_shows_is_found(dish: tuple[Body, Views]) -> None:
     body, views = dish
     lidded = Body(lambda x: np.maximum(ellipsoid(OUTER).value(x), x[:, 0] - RIM))
     start = level_set_of(lidded, views)
@@ -213,19 +213,19 @@ def test_a_patch_that_settled_steps_leave_unexplained_is_searched_as_a_whole(
 ) -> None:
     """Though no part of it is unexplained by itself; not where steps explain it."""
     body, views = dish
-    lid = level_set_of(Body(lambda x: np.maximum(ellipsoid(OUTER).value(x), x[:, 0] - RIM)), views)
+    cap = level_set_of(Body(lambda x: np.maximum(ellipsoid(OUTER).value(x), x[:, 0] - RIM)), views)
     monkeypatch.setattr(concave, "LEAST_DISAGREEMENT", 10.0)
     monkeypatch.setattr(concave, "SETTLED_DISAGREEMENT", 0.7)
     pixels, chart = solid_pixels(views, QUICK["RAYS"]), Chart.about(np.array([0.5, 0.0, 0.0]), np.eye(3)[0], 0.5)
     under_lid, under_body = (
-        list(unexplained_patches(chart, lid, settled, pixels)) for settled in (lid, level_set_of(body, views, 60))
+        list(unexplained_patches(chart, cap, settled, pixels)) for settled in (cap, level_set_of(body, views, 60))
     )
     assert len(under_lid) == 1
     assert not under_body
 
 
 @pytest.mark.usefixtures("quick")
-def test_photographs_of_one_color_show_no_hollow(dish: tuple[Body, Views]) -> None:
+def test_photographs_of_one_color_show_no_concavity(dish: tuple[Body, Views]) -> None:
     body, views = dish
     plain = tuple(replace(view, radiance=0 * view.radiance + 0.5) for view in views.train)
     start = level_set_of(body, views)
@@ -233,16 +233,16 @@ def test_photographs_of_one_color_show_no_hollow(dish: tuple[Body, Views]) -> No
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_surface_that_no_pixel_meets_has_no_hollow(dish: tuple[Body, Views]) -> None:
+def test_a_surface_that_no_pixel_meets_has_no_concavity(dish: tuple[Body, Views]) -> None:
     far = level_set_of(Body(lambda x: np.linalg.norm(x - [0, 0, 9.0], axis=1)), dish[1])
     assert concave_start(dish[1], far, far) is None
 
 
-def test_hollows_are_looked_for_under_lids_where_the_start_has_none(
+def test_concavities_are_looked_for_under_lids_where_the_start_has_none(
     dish: tuple[Body, Views], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One after the other, until there is one."""
-    start, lid, other = (level_set_of(ellipsoid(), dish[1], 20) for _ in range(3))
+    start, cap, other = (level_set_of(ellipsoid(), dish[1], 20) for _ in range(3))
     searched = []
 
     def looked_for(views: Views, surface: LevelSet, settled: LevelSet) -> LevelSet | None:
@@ -251,8 +251,8 @@ def test_hollows_are_looked_for_under_lids_where_the_start_has_none(
 
     monkeypatch.setattr(fit, "concave_start", looked_for)
     rounds = (replace(COARSE[0], rays=2000, steps=1),)
-    fit_free_form(dish[1], start, Schedule((), rounds, (), rounds, (), ()), lids=(lid, other))
-    assert [each is known for each, known in zip(searched, (start, lid), strict=True)] == [True, True]
+    fit_free_form(dish[1], start, Schedule((), rounds, (), rounds, (), ()), caps=(cap, other))
+    assert [each is known for each, known in zip(searched, (start, cap), strict=True)] == [True, True]
 
 
 @pytest.mark.slow

@@ -30,7 +30,7 @@ from panoless.geometry.free_form.fit import (
 )
 from panoless.geometry.free_form.kind import FreeFormFamily, FreeFormMirror
 from panoless.geometry.free_form.options import FreeFormOptions
-from panoless.geometry.free_form.photometric import INNER_PX, LEAST_COSINE, Sights, Solution
+from panoless.geometry.free_form.photometric import INNER_PX, LEAST_COSINE, Linearization, ReflectedRays
 from panoless.geometry.free_form.schedule import COARSE, DESCENT, DETAILED, Round, Schedule
 from panoless.geometry.free_form.start import FirstSurfaces, first_surfaces, started
 from panoless.geometry.free_form.steps import Change, gauss_newton_step
@@ -58,7 +58,7 @@ from tests.support.mirror_body import (
     wavy_ball,
 )
 
-OPTIONS = FreeFormOptions(hollows=False, starts=False, finest_cells=28)
+OPTIONS = FreeFormOptions(concavities=False, starts=False, finest_cells=28)
 SCHEDULE = replace(
     Schedule.of(OPTIONS), coarse=tuple(replace(settings, rays=settings.rays // 2) for settings in COARSE)
 )
@@ -209,8 +209,8 @@ def test_held_out_pixels_that_miss_the_surface_are_unexplained() -> None:
     small = replace(whole, coefficients=whole.coefficients + 0.3 / whole.spacing)
     pixels = solid_pixels(tested, HELD_OUT_RAYS)
     for surface, bare in ((whole, False), (small, True)):
-        sights, inner = Sights.of(surface, pixels.rays, 1, LEAST_COSINE), pixels.inner_px > INNER_PX
-        missed, clear = (inner & ~sights.hits.met).sum(), (inner & sights.clear).sum()
+        reflected, inner = ReflectedRays.of(surface, pixels.rays, 1, LEAST_COSINE), pixels.inner_px > INNER_PX
+        missed, clear = (inner & ~reflected.hits.met).sum(), (inner & reflected.clear).sum()
         assert (missed > 0.2 * clear) == bare
         error = held_out_error(solved, tested, FitStage.begun(surface))
         assert error == pytest.approx(missed / (missed + clear), abs=1e-3)
@@ -239,53 +239,61 @@ def test_a_world_that_is_turned_and_scaled_gives_the_same_surface() -> None:
 
 
 @pytest.fixture(scope="module")
-def solution() -> Solution:
+def linearization() -> Linearization:
     """A wavy ball between two rounds."""
     views = body_views(wavy_ball(), 12, 60)
     surface = fitted(views, replace(SCHEDULE, coarse=SCHEDULE.coarse[:1]))
-    return Solution.at(make_task(views, SECOND), surface, full_trust(surface, 20), None, 2)
+    return Linearization.at(make_task(views, SECOND), surface, full_trust(surface, 20), None, 2)
 
 
 @pytest.mark.slow
-def test_a_step_with_the_map_solved_again_gains_what_its_equations_promise(solution: Solution) -> None:
-    step = gauss_newton_step(solution, 1e-3).coefficients
-    promised = -float((step * solution.gradient()[0]).sum()) - float((step * solution.product(step)[0]).sum()) / 2
-    surface = replace(solution.surface, coefficients=solution.surface.coefficients + step)
-    moved = Solution.at(solution.task, surface, solution.trust, solution.environment, 3)
-    gained = solution.cost(solution) - moved.cost(solution)
+def test_a_step_with_the_map_solved_again_gains_what_its_equations_promise(linearization: Linearization) -> None:
+    step = gauss_newton_step(linearization, 1e-3).coefficients
+    promised = (
+        -float((step * linearization.gradient()[0]).sum()) - float((step * linearization.product(step)[0]).sum()) / 2
+    )
+    surface = replace(linearization.surface, coefficients=linearization.surface.coefficients + step)
+    moved = Linearization.at(linearization.task, surface, linearization.trust, linearization.environment, 3)
+    gained = linearization.cost(linearization) - moved.cost(linearization)
     assert promised > 0
     assert 0.4 < gained / promised < 1.6
 
 
-def test_the_gradient_is_that_of_finite_differences(solution: Solution) -> None:
+def test_the_gradient_is_that_of_finite_differences(linearization: Linearization) -> None:
     """Of outlines and gauge; outlines near to zero hardly feel the slope that their distances are divided by."""
-    parts = solution.silhouettes, solution.gauge
-    gradient = sum(rows.backward(rows.residual, solution.surface.shape) for rows in parts) * solution.active
+    parts = linearization.silhouettes, linearization.gauge
+    gradient = sum(rows.backward(rows.residual, linearization.surface.shape) for rows in parts) * linearization.active
     change, costs = 1e-3 * gradient / np.abs(gradient).max(), []
     for sign in (-1, 1):
-        surface = replace(solution.surface, coefficients=solution.surface.coefficients + sign * change)
-        moved = replace(solution, surface=surface)
+        surface = replace(linearization.surface, coefficients=linearization.surface.coefficients + sign * change)
+        moved = replace(linearization, surface=surface)
         costs.append(moved.silhouettes.cost + moved.gauge.cost)
     assert (costs[1] - costs[0]) / 2 == pytest.approx(float((gradient * change).sum()), rel=0.02)
 
 
-def test_a_prior_on_the_increment_smooths_the_change_alone(solution: Solution) -> None:
-    coefficients = solution.surface.coefficients
-    same = replace(solution, task=replace(solution.task, reference=coefficients))
+def test_a_prior_on_the_increment_smooths_the_change_alone(linearization: Linearization) -> None:
+    coefficients = linearization.surface.coefficients
+    same = replace(linearization, task=replace(linearization.task, reference=coefficients))
     assert np.abs(same.bent).max() == 0
-    np.testing.assert_allclose(solution.gradient()[0] - same.gradient()[0], solution.bent * solution.active, atol=1e-9)
-    free = replace(solution, task=replace(solution.task, reference=np.zeros_like(coefficients)))
-    np.testing.assert_array_equal(free.bent, solution.bent)
-    assert same.cost(same) < solution.cost(solution) == free.cost(free)
+    np.testing.assert_allclose(
+        linearization.gradient()[0] - same.gradient()[0], linearization.bent * linearization.active, atol=1e-9
+    )
+    free = replace(linearization, task=replace(linearization.task, reference=np.zeros_like(coefficients)))
+    np.testing.assert_array_equal(free.bent, linearization.bent)
+    assert same.cost(same) < linearization.cost(linearization) == free.cost(free)
 
 
 @pytest.mark.parametrize("cells", [-1.0, 1.0])
-def test_a_step_that_moves_all_of_the_surface_alike_costs_no_smoothness(solution: Solution, cells: float) -> None:
+def test_a_step_that_moves_all_of_the_surface_alike_costs_no_smoothness(
+    linearization: Linearization, cells: float
+) -> None:
     """Third differences of a constant are zero; coefficients that come near the surface have not been smoothed yet."""
-    moved = replace(solution, surface=replace(solution.surface, coefficients=solution.surface.coefficients + cells))
-    assert (moved.active & ~solution.active).any()
-    assert moved.prior(solution) == pytest.approx(solution.prior(solution), rel=1e-9)
-    assert moved.prior(moved) != pytest.approx(solution.prior(solution), rel=0.1)
+    moved = replace(
+        linearization, surface=replace(linearization.surface, coefficients=linearization.surface.coefficients + cells)
+    )
+    assert (moved.active & ~linearization.active).any()
+    assert moved.prior(linearization) == pytest.approx(linearization.prior(linearization), rel=1e-9)
+    assert moved.prior(moved) != pytest.approx(linearization.prior(linearization), rel=0.1)
 
 
 def with_waves(surface: LevelSet) -> LevelSet:
@@ -321,11 +329,13 @@ def test_the_plain_surface_descends_alone_where_pixels_agree_on_it(monkeypatch: 
     np.testing.assert_array_equal(found.coefficients, dominated.coefficients)
 
 
-def test_the_matrix_is_symmetric_and_positive(solution: Solution) -> None:
+def test_the_matrix_is_symmetric_and_positive(linearization: Linearization) -> None:
     rng = np.random.default_rng(1)
-    one, other = (rng.normal(size=solution.surface.shape) * solution.active for _ in range(2))
-    assert (one * solution.product(other)[0]).sum() == pytest.approx((other * solution.product(one)[0]).sum(), rel=1e-6)
-    assert (one * solution.product(one)[0]).sum() > 0
+    one, other = (rng.normal(size=linearization.surface.shape) * linearization.active for _ in range(2))
+    assert (one * linearization.product(other)[0]).sum() == pytest.approx(
+        (other * linearization.product(one)[0]).sum(), rel=1e-6
+    )
+    assert (one * linearization.product(one)[0]).sum() > 0
 
 
 @pytest.mark.slow
@@ -378,26 +388,26 @@ def test_the_kind_keeps_the_protocol(ring: tuple[Views, FreeFormMirror]) -> None
 
 
 @pytest.mark.parametrize("kind", BLOCKS, ids=[kind.name for kind in BLOCKS])
-def test_rows_of_a_block_are_those_of_finite_differences(solution: Solution, kind: type[Block]) -> None:
+def test_rows_of_a_block_are_those_of_finite_differences(linearization: Linearization, kind: type[Block]) -> None:
     """Of photographs under a map and on a surface that stay, and of silhouettes."""
     near = Surroundings(np.array([0.1]), Floor(np.array([0.0, 0.0, 1.0]), 1.2, 4.0))
     block = kind.of(body_views(wavy_ball(), 12, 20), near)
     assert block is not None
-    known, nuisance = solution.environment, Nuisance((block,), (block.name,))
-    moved = Solution.at(solution.task, solution.surface, solution.trust, known, 0, nuisance)
+    known, nuisance = linearization.environment, Nuisance((block,), (block.name,))
+    moved = Linearization.at(linearization.task, linearization.surface, linearization.trust, known, 0, nuisance)
     change = 1e-5 * np.random.default_rng(0).normal(size=block.values.shape)
     change -= change.mean(0) if kind.by_view and kind.count < 6 else 0
     sides = [replace(moved, nuisance=Nuisance((block.stepped(sign * change),))) for sign in (1, -1)]
     photographs, silhouettes = moved.beside[0].photographs, moved.beside[0].silhouettes
-    clear, left = moved.sights.clear, []
-    length = solution.environment.shape[-1] + 2
-    padded = padded_texels(solution.environment).reshape(6, length, length, 3).double().numpy()
+    clear, left = moved.reflected.clear, []
+    length = linearization.environment.shape[-1] + 2
+    padded = padded_texels(linearization.environment).reshape(6, length, length, 3).double().numpy()
     for side in sides:
-        surface = replace(solution.surface, surroundings=side.nuisance.around(FAR))
-        sights = Sights.of(surface, side.rays, solution.task.settings.samples, LEAST_COSINE)
-        clear = clear & sights.clear
-        radiance = solution.task.pixels.radiance * np.exp(-side.nuisance.log_gains(side.rays.view))
-        left.append(seen_with_slopes(padded, sights.outgoing)[0] - radiance)
+        surface = replace(linearization.surface, surroundings=side.nuisance.around(FAR))
+        reflected = ReflectedRays.of(surface, side.rays, linearization.task.settings.samples, LEAST_COSINE)
+        clear = clear & reflected.clear
+        radiance = linearization.task.pixels.radiance * np.exp(-side.nuisance.log_gains(side.rays.view))
+        left.append(seen_with_slopes(padded, reflected.outgoing)[0] - radiance)
     clear &= photographs.weights > 0
     expected = ((left[0] - left[1]) / 2 * moved.gain[:, None])[clear]
     found = photographs.forward(change)[clear]
@@ -407,7 +417,7 @@ def test_rows_of_a_block_are_those_of_finite_differences(solution: Solution, kin
         expected, found = expected[bright], found[bright]
     assert len(expected) > 100
     assert np.median(np.abs(found - expected)) <= 0.02 * np.median(np.abs(expected))
-    count = len(solution.task.outlines.size)
+    count = len(linearization.task.outlines.size)
     expected = ((sides[0].silhouettes.residual - sides[1].silhouettes.residual) / 2)[:count]
     found = silhouettes.forward(change)[:count]
     assert np.median(np.abs(found - expected)) <= 0.01 * np.median(np.abs(expected))
@@ -419,10 +429,10 @@ def all_free(views: Views) -> Nuisance:
     return nuisance.replaced([each.stepped(1e-3 * rng.normal(size=each.values.shape)) for each in nuisance.blocks])
 
 
-def test_the_matrix_with_all_unknowns_is_symmetric(solution: Solution) -> None:
+def test_the_matrix_with_all_unknowns_is_symmetric(linearization: Linearization) -> None:
     near = Surroundings(np.array([0.1, 0.02, 0.0, 0.01]))
     nuisance = all_free(body_views(wavy_ball(), 12, 20)).replaced([Walls.about(near)])
-    moved = replace(solution, surface=replace(solution.surface, surroundings=near), nuisance=nuisance)
+    moved = replace(linearization, surface=replace(linearization.surface, surroundings=near), nuisance=nuisance)
     sizes = moved.surface.shape, *(each.value.shape for each in moved.beside)
     rng = np.random.default_rng(1)
     one, other = (([rng.normal(size=size) for size in sizes]) for _ in range(2))
@@ -437,15 +447,15 @@ def test_the_matrix_with_all_unknowns_is_symmetric(solution: Solution) -> None:
 
 
 @pytest.mark.slow
-def test_blocks_of_views_end_where_scipy_ends(solution: Solution) -> None:
+def test_blocks_of_views_end_where_scipy_ends(linearization: Linearization) -> None:
     """Under a surface and a map that stay: the cost of exposures and masks is no higher than that of its minimum."""
     nuisance = nuisance_of(body_views(wavy_ball(), 12, 20), [Exposures, MaskOffsets])
-    settings = replace(solution.task.settings, steps=12, under_known_map=True, least_gain=0.0)
-    task = replace(solution.task, settings=settings)
+    settings = replace(linearization.task.settings, steps=12, under_known_map=True, least_gain=0.0)
+    task = replace(linearization.task, settings=settings)
     gains = np.linspace(-0.2, 0.2, 12)
     darker = replace(task.pixels, radiance=task.pixels.radiance * np.exp(gains)[task.pixels.rays.view, None])
-    begun = Solution.at(
-        replace(task, pixels=darker), solution.surface, solution.trust, solution.environment, 0, nuisance
+    begun = Linearization.at(
+        replace(task, pixels=darker), linearization.surface, linearization.trust, linearization.environment, 0, nuisance
     )
     found, _ = steps.take_steps(begun, 1e-3, still=True)
 
@@ -464,21 +474,23 @@ def changed_values(before: Nuisance, after: Nuisance) -> np.ndarray:
     return np.concatenate([new.values - old.values for old, new in pairs], 1)
 
 
-def test_a_refused_step_is_tried_again_with_more_damping(solution: Solution, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_step_is_tried_again_with_more_damping(
+    linearization: Linearization, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whatever is refused below a damping of 0.06, a round goes on until that is reached, and then moves."""
     tried: list[float] = []
 
-    def step(solution: Solution, damping: float, **_: bool) -> Change:
+    def step(linearization: Linearization, damping: float, **_: bool) -> Change:
         tried.append(damping)
-        found = gauss_newton_step(solution, damping)
+        found = gauss_newton_step(linearization, damping)
         return found if damping > 0.06 else replace(found, coefficients=-100 * found.coefficients)
 
     monkeypatch.setattr(steps, "gauss_newton_step", step)
-    settings = replace(solution.task.settings, steps=3)
-    moved, _ = steps.take_steps(replace(solution, task=replace(solution.task, settings=settings)), 1e-3)
+    settings = replace(linearization.task.settings, steps=3)
+    moved, _ = steps.take_steps(replace(linearization, task=replace(linearization.task, settings=settings)), 1e-3)
     assert tried[0] == 1e-3
     assert tried[1] > 0.06
-    assert moved.cost(solution) < solution.cost(solution)
+    assert moved.cost(linearization) < linearization.cost(linearization)
 
 
 @pytest.mark.slow
@@ -542,18 +554,18 @@ def left_deg(found: Poses, wrong: Poses) -> float:
     return float(np.degrees(np.median((left.mean().inv() * left).magnitude())))
 
 
-def test_photographs_agree_with_masks_unless_outlines_lie_to_one_side_of_them(solution: Solution) -> None:
+def test_photographs_agree_with_masks_unless_outlines_lie_to_one_side_of_them(linearization: Linearization) -> None:
     """A surface that is larger by 0.05 px is as near to the masks as theirs may be, but not as one that they tell."""
 
-    def apart_px(moved: Solution) -> float:
+    def apart_px(moved: Linearization) -> float:
         return float(np.median(moved.silhouettes.residual[: len(moved.task.outlines.view)]))
 
-    def larger(cells: float) -> Solution:
-        surface = replace(solution.surface, coefficients=solution.surface.coefficients - cells)
-        return replace(solution, surface=surface)
+    def larger(cells: float) -> Linearization:
+        surface = replace(linearization.surface, coefficients=linearization.surface.coefficients - cells)
+        return replace(linearization, surface=surface)
 
     cells_a_pixel = 0.01 / (apart_px(larger(0.0)) - apart_px(larger(0.01)))
-    level = apart_px(solution) * cells_a_pixel
+    level = apart_px(linearization) * cells_a_pixel
     assert larger(level).outlines_agree
     for off_px in (-0.2, -0.05, 0.05, 0.2):
         assert not larger(level + off_px * cells_a_pixel).outlines_agree

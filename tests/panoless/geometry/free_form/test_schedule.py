@@ -28,5 +28,5 @@ def test_a_grid_of_28_cells_leaves_out_the_finer_rounds_alone() -> None:
 
 
 def test_what_is_not_looked_for_has_no_rounds() -> None:
-    assert Schedule.of(FreeFormOptions(hollows=False)) == Schedule(hollowed=())
+    assert Schedule.of(FreeFormOptions(concavities=False)) == Schedule(concave=())
     assert Schedule.of(FreeFormOptions(starts=False)) == Schedule(descent=(), detailed=())

@@ -32,7 +32,7 @@ SLOPE_WEIGHT = 1.0
 
 
 @dataclass(frozen=True)
-class FollowingMap:
+class VariableProjection:
     """What rays count, and how a map that follows can change what they see."""
 
     weights: Float[np.ndarray, "P"]
@@ -42,7 +42,7 @@ class FollowingMap:
     @classmethod
     def of(
         cls, directions: Float[np.ndarray, "P 3"], weights: Float[np.ndarray, "P"], resolution: int
-    ) -> "FollowingMap":
+    ) -> "VariableProjection":
         """Of rays into a map of so many texels along a face side."""
         from scipy.sparse import hstack
 

@@ -17,6 +17,7 @@ from panoless.capture.views import Views, held_out_parts
 from panoless.config import FitConfig
 from panoless.environment.footprints import PixelFootprints, thinned
 from panoless.environment.lobe import Lobe
+from panoless.environment.options import MaterialOptions
 from panoless.environment.resolution import ERROR_SCALE
 from panoless.environment.roughness import SHARPENING_ROUNDS, sharpened_map
 from panoless.environment.solve import solve_environment
@@ -36,7 +37,7 @@ FIRST_ROUGHNESS = 0.085
 LEAST_ROUGHNESS_GAIN = 0.01
 """Share by which that has to lower the held-out error, also that of a sharp map which its lobe smooths afterwards."""
 LEAST_UNEXPLAINED = 0.01
-"""Held-out error of a sharp map from which anything softer is tried."""
+"""Held-out error of a sharp map from which roughness and blur are tried."""
 ROUGHNESSES = (0.06, 0.3)
 """Among these a roughness is searched for."""
 TRIALS = 6
@@ -48,7 +49,7 @@ JUDGED_ROUNDS = 8
 
 
 @dataclass(frozen=True)
-class Softness:
+class Blur:
     """What blurs the mirrored light on its way to the pixels."""
 
     roughness: float | None = None
@@ -58,7 +59,7 @@ class Softness:
 
 
 @remembered()
-def earned_softness(
+def needed_blur(
     views: Views,
     geometry: Geometry,
     config: FitConfig,
@@ -66,51 +67,60 @@ def earned_softness(
     first_roughness: float = FIRST_ROUGHNESS,
     roughnesses: tuple[float, float] = ROUGHNESSES,
     trials: int = TRIALS,
-) -> Softness:
+) -> Blur:
     """Roughness of the object or blur of the pictures, if held-out views are clearly better explained by one of them.
     Views are those of usable pixels.
 
     Four fifths of the views make the maps by which the others are judged: one that is shown as it is, one that a lobe
     blurs, and one under wider pixels, after the same steps from the same start, and on areas of pixels, because a map
-    that knows of none is better blurred for that. A lobe averages noise, too, as that of compression. So a map that is
-    shown as it is has to explain less even where the lobe smooths it afterwards, which averages as much. A first value
-    of each tells whether to search on, and for which (Brent 1973). Where the sharp map leaves next to nothing
-    unexplained, nothing softer is needed. A lobe blurs all directions alike, a wider pixel
-    those that a curved part spreads. Nobody asks where the roughness is known, or in a high dynamic range, in which a
-    mean of encoded values is not the encoding of the mean.
+    that knows of none is better blurred for that. A lobe blurs all directions alike, a wider pixel those that a curved
+    part spreads. A known roughness is taken. In a high dynamic range there is no blur: a mean of encoded values is not
+    the encoding of the mean.
     """
     options, encoding = config.material, encoding_of(config)
     if encoding.high_dynamic_range or options.roughness == options.blur == "off":
-        return Softness()
+        return Blur()
     if options.roughness == "auto" and options.known_roughness > 0:
-        return Softness(options.known_roughness)
+        return Blur(options.known_roughness)
     with torch.no_grad():
-        trial = _SoftnessTrial.of(views, geometry, config)
-        if trial is None:
-            return Softness()
-        rounds = JUDGED_ROUNDS
-        sharp = trial.errors(Softness(), rounds)
-        if sharp.mean() < LEAST_UNEXPLAINED:
-            return Softness()
-        smoothing = Softness(roughness=first_roughness)
-        smoothed = trial.errors(Softness(), rounds, smoothing)
-        asked = []
-        if options.roughness == "auto":
-            asked.append(smoothing)
-        if options.blur == "auto":
-            asked.append(Softness(blur_px=FIRST_BLUR_PX))
-        errors = [trial.errors(each, rounds) for each in asked]
-        best = int(np.argmin([each.mean() for each in errors]))
-        is_more_than_smooth = errors[best].mean() < (1 - LEAST_ROUGHNESS_GAIN) * smoothed.mean()
-        if not is_more_than_smooth or not is_clearly_lower(errors[best], sharp, LEAST_ROUGHNESS_GAIN):
-            return Softness()
-        if asked[best].roughness is None:
-            return Softness(blur_px=trial.searched(lambda value: Softness(blur_px=value), BLURS_PX, trials))
-        return Softness(roughness=trial.searched(lambda value: Softness(roughness=value), roughnesses, trials))
+        trial = BlurTrial.of(views, geometry, config)
+        return Blur() if trial is None else judged_blur(trial, options, first_roughness, roughnesses, trials)
+
+
+def judged_blur(
+    trial: "BlurTrial",
+    options: MaterialOptions,
+    first_roughness: float = FIRST_ROUGHNESS,
+    roughnesses: tuple[float, float] = ROUGHNESSES,
+    trials: int = TRIALS,
+) -> Blur:
+    """The blur by the held-out errors of a trial.
+
+    A lobe averages noise, too, as that of compression. So a map that is shown as it is has to explain less even where
+    the lobe smooths it afterwards, which averages as much. A first value of each decides whether to search on, and for
+    which (Brent 1973). Where the sharp map leaves next to nothing unexplained, nothing else is tried.
+    """
+    rounds = JUDGED_ROUNDS
+    sharp = trial.errors(Blur(), rounds)
+    if sharp.mean() < LEAST_UNEXPLAINED:
+        return Blur()
+    smoothing = Blur(roughness=first_roughness)
+    smoothed = trial.errors(Blur(), rounds, smoothing)
+    tried = [smoothing] if options.roughness == "auto" else []
+    if options.blur == "auto":
+        tried.append(Blur(blur_px=FIRST_BLUR_PX))
+    errors = [trial.errors(each, rounds) for each in tried]
+    best = int(np.argmin([each.mean() for each in errors]))
+    is_more_than_smooth = errors[best].mean() < (1 - LEAST_ROUGHNESS_GAIN) * smoothed.mean()
+    if not is_more_than_smooth or not is_clearly_lower(errors[best], sharp, LEAST_ROUGHNESS_GAIN):
+        return Blur()
+    if tried[best].roughness is None:
+        return Blur(blur_px=trial.searched(lambda value: Blur(blur_px=value), BLURS_PX, trials))
+    return Blur(roughness=trial.searched(lambda value: Blur(roughness=value), roughnesses, trials))
 
 
 @dataclass(frozen=True)
-class _SoftnessTrial:
+class BlurTrial:
     """Areas of pixels of the views that make a map, those of each other view, and the start of that map."""
 
     known: list[PixelFootprints]
@@ -119,7 +129,7 @@ class _SoftnessTrial:
     saturation: Float[Tensor, "3"]
 
     @classmethod
-    def of(cls, views: Views, geometry: Geometry, config: FitConfig) -> "_SoftnessTrial | None":
+    def of(cls, views: Views, geometry: Geometry, config: FitConfig) -> "BlurTrial | None":
         """None where there are too few views."""
         parts = held_out_parts(views)
         if parts is None:
@@ -134,12 +144,12 @@ class _SoftnessTrial:
         return cls(known, held_out, start, encoding_of(config).saturation)
 
     @remembered()
-    def errors(self, softness: Softness, rounds: int, smoothing: Softness = Softness()) -> Float[np.ndarray, "V"]:
-        """Mean of ‖e‖²/(‖e‖² + s²) of each held-out view with that softness, after so many rounds, under the map that
+    def errors(self, blur: Blur, rounds: int, smoothing: Blur = Blur()) -> Float[np.ndarray, "V"]:
+        """Mean of ‖e‖²/(‖e‖² + s²) of each held-out view with that blur, after so many rounds, under the map that
         the lobe of another one then smooths.
         """
-        lobe, smoother = (Lobe.of(each.roughness, self.start.shape[-1]) for each in (softness, smoothing))
-        blur_px = softness.blur_px or 0.0
+        lobe, smoother = (Lobe.of(each.roughness, self.start.shape[-1]) for each in (blur, smoothing))
+        blur_px = blur.blur_px or 0.0
         known = [each.widened(blur_px) for each in self.known]
         found = sharpened_map(self.start, known, lobe, self.saturation, rounds)
         shown, found_errors = smoother.blurred(lobe.blurred(found)), []
@@ -149,12 +159,12 @@ class _SoftnessTrial:
             found_errors.append(float(bounded_error(torch.cat(error), ERROR_SCALE).mean()) if error else 0.0)
         return np.array(found_errors)
 
-    def searched(self, softness: Callable[[float], Softness], bounds: tuple[float, float], trials: int) -> float:
+    def searched(self, blur: Callable[[float], Blur], bounds: tuple[float, float], trials: int) -> float:
         """The value between bounds that leaves the least error after the steps of the exported map; by logarithms."""
         from scipy.optimize import minimize_scalar
 
         found = minimize_scalar(
-            lambda logarithm: float(self.errors(softness(math.exp(logarithm)), SHARPENING_ROUNDS).mean()),
+            lambda logarithm: float(self.errors(blur(math.exp(logarithm)), SHARPENING_ROUNDS).mean()),
             bounds=np.log(bounds),
             method="bounded",
             options={"maxiter": trials},

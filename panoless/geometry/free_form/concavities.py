@@ -1,4 +1,4 @@
-"""A hollow of few parameters under a patch of a surface, and the surface from which it is carved."""
+"""A concavity of few parameters under a patch of a surface, and the surface from which it is carved."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,17 +11,17 @@ from panoless.numeric.factorize import regularize
 from shinypartial.core.sphere import tangents
 
 KNOTS = np.linspace(0, np.pi / 2, 5)
-"""Angles from a hollow's axis at which its reach is given; at the first and the last of them it is 1."""
+"""Angles from a concavity's axis at which its reach is given; at the first and the last of them it is 1."""
 HALF_SIDE, SIDE = 1.8, 73
 """Half the side of a chart in its radii, and points along the side."""
 FAR_CELLS = 8.0
-"""Most distance from a hollow's wall that counts."""
+"""Most distance from a concavity's wall that counts."""
 ROUNDING_CELLS = 0.7
-"""Width over which hollow and surface melt together at the rim."""
+"""Width over which concavity and surface melt together at the rim."""
 RIM_SHARE = 0.08
-"""The lid is fitted to the surface within so much of the rim, in ways to it."""
+"""The cap is fitted to the surface within so much of the rim, in ways to it."""
 LID_STIFFNESS = 0.02
-"""Weight of a lid's squared curvatures, in heights."""
+"""Weight of a cap's squared curvatures, in heights."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class Chart:
 
 
 @dataclass(frozen=True)
-class Hollow:
-    """A hollow under a lid, given in radii of a chart.
+class Concavity:
+    """A concavity under a cap, given in radii of a chart.
 
     Its rim lies at log r(θ) = size + a₂ cos 2θ + b₂ sin 2θ + a₃ cos 3θ + b₃ sin 3θ about its middle. With ρ the share
-    of the way to the rim, δ what lies below the lid in depths, and ψ = atan2(ρ, δ), it contains the points whose
+    of the way to the rim, δ what lies below the cap in depths, and ψ = atan2(ρ, δ), it contains the points whose
     g = √(ρ² + δ²)/s(ψ) < 1. The reach s is a monotone cubic through its values at the knots, so walls may be steep; an
     ellipsoid has s = 1. The middle shifts by the lean down to the depth.
     """
@@ -70,13 +70,13 @@ class Hollow:
         return np.concatenate([self.middle, [self.size], self.waves, [self.depth], self.reach, self.lean])
 
     @classmethod
-    def from_vector(cls, values: Float[np.ndarray, "13"]) -> "Hollow":
-        """The inverse of `vector`, with the least depth and reach that a hollow has."""
+    def from_vector(cls, values: Float[np.ndarray, "13"]) -> "Concavity":
+        """The inverse of `vector`, with the least depth and reach that a concavity has."""
         depth, reach = max(float(values[7]), 0.02), np.clip(values[8:11], 0.2, 2.0)
         return cls(values[:2], float(values[2]), values[3:7], depth, reach, values[11:])
 
     @classmethod
-    def bowl(cls, size: float, waves: Float[np.ndarray, "4"], depth: float, exponent: float = 2.0) -> "Hollow":
+    def bowl(cls, size: float, waves: Float[np.ndarray, "4"], depth: float, exponent: float = 2.0) -> "Concavity":
         """About the middle of the chart, with the superellipse ρᵖ + δᵖ = 1 for a profile."""
         inner = KNOTS[1:-1]
         reach = (np.sin(inner) ** exponent + np.cos(inner) ** exponent) ** (-1 / exponent)
@@ -95,7 +95,7 @@ class Hollow:
     def level(
         self, u: Float[np.ndarray, "*P"], v: Float[np.ndarray, "*P"], below: Float[np.ndarray, "*P"]
     ) -> Float[np.ndarray, "*P"]:
-        """g at places so far below the lid; above it the hollow goes on as a cylinder."""
+        """g at places so far below the cap; above it the concavity goes on as a cylinder."""
         from scipy.interpolate import PchipInterpolator
 
         sunk = np.maximum(below, 0) / self.depth
@@ -153,23 +153,23 @@ class Relief:
         found = self.chart.coordinates(self.surface.points(nodes.reshape(-1, 3)))
         return found.reshape(nodes.shape)
 
-    def lid(self, hollow: Hollow) -> Float[np.ndarray, "6"]:
+    def cap(self, concavity: Concavity) -> Float[np.ndarray, "6"]:
         """Coefficients of 1, u, v, u², uv and v² of the height that passes through the surface along a rim."""
         u, v = self.grid
-        at_rim = (np.abs(hollow.share(u, v) - 1) < RIM_SHARE) & np.isfinite(self.heights)
+        at_rim = (np.abs(concavity.share(u, v) - 1) < RIM_SHARE) & np.isfinite(self.heights)
         rows, heights = _quadric(u[at_rim], v[at_rim]), self.heights[at_rim]
         stiff = np.diag([1e-6, 1e-6, 1e-6, 1.0, 1.0, 1.0]) * LID_STIFFNESS * max(len(rows), 1)
-        found: np.ndarray = np.linalg.solve(regularize(rows.T @ rows + stiff, "a lid"), rows.T @ heights)
+        found: np.ndarray = np.linalg.solve(regularize(rows.T @ rows + stiff, "a cap"), rows.T @ heights)
         return found
 
-    def carved(self, hollow: Hollow, rounding_cells: float = ROUNDING_CELLS) -> LevelSet:
-        """The surface without the hollow and what lies above its lid: max(φ, (1 − g)/‖∇g‖)."""
+    def carved(self, concavity: Concavity, rounding_cells: float = ROUNDING_CELLS) -> LevelSet:
+        """The surface without the concavity and what lies above its cap: max(φ, (1 − g)/‖∇g‖)."""
         u, v, w = np.moveaxis(self.places, -1, 0)
-        level = hollow.level(u, v, _quadric(u, v) @ self.lid(hollow) - w)
+        level = concavity.level(u, v, _quadric(u, v) @ self.cap(concavity) - w)
         slope = np.sqrt(sum(each**2 for each in np.gradient(level)))
         values = self.values.copy()
-        hollowed = (1 - level) / np.maximum(slope, 1e-3)
-        values[self.box] = smooth_maximum(values[self.box], np.minimum(hollowed, FAR_CELLS), rounding_cells)
+        concave = (1 - level) / np.maximum(slope, 1e-3)
+        values[self.box] = smooth_maximum(values[self.box], np.minimum(concave, FAR_CELLS), rounding_cells)
         return self.surface.interpolating(values)
 
 
