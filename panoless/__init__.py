@@ -5,7 +5,7 @@
     result = panoless.fit("datasets/vase-400")
     result.environment, result.visibility, result.model, result.normals(0)
 
-Importing this package loads no torch and no numpy; its functions do when they are first asked for. It gives numpy's
+Importing this package loads no torch and no numpy; its functions do when they are first requested. It gives numpy's
 OpenBLAS a single thread unless `OPENBLAS_NUM_THREADS` says otherwise: a fit solves very many small systems, over which
 two threads wait for each other most of the time.
 """

@@ -43,7 +43,7 @@ RUNS = Path("runs")
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """A prediction folder, read when it is asked for. Everything is in the world frame of the dataset."""
+    """A prediction folder, read when it is requested. Everything is in the world frame of the dataset."""
 
     folder: Path
     """The prediction folder, which `shinypartial.evaluate` scores."""
@@ -277,8 +277,8 @@ def announce_compilation() -> None:
                 self.made = True
                 clear = "\r\x1b[2K" if sys.stderr.isatty() else ""
                 print(clear, end="", file=sys.stderr)
-                told = "some 20 seconds in all if none is there yet; later runs find them on disk"
-                note(f"Compiling kernels for this machine: {told} …")
+                time = "some 20 seconds in all if none is there yet; later runs find them on disk"
+                note(f"Compiling kernels for this machine: {time} …")
 
         def on_end(self, event: object) -> None:
             pass

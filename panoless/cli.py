@@ -229,8 +229,8 @@ class Capture(LongCommand):
     """Folder of masks by the names of the photographs, white on the object; found where it is SOURCE/masks or beside a
     video, and has a mask for each of them."""
     segmenter: Path | None = None
-    """Without masks: an ONNX model that tells the object from its surroundings; docs/how-to/capture.md says what it is
-    given and has to return."""
+    """Without masks: an ONNX model that segments the object from its surroundings; docs/how-to/capture.md says what it
+    is given and has to return."""
     box: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="X0,Y0,X1,Y1")] = ()
     """Without masks: a rectangle about the object, in pixels of the photograph that --box-in names. May be repeated."""
     box_in: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME")] = ()

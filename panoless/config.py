@@ -60,12 +60,12 @@ class EnvironmentConfig:
     solve: bool = True
     """Start and end with the closed-form robust least-squares map instead of what gradient descent left."""
     rays: Annotated[int, Meta(ge=8)] = 8_000_000
-    """Most rays that the closed-form map is solved from; an eighth of them tells which surfels to trust."""
+    """Most rays that the closed-form map is solved from; an eighth of them determines which surfels to trust."""
     fill: bool = True
     """Fill directions that no ray of the closed-form map met from what is known around them; else they stay gray."""
     trace: bool = True
     """Leave pixels out of the closed-form map whose mirrored ray meets a plane's frame, or a surface of revolution
-    again; a bent plane always does, surfels can't tell."""
+    again; a bent plane always does, surfels can't show it."""
     solve_resolution: Natural = 0
     """Texels along a face side of the closed-form map that is exported. 0: 64, 128 or 256, which held-out views choose
     for surfels, held-out pixels for kinds whose pixels are areas, and the density of rays for others. Where the mirror

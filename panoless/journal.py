@@ -2,7 +2,7 @@
 
 A function that is `remembered` is computed once in a run folder. Its result lies in a file that is named after
 everything it was given, so whatever differs (photographs, options, a decision before, the last digit of a number) is
-computed anew. Outside of a run folder it is computed whenever it is called.
+recomputed. Outside of a run folder it is computed whenever it is called.
 """
 
 import functools
@@ -145,7 +145,7 @@ def _name(thing: Any) -> str:
     """Of a class or a function in a module, by which it is imported."""
     name = f"{thing.__module__}.{thing.__qualname__}"
     if "<locals>" in name or inspect.ismethod(thing):
-        raise TypeError(f"{name} is not told by its name")
+        raise TypeError(f"{name} has no name that identifies it")
     return name
 
 

@@ -17,7 +17,7 @@ from hypothesis import settings
 from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).resolve().parent.parent
-#: As PEP 484 has it, an int will do where a float is asked for.
+#: As PEP 484 has it, an int will do where a float is requested.
 TYPE_CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
 #: Numba and Triton compile these from their source, which a decorator in between would hide.
 COMPILED = ("cpu", "gpu")

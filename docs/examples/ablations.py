@@ -5,7 +5,7 @@
     python docs/examples/ablations.py
 
 Every row is `panoless fit` and `shinypartial evaluate` in a process of its own. What was scored before is kept, so the
-command continues where it stopped; delete predictions/ablations and the runs of these names to begin anew. Normals and
+command continues where it stopped; delete predictions/ablations and the runs of these names to begin again. Normals and
 renders are scored on every fifth test view. `--seeds 0 1 2` sets the seeds, `--tables levers counts` makes some tables
 only, `--collect` none. The numbers lie in docs/results/ablations.json, and the tables between the marks of the page.
 """
@@ -267,7 +267,7 @@ def collect(seeds: list[int]) -> None:
 
 
 def main() -> None:
-    """Make the tables asked for, then the page."""
+    """Make the tables requested, then the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--tables", nargs="+", choices=sorted(TABLES), default=sorted(TABLES))

@@ -135,13 +135,13 @@ class EllipsoidFamily(ExactFamily):
     geometry: ClassVar[type[Geometry]] = EllipsoidMirror
     label: ClassVar[str] = "an ellipsoid"
 
-    def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
+    def propose(self, views: Views, config: FitConfig, *, requested: bool) -> Proposal | None:
         """By silhouettes alone, from a sphere of the radius 0.7 about the origin, where the object has the radius 1."""
         if len(outline_rays(views, longest_only=True).size):
             start = EllipsoidUnknowns(Ellipsoid(np.zeros(3), np.eye(3) / 0.7**2))
             nearest = by_outlines_alone(views, start)
             return Proposal.of(views, nearest.surface, nearest)
-        if asked:
+        if requested:
             raise InputError(expected="masks with an outline", found="none", remedy="Show the object within pictures.")
         return None
 

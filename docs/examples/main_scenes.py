@@ -5,7 +5,7 @@
     python docs/examples/main_scenes.py --collect  # only write the tables of what is there
 
 Every step is a command in a process of its own; finished ones are skipped and interrupted ones continue, so the same
-line may be started again at any moment. Delete a prediction and its folder in runs/ to have it made anew. The numbers
+line may be started again at any moment. Delete a prediction and its folder in runs/ to have it made again. The numbers
 lie in docs/results/main-scenes.json, one entry a dataset; the tables show each scene at its largest resolution there.
 """
 

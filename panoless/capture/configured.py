@@ -1,4 +1,4 @@
-"""The views that a configuration asks for."""
+"""The views that a configuration requires."""
 
 from dataclasses import replace
 

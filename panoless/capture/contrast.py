@@ -27,7 +27,7 @@ LEAST_KNEE = 0.002
 class Contrast:
     """Radiance c as ln(1 + c/k)/ln(1 + 1/k), which takes [0, 1] to itself; as it is where no knee k is given.
 
-    Under a bright sky a dark ground has no say in residuals of radiance, and what mirrors it gets no shape. As a
+    Under a bright sky a dark ground has no weight in residuals of radiance, and what mirrors it gets no shape. As a
     logarithm it has the say that its contrast gives it.
     """
 
@@ -35,7 +35,7 @@ class Contrast:
 
     @classmethod
     def of(cls, views: Views, *, least_knee: float = LEAST_KNEE) -> "Contrast":
-        """What views ask for: logarithms where the median brightness of the object's pixels is far below the mean.
+        """What views require: logarithms where the median brightness of the object's pixels is far below the mean.
 
         The share of the two does not depend on the exposure, but for what that saturates.
         """

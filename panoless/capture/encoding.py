@@ -40,7 +40,7 @@ class RadianceEncoding:
     def clipped(self, frame: Frame, view: View) -> Float[np.ndarray, "H W 3"]:
         """Radiance of a view, not encoded, without what its range excludes.
 
-        Raises InputError when a high dynamic range is asked of an 8-bit image.
+        Raises InputError when a high dynamic range is required of an 8-bit image.
         """
         if self.high_dynamic_range and not view.high_dynamic_range:
             raise InputError(
@@ -95,6 +95,6 @@ LDR = RadianceEncoding()
 
 
 def encoding_of(config: FitConfig) -> RadianceEncoding:
-    """The encoding that a configuration asks for."""
+    """The encoding that a configuration requires."""
     high, srgb = config.environment.range == "hdr", config.splats.surfels.shading != "mirror"
     return RadianceEncoding(high, config.tint, srgb, config.exposure or 1.0)

@@ -26,7 +26,7 @@ INVERSE_STEPS = 6
 
 @dataclass(frozen=True)
 class LensChange:
-    """Unknowns of a lens that all views share; None for one that is believed."""
+    """Unknowns of a lens that all views share; None for one that is fixed."""
 
     focal: float | None = None
     """s where the focal length is said to be e⁻ˢ times what it is: cameras are eˢ as far away and see through a lens of

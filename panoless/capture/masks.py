@@ -22,7 +22,7 @@ MASK_LEVEL = 0.5
 #: Pieces of a mask smaller than this share of its largest are specks, and are removed. An object's own pieces, such as
 #: a tip that shows beyond a rim, are larger; a larger stray piece harms nothing but the size of the crop.
 SPECK_SHARE = 0.002
-#: Pieces smaller than this share have no say in center and radius.
+#: Pieces smaller than this share have no weight in center and radius.
 MAIN_SHARE = 0.05
 #: The ball has this much more radius than the median mask.
 SPARE = 1.1
@@ -155,7 +155,7 @@ def _mask_radius(camera: Camera, inside: Bool[np.ndarray, "H W"], center: Float[
             expected="cameras that look at one object",
             found="an object center behind one of the cameras",
             remedy="Check the axes of transform_matrix: OpenGL, the camera looks along −z. Cameras that stand in one "
-            "place do not tell where the object is.",
+            "place do not determine where the object is.",
         )
     rows, columns = np.nonzero(inside)
     across = np.hypot((columns + PIXEL_CENTER - x) / camera.fx, (rows + PIXEL_CENTER - y) / camera.fy).max()

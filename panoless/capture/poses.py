@@ -1,6 +1,7 @@
 """Cameras that are not quite where they are said to be: a turn and a shift of each view.
 
-What all cameras share is no error of theirs: no photograph of a far world tells it, so it can be found and taken back.
+What all cameras share is no error of theirs: no photograph of a far world determines it, so it can be found and taken
+back.
 """
 
 import math
@@ -78,10 +79,10 @@ class Poses:
         """What turns, shifts and scales all cameras alike, by least squares under the weights of the prior, and the
         poses in a world from which that was taken back.
 
-        For cameras at o these are (θ, θ × o), (0, t) and (0, σ o). No photograph of a far world tells them. A principal
-        point that is wrong in all views looks like turns by the same angles about the axes of each camera. On an arc of
-        views these are nearly a common turn: where they explain most of what common motions leave, they stay in the
-        poses.
+        For cameras at o these are (θ, θ × o), (0, t) and (0, σ o). No photograph of a far world determines them. A
+        principal point that is wrong in all views looks like turns by the same angles about the axes of each camera. On
+        an arc of views these are nearly a common turn: where they explain most of what common motions leave, they stay
+        in the poses.
         """
         found = self._alike(cameras, prior)[0]
         common = Similarity(1 + float(found[6]), Rotation.from_rotvec(found[:3]).as_matrix(), found[3:6])
@@ -97,7 +98,7 @@ class Poses:
 
     def principal_point_px(self, views: Views, prior: Float[np.ndarray, "V 6 6"]) -> tuple[float, float] | None:
         """By how much the principal point lies to the right and below of where it is said to be, in all views alike;
-        None where that is not told.
+        None where that is not determined.
         """
         turn = self.lens_turn(StatedCameras.of(views), prior)
         if turn is None:

@@ -41,7 +41,7 @@ LARGEST_LENGTH = 6.0
 LEAST_SHARE = 0.75
 """Share that parts which are not long have of all that is as wide and contradicts, at least."""
 ROUNDS = 4
-"""Most rounds on each grid: masks that were mended tell more about others."""
+"""Most rounds on each grid: masks that were mended determine more about others."""
 
 Image = Bool[np.ndarray, "H W"]
 #: The grid holds the ball about the object with this much more than its radius.
@@ -54,10 +54,10 @@ def with_repaired_masks(views: Views, *, grids: tuple[int, int] = GRIDS) -> View
     """The views with masks from which nothing as large as a blob is missing, and nothing stands out, by what the others
     say.
 
-    What is filled is on the object, but no photograph shows it whole, so it tells no color. Crescents along an outline
-    stay: wrong poses make them, and masks that are too small. Where these are most of what contradicts, nothing is
-    mended. What is missing is filled first: holes in other masks look as if a view showed too much. In each round the
-    mended masks vote on the masks as they were, in the last rounds on a finer grid.
+    What is filled is on the object, but no photograph shows it whole, so it determines no color. Crescents along an
+    outline stay: wrong poses make them, and masks that are too small. Where these are most of what contradicts, nothing
+    is mended. What is missing is filled first: holes in other masks look as if a view showed too much. In each round
+    the mended masks vote on the masks as they were, in the last rounds on a finer grid.
     """
     if len(views.train) < LEAST_VIEWS:
         return views

@@ -44,7 +44,7 @@ class MaskDistance:
     def distances(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
         """Signed distance of points from the silhouette's cone, to first order: pixels · depth / focal length.
 
-        −∞ where the view doesn't tell: beyond the last pixel centers at a side of the picture that cuts the mask.
+        −∞ where the view leaves it open: beyond the last pixel centers at a side of the picture that cuts the mask.
         """
         camera = self.camera
         points_camera = in_camera(camera, points)

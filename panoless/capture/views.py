@@ -68,7 +68,7 @@ class TrainView:
 
     @property
     def rays_camera(self) -> Float[Tensor, "3 H W"]:
-        """Unit ray directions in the camera frame through pixel centers, made anew: a view is 16 bytes a pixel."""
+        """Unit ray directions in the camera frame through pixel centers, made again: a view is 16 bytes a pixel."""
         return unit_rays_camera(self.camera, self.mask.device)
 
     def directions_world(self, pixels: Int[Tensor, "P"]) -> Float[Tensor, "P 3"]:

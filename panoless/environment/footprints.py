@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from panoless.environment.cubemap import flat_texels
-from panoless.environment.rays import Believed, Rays
+from panoless.environment.rays import Rays, Weighted
 from panoless.kernels.cubemap import apply_gram, lookup_gram, sample_cubemap, scatter_cubemap, weigh_cubemap
 from panoless.numeric.robust import robust_weight
 
@@ -21,13 +21,13 @@ batches of four views of 160 px, that of Vase takes 1.3 times as long."""
 
 
 @dataclass(frozen=True)
-class PixelFootprints(Believed):
+class PixelFootprints(Weighted):
     """K directions over the area of each pixel, and the mean radiance seen there."""
 
     directions: Float[Tensor, "P K 3"]
     radiance: Float[Tensor, "P 3"]
     trust: Float[Tensor, "P"] | None = None
-    """How far each is believed beforehand; None: all alike."""
+    """How far each is weighted beforehand; None: all alike."""
 
     @classmethod
     def centers(cls, rays: Rays) -> "PixelFootprints":
@@ -48,7 +48,7 @@ class PixelFootprints(Believed):
         return PixelFootprints(self.directions[part].contiguous(), self.radiance[part].contiguous(), trust)
 
     def without(self, stride: int, first: int) -> "PixelFootprints":
-        """All of them, but those of `every` are not believed at all."""
+        """All of them, but those of `every` are not weighted at all."""
         trust = self.initial_weight()
         trust[first::stride] = 0
         return replace(self, trust=trust)
@@ -67,7 +67,7 @@ class PixelFootprints(Believed):
 
     @classmethod
     def joined(cls, parts: "Sequence[PixelFootprints]") -> "PixelFootprints":
-        """All pixels of at least one part, which all say how far they are believed, or none."""
+        """All pixels of at least one part, which all say how far they are weighted, or none."""
         trust = [part.trust for part in parts if part.trust is not None]
         directions = torch.cat([part.directions for part in parts])
         radiance = torch.cat([part.radiance for part in parts])
@@ -85,7 +85,7 @@ class PixelFootprints(Believed):
         self, weights: Float[Tensor, "P W"], resolution: int
     ) -> Callable[[Float[Tensor, "6 C L L"]], Float[Tensor, "6 C L L"]]:
         """What is `seen` of a map, times weights of all channels or of each, `spread`: as a function of the map, for a
-        face of so many texels. It asks no pixel again where each has one direction and one weight.
+        face of so many texels. No pixel is seen again where each has one direction and one weight.
         """
         if self.directions.shape[1] == weights.shape[1] == 1:
             gram = lookup_gram(self.directions[:, 0], weights[:, 0], resolution)
@@ -148,7 +148,7 @@ def splat(batch: Rays | PixelFootprints, weights: Float[Tensor, "P"], resolution
 def counting_saturated(
     batch: Batch, weight: float, level: Float[Tensor, "3"], share: Float[Tensor, "P"] | float = 1.0
 ) -> Batch:
-    """The same, but of those that reach a radiance in some channel, a share is believed by so much of what it was."""
+    """The same, but of those that reach a radiance in some channel, a share is weighted by so much of what it was."""
     return replace(batch, trust=batch.initial_weight() * (1 - batch.reaches(level) * share * (1 - weight)))
 
 

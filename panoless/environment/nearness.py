@@ -2,7 +2,7 @@
 
 Two points of the object that look in one direction see the same of a far world, and shifted parts of a near one. With
 the rows B of `Surroundings.rows` and the residuals e under the map that explains the rays best, each texel takes the
-mean of what its rays ask for, and only the rest moves the walls: k ← k − (Bᵀ W (1 − Π) B)⁻¹ Bᵀ W (1 − Π) e.
+mean of what its rays require, and only the rest moves the walls: k ← k − (Bᵀ W (1 − Π) B)⁻¹ Bᵀ W (1 − Π) e.
 """
 
 from collections.abc import Sequence
@@ -28,13 +28,13 @@ RESOLUTIONS = (8, 8, 16, 16, 16, 32, 32, 32, 64, 64, 64)
 STRETCH = 1.7
 """Factor of a step: it lets each texel follow by the mean of its rays, as a map does not quite."""
 LEAST_SHARE = 1e-3
-"""Share of the mean diagonal that is added to the diagonal, for walls that no ray tells."""
+"""Share of the mean diagonal that is added to the diagonal, for walls that no ray determines."""
 FLOOR_DEPTHS = (0.45, 0.55, 0.65, 0.8, 1.0)
 """Of what the object may stand on below its center, in radii of the object: those that are tried first."""
 FLOOR_REACHES = (2.5, 4.0, 8.0)
 """How far that may reach, in radii of the object."""
 FLOOR_RESOLUTION = 16
-"""Texels along a face side of the maps that tell which of these explains most."""
+"""Texels along a face side of the maps that determine which of these explains most."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Linearized:
         return cls(_cost(residual), gradient, matrix)
 
     def step(self) -> Float[np.ndarray, "D"]:
-        """−(H + λ)⁻¹ g, λ a small share of the mean diagonal; none where no ray tells anything."""
+        """−(H + λ)⁻¹ g, λ a small share of the mean diagonal; none where no ray determines anything."""
         return damped_step(self.gradient, self.matrix, LEAST_SHARE)
 
     def pull(self) -> float:

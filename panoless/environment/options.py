@@ -10,7 +10,8 @@ COARSEST = 4
 
 
 def halves_whole(resolution: int) -> bool:
-    """Whether a map of so many texels along a face side is halved without a rest until it is as coarse as blurs ask."""
+    """Whether a map of so many texels along a face side is halved without a rest until it is as coarse as blurs
+    require."""
     while resolution > COARSEST and resolution % 2 == 0:
         resolution //= 2
     return resolution <= COARSEST
@@ -39,10 +40,10 @@ class MaterialOptions:
     scattering: Literal["auto", "off"] = "auto"
     """Whether the shape is looked for again without scattered light, where there is some."""
     roughness: Literal["auto", "off"] = "auto"
-    """Whether the mirror may be slightly rough; not of surfels, whose normals are too coarse to tell, and never in a
-    high dynamic range."""
+    """Whether the mirror may be slightly rough; not of surfels, whose normals are too coarse to determine, and never in
+    a high dynamic range."""
     blur: Literal["auto", "off"] = "auto"
     """Whether pictures may be blurred, as out of focus or by compression. Where roughness explains held-out views
     better, too, the one that does so more is taken."""
     known_roughness: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.0
-    """Where it is known, in units of Blender's principled shader; 0: held-out views tell it."""
+    """Where it is known, in units of Blender's principled shader; 0: held-out views determine it."""

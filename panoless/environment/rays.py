@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 
-class Believed:
-    """What saw radiance and is believed beforehand as far as its trust says."""
+class Weighted:
+    """What saw radiance and is weighted beforehand as far as its trust says."""
 
     radiance: Float[Tensor, "P 3"]
     trust: Float[Tensor, "P"] | None
@@ -24,11 +24,11 @@ class Believed:
 
 
 @dataclass(frozen=True)
-class Rays(Believed):
+class Rays(Weighted):
     """Observations of the environment: unit world directions and the linear radiance seen along them.
 
-    `trust` says how far each is believed beforehand, in [0, 1]; None: all alike. `incoming` are the unit world
-    directions of the cameras' rays, which tell the angles at which these met the mirror; None: nobody asks.
+    `trust` says how far each is weighted beforehand, in [0, 1]; None: all alike. `incoming` are the unit world
+    directions of the cameras' rays, which determine the angles at which these met the mirror; None: no use needs them.
     """
 
     directions: Float[Tensor, "P 3"]

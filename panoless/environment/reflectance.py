@@ -108,7 +108,7 @@ def normals_of(rays: Rays) -> Float[Tensor, "P 3"]:
 
 def unsaturated(rays: Rays, saturation: Float[Tensor, "3"]) -> Rays:
     """The rays whose radiance is known in all channels, all trusted alike: those that graze see wide parts of a map and
-    are trusted less for that, but tell most about the mirror.
+    are trusted less for that, but determine most about the mirror.
     """
     known = rays.kept((rays.radiance < SATURATED * saturation.to(rays.radiance)).all(1))
     return replace(known, trust=None)
@@ -144,7 +144,7 @@ def find_reflectance(
 
     w are the rays' trust and Geman–McClure weights. Each round is a Gauss–Newton step of each channel's unknowns, from
     which the texels are eliminated: all that counts is how a direction looks at different angles. A plane in a far
-    world shows each direction at one angle and tells nothing; F₀ stays 1 and ρ zero there.
+    world shows each direction at one angle and determines nothing; F₀ stays 1 and ρ zero there.
     """
     texels = _Texels.of(rays, resolution)
     if metal is None:

@@ -43,20 +43,20 @@ def sharpened_map(
         E ← E · (Bᵀ Aᵀ W c / Bᵀ Aᵀ W A B E)ᵖ .
 
     They keep it positive, move lamps as fast as what is dim, and the more are taken, the finer is what they sharpen.
-    The weights W are Geman and McClure's, found anew in each; a saturated pixel, c = s, has none while its prediction
+    The weights W are Geman and McClure's, found again in each; a saturated pixel, c = s, has none while its prediction
     is saturated, too. What no pixel sees stays.
     """
     resolution, saturation = environment.shape[-1], saturation.to(environment)
     environment = environment.clamp(min=LEAST_LIGHT)
     for _ in range(rounds):
         shown = lobe.blurred(environment)
-        asked, found = torch.zeros_like(environment), torch.zeros_like(environment)
+        requested, found = torch.zeros_like(environment), torch.zeros_like(environment)
         for each in areas:
             seen = each.seen(shown)
             weight = each.weights(seen, saturation, SHARPENING_SCALE, SATURATED)
-            asked += each.spread(weight * each.radiance, resolution)
+            requested += each.spread(weight * each.radiance, resolution)
             found += each.spread(weight * seen, resolution)
-        ratio = (lobe.gathered(asked) + INERTIA) / (lobe.gathered(found) + INERTIA)
+        ratio = (lobe.gathered(requested) + INERTIA) / (lobe.gathered(found) + INERTIA)
         environment = environment * ratio**STEP_POWER
     return environment
 
@@ -67,8 +67,8 @@ def with_smaller_lamps(
     """A start for a sharpened map: what a lobe saturates about a lamp is filled from around, and the lamp is brighter.
 
     Of each region in which a channel is saturated, texels within `LAMP_BORDER_RAD` of its border are filled, but for
-    the innermost ones of a region that is no wider. Photographs that end at s do not tell a lamp from a smaller and
-    brighter one; of all that explain them, steps lead to one near to where they start.
+    the innermost ones of a region that is no wider. Photographs that end at s do not distinguish a lamp from a smaller
+    and brighter one; of all that explain them, steps lead to one near to where they start.
     """
     most = saturation.to(environment)[:, None, None]
     lit = environment >= LIT * most

@@ -3,7 +3,7 @@
 min_E Σ w ‖mean_k E(ω_k) − c‖² + λ Σ v ‖E_i − E_j‖² + ε ‖E − E₀‖², over 2×2 directions ω_k of each pixel and over
 neighboring texels that pixels see, by conjugate gradients from the map E₀ of pixel centers. With v = 1/(1 + ‖E_i −
 E_j‖²/s²) edges of lamps and windows stay, and noise does not. Views are clipped at some largest radiance, c = min(S,
-mean_k E(ω_k)): a saturated pixel has no error while its prediction is saturated too, and light above S is told by
+mean_k E(ω_k)): a saturated pixel has no error while its prediction is saturated too, and light above S is determined by
 pixels that see a lamp in part.
 
 A lamp of radiance L saturates each pixel of which it covers more than S/L. Of the pixels over a point of its border,
@@ -60,8 +60,8 @@ LEAST_GAIN = 0.002
 """Share of the error of held-out pixels by which a map of twice the resolution has to lower it."""
 LEAST_UNSATURATED_GAIN = 0.005
 """The same of unsaturated pixels alone, where all together are explained no worse."""
-LEAST_TOLD = 1.0
-"""Pixels on a texel of the coarsest map from which their footprints tell where the map starts."""
+LEAST_DETERMINED = 1.0
+"""Pixels on a texel of the coarsest map from which their footprints determine where the map starts."""
 PULL = 0.002
 """Weight ε of the start, in pixels."""
 STEPS = 6
@@ -77,7 +77,7 @@ LIT = 0.95
 CEILING = 4.0
 """Largest radiance of the map, in those of views."""
 COARSE_PIXELS = 200_000
-"""About so many pixels at most tell how bright the inside of saturated regions is."""
+"""About so many pixels at most determine how bright the inside of saturated regions is."""
 COARSE_RESOLUTION = 8
 """Texels along a face side of what is added there."""
 COARSE_ROUNDS = 2
@@ -102,7 +102,7 @@ class Sharpness:
     smoothness: float
     """λ, in pixels."""
     lamps: Lamps
-    """How saturated pixels are believed."""
+    """How saturated pixels are weighted."""
 
 
 def sharpest_map(
@@ -112,27 +112,29 @@ def sharpest_map(
     saturation: Float[Tensor, "3"],
 ) -> Float[Tensor, "6 3 L L"]:
     """The map of all pixels: `rays` are their centers, also of those without footprints. The resolutions that it may
-    have go from coarse to fine; the coarsest has enough pixels a texel to say where footprints tell it. E₀ is solved
-    from them twice: the second time, where they do, from a map of footprints. Under that fewer rays look as if they
-    were wrong.
+    have go from coarse to fine; the coarsest has enough pixels a texel to say where footprints determine it. E₀ is
+    solved from them twice: the second time, where they do, from a map of footprints. Under that fewer rays look as if
+    they were wrong.
     """
     chosen = chosen_sharpness(footprints.smooth, resolutions, saturation)
-    told = footprints.smooth[0].radiance.new_zeros(6, 1, resolutions[0], resolutions[0])
+    determined = footprints.smooth[0].radiance.new_zeros(6, 1, resolutions[0], resolutions[0])
     for each in footprints.smooth:
-        told += each.spread(each.initial_weight()[:, None], resolutions[0])
-    told = (told >= LEAST_TOLD).float()
+        determined += each.spread(each.initial_weight()[:, None], resolutions[0])
+    determined = (determined >= LEAST_DETERMINED).float()
     level = SATURATED * saturation
-    believed = [
-        counting_saturated(each, chosen.lamps.saturated_weight, level, sample_cubemap(told, each.directions)[:, 0])
+    weighted = [
+        counting_saturated(
+            each, chosen.lamps.saturated_weight, level, sample_cubemap(determined, each.directions)[:, 0]
+        )
         for each in rays
     ]
-    start = solve_environment(believed, chosen.resolution)
+    start = solve_environment(weighted, chosen.resolution)
     seen = deblur_map(
         Footprints(footprints.smooth), start, saturation, chosen.smoothness, chosen.lamps, steps=TRIAL_STEPS
     )
     seen = seen.minimum(saturation.to(seen)[:, None, None])
-    told = resample(told, chosen.resolution) > 0.5
-    start = solve_environment(believed, chosen.resolution, torch.where(told, seen, start))
+    determined = resample(determined, chosen.resolution) > 0.5
+    start = solve_environment(weighted, chosen.resolution, torch.where(determined, seen, start))
     return deblur_map(footprints, start, saturation, chosen.smoothness, chosen.lamps)
 
 
@@ -148,8 +150,8 @@ def chosen_sharpness(
     `LEAST_UNSATURATED_GAIN`. One that is as fine as a refused one is not tried again.
 
     Held-out pixels that are saturated count as they do in the map; at the borders of lamps they prefer blur. Which kind
-    of lamps there is, unsaturated pixels tell before that: those beside lamps that are shown too large. Saturated ones
-    always prefer larger lamps.
+    of lamps there is, unsaturated pixels determine before that: those beside lamps that are shown too large. Saturated
+    ones always prefer larger lamps.
     """
 
     def sharpness(place: tuple[int, int], lamps: Lamps) -> Sharpness:
@@ -202,7 +204,7 @@ class _Trial:
     ) -> None:
         areas = in_patches(areas, pixels, TRIAL_PATCHES)
         self.kept = [each.without(HELD_OUT, index % HELD_OUT) for index, each in enumerate(areas)]
-        self.asked = [each.every(HELD_OUT, index % HELD_OUT) for index, each in enumerate(areas)]
+        self.requested = [each.every(HELD_OUT, index % HELD_OUT) for index, each in enumerate(areas)]
         self.saturation, self.level = saturation, SATURATED * saturation
         self.is_saturated = any(bool(each.reaches(self.level).any()) for each in areas)
         self._starts: dict[tuple[int, Lamps], Tensor] = {}
@@ -218,9 +220,9 @@ class _Trial:
         return _Tried(*self._errors(environment, lamps))
 
     def _errors(self, environment: Float[Tensor, "6 3 L L"], lamps: Lamps) -> tuple[float, float]:
-        """Of all pixels that are asked, and of the unsaturated ones."""
+        """Of all pixels that are requested, and of the unsaturated ones."""
         summed = torch.zeros(2, 2)
-        for each in self.asked:
+        for each in self.requested:
             error = each.seen(environment).minimum(self.saturation.to(environment)) - each.radiance
             badly = bounded_error(error, ROBUST_SCALE)
             weight = counting_saturated(each, lamps.saturated_weight, self.level).initial_weight()
@@ -242,8 +244,8 @@ def deblur_map(
     """The map E₀ of pixel centers, sharpened; texels that no footprint touches stay. Views are clipped at `saturation`.
 
     It lies between 0 and that, or `CEILING` times that in channels in which pixels are saturated. Before each round,
-    pixels that bend the light much, or reflect it often, and so see wide parts of it, tell how bright the inside of
-    saturated regions is, coarsely.
+    pixels that bend the light much, or reflect it often, and so see wide parts of it, determine how bright the inside
+    of saturated regions is, coarsely.
     """
     if not footprints.smooth:
         return environment

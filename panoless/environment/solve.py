@@ -54,7 +54,7 @@ def solve_environment(
 
 
 def merged(rays: Iterable[Rays]) -> list[Rays]:
-    """The rays in batches of about a million, without where they came from, which a map does not ask for. Those that
+    """The rays in batches of about a million, without where they came from, which a map does not require. Those that
     come one by one need memory once.
     """
     groups = grouped((replace(batch, incoming=None) for batch in rays), MERGED_RAYS)

@@ -200,7 +200,7 @@ def is_exported(folder: Path, state: FitState, config: FitConfig, dataset: Datas
 
 def _description(folder: Path, state: FitState, config: FitConfig, dataset: Dataset) -> PredictionInfo | None:
     """What the folder says of a moment of this fit, None where it says nothing or is of another one; equal seconds to
-    the millisecond tell fits apart.
+    the millisecond distinguish fits.
     """
     try:
         info = read_info(folder)

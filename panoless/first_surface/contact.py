@@ -18,7 +18,7 @@ NEIGHBOR_VIEW_DEG = 12.0
 NEIGHBOR_HEIGHT_DEG = 8.0
 """…and over about this difference of their heights above the tangent plane."""
 CONTACT_VIEWS = 150
-"""Views that tell contacts, at most: as well as all of a long video."""
+"""Views that determine contacts, at most: as well as all of a long video."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Contact:
     """How each vertex of a hull meets the outline that comes nearest to it, in normalized units.
 
     `margin` is its distance inside the outline's cone; `offset` its distance, along the ray, from the contour
-    generator where that cone touches the object. Both are infinite where no view tells.
+    generator where that cone touches the object. Both are infinite where no view shows one.
     """
 
     margin: Float[np.ndarray, "V"]

@@ -1,7 +1,7 @@
 """The visual hull below the size of a pixel: where every outline, interpolated between mask pixels, allows the object.
 
 A mask's half level is a curve that lies between pixels. The hull function at a point is its largest signed distance
-over the views, outside these curves, in normalized units; its zero level is the hull. A view has no say about what it
+over the views, outside these curves, in normalized units; its zero level is the hull. A view does not count for what it
 doesn't show.
 """
 
@@ -26,7 +26,7 @@ BAND_VOXELS = 1.5
 """|h|, in voxels, below which the surface may pass through a voxel's refined cells: half its diagonal and some to
 spare."""
 TESTED_RAYS = 4000
-"""Rays through silhouettes that tell whether the views agree."""
+"""Rays through silhouettes that determine whether the views agree."""
 RAY_SAMPLES = 128
 """Points tested along each of them."""
 LARGEST_GAP_PX = 10.0
@@ -45,7 +45,7 @@ SPARE = 1.1
 POINTS_AT_ONCE = 1 << 18
 FEWEST_VOXELS = 8
 DEEPEST = 4.0
-"""−h, in normalized units, where no view tells: deeper inside than any point of the usual cube."""
+"""−h, in normalized units, where no view shows it: deeper inside than any point of the usual cube."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Hull:
     half_side: float
     pixel: float
     left_out: int = 0
-    """How many views have no say at a point, because they contradict the others."""
+    """How many views have no weight at a point, because they contradict the others."""
 
     @property
     def voxel(self) -> float:
@@ -84,7 +84,7 @@ class Hull:
 def largest_distances(
     outlines: Sequence[MaskDistance], points: Float[Tensor, "P 3"], count: int
 ) -> Float[Tensor, "count P"]:
-    """The largest, second largest, … signed distance of each point over the views that tell."""
+    """The largest, second largest, … signed distance of each point over the views that count there."""
     blocks = []
     for block in points.split(POINTS_AT_ONCE):
         largest = torch.full((count, len(block)), -math.inf, device=points.device)

@@ -35,7 +35,7 @@ SAMPLES = 4
 """Rays along a side of a pixel at the outline, for its alpha, and of every pixel, for the mean light over its area."""
 MERIDIANS, RINGS = 128, 64
 _last_usable: MutableMapping["Geometry", tuple[Callable[[], Views | None], Views]] = WeakIdKeyDictionary()
-"""The views that were asked for last, and the answer."""
+"""The views that were requested last, and the answer."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ class Geometry(Protocol):
 
     @property
     def poses(self) -> Poses | None:
-        """How the training views are turned and shifted against what is said of them; None: they are believed."""
+        """How the training views are turned and shifted against what is said of them; None: they are fixed."""
         ...
 
     def with_poses(self, poses: Poses | None) -> "Geometry":
@@ -205,7 +205,7 @@ class Geometry(Protocol):
         ...
 
     def corrected(self, views: Views) -> Views:
-        """The views with their cameras where the poses have them; as they are where they are believed."""
+        """The views with their cameras where the poses have them; as they are where they are fixed."""
         ...
 
     @property
@@ -312,34 +312,34 @@ class Family(Protocol):
     label: ClassVar[str]
     """With its article, as sentences name it."""
     refines: ClassVar[str | None]
-    """The kind whose proposal it takes on where that one is not chosen; None: it makes its own."""
+    """The kind whose proposal it starts from where that one is not chosen; None: it makes its own."""
     in_few_steps: ClassVar[bool]
     """Whether the kind that it refines is compared with it, fitted in few steps."""
     needs_depth: ClassVar[bool]
-    """Whether views have to come from different directions, which tell how far away the object is."""
+    """Whether views have to come from different directions, which determine how far away the object is."""
     silhouettes_suffice: ClassVar[bool]
-    """Whether outlines tell the whole shape, so that what photographs leave unexplained is no doubt of it but noise, or
-    who holds the camera."""
+    """Whether outlines determine the whole shape, so that what photographs leave unexplained is no doubt of it but
+    noise, or who holds the camera."""
 
-    def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
+    def propose(self, views: Views, config: FitConfig, *, requested: bool) -> Proposal | None:
         """A shape that explains the silhouettes; None where they determine none.
 
-        Raises InputError in that case when the kind was `asked` for.
+        Raises InputError in that case when the kind was `requested`.
         """
         ...
 
     def proposed_over(
-        self, views: Views, proposal: Proposal, config: FitConfig, *, asked: bool = False
+        self, views: Views, proposal: Proposal, config: FitConfig, *, requested: bool = False
     ) -> Proposal | None:
         """Of a kind that refines another, the proposal that starts from the other's; None without one."""
         ...
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
-        """A proposal as a geometry, which tells what is wrong with cameras and masks."""
+        """A proposal as a geometry, which determines what is wrong with cameras and masks."""
         ...
 
     def before_steps(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:
-        """The shape that a fit takes its first step from, which tells how near the surroundings are."""
+        """The shape that a fit takes its first step from, which determines how near the surroundings are."""
         ...
 
     def refitted(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:
@@ -395,7 +395,7 @@ def poses_from_plain(content: dict[str, Any]) -> Poses | None:
 def usable_views(views: Views, geometry: Geometry) -> Views:
     """The views with their cameras as a geometry has them, and its usable pixels as their solid ones.
 
-    The last answer for each geometry is kept, because selection, map and verdict ask for pixels of the same views.
+    The last answer for each geometry is kept, because selection, map and verdict require pixels of the same views.
     """
     last = _last_usable.get(geometry)
     if last is not None and last[0]() is views:

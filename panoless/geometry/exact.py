@@ -165,7 +165,7 @@ class ExactFamily:
     """Whether silhouettes determine the shape to the end, so that photographs do not refine it."""
 
     def proposed_over(
-        self, views: Views, proposal: Proposal, config: FitConfig, *, asked: bool = False
+        self, views: Views, proposal: Proposal, config: FitConfig, *, requested: bool = False
     ) -> Proposal | None:
         """The proposal itself."""
         return proposal
@@ -185,7 +185,7 @@ class ExactFamily:
     def refitted(self, views: Views, fitted: Any, config: FitConfig) -> Geometry:
         """By silhouettes once more, or after the last round of the joint solve."""
         if self.by_silhouettes:
-            again = cast(Family, self).propose(views, config, asked=False)
+            again = cast(Family, self).propose(views, config, requested=False)
             return fitted if again is None else fitted.with_shape(again.shape).in_surroundings(fitted.surroundings)
         with torch.no_grad():
             surface = self.unknowns(views, Proposal(fitted.shape, 0.0, 1.0), config)
@@ -274,8 +274,8 @@ class ExactFamily:
 
 
 class SeenByCenters(ExactGeometry):
-    """A surface that tells what pixels see by their centers. Over its area, a pixel sees what centers do in pictures
-    that are shifted by parts of a pixel.
+    """A surface that is traced through pixel centers. Over its area, a pixel sees what centers do in pictures that are
+    shifted by parts of a pixel.
     """
 
     def usable_pixels(self, view: TrainView) -> Int[Tensor, "P"]:

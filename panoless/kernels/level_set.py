@@ -43,7 +43,7 @@ def first_hits(
     φ = 0 is met to 1e-9 of the distance. Rays that start on the surface and are `leaving` it are followed from up to a
     quarter of a cell on. Where φ is near to zero steps are a quarter of a cell or more, so a part of the surface that a
     ray crosses within less than that may be missed. Cells whose coefficients are all positive are passed at once:
-    `empty` are their `empty_cells`, counted anew where they are not given.
+    `empty` are their `empty_cells`, counted again where they are not given.
     """
     _check_coefficients(coefficients)
     empty = empty_cells(coefficients) if empty is None else empty
@@ -187,7 +187,7 @@ def third_differences(
     """DᵀD c with ‖D c‖² = Σ |D³c|² over all third differences whose coefficients are all active.
 
     There are ten kinds, of which a mixed one counts as often as it is in |D³c|². `whole` are the `whole_differences` of
-    what is active, found anew where they are not given.
+    what is active, found again where they are not given.
     """
     _check_coefficients(coefficients)
     whole = whole_differences(active) if whole is None else whole

@@ -1,5 +1,5 @@
-"""Matrices of least squares, made fit for a solution: symmetric, positive semidefinite, singular where data tell too
-little.
+"""Matrices of least squares, made fit for a solution: symmetric, positive semidefinite, singular where data determine
+too little.
 
 What is regular stays as it is, to the bit. A matrix H that is singular up to rounding becomes H + d·diag(H): a
 solution is then near zero in what is open.
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from scipy.sparse import spmatrix
 
 LEAST_DAMPING = 1e-9
-"""As little as keeps a matrix regular where nothing tells a parameter; not tuned."""
+"""As little as keeps a matrix regular where nothing determines a parameter; not tuned."""
 LARGEST_ERROR = 1e-2
 """Of a solution that is known: with more, a sparse matrix counts as singular. Plates of ordinary hulls, whose rounding
 grows with the pixels a voxel is smaller than, are below 3e-4."""

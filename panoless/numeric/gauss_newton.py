@@ -80,7 +80,7 @@ def keep_if_better(
     """The last of the candidates, from simple to fine, up to which each lowers the held-out cost by `least_gain`.
 
     A candidate is kept if its cost is below (1 − least_gain) times that of the one before it. The first that is not
-    ends the search, so candidates may be made one by one. At least one is needed, and a single one is not asked for its
+    ends the search, so candidates may be made one by one. At least one is needed, and of a single one there is no
     cost.
     """
     remaining = iter(candidates)

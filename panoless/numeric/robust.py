@@ -15,7 +15,7 @@ def robust_weight(error: Residuals, scale: float | Residuals) -> Residuals:
     """Geman–McClure weight w = (1 + ‖e‖²/s²)⁻² of each residual; (P,), in (0, 1].
 
     `error` is (P,) or (P, C); `scale` s has its unit and is one number or (P,). w e is the gradient of s²ρ/2 with ρ the
-    bounded error: least squares, weighted anew in each step, minimize Σ ρ.
+    bounded error: least squares, weighted again in each step, minimize Σ ρ.
     """
     return 1 / (1 + _squared(error) / scale**2) ** 2
 

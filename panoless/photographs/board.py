@@ -188,7 +188,7 @@ def poses_from_board(
         sightings, adjusted = _robust(board, located, adjusted.lens, 1)
     if not adjusted.focal_error < MOST_FOCAL_ERROR:
         raise InputError(
-            expected=f"frames that tell the focal length to {MOST_FOCAL_ERROR:.0%}",
+            expected=f"frames that determine the focal length to {MOST_FOCAL_ERROR:.0%}",
             found=f"an uncertainty of {adjusted.focal_error:.1%}",
             remedy="Add frames that see the board at a slant, from different sides.",
         )

@@ -2,7 +2,7 @@
 
 The plane is known, so that each photograph can be laid out on it. What the plane shows is the color on which most of
 them agree; a mirror, and all that stands above the plane, moves against it from view to view. A pixel that shows the
-plane tells that nothing is on its ray: so points of space are cleared away by votes, and what is left over is the
+plane determines that nothing is on its ray: so points of space are cleared away by votes, and what is left over is the
 object. Near its outline each view's own pixels decide.
 """
 
@@ -55,13 +55,13 @@ GIVE_MASKS = (
     "Give a folder of masks (--masks), a model (--segmenter), a rectangle about the object in a frame or two "
     "(--box X0,Y0,X1,Y1 --box-in NAME), or clicks (--clicks)."
 )
-#: One texel of this many tells how bright a view is.
+#: One texel of this many determines how bright a view is.
 SPARSE = 4
 SPECK_PX = 5
 #: Differences of a pixel from the ground, in codes of 1, between which they are counted.
 STEPS = np.array([0.005, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.25])
-#: A point is judged where so large a share of the views can tell.
-LEAST_ASKED = 0.3
+#: A point is judged where so large a share of the views shows it.
+LEAST_REQUESTED = 0.3
 
 
 @dataclass(frozen=True)
@@ -93,12 +93,12 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the pixels of a view tell about the ground."""
+    """What the pixels of a view show of the ground."""
 
     camera: Camera
     shown: Bool[np.ndarray, "H W"]
     """Where the ground is seen for sure: in a whole window."""
-    told: Bool[np.ndarray, "H W"]
+    determined: Bool[np.ndarray, "H W"]
     """Where the ground's color is known."""
     left: Float[np.ndarray, "H W"]
     """By how much each pixel differs from the ground that it would show, in codes of 1."""
@@ -180,30 +180,30 @@ def evidence_of(
     cv2 = opencv()
     size, homography = (camera.width, camera.height), sheet.to_pixels(camera)
     expected = cv2.warpPerspective(pattern, homography, size, flags=cv2.INTER_LINEAR)
-    told = cv2.warpPerspective(known.astype(np.uint8) * 255, homography, size, flags=cv2.INTER_LINEAR) == 255
+    determined = cv2.warpPerspective(known.astype(np.uint8) * 255, homography, size, flags=cv2.INTER_LINEAR) == 255
     color = picture.astype(np.float32) / 255 * gain
     around = np.ones((3, 3), np.uint8)
     low, high = cv2.erode(expected, around), cv2.dilate(expected, around)
     left = np.maximum(np.maximum(low - color, color - high), 0)
-    wide, shown = (told & _matches(color, expected, left, told, width) for width in (WIDE_PX, WINDOW_PX))
+    wide, shown = (determined & _matches(color, expected, left, determined, width) for width in (WIDE_PX, WINDOW_PX))
     spread = 2 * ((WIDE_PX - WINDOW_PX) // 2 + 1) + 1
     shown &= cv2.dilate(wide.astype(np.uint8), np.ones((spread, spread), np.uint8)) > 0
-    return Evidence(camera, shown, told, left.max(-1))
+    return Evidence(camera, shown, determined, left.max(-1))
 
 
 def _matches(
     color: Float[np.ndarray, "H W 3"],
     expected: Float[np.ndarray, "H W 3"],
     left: Float[np.ndarray, "H W 3"],
-    told: Bool[np.ndarray, "H W"],
+    determined: Bool[np.ndarray, "H W"],
     width: int,
 ) -> Bool[np.ndarray, "H W"]:
     """Where little is `left` in a window of that width, beside the contrast of what is seen or expected there."""
     cv2 = opencv()
-    share = np.maximum(cv2.blur(told.astype(np.float32), (width, width)), 1e-6)[..., None]
+    share = np.maximum(cv2.blur(determined.astype(np.float32), (width, width)), 1e-6)[..., None]
 
     def mean(values: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
-        found: np.ndarray = cv2.blur(np.where(told[..., None], values, 0), (width, width)) / share
+        found: np.ndarray = cv2.blur(np.where(determined[..., None], values, 0), (width, width)) / share
         return found
 
     contrast = mean(color**2) - mean(color) ** 2 + mean(expected**2) - mean(expected) ** 2 + NOISE**2
@@ -212,15 +212,15 @@ def _matches(
 
 
 def cleared(seen: Sequence[Evidence], points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
-    """The share of the views that see ground at each point, of those that can tell; 1 where few can."""
-    clear, asked = np.zeros(len(points)), np.zeros(len(points))
+    """The share of the views that see ground at each point, of those that show it; 1 where few do."""
+    clear, requested = np.zeros(len(points)), np.zeros(len(points))
     for view in seen:
         rows, columns, within, depth = pixels_of(view.camera, points)
         within &= depth > 0
         at = np.where(within, rows, 0), np.where(within, columns, 0)
         clear += within & view.shown[at]
-        asked += within & view.told[at]
-    return np.where(asked >= LEAST_ASKED * len(seen), clear / np.maximum(asked, 1), 1.0)
+        requested += within & view.determined[at]
+    return np.where(requested >= LEAST_REQUESTED * len(seen), clear / np.maximum(requested, 1), 1.0)
 
 
 def ground_masks(
@@ -292,7 +292,7 @@ def odds_of(seen: Sequence[Evidence], outlines: Sequence[Sequence[Bool[np.ndarra
         step = np.searchsorted(STEPS, view.left)
         around = _distance_px(~perhaps)
         for which, where in enumerate((_distance_px(sure) > 3, (around > 4) & (around < 40))):
-            counts[which] += np.bincount(step[where & view.told], minlength=len(STEPS) + 1)
+            counts[which] += np.bincount(step[where & view.determined], minlength=len(STEPS) + 1)
     on_object, on_ground = np.log(counts / counts.sum(1, keepdims=True))
     odds: np.ndarray = on_object - on_ground
     return odds
@@ -310,11 +310,11 @@ def _mask(
 ) -> Bool[np.ndarray, "H W"]:
     """Between the outlines of what is the object for sure and of what is perhaps, the pixels of the view decide.
 
-    That a place is likely the object counts as a pixel with odds of e; where a pixel can't tell, this alone counts.
+    That a place is likely the object counts as a pixel with odds of e; where a pixel shows nothing, this alone counts.
     """
     cv2 = opencv()
     sure, likely, perhaps = outlines
-    odds = np.where(likely, 1.0, -1.0) + np.where(view.told, odds_of_step[np.searchsorted(STEPS, view.left)], 0.0)
+    odds = np.where(likely, 1.0, -1.0) + np.where(view.determined, odds_of_step[np.searchsorted(STEPS, view.left)], 0.0)
     mask = (_distance_px(sure) > 2) | (perhaps & (cv2.GaussianBlur(odds, (0, 0), 1.0) > 0))
     return largest_pieces(cv2.medianBlur(mask.astype(np.uint8), SPECK_PX) > 0, MAIN_SHARE)
 
@@ -322,14 +322,14 @@ def _mask(
 def _agreed(
     seen: Sequence[Evidence], masks: Sequence[Bool[np.ndarray, "_ _"]], found: _Points
 ) -> list[Bool[np.ndarray, "_ _"]]:
-    """Masks by the hull of these where the view itself cannot tell, as before the far end of the room."""
+    """Masks by the hull of these where the view itself shows nothing, as before the far end of the room."""
     views = [(view.camera, mask) for view, mask in zip(seen, masks, strict=True)]
     allowed = int(TOLERATED * len(views))
     points = carve(views, found.center, found.half_side, HULL_VOXELS, allowed)
     agreed = []
     for view, mask in zip(seen, masks, strict=True):
         hull = outline(view.camera, points, found.spacing)
-        agreed.append(largest_pieces(np.where(view.told, mask, hull), MAIN_SHARE))
+        agreed.append(largest_pieces(np.where(view.determined, mask, hull), MAIN_SHARE))
     return agreed
 
 

@@ -16,7 +16,7 @@ def nearest_point(
 ) -> Float[np.ndarray, "3"]:
     """The point nearest, in least squares, to rays through pixels (x, y) and to the optical axes of all cameras.
 
-    Axes weigh a hundredth of a ray; they tell the depth where there is one ray.
+    Axes weigh a hundredth of a ray; they determine the depth where there is one ray.
     """
     normal_matrix, right_side = np.zeros((3, 3)), np.zeros(3)
     axes = [(camera, (camera.cx, camera.cy), 0.01) for camera in cameras]

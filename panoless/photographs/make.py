@@ -264,12 +264,12 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
         shutil.rmtree(train, ignore_errors=True)
         own, remedy = True, CHECK_MASKS
         cameras = {view.name: view.camera for view in poses.views}
-        told = bool(given_masks or request.hints)
+        given = bool(given_masks or request.hints)
 
         def undistort(view: PosedView) -> bool:
             """Whether the picture has an alpha channel; a mask of its own replaces it."""
             picture = view.lens.undistorted(read_png(work / "frames" / f"{view.name}.png"))
-            write_png(train / f"{view.name}.png", picture[..., :3] if told else picture, quick=True)
+            write_png(train / f"{view.name}.png", picture[..., :3] if given else picture, quick=True)
             return picture.shape[2] == 4
 
         progress = Progress("undistorting", len(poses.views))

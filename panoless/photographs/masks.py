@@ -2,7 +2,7 @@
 
 GrabCut (Rother et al. 2004) parts the object from what lies around: within a rectangle, or that of clicks around it. A
 mask moves to the nearest view without one, as if painted on a plane, and GrabCut finds its edge there. Then each view
-and its neighbors vote, and edges are found anew. The visual hull of all masks judges them: it is as large as each of
+and its neighbors vote, and edges are found again. The visual hull of all masks judges them: it is as large as each of
 them only where they agree.
 """
 
@@ -66,7 +66,7 @@ SEED_ITERATIONS, ITERATIONS = 5, 2
 
 @dataclass(frozen=True)
 class Hint:
-    """What is told of the object in one photograph, in its pixels: a rectangle, or points around it, or both."""
+    """Hints on the object in one photograph, in its pixels: a rectangle, or points around it, or both."""
 
     box: Box | None = None
     """A rectangle about the object: left, top, right, bottom."""
@@ -191,7 +191,7 @@ def read_clicks(path: Path) -> dict[str, Hint]:
 def find_masks(
     whole: Mapping[str, Camera], folder: Path, hints: Mapping[str, Hint]
 ) -> dict[str, UInt8[np.ndarray, "_ _"]]:
-    """Masks of all views from hints in some. Raises InputError for names of no view and for hints that tell nothing."""
+    """Masks of all views from hints in some. Raises InputError for names of no view and for hints without content."""
     unknown = [name for name in hints if name not in whole]
     if unknown or not hints:
         raise InputError(
@@ -248,7 +248,7 @@ def enlarged(mask: Bool[np.ndarray, "_ _"], camera: Camera, side: int) -> Float[
 
 
 def _hinted(trimap: UInt8[np.ndarray, "H W"], hint: Hint) -> UInt8[np.ndarray, "H W"]:
-    """The trimap with what is told surely: nothing beyond the rectangle, and disks about clicks."""
+    """The trimap with what hints fix: nothing beyond the rectangle, and disks about clicks."""
     found = trimap.copy()
     left, top, right, bottom = (max(round(value), 0) for value in hint.bounds)
     within = np.zeros(trimap.shape, bool)
@@ -261,7 +261,7 @@ def _hinted(trimap: UInt8[np.ndarray, "H W"], hint: Hint) -> UInt8[np.ndarray, "
 
 
 def _sharpened(mask: Bool[np.ndarray, "_ _"], camera: Camera, side: int, picture: Path) -> Bool[np.ndarray, "H W"]:
-    """The mask of blocks of pixels in those pixels themselves: its edge is found anew near by."""
+    """The mask of blocks of pixels in those pixels themselves: its edge is found again near by."""
     if side == 1:
         return mask
     trimap = _band(enlarged(mask, camera, side) > 0.5, 0.0, least_px=1.5 * side)

@@ -44,7 +44,7 @@ INNER_PX = 1.5
 COUNTED_RAYS = 30_000
 """Rays count as so many where there are more: errors of surface and map repeat between them."""
 LEAST_CLEAR = 50
-"""Fewer rays that see the surroundings have no say."""
+"""Fewer rays that see the surroundings have no weight."""
 DAMPINGS = (1e-6, 1e-3, 1e-1, 10.0)
 """Of a step, in shares of the matrix' diagonal (Levenberg and Marquardt), tried in turn."""
 CONTOUR_SCALE_PX = 0.5

@@ -35,7 +35,7 @@ def complete(state: FitState, views: Views, config: FitConfig) -> tuple[Views, F
     The map is solved in closed form, unless the configuration keeps that of an iterative fit, which knows no material.
     It is that of photographs as they were taken: exposed more, their robust scales would leave out what is beside a
     lamp, which counts most in a map.
-    Only kinds in closed form are asked for a roughness: wrong normals blur a map as well.
+    Only kinds in closed form have a roughness: wrong normals blur a map as well.
     """
     usable, exposure = usable_views(views, state.geometry), encoding_of(config).exposure
     if config.environment.solve or state.training is None:

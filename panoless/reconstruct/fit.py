@@ -52,7 +52,7 @@ def fit(
     the next fit in that folder goes on from the last checkpoint.
 
     The views, the surfels and the environment are placed on `device` once and stay there; the state that is returned
-    lies in main memory. Raises InputError when another fit is writing to the folder, or snapshots are asked of a
+    lies in main memory. Raises InputError when another fit is writing to the folder, or snapshots are required of a
     finished fit that has none.
     """
     check_config(config)
@@ -153,9 +153,9 @@ def _begin_surfels(views: Views, config: FitConfig) -> FitState:
     if views.object_frame.depth_is_open:
         raise along_one_line()
     mirror = first_mirror(views, config)
-    asked_for = Candidate(mirror.kind, Verdict.CHOSEN, "asked for")
+    requested = Candidate(mirror.kind, Verdict.CHOSEN, "requested")
     training = first_training(views, mirror, config)
-    return FitState(mirror, views.object_frame, Selection(mirror.kind, (asked_for,)), training)
+    return FitState(mirror, views.object_frame, Selection(mirror.kind, (requested,)), training)
 
 
 def assess(state: FitState, views: Views, config: FitConfig, ball: BallEvidence | None = None) -> Trust:
@@ -185,5 +185,5 @@ def find_device(name: str) -> torch.device:
 
 
 def device_name(device: torch.device) -> str:
-    """What tells one piece of hardware from another: the GPU's name, or the type of the device."""
+    """What distinguishes one piece of hardware from another: the GPU's name, or the type of the device."""
     return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type

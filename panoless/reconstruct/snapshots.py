@@ -55,7 +55,7 @@ def snapshot_folders(run: Path) -> list[Path]:
 
 
 def require_snapshots(run: Path, schedule: SnapshotSchedule) -> None:
-    """InputError when a finished run has none of the snapshots that are asked for: it can't take them any more."""
+    """InputError when a finished run has none of the snapshots that are requested: it can't take them any more."""
     if schedule and not snapshot_folders(run):
         raise InputError(
             expected=f"snapshots of the finished run {run}",

@@ -45,11 +45,11 @@ class FitState:
     device: str = "cpu"
     """The name of what computed it."""
     reflectance: Reflectance | None = None
-    """Of the object, where held-out views ask for one; None: it mirrors all light."""
+    """Of the object, where held-out views require one; None: it mirrors all light."""
     roughness: float | None = None
-    """Of the object, where held-out views ask for one; None: it is smooth."""
+    """Of the object, where held-out views require one; None: it is smooth."""
     blur_px: float | None = None
-    """Standard deviation of a Gaussian that blurred the pictures, where held-out views ask for one."""
+    """Standard deviation of a Gaussian that blurred the pictures, where held-out views require one."""
     verdict: Trust | None = None
     """How far it is to be trusted; None before the end, and in runs of an earlier version."""
     is_preliminary: bool = False

@@ -41,7 +41,7 @@ LEAST_UNEXPLAINED = 0.01
 ROUGHNESSES = (0.06, 0.3)
 """Among these a roughness is searched for."""
 TRIALS = 6
-"""So many are tried in the search, which tells it to 15 %, and in that of a blur."""
+"""So many are tried in the search, which determines it to 15 %, and in that of a blur."""
 JUDGED_PIXELS = 60_000
 """About so many pixels at most make a map under which roughness is judged: two or three a texel."""
 JUDGED_ROUNDS = 8

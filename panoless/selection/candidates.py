@@ -37,14 +37,14 @@ class Candidate:
     held_out_error: float | None = None
     """Mean of ‖e‖²/(‖e‖² + s²) over rays of held-out views, in [0, 1]."""
     camera_turn_deg: float | None = None
-    """By how much the cameras were turned, median over views; None where they were believed."""
+    """By how much the cameras were turned, median over views; None where they were fixed."""
     corrections: Corrections = NO_CORRECTIONS
     """Of the photographs that it was fitted to."""
     blocks: tuple[dict[str, Any], ...] = ()
     """Of a joint fit: what was decided of each nuisance block (see `panoless.problem.evidence.Decision`)."""
     principal_point_px: tuple[float, float] | None = None
     """By how much the principal point lies to the right and below of where it is said to be; None where that is not
-    told."""
+    determined."""
 
     @property
     def is_matte(self) -> bool:

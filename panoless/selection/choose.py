@@ -64,9 +64,9 @@ def choose_geometry(views: Views, config: FitConfig) -> tuple[Geometry, Selectio
 
     Candidates are examined from the simplest on. One is refused when it misses the silhouettes, or when a kind that
     refines it explains held-out views clearly better. One that leaves more than right ones do is taken unless one after
-    it leaves much less, or at once where outlines tell its whole shape. One that leaves too much waits until all others
-    are refused; of those the one that leaves least is taken. `config.model` overrides.
-    Raises InputError when a kind is asked for and can't be proposed, and when the silhouettes refuse all kinds.
+    it leaves much less, or at once where outlines determine its whole shape. One that leaves too much waits until all
+    others are refused; of those the one that leaves least is taken. `config.model` overrides.
+    Raises InputError when a kind is requested and can't be proposed, and when the silhouettes refuse all kinds.
     """
     if config.model != ANY:
         return _fit_asked(views, config)
@@ -80,7 +80,7 @@ def choose_geometry(views: Views, config: FitConfig) -> tuple[Geometry, Selectio
             break
         source = _source(family)
         if family.refines is None:
-            before = start = begun(family, views, config, asked=False)
+            before = start = begun(family, views, config, requested=False)
         else:
             before = refused.get(source.kind)
             start = begun_over(family, before, views, config)
@@ -148,7 +148,7 @@ def _with_missed(each: tuple[Candidate, Geometry], views: Views, config: FitConf
 
 def least_unexplained(fitted: Sequence[tuple[Candidate, Geometry]], config: FitConfig) -> tuple[Candidate, Geometry]:
     """Of what leaves too much unexplained, the simplest than which nothing else explains clearly more. A kind that
-    another takes on counts only where no other was fitted.
+    another kind starts from counts only where no other was fitted.
     """
     waiting = [each for each in fitted if not is_refined(each[0].kind)] or fitted
     enough = min(map(error_of, waiting)) / (1 - LEAST_GAIN)
@@ -169,11 +169,11 @@ class Start:
 
 
 @remembered()
-def begun(source: Family, views: Views, config: FitConfig, *, asked: bool) -> Start | None:
+def begun(source: Family, views: Views, config: FitConfig, *, requested: bool) -> Start | None:
     """A proposal, with the cameras as they are stated, or where silhouettes turn them if that brings it clearly nearer
     to the masks. A few of many views determine first whether it does.
     """
-    first = proposed(source, views, config, asked=asked)
+    first = proposed(source, views, config, requested=requested)
     if first is None:
         return None
     start = Start(first)
@@ -181,7 +181,7 @@ def begun(source: Family, views: Views, config: FitConfig, *, asked: bool) -> St
     if config.corrections.poses == "off" or not is_off or is_near(start, views, config, bent=False):
         return start
     stride = len(views.train) // TRIAL_VIEWS
-    if stride >= 2 and not asked:
+    if stride >= 2 and not requested:
         few = replace(views, train=views.train[::stride])
         turned = _turned(source, few, first, config)
         if turned is None or not is_near(turned, few, config, bent=True):
@@ -191,13 +191,13 @@ def begun(source: Family, views: Views, config: FitConfig, *, asked: bool) -> St
 
 @remembered()
 def begun_over(
-    family: Family, start: Start | None, views: Views, config: FitConfig, *, asked: bool = False
+    family: Family, start: Start | None, views: Views, config: FitConfig, *, requested: bool = False
 ) -> Start | None:
     """What a kind that refines another starts from, by the start of that one."""
     if start is None:
         return None
     posed = views if start.poses is None else start.poses.moved(views)
-    found = family.proposed_over(posed, start.proposal, config, asked=asked)
+    found = family.proposed_over(posed, start.proposal, config, requested=requested)
     return None if found is None else replace(start, proposal=found)
 
 
@@ -275,22 +275,22 @@ def _fit_asked(views: Views, config: FitConfig) -> tuple[Geometry, Selection]:
     family = FAMILIES[config.model]
     if views.object_frame.depth_is_open and family.needs_depth:
         raise along_one_line()
-    start = begun(_source(family), views, config, asked=True)
+    start = begun(_source(family), views, config, requested=True)
     if family.refines is not None:
-        start = begun_over(family, start, views, config, asked=True)
-    assert start is not None, "a kind that is asked for is proposed"
+        start = begun_over(family, start, views, config, requested=True)
+    assert start is not None, "a kind that is requested is proposed"
     fitted = fit_jointly(family, _source(family), views, start.proposal, config)
     asked_for = Candidate(
         family.kind,
         Verdict.CHOSEN,
-        "asked for",
+        "requested",
         **_found(fitted, views),
     )
     return fitted.geometry, Selection(family.kind, (asked_for,))
 
 
 def along_one_line() -> InputError:
-    """What is said where views don't tell how far away the object is."""
+    """What is said where views don't determine how far away the object is."""
     labels = " or ".join(family.label for family in FAMILIES.values() if not family.needs_depth)
     return InputError(
         expected=f"cameras that see the object from different directions, or {labels}",

@@ -30,7 +30,7 @@ class Fitted:
 
 
 def is_refined(kind: str) -> bool:
-    """Whether another kind takes on this one's proposal where it is refused."""
+    """Whether another kind starts from this one's proposal where it is refused."""
     return kind in {family.refines for family in FAMILIES.values()}
 
 

@@ -24,9 +24,9 @@ COMPARED_RESOLUTION = 128
 MATTE_SHARE = 0.6
 """Error under one color a place, in that under other models, below which an object is matte."""
 MATTE_VIEWS = 24
-"""Views by which that is judged, of those that tell the colors and of the others."""
+"""Views by which that is judged, of those that determine the colors and of the others."""
 LEAST_COLORS = 0.01
-"""Error under one color a view from which photographs tell places apart."""
+"""Error under one color a view from which photographs distinguish places."""
 
 
 def held_out_errors(views: Views, config: FitConfig, geometry: Geometry) -> Float[np.ndarray, "V"] | None:

@@ -44,9 +44,9 @@ def nuisance_kinds(config: FitConfig) -> tuple[list[type[Block]], list[str]]:
 
 
 @remembered()
-def proposed(source: Family, views: Views, config: FitConfig, *, asked: bool = False) -> Proposal | None:
+def proposed(source: Family, views: Views, config: FitConfig, *, requested: bool = False) -> Proposal | None:
     """What a kind proposes of views."""
-    return source.propose(views, config, asked=asked)
+    return source.propose(views, config, requested=requested)
 
 
 @remembered()

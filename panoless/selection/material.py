@@ -265,8 +265,8 @@ def without_scattered_light(
     held-out views are left with an `error` that this may have made; else None. The configuration says at which radiance
     they are saturated.
 
-    `corrected` are the same views as the geometry was fitted to. They tell the light and where the cameras stand; what
-    their exposures and their lens differ by is small beside what is scattered, and is left to the next choice.
+    `corrected` are the same views as the geometry was fitted to. They determine the light and where the cameras stand;
+    what their exposures and their lens differ by is small beside what is scattered, and is left to the next choice.
     """
     if config.material.scattering == "off" or error < LEAST_SCATTERING_ERROR:
         return None

@@ -1,7 +1,7 @@
 """How near the surroundings are, before a shape is fitted in them.
 
-A shape that believes in a far world bends until it agrees with a near one as well as it can, and then hides how near
-that is. A shape from silhouettes alone knows of no light, so it tells the distance at once.
+A shape that assumes a far world bends until it agrees with a near one as well as it can, and then hides how near
+that is. A shape from silhouettes alone knows of no light, so it determines the distance at once.
 """
 
 from dataclasses import replace
@@ -23,7 +23,7 @@ from panoless.selection.held_out import LEAST_GAIN, is_clearly_lower
 RAYS = 60_000
 """About so many pixels of all views determine how near they are."""
 CHECKED_VIEWS = 10
-"""So many views tell whether to look closer…"""
+"""So many views determine whether to look closer…"""
 CHECKED_RAYS = 20_000
 """…by about so many pixels…"""
 CHECKED_RESOLUTION = 8
@@ -35,12 +35,12 @@ LARGEST_FLOOR_COST = 0.99
 LEAST_FLOOR_GAIN = 0.02
 """Share of the cost of walls alone by which a floor before walls has to be below it."""
 JUDGED_RAYS = 400_000
-"""About so many pixels of all views tell whether a fit in near surroundings explains more than a far one."""
+"""About so many pixels of all views determine whether a fit in near surroundings explains more than a far one."""
 JUDGED_RESOLUTION = 64
 """Texels along a face side of the map that predicts held-out views, and under which a floor is compared."""
 
 NEARER = 1e-2
-"""By which 1/D is changed to tell where a ray leaves the object; not tuned."""
+"""By which 1/D is changed to determine where a ray leaves the object; not tuned."""
 
 
 @remembered()

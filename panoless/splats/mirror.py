@@ -76,7 +76,7 @@ class SurfelMirror:
 
     @property
     def poses(self) -> Poses | None:
-        """None: cameras are believed."""
+        """None: cameras are fixed."""
         return None
 
     def with_poses(self, poses: Poses | None) -> "SurfelMirror":
@@ -216,8 +216,8 @@ def surfel_trust(views: Views, mirror: SurfelMirror, environment: Float[Tensor, 
     """Share of the pixels that a surfel makes up, over some views, whose radiance agrees with a map; in [0, 1].
 
     A surfel whose normal is wrong disagrees in most views although its rays agree with each other in one; a pixel alone
-    cannot tell. Agreement is the Geman–McClure weight of the residual; a pixel counts for a surfel by its share in the
-    blend, which is the derivative of the blended image.
+    cannot show that. Agreement is the Geman–McClure weight of the residual; a pixel counts for a surfel by its share in
+    the blend, which is the derivative of the blended image.
     """
     surfels = mirror.surfels
     agreeing, total = torch.zeros_like(surfels.means[:, 0]), torch.zeros_like(surfels.means[:, 0])

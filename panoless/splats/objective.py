@@ -77,7 +77,7 @@ class StepObjective(Protocol):
         ...
 
     def restarts(self, iteration: int) -> bool:
-        """Whether materials and map begin anew before this iteration."""
+        """Whether materials and map begin again before this iteration."""
         ...
 
     def restarted(self, surfels: Surfels) -> Surfels:

@@ -111,7 +111,7 @@ class SurfelTrainer:
         return step.terms
 
     def _restart(self, iteration: int) -> None:
-        """Materials and map begin anew where the objective says so; shapes stay."""
+        """Materials and map begin again where the objective says so; shapes stay."""
         if self._objective.restarts(iteration):
             self.optimizer.set_values(self._objective.restarted(self.optimizer.surfels.detached()))
             generator = generator_of(self.config.seed, iteration, 3)

@@ -1,4 +1,4 @@
-"""What steps of gradient descent need to continue, and who is told of them."""
+"""What steps of gradient descent need to continue, and their listeners."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -30,7 +30,7 @@ class Training:
 
 @runtime_checkable
 class TrainingObserver(Protocol):
-    """Who is told of the steps of a fit."""
+    """Listeners to the steps of a fit."""
 
     title: str
     """What the progress is called."""

@@ -1,6 +1,6 @@
 """What training views say about a finished fit: held-out light, silhouettes, and how much was there to be seen.
 
-Every fifth view is held out from a map that is solved anew for the final geometry, of pixels as areas where the kind
+Every fifth view is held out from a map that is solved again for the final geometry, of pixels as areas where the kind
 knows them: what a pixel blurs is no error of the shape. What the map leaves unexplained is compared with what two
 models leave that know no mirror: one color a view, and one color a place on the surface, as a matte object has. Where
 most of what the object shows is dark, errors are those of the logarithms of radiance.
@@ -47,7 +47,7 @@ SHIFT_MEDIANS = 3.0
 SHIFT_ROUNDS = 5
 """Rounds of such weights."""
 WELL_INSIDE_PX = 4.0
-"""Pixels as far inside and outside the masks tell whether the surface covers them."""
+"""Pixels as far inside and outside the masks determine whether the surface covers them."""
 VIEWED_WITHIN_RAD = math.radians(15.0)
 """What is as near to the direction of a camera was seen from it."""
 VIEWED_DIRECTIONS = 4000
@@ -71,7 +71,7 @@ SURE = 0.5
 
 @dataclass(frozen=True)
 class Evidence:
-    """Figures of a fit. Errors are means of ‖e‖²/(‖e‖² + s²) over held-out rays; what can't be told is None."""
+    """Figures of a fit. Errors are means of ‖e‖²/(‖e‖² + s²) over held-out rays; what can't be determined is None."""
 
     unexplained: float | None
     """Of the light that held-out views show, under the mirror and the map of the other views, in [0, 1]."""
@@ -102,7 +102,7 @@ class Evidence:
     coverage: float
     """Share of all directions that some pixel saw."""
     rank_correlation: float | None
-    """Spearman's, of confidence and the error of held-out rays: negative where confidence tells the truth."""
+    """Spearman's, of confidence and the error of held-out rays: negative where errors fall with confidence."""
     camera_turn_deg: float
     """By which the fit turned the cameras: median over views."""
     views: int
@@ -142,8 +142,8 @@ def gather_evidence(
     roughness: float | None = None,
     ball: BallEvidence | None = None,
 ) -> Evidence:
-    """The evidence for a geometry in the views that it was fitted to, after their corrections, which are told along as
-    the roughness is; `visibility` is that of the final map.
+    """The evidence for a geometry in the views that it was fitted to, after their corrections, which are listed along
+    as the roughness is; `visibility` is that of the final map.
 
     The shape and the cameras of a `ball` that was captured are known before. So held-out light counts where the map is
     rather sure than not: what stands near the ball, and who photographs it, is left to the visibility.

@@ -42,9 +42,9 @@ POSES = "Refine the camera poses and the focal length, or take them from a board
 MASKS = "Look at the masks, and at the poses of the views whose silhouettes disagree."
 MATTER = "Photograph a shinier object: this one shows its own color."
 SHAPE = "Look at poses, masks and exposure first; parts that are concave or see themselves may be wrong as well."
-PART = "See where that is: a part may be matte, or a concavity may have been missed. A mesh tells by its confidence."
+PART = "See where that is: a part may be matte, or a concavity may have been missed. A mesh shows it by its confidence."
 SURPLUS = (
-    "If --model asked for this kind, the object may be of another; else look at the masks, which may lack a part of "
+    "If --model requested this kind, the object may be of another; else look at the masks, which may lack a part of "
     "it, or the shape has grown one that isn't there."
 )
 VIEWS = "Add views: at least five that see the object from different sides."
@@ -59,13 +59,13 @@ NEAR_BALL = (
 RIM = "Look at capture/ball.jpg: the circle must lie on the rim of a polished ball; else give --box or --clicks."
 LEAST_AGREEMENT = 0.1
 """Correlation from which direct and mirrored views agree for sure: random poses give 0.00 ± 0.01 (37 photographs)."""
-#: Light that one color a view leaves unexplained is not told from none below this.
-LEAST_TOLD = 1e-3
+#: Light that one color a view leaves unexplained is not distinguished from none below this.
+LEAST_DETERMINED = 1e-3
 
 
 @dataclass(frozen=True)
 class _Doubt:
-    """A figure that may speak against a fit; `measure` is None where it can't be told."""
+    """A figure that may speak against a fit; `measure` is None where it can't be determined."""
 
     measure: Callable[[Evidence], float | None]
     limit: float
@@ -81,7 +81,7 @@ def _disagreement(found: Evidence) -> float | None:
     """
     if found.rim_px is None or (found.agreement is None and found.views > 1):
         return None
-    return 2.0 if found.agreement is None else LEAST_AGREEMENT / max(found.agreement, LEAST_TOLD)
+    return 2.0 if found.agreement is None else LEAST_AGREEMENT / max(found.agreement, LEAST_DETERMINED)
 
 
 DOUBTS = (
@@ -175,9 +175,9 @@ DOUBTS = (
         EXPOSURE,
     ),
     _Doubt(
-        lambda found: None if found.one_color is None else 1 / max(found.one_color, LEAST_TOLD),
+        lambda found: None if found.one_color is None else 1 / max(found.one_color, LEAST_DETERMINED),
         1 / LEAST_ONE_COLOR,
-        lambda found: "the photographs show one plain color, so that they don't tell one direction from another",
+        lambda found: "the photographs show one plain color, so that they don't distinguish one direction from another",
         TEXTURE,
         TEXTURE,
     ),

@@ -1,7 +1,7 @@
 """Where light leaves a perfect mirror to: paths through a grid of points in every pixel, traced by Cycles itself.
 
-A perfect mirror's path has no chance in it, so one sample through the center of a sub-pixel tells all about that path.
-A scene beside the main one shares its meshes and materials; its world shines with the number of bounces and the
+A perfect mirror's path has no chance in it, so one sample through the center of a sub-pixel determines all about that
+path. A scene beside the main one shares its meshes and materials; its world shines with the number of bounces and the
 direction in place of light, and everything that is no perfect mirror shines with a mark.
 """
 
@@ -126,7 +126,7 @@ def _bounces(color: Float[np.ndarray, "h w"]) -> tuple[Int[np.ndarray, "h w"], B
 
 
 def _direction_world(bpy: Any) -> Any:
-    """Light that tells its direction and how many reflections led to it."""
+    """Light that determines its direction and how many reflections led to it."""
     world = bpy.data.worlds.new(DIRECTIONS)
     nodes, links = world.node_tree.nodes, world.node_tree.links
     nodes.clear()

@@ -22,7 +22,7 @@ class Start:
 
 @dataclass(frozen=True)
 class BackdropOf:
-    """In place of a camera: what it sees around the object is asked for."""
+    """In place of a camera: what it sees around the object is requested."""
 
     camera: Camera
 

@@ -1,6 +1,6 @@
 """Render views of an assembled scene and hand back their passes as arrays.
 
-Where the object mirrors a far world perfectly, paths through a grid of points tell what smooth pixels show
+Where the object mirrors a far world perfectly, paths through a grid of points determine what smooth pixels show
 (`directions`, `footprint`), and only the others are path traced (`sparse_pixels`). Anything else is path traced as a
 whole.
 """
@@ -176,8 +176,8 @@ def open_renderer(
 ) -> Iterator[Renderer]:
     """Assemble the scene; its passes go through a temporary folder, inside `folder`, that is removed at the end.
 
-    Cycles uses as many `threads` on the CPU, or one for every core. Every pixel is path traced where `path_traced` asks
-    for it, or where samples are many, or the object is no perfect mirror in a far world.
+    Cycles uses as many `threads` on the CPU, or one for every core. Every pixel is path traced where `path_traced`
+    requests for it, or where samples are many, or the object is no perfect mirror in a far world.
     """
     bpy = import_blender()
     with tempfile.TemporaryDirectory(prefix="shinypartial-", dir=folder) as scratch:

@@ -1,4 +1,4 @@
-"""A process that renders what its parent asks for: `python -m shinypartial.blender.worker`, started by `worker_pool`.
+"""A process that renders what its parent requests: `python -m shinypartial.blender.worker`, started by `worker_pool`.
 
 Blender keeps memory that it no longer uses, must not be forked and may crash; in a process of its own it does no harm.
 """
@@ -33,9 +33,9 @@ def main() -> None:
         with open_renderer(start.spec, threads=start.threads, folder=start.folder) as renderer:
             send(replies, Ready(renderer.device))
             while True:
-                asked = cameras.get()
-                backdrop = isinstance(asked, BackdropOf)
-                send(replies, renderer.render_backdrop(asked.camera) if backdrop else renderer.render(asked))
+                requested = cameras.get()
+                backdrop = isinstance(requested, BackdropOf)
+                send(replies, renderer.render_backdrop(requested.camera) if backdrop else renderer.render(requested))
     except (InputError, OSError) as error:
         refusal = from_os_error(error) if isinstance(error, OSError) else error
         send(replies, Refused(refusal.expected, refusal.found, refusal.remedy))

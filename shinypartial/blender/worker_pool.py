@@ -56,7 +56,7 @@ def plan_pool(cores: int | None = None) -> PoolPlan:
 
 
 class PoolClosed(Exception):
-    """A view was asked for when the pool was closed, or it was closed before the view was there."""
+    """A view was requested when the pool was closed, or it was closed before the view was there."""
 
 
 class _WorkerDied(Exception):
@@ -69,7 +69,7 @@ class _Worker:
     folder: Path
     rendered: int = field(default=0)
 
-    def ask(self, message: Any) -> Any:
+    def request(self, message: Any) -> Any:
         """Send a message and wait for the answer to it; raises _WorkerDied, or the InputError that it answers with."""
         assert self.process.stdin
         assert self.process.stdout
@@ -104,7 +104,7 @@ class WorkerPool:
         self._lock = threading.Lock()
         self._closed = False
         self._live: set[_Worker] = set()
-        # A seat holds an idle worker or nobody yet. There is one until the first worker has told its device.
+        # A seat holds an idle worker or nobody yet. There is one until the first worker has stated its device.
         self._seats: queue.Queue[_Worker | None] = queue.Queue()
         self._seats.put(None)
 
@@ -152,7 +152,7 @@ class WorkerPool:
         try:
             if worker is None:
                 worker = self._start()
-            answer = worker.ask(message)
+            answer = worker.request(message)
             worker.rendered += 1
             if worker.rendered >= self.plan.frames_per_worker:
                 self._dismiss(worker)
@@ -178,7 +178,7 @@ class WorkerPool:
             worker = _Worker(_spawn(folder), folder)
             self._live.add(worker)
         try:
-            ready: Ready = worker.ask(Start(self.spec, folder, self.plan.threads))
+            ready: Ready = worker.request(Start(self.spec, folder, self.plan.threads))
         except BaseException:
             self._dismiss(worker)
             if self._closed:

@@ -118,7 +118,7 @@ class Import:
     background: Literal["white", "black"] | None = None
     """Behind the object in its renders; as its cfg_args says when not given."""
     seconds: float | None = None
-    """How long it trained, which its folder doesn't tell."""
+    """How long it trained, which its folder lacks."""
     device: str | None = None
     """What it trained on, such as "NVIDIA RTX 4090"."""
 

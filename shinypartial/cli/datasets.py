@@ -15,7 +15,7 @@ from shinypartial.dataset.perturb.options import CameraErrors, MaskErrors, Pertu
 
 @dataclass(frozen=True)
 class Subset:
-    """Cut a 360° dataset down to one hemisphere: the cameras near the crossing of their looped path, split anew."""
+    """Cut a 360° dataset down to one hemisphere: the cameras near the crossing of their looped path, split again."""
 
     source: tyro.conf.Positional[Path]
     """Folder in the layout of Shiny Blender (or of NeRF-synthetic); it is only read."""
@@ -74,7 +74,7 @@ class FindLight:
         known = {path.stem: path for path in self.worlds} or {name: studio_light(name) for name in STUDIO_LIGHTS}
         if self.worlds and len(known) < len(self.worlds):
             raise InputError(
-                expected="--worlds of different file names, by which maps are told apart",
+                expected="--worlds of different file names, by which maps are distinguished",
                 found=", ".join(map(str, self.worlds)),
                 remedy="Rename files, or name each map once.",
             )

@@ -188,7 +188,7 @@ def _verdict(difference: PairedDifference, definition: Metric) -> str:
 
 
 def comparison_lines(comparison: Comparison) -> list[str]:
-    """The most telling metrics as a table for a terminal."""
+    """The most important metrics as a table for a terminal."""
     pairs = max(one.difference.pairs for one in comparison.metrics)
     kind = "exact" if pairs <= MOST_ENUMERATED else "randomized"
     lines = [
@@ -207,7 +207,9 @@ def comparison_lines(comparison: Comparison) -> list[str]:
         lines.append("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
     if pairs < FEWEST_PAIRS:
         least = f"{pairs} {'pair has' if pairs == 1 else 'pairs have'} p ≥ {2.0 ** (1 - pairs):.3g}"
-        lines.append(f"  {least}: score {FEWEST_PAIRS} seeds or scenes or more to tell a difference from chance.")
+        lines.append(
+            f"  {least}: score {FEWEST_PAIRS} seeds or scenes or more to distinguish a difference from chance."
+        )
     return lines
 
 

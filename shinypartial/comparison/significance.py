@@ -1,4 +1,4 @@
-"""What a few repetitions tell: their spread, Student's interval of a mean, and the exact sign-flip test of it."""
+"""What a few repetitions show: their spread, Student's interval of a mean, and the exact sign-flip test of it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -52,7 +52,7 @@ class Layout:
     masks: str | None = None
     """Coverage in 8 bits. None: it writes none that can be read, and the dataset's masks cut out its test views."""
     photographs: str | None = None
-    """The photograph of each number, which tells the view; None: numbers follow `transforms_test.json`."""
+    """The photograph of each number, which determines the view; None: numbers follow `transforms_test.json`."""
     visibility: str | None = None
     """How well directions were seen, 0 to 1 in 8 bits."""
     visibility_grid: Grid | None = None

@@ -11,7 +11,7 @@ from shinypartial.core.sphere import fibonacci_directions, latlong_directions, l
 from shinypartial.metrics.environment import to_protocol_size
 
 ROWS = 32
-"""Of the grid on which lobes are fitted; narrower ones than of some 5° are not told."""
+"""Of the grid on which lobes are fitted; narrower ones than of some 5° are not determined."""
 SHARPNESS_SHARES = (0.25, 0.5, 1.0, 2.0, 4.0)
 """Sharpnesses that are tried, as shares of the number of lobes. With λ = N/2 a lobe falls to 1/e at its neighbors."""
 MOST_LOBES = 512

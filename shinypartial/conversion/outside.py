@@ -39,7 +39,7 @@ NORMAL_LENGTHS = (0.5, 1.5)
 
 @dataclass(frozen=True)
 class Cost:
-    """What the folders don't tell; None: not stated."""
+    """What the folders lack; None: not stated."""
 
     seconds: float | None = None
     device: str | None = None
@@ -240,7 +240,7 @@ def _import_views(
 def _numbers_of_views(result: _Result, data: Dataset) -> dict[str, int]:
     """The number under which the method wrote each test view, by the view's name.
 
-    Where it wrote the photographs along, they tell: a number is the view whose picture is the same to the bit.
+    Where it wrote the photographs along, they decide: a number is the view whose picture is the same to the bit.
     """
     pattern = result.layout.photographs
     if pattern is None:

@@ -11,7 +11,7 @@ from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import latlong_directions, latlong_solid_angles
 from shinypartial.prediction.format import INVERSE_DISTANCE, read_inverse_distance
 
-#: Directions within this angle of an axis tell where the wall across it is; not tuned.
+#: Directions within this angle of an axis determine where the wall across it is; not tuned.
 WALL_DEG = 30.0
 #: 1/D below which a direction is open, in inverse scene units; not tuned.
 LEAST_INVERSE = 1e-6

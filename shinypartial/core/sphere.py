@@ -14,7 +14,7 @@ from shinypartial.core.conventions import FACE_AXES
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-#: Side (rad) of what a pixel sees when no neighbor tells: such a lone pixel is given hardly any weight.
+#: Side (rad) of what a pixel sees when no neighbor shows it: such a lone pixel is given hardly any weight.
 UNKNOWN_SPREAD = 1.0
 #: A blur ends at this many standard deviations, where its kernel has fallen to 4e-6.
 BLUR_REACH = 5.0

@@ -1,4 +1,4 @@
-"""A dataset folder made from another one: the same files, copied, linked or made anew.
+"""A dataset folder made from another one: the same files, copied, linked or made again.
 
 A run that is killed continues when it is started again, and a folder that holds anything else is refused.
 """

@@ -59,7 +59,7 @@ def newest_dataset(parent: Path = DEFAULT_FOLDER) -> Path:
 def open_dataset(root: Path, *, shared_names: bool = False) -> Dataset:
     """Read manifest and cameras; images are read one by one with `read_view`.
 
-    Predictions of test views are told apart by file name, which two may have in common only with `shared_names`.
+    Predictions of test views are distinguished by file name, which two may have in common only with `shared_names`.
     Raises InputError for a missing folder, transforms that are missing or broken, and poses that are not rigid.
     """
     require_dataset_folder(root)
@@ -87,9 +87,9 @@ def _require_own_names(dataset: Dataset) -> None:
     shared = [name for name, count in names.items() if count > 1]
     if shared:
         raise InputError(
-            expected=f"test views of different file names in {dataset.root}, by which predictions are told apart",
+            expected=f"test views of different file names in {dataset.root}, by which predictions are distinguished",
             found=f"{names[shared[0]]} views named {shared[0]}",
-            remedy="Rename the pictures and correct transforms_test.json; `shinypartial subset` names views anew, too.",
+            remedy="Rename the pictures and correct transforms_test.json; `shinypartial subset` renames views, too.",
         )
 
 

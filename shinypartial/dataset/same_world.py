@@ -1,7 +1,7 @@
 """A captured dataset beside its truth: both in one world, and how far cameras and masks are off.
 
-What photographs tell has a gauge: cameras that structure from motion finds are right up to a similarity, those from a
-board in the board's own world, and those about a ball of radius 1 up to a rotation about its center.
+What photographs determine has a gauge: cameras that structure from motion finds are right up to a similarity, those
+from a board in the board's own world, and those about a ball of radius 1 up to a rotation about its center.
 Poses are moved, pictures and masks stay as they are.
 """
 
@@ -25,7 +25,7 @@ from shinypartial.io.records import write_record
 
 GaugeKind = Literal["board", "ball", "similarity", "same"]
 ALIGNMENT = "alignment.json"
-#: Camera centers that span less than this share of their distance from the world's origin tell no scale.
+#: Camera centers that span less than this share of their distance from the world's origin determine no scale.
 LEAST_SPREAD = 1e-6
 FEWEST_CAMERAS = 2
 #: Of rotation and scale in turn, which then stand still to the last digits.
@@ -67,7 +67,7 @@ def similarity(captured: Float[np.ndarray, "V 4 4"], true: Float[np.ndarray, "V 
     the object is: Σ ‖R Aᵢ − Bᵢ‖²/2 + ‖s R xᵢ + t − yᵢ‖²/d², with rotations A and centers x of the captured cameras, B
     and y of the true ones. For a scale s that is an orthogonal Procrustes problem (Schönemann 1966), and for R the
     scale is that of Umeyama (1991). Centers alone leave the turn about a line open on which they almost stand.
-    Raises InputError for fewer than two, and for centers at one place, which tell no scale.
+    Raises InputError for fewer than two, and for centers at one place, which determine no scale.
     """
     ours, theirs = (poses[:, :3, 3] - poses[:, :3, 3].mean(0) for poses in (captured, true))
     distance = np.median(np.linalg.norm(true[:, :3, 3], axis=1)) if len(true) else 1.0

@@ -41,8 +41,8 @@ class View:
 
     `radiance` is linear and premultiplied by alpha; `normals_world` are unit where the object is and zero elsewhere;
     `depth` is camera z-depth in scene units, zero where the object is not. `None`: the dataset doesn't hold it.
-    `high_dynamic_range` tells whether radiance came from EXR, HDR or a TIFF of floating point (unbounded), or from sRGB
-    codes (in [0, 1]).
+    `high_dynamic_range` determines whether radiance came from EXR, HDR or a TIFF of floating point (unbounded), or from
+    sRGB codes (in [0, 1]).
     `self_reflection` is 1 where the mirror ray of the pixel's center meets the object again, or something else that
     stands near it, in place of the environment; 0 elsewhere, also where the object is not.
     """

@@ -1,4 +1,4 @@
-"""Partial Shiny Blender: the cameras of a 360° dataset near the crossing of their path, split anew.
+"""Partial Shiny Blender: the cameras of a 360° dataset near the crossing of their path, split again.
 
 The images are copied as they are, so that the new folder has the layout of the old one. A run that is killed
 continues when it is started again, and a folder that holds anything else is refused.

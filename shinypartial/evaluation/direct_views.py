@@ -153,7 +153,7 @@ def compare_direct(
 
 
 def _distance(view: DirectView, environment: Float[np.ndarray, "H W 3"]) -> float:
-    """Of DISTANCES, the one at which features are least off; the first where no feature tells."""
+    """Of DISTANCES, the one at which features are least off; the first where no feature shows one."""
     offsets = []
     for distance in DISTANCES:
         directions = seen_from_origin(with_margin(view.camera, REACH), np.full((2, 4), 1 / distance))

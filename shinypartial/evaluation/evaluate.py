@@ -88,7 +88,7 @@ from shinypartial.prediction.format import read_inverse_distance as read_predict
 
 #: Test views that are shown in the report, spread evenly over the split.
 PICTURED_VIEWS = 4
-#: Test views whose normals tell the errors of the surface, spread likewise.
+#: Test views whose normals determine the errors of the surface, spread likewise.
 SURFACE_VIEWS = 16
 
 #: What to score: the benchmark's own protocol, with or without the one that serves comparison with published tables.
@@ -160,7 +160,7 @@ def evaluate(
         _picture_surface(prediction, pictures, data, left_out)
         progress.advance("environment")
         if not with_paper:
-            left_out.append(LeftOut(PAPER_PROTOCOL, "not asked for (--protocol both)"))
+            left_out.append(LeftOut(PAPER_PROTOCOL, "not requested (--protocol both)"))
         scores = Scores(
             protocol=PROTOCOL,
             dataset=data.name,

@@ -1,4 +1,4 @@
-"""The most telling metrics: the one list of paths that summary, report, ranking, comparison and charts show."""
+"""The most important metrics: the one list of paths that summary, report, ranking, comparison and charts show."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -26,7 +26,7 @@ ELEVATION_DEG = 20.0
 DEPTH_SHARE = 0.03
 #: Where a dataset has no depth, the nearest point hides others within squares of so many pixels.
 COVERED_PX = 2
-#: Errors of good fits are below a degree: the scale ends where that of pictures begins to tell.
+#: Errors of good fits are below a degree: the scale ends where that of pictures begins to count.
 SURFACE_ERROR = Scale("angular error", "magma", 0.0, 5.0, "°")
 #: Offsets of the pixels that a point fills.
 ROWS, COLUMNS = (each.ravel() for each in np.mgrid[:3, :3])

@@ -27,7 +27,7 @@ NO_VIEWS = "the dataset or the prediction has no test views"
 class ViewResult:
     """What one test view adds; `normal_errors` holds one value per mask pixel, NaN for a hole.
 
-    `sees_environment` tells which of these pixels do; None where the dataset doesn't know.
+    `sees_environment` determines which of these pixels do; None where the dataset doesn't know.
     """
 
     scores: ViewScores

@@ -62,7 +62,7 @@ def write_exr(path: Path, channels: Channels, *, y_up_environment: bool = False)
         try:
             OpenEXR.File(header, planes).write(str(temporary))
         except Exception as error:
-            # The temporary file was made, so permission is not what is missing, and OpenEXR doesn't tell the errno.
+            # The temporary file was made, so permission is not what is missing, and OpenEXR doesn't state the errno.
             raise OSError(errno.ENOSPC, f"could not write the EXR ({error})", str(path)) from None
         _require_complete_write(temporary, path)
 

@@ -47,7 +47,7 @@ def read_record(
     """Build dataclass `cls` from nested tables; `what` names their origin in messages, such as a file.
 
     Fields may be dataclasses, tuples, Literals, Paths, numbers and texts, each also `| None`. A union of dataclasses is
-    told apart by the field `kind`, whose default names the class. Keys that are missing take the field's default
+    distinguished by the field `kind`, whose default names the class. Keys that are missing take the field's default
     (`complete`: every key must be there); unknown keys are refused unless `allow_unknown`, and empty lists where a
     field is `NonEmpty`.
 

@@ -1,4 +1,5 @@
-"""What Linux, macOS and Windows do differently: locks, memory, processors. No other module asks which of them runs."""
+"""What Linux, macOS and Windows do differently: locks, memory, processors. No other module depends on which of them
+runs."""
 
 import contextlib
 import ctypes

@@ -123,7 +123,7 @@ def _inverse_at(
 
 
 def gain_between(views: Sequence[DirectView], rendered: Sequence[Float[np.ndarray, "_ _ 3"]]) -> Float[np.ndarray, "3"]:
-    """Median ratio of what is seen to what the map has, per channel, over all cells of all views that tell."""
+    """Median ratio of what is seen to what the map has, per channel, over all cells of all views that show them."""
     seen = np.concatenate([view.radiance[view.shown] for view in views])
     had = np.concatenate([picture[view.shown] for view, picture in zip(views, rendered, strict=True)])
     good = (seen > LIGHT[0]) & (seen < LIGHT[1]) & (had > 0)

@@ -1,8 +1,8 @@
 """Which of some known environment maps lights the object of a dataset, and how that map is turned about the vertical.
 
 Public sets of rendered objects were lit by maps that are known, but come without them. With ground-truth normals the
-photographs tell the map well enough to recognize it, and then environments can be scored there, too. No prediction is
-looked at.
+photographs determine the map well enough to recognize it, and then environments can be scored there, too. No prediction
+is looked at.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -51,7 +51,7 @@ ENVIRONMENT_FILES = (
 BRIGHTNESS_REACH = 5.0
 """By so many stops the brightness may be another than the one with the highest correlation."""
 MOST_VIEWS = 40
-"""Views that tell the light, evenly spread over those that have normals."""
+"""Views that determine the light, evenly spread over those that have normals."""
 HEIGHT = 64
 """Rows of the maps in which all turns are compared."""
 DETAIL_RAD = 0.1
@@ -105,8 +105,9 @@ def find_light(
 ) -> LitDataset:
     """Copy a dataset to `root` with the map of `worlds` (name to linear 2:1 EXR) that lights it as its environment.
 
-    The map is multiplied by `strength`, which photographs of anything but a mirror don't tell. Raises InputError where
-    the dataset has an environment or no normals, or pictures outside of its folder, or where no map is clearly the one.
+    The map is multiplied by `strength`, which photographs of anything but a mirror don't determine. Raises InputError
+    where the dataset has an environment or no normals, or pictures outside of its folder, or where no map is clearly
+    the one.
     """
     dataset = open_source(source, root)
     if (dataset.root / ENVIRONMENT_LATLONG).exists():
@@ -157,7 +158,7 @@ def mirrored_rays(dataset: Dataset) -> Seen:
         raise InputError(
             expected=f"ground-truth normals in some views of {dataset.root}",
             found="none",
-            remedy="The light of photographs without normals can't be told.",
+            remedy="The light of photographs without normals can't be determined.",
         )
     directions, codes = (np.concatenate(each).astype(np.float64) for each in zip(*parts, strict=True))
     return Seen(directions, codes)
@@ -192,7 +193,7 @@ def clear_winner(matches: Iterable[Match]) -> Match:
             expected=f"one map whose details correlate with what is mirrored by {LEAST_CORRELATION:g} or more, "
             f"and by {LEAST_LEAD:g} more than those of any other",
             found=near,
-            remedy="Name more maps by --worlds: the object is lit by none of these, or it is too rough to tell.",
+            remedy="Name more maps by --worlds: none of these lights the object, or it is too rough to recognize one.",
         )
     return best
 
@@ -280,7 +281,7 @@ def _exact(match: Match, seen: Seen, world: Float[np.ndarray, "H W 3"], column_d
         return float(np.abs(shown(turn_deg, stops) - seen.codes).mean())
 
     turn, stops = match.turn_deg, match.stops
-    # Correlations hardly tell the brightness, so it is sought among all of them first.
+    # Correlations hardly determine the brightness, so it is sought among all of them first.
     for columns, reach in ((1.0, BRIGHTNESS_REACH), (0.5, 1.0)):
         stops = _lowest(partial(unlike, turn), stops, reach)
         turn = _lowest(partial(unlike, stops=stops), turn, columns * column_deg)

@@ -180,7 +180,7 @@ class NearSurroundings:
 
 @dataclass(frozen=True)
 class FoundCamera:
-    """What a method found about a training view that its dataset says otherwise; None: it believed that.
+    """What a method found about a training view that its dataset says otherwise; None: it took that as stated.
 
     The camera is turned about its own center by the rotation vector `turn_deg` (world axes) and then moved by `shift`
     (world units). `turn_sigma_deg` and `shift_sigma` are standard deviations of their components. `gain` (linear red,

@@ -29,7 +29,7 @@ from shinypartial.prediction.format import (
     write_info,
 )
 
-#: What is written anew, or says nothing about the changed map; everything else is taken over as it is.
+#: What is written again, or says nothing about the changed map; everything else is taken over as it is.
 NOT_TAKEN_OVER = (DESCRIPTION, ENVIRONMENT, SCORES, REPORT)
 FOLDERS_NOT_TAKEN_OVER = (SNAPSHOTS, EVALUATION)
 LEVELS = 256
@@ -57,13 +57,13 @@ class Blurred:
 def otsu_threshold(visibility: Float[np.ndarray, "H W"]) -> float:
     """Otsu's threshold (1979) of a lat-long map, each texel counted by its solid angle, in 256 levels.
 
-    Raises InputError when all values are one, which leaves nothing to tell apart.
+    Raises InputError when all values are one, which leaves nothing to distinguish.
     """
     from skimage.filters import threshold_otsu
 
     if float(visibility.min()) == float(visibility.max()):
         raise InputError(
-            expected="a visibility map that tells directions apart",
+            expected="a visibility map that distinguishes directions",
             found=f"the value {float(visibility.min()):.3g} everywhere",
             remedy="Nothing is to be done for such a prediction: all of it was seen equally well.",
         )
@@ -116,7 +116,7 @@ def postprocess(prediction: Path, output: Path, options: BlurOptions = BlurOptio
                 link_or_copy(path, output / place)
         write_environment_map(output, blurred.radiance)
         if not (prediction / TEST_VIEWS).is_dir():
-            shutil.rmtree(output / TEST_VIEWS)  # Where that folder is, an evaluation asks for every test view.
+            shutil.rmtree(output / TEST_VIEWS)  # Where that folder is, an evaluation requires every test view.
         write_info(output, _describe(info, prediction, blurred, options, time.monotonic() - start))
     return blurred
 

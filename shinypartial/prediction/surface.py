@@ -25,7 +25,7 @@ class PredictedSurface(Mesh):
 
 def surface_of(prediction: Path, *, clouds: bool = False) -> PredictedSurface | None:
     """The one PLY of the folder, in world units; None where there is none, or a cloud of points, unless `clouds` are
-    asked for as surfaces without faces.
+    requested as surfaces without faces.
 
     Normals are its columns nx, ny, nz; where it has none, those of the faces around a vertex, weighted by area.
     Confidence is its column `confidence`. Raises InputError for a PLY that is incomplete, has vertices that are not

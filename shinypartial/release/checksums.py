@@ -9,7 +9,7 @@ from shinypartial.dataset.schema import CHECKSUMS
 from shinypartial.dataset.violations import Violation
 from shinypartial.io.files import PARTIAL_PREFIX, sha256_of, write_text
 
-#: A comment to sha256sum; it lets damage of the list itself be told from damage of a file.
+#: A comment to sha256sum; it distinguishes damage of the list itself from damage of a file.
 SEAL = "# sha256 of the lines below: "
 RESTORE = "Download or copy it again."
 #: What hosts and download tools add beside a release.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SIZE_INCHES = (5.8, 3.1)
-#: Colors that people with color blindness can tell apart (Okabe and Ito 2008), taken in turn.
+#: Colors that people with color blindness can distinguish (Okabe and Ito 2008), taken in turn.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#7f5539", "#7f7f7f")
 #: Colors of a light page, and the variables that a page has for them.
 INK, DIM, RULE, CARD = "#1b1d21", "#5d6470", "#dfe1e5", "#fefefe"
@@ -86,7 +86,7 @@ def draw(plot: Plot) -> str:
 
 
 def svg_text(make: Callable[[], "Figure"], salt: str) -> str:
-    """A figure, made in our style, as SVG text that holds nothing of when it was made; `salt` tells its ids apart."""
+    """A figure, made in our style, as SVG text that holds nothing of when it was made; `salt` distinguishes its ids."""
     import matplotlib
 
     stream = io.StringIO()

@@ -1,4 +1,4 @@
-"""Find scenes, load them, and vary them as the command line asks."""
+"""Find scenes, load them, and vary them as the command line states."""
 
 import tomllib
 from dataclasses import asdict, fields, replace

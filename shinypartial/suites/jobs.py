@@ -31,7 +31,7 @@ class Plan(Protocol):
 
     @property
     def facts(self) -> Mapping[str, Any]:
-        """What tells what the jobs are for, as JSON has it."""
+        """What the jobs are for, as JSON has it."""
 
 
 @dataclass(frozen=True)

@@ -300,7 +300,7 @@ def _powers(base: int, values: list[float]) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Measure and print every case, what follows from them, and write the files asked for."""
+    """Measure and print every case, what follows from them, and write the files requested."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--dataset", type=Path, help="dataset of square images; default: a synthetic mirror sphere")
     parser.add_argument("--steps", type=int, default=15, help="timed steps of a case")

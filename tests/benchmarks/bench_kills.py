@@ -1,9 +1,9 @@
 """What `kill -9` does to commands: `python -m tests.benchmarks.bench_kills --json docs/results/kills.json`.
 
 Each command is killed with all its processes at moments that are drawn evenly over its whole time, and begun again
-with the same words, until it has been killed as often as asked; whenever it comes to its end, that is compared with the
-end of a run that nobody killed, and it begins anew. Runs have one thread; another one with two is compared, too. An
-hour on two cores; `--kills 0.1` is a quicker look.
+with the same words, until it has been killed as often as requested; whenever it comes to its end, that is compared with
+the end of a run that nobody killed, and it begins again. Runs have one thread; another one with two is compared, too.
+An hour on two cores; `--kills 0.1` is a quicker look.
 
 Compared are the bytes of all files, but for pages that state times; JSON files without their times. What a
 command had finished at a kill (`once`: files of its result, stages of a fit) must not be written again later.

@@ -137,7 +137,7 @@ def coverage_and_pairs(surfels: Vase, camera: RasterCamera) -> tuple[float, floa
 
 
 def calibrated_vase(count: int, camera: RasterCamera) -> tuple[Vase, float, float]:
-    """The vase whose surfels are as large as the wanted number of pairs asks for, with its coverage and pairs."""
+    """The vase whose surfels are as large as the wanted number of pairs requires, with its coverage and pairs."""
     low, high = 0.15, 2.0
     for _ in range(7):
         surfels = vase(count, math.sqrt(low * high))

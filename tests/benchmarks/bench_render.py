@@ -234,7 +234,7 @@ def time_pool(spec: SceneSpec, plan: PoolPlan, frames: int) -> float:
         def one(index: int) -> RenderedView:
             return pool.render(cameras[index % len(cameras)], "a view")
 
-        one(0)  # The first tells its device, after which the others start.
+        one(0)  # The first determines its device, after which the others start.
         list(callers.map(one, range(3 * plan.workers)))
         begin = time.perf_counter()
         for each in [callers.submit(one, i) for i in range(frames)]:
@@ -283,7 +283,7 @@ def measure_memory(name: str, frames: int, frames_per_worker: int, resolution: i
 
 
 def main() -> None:
-    """Measure what is asked for and write one JSON file."""
+    """Measure what is requested and write one JSON file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--scene", nargs="*", default=list(scene_names()))

@@ -121,9 +121,9 @@ BELIEVED = "corrections.masks=off", "corrections.exposure=off", "corrections.len
 
 
 def short_config(kind: str) -> FitConfig:
-    """A fit of few steps; of spheres with all that is asked of photographs."""
-    believed = () if kind == "sphere" else BELIEVED
-    return with_overrides(tiny_config(), (f"model={kind}", *SHORT.get(kind, ()), *believed))
+    """A fit of few steps; of spheres with all that is required of photographs."""
+    weighted = () if kind == "sphere" else BELIEVED
+    return with_overrides(tiny_config(), (f"model={kind}", *SHORT.get(kind, ()), *weighted))
 
 
 def numbers(state: FitState) -> list[object]:
@@ -144,7 +144,7 @@ def numbers(state: FitState) -> list[object]:
 def test_a_fit_ends_in_parts_that_are_each_too_short_for_it(
     tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    """Interrupted after 0.4 to 0.7 of its processor time again and again, a fit that began anew would never end. This
+    """Interrupted after 0.4 to 0.7 of its processor time again and again, a fit that began again would never end. This
     one ends, as if it had not been interrupted, on one thread: two have other last digits.
     """
     monkeypatch.setattr(recorder, "CHECKPOINT_INTERVAL_S", 0.2)

@@ -157,10 +157,10 @@ def test_a_model_that_is_asked_for_is_taken_and_saved(
     coarse = ["--config.environment.resolution", "16", "--config.environment.solve-resolution", "16", *AS_TOLD]
     for model in ("plane", "surfels"):
         assert main(["fit", str(many_views_dataset.root), *TINY, *coarse, "--model", model, "--output", model]) == 0
-        assert f"Model: {model} (asked for" in capsys.readouterr().err
+        assert f"Model: {model} (requested" in capsys.readouterr().err
         content = json.loads((tmp_path / model / "prediction.json").read_text())
         assert content["config"]["model"] == model
-        assert content["model"].startswith(f"{model} (asked for")
+        assert content["model"].startswith(f"{model} (requested")
         for other, table in tables.items():
             assert (tmp_path / model / table).exists() == (model == other)
 

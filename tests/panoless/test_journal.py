@@ -143,7 +143,7 @@ def test_what_is_returned_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     assert second[1].strides == values.strides
     assert type(second[4]) is np.float32
     assert sum(path.stat().st_size for path in entries(tmp_path)) < 20_000
-    with journal_in(tmp_path), pytest.raises(TypeError, match="not told by its name"):
+    with journal_in(tmp_path), pytest.raises(TypeError, match="not determined by its name"):
         same(Unused())
 
 
@@ -157,7 +157,7 @@ def _of_parts(given: list) -> list:
 
 
 def test_an_object_that_was_given_is_the_same_later(tmp_path: Path) -> None:
-    """A choice between what was there and what is new is often told by identity."""
+    """A choice between what was there and what is new is often determined by identity."""
     for _ in range(2):
         given = Corrections(0.5)
         with journal_in(tmp_path):

@@ -110,7 +110,7 @@ def reflecting_views(plane: Plane, cameras: list[RasterCamera], bend: float = 0.
 
 def traced(plane: Plane, camera: RasterCamera, alpha: Float[np.ndarray, "H W"], bend: float = 0.0) -> View:
     """What a camera sees of the mirror. At plane coordinates p its normal is n + bend·(p₁ t_u + p₂ t_v), made unit:
-    that of a shallow dome, which the boundary does not tell.
+    that of a shallow dome, which the boundary does not determine.
     """
     rotation, center = pose_of(camera)
     rays = unit_rays_camera(camera).numpy().astype(np.float64).transpose(1, 2, 0)

@@ -128,7 +128,7 @@ def trace(
         alive, points, ways, triangle = alive[met], points[met], ways[met], found["primID"][met]
         if not len(alive):
             break
-        # Embree works in single precision: the hit is found anew in the plane of its triangle.
+        # Embree works in single precision: the hit is found again in the plane of its triangle.
         a, b, c = corners[triangle].transpose(1, 0, 2)
         across = np.cross(b - a, c - a)
         distance = ((a - points) * across).sum(1) / (ways * across).sum(1)

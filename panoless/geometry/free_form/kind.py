@@ -193,12 +193,12 @@ class FreeFormFamily(ExactFamily):
     geometry: ClassVar[type[Geometry]] = FreeFormMirror
     label: ClassVar[str] = "a free-form surface"
 
-    def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
+    def propose(self, views: Views, config: FitConfig, *, requested: bool) -> Proposal | None:
         """First surfaces as level sets; one that is closed explains any silhouettes in the end.
 
         None where there are too few views to judge it by.
         """
-        if len(views.train) < LEAST_VIEWS and not asked:
+        if len(views.train) < LEAST_VIEWS and not requested:
             return None
         return Proposal(first_surfaces(views, config), 0.0, 1.0)
 

@@ -55,9 +55,9 @@ class HeightFieldFamily(WithinOneBoundary):
     label: ClassVar[str] = "a height field over it"
     refines: ClassVar[str | None] = "plane"
 
-    def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
+    def propose(self, views: Views, config: FitConfig, *, requested: bool) -> Proposal | None:
         """None: a height field starts from the proposal of a plane."""
-        if asked:
+        if requested:
             raise InputError(
                 expected="a plane that a height field may bend, for --model height_field",
                 found="silhouettes that determine none",

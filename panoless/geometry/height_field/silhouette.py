@@ -1,7 +1,7 @@
 """Where the edge of a bent mirror is seen: the boundary of its plane, lifted to the mirror's height there.
 
-A boundary alone can't tell whether a mirror bends, but its edge is a curve in space: a height shifts it against views
-from either side. A frame in front of it is flat and says how the plane of the frame lies.
+A boundary alone can't determine whether a mirror bends, but its edge is a curve in space: a height shifts it against
+views from either side. A frame in front of it is flat and says how the plane of the frame lies.
 """
 
 from typing import TYPE_CHECKING
@@ -32,7 +32,7 @@ def edge_residuals(contours: MaskContours, height_field: HeightField) -> Boundar
 def edge_jacobian(residuals: BoundaryResiduals, height_field: HeightField) -> "csr_matrix":
     """Derivatives of the distances by four numbers of the plane, two of each vertex of the boundary, the coefficients.
 
-    The plane's offset is left to the coefficients. So is its tilt, unless a frame tells them apart.
+    The plane's offset is left to the coefficients. So is its tilt, unless a frame distinguishes them.
     """
     from scipy import sparse
 

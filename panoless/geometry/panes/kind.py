@@ -45,11 +45,11 @@ class PanesFamily(HeightFieldFamily):
     in_few_steps: ClassVar[bool] = False
 
     def proposed_over(
-        self, views: Views, proposal: Proposal, config: FitConfig, *, asked: bool = False
+        self, views: Views, proposal: Proposal, config: FitConfig, *, requested: bool = False
     ) -> Proposal | None:
         """Panes by the slopes of tiles. Of smooth slopes None, or one pane for a user who wants panes."""
         panes = panes_over(self.outlined(views), proposal.shape)
-        if panes is None and asked:
+        if panes is None and requested:
             panes = one_pane(views, proposal.shape)
         return None if panes is None else replace(proposal, shape=panes)
 

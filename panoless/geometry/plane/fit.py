@@ -1,9 +1,9 @@
 """One plane from silhouettes alone: the boundary, carried from view to view through it, has to stay the boundary.
 
-Tilting a planar mirror and turning the environment the other way leaves every picture as it was, so no color can tell
-the tilt of a mirror (see docs/explanation/planar-mirrors.md); its boundary can. The plane's three numbers, the
-boundary's vertices and the height of a frame that hides part of the mirror are found together, by robust Gauss–Newton
-on the distances, in pixels, of each view's contour from the boundary that it should see.
+Tilting a planar mirror and turning the environment the other way leaves every picture as it was, so no color can
+determine the tilt of a mirror (see docs/explanation/planar-mirrors.md); its boundary can. The plane's three numbers,
+the boundary's vertices and the height of a frame that hides part of the mirror are found together, by robust
+Gauss–Newton on the distances, in pixels, of each view's contour from the boundary that it should see.
 """
 
 import math

@@ -71,12 +71,12 @@ class PlaneFamily(WithinOneBoundary):
     label: ClassVar[str] = "a plane"
     by_silhouettes: ClassVar[bool] = True
 
-    def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
+    def propose(self, views: Views, config: FitConfig, *, requested: bool) -> Proposal | None:
         """Plane, boundary and frame by silhouettes."""
         try:
-            found = fit_plane(self.outlined(views), thorough=asked)
+            found = fit_plane(self.outlined(views), thorough=requested)
         except InputError:
-            if asked:
+            if requested:
                 raise
             return None
         return Proposal(found.plane, float(np.median(found.median_px)), float(np.median(found.iou)))

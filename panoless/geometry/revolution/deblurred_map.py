@@ -15,7 +15,7 @@ from panoless.geometry.revolution.render import LARGEST_BEND, smooth_pixels
 PIXELS = 3_500_000
 """Most pixels with a footprint."""
 TRACED = 60_000
-"""Pixels without a smooth footprint that tell how bright saturated regions are."""
+"""Pixels without a smooth footprint that determine how bright saturated regions are."""
 
 OFFSETS = (-0.25, 0.25)
 """Of a footprint's directions from the pixel's center, in pixels."""

@@ -79,11 +79,11 @@ DESCENT = (
 )
 """Rounds of that descent."""
 LEAST_FLOOR_PIXELS = 200
-"""Fewer pixels whose paths meet the floor tell nothing."""
+"""Fewer pixels whose paths meet the floor determine nothing."""
 LIP_PIXELS = 8_000
 """Mixed pixels that refine the lip."""
 LEAST_LIP_PIXELS = 500
-"""Fewer tell nothing."""
+"""Fewer determine nothing."""
 FINEST_MAP_RAYS = 2_000_000
 """Rays of the map that has the resolution of the last round."""
 LEAST_GAIN = 0.02
@@ -108,7 +108,7 @@ def propose_revolution(views: Views) -> RevolutionProposal | None:
     """Axis and outer profile that explain the masks best; None when none comes near.
 
     What may be a stem below the body, or a cone that silhouettes leave beyond its lip, and then what lies beyond a
-    narrow place, is believed only where the body without it misses the masks.
+    narrow place, is accepted only where the body without it misses the masks.
     """
     rays = contour_rays(views)
     if len(np.unique(rays.view)) < LEAST_VIEWS:

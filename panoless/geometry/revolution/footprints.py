@@ -1,8 +1,8 @@
 """Grooves and edges no wider than some pixels: a surface of revolution refined by pixels as areas, coarse to fine.
 
 Where the profile turns within a pixel, that pixel shows the mean of what several normals mirror, and no single ray
-tells it. Blurred maps come first, because blurring widens the basin of convergence to the size of the initial normal
-errors.
+determines it. Blurred maps come first, because blurring widens the basin of convergence to the size of the initial
+normal errors.
 """
 
 import math
@@ -36,7 +36,7 @@ LARGEST_SHARE = 1 / 3
 SEARCHED_PIXELS = 2_000_000
 """Pixels among which those are searched that see the profile turn."""
 CURVED_RAD = math.radians(2.0)
-"""Where the profile turns by more within two pixels, single rays tell less than areas."""
+"""Where the profile turns by more within two pixels, single rays determine less than areas."""
 CURVED_SHARE = 0.75
 """Of the pixels taken that see such a place."""
 EDGE_RAD = math.radians(8.0)

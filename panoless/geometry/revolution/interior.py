@@ -1,4 +1,5 @@
-"""The interior of a mouth or a lid, which no silhouette tells: a shortest path through what photographs say of slopes.
+"""The interior of a mouth or a lid, which no silhouette determines: a shortest path through what photographs say of
+slopes.
 
 In the half-plane of radius and height, the ray of a pixel that looks onto the lid of a closed surface passes through
 cells below it. If the surface were there, with the profile's direction θ, the pixel would show the environment in a
@@ -23,7 +24,7 @@ from panoless.kernels.revolution import slope_votes
 SEARCHED_PIXELS = 60_000
 """Most pixels that vote."""
 SLOPES = 48
-"""Directions of the profile that the search tells apart."""
+"""Directions of the profile that the search distinguishes."""
 CELL_PX = 0.75
 """Size of the search's cells (px)."""
 CELLS = 128

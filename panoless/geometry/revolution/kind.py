@@ -99,12 +99,12 @@ class RevolutionFamily(ExactFamily):
     geometry: ClassVar[type[Geometry]] = RevolutionMirror
     label: ClassVar[str] = "a surface of revolution"
 
-    def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
+    def propose(self, views: Views, config: FitConfig, *, requested: bool) -> Proposal | None:
         """Axis and outer profile by silhouettes."""
         found = propose_revolution(views)
         if found is not None:
             return Proposal(found.surface, float(np.median(found.median_px)), float(np.median(found.iou)))
-        if asked:
+        if requested:
             raise InputError(
                 expected="masks of a surface of revolution, for --model revolution",
                 found="no axis around which their silhouettes agree",

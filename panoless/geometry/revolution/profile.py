@@ -11,7 +11,7 @@ from panoless.numeric.bspline import cubic_bsplines_at
 LEAST_CORNER_SINE = 0.5
 """A vertex whose sides turn by more than half a right angle or so is a corner: it moves to where both sides move."""
 UNEVEN = 0.3
-"""Share of the mean length by which sides may differ before a profile is sampled anew."""
+"""Share of the mean length by which sides may differ before a profile is resampled."""
 LARGEST_SHIFT_SIDES = 1.5
 """A vertex moves by at most this many lengths of a side in one step, or the profile could fold."""
 
@@ -19,7 +19,7 @@ LARGEST_SHIFT_SIDES = 1.5
 def resample_profile(surface: SurfaceOfRevolution, spacing: float) -> SurfaceOfRevolution:
     """The same surface with vertices about `spacing` apart outside and inside; base and lip stay where they are.
 
-    A part whose vertices are nearly so is left alone: sampling anew cuts its corners.
+    A part whose vertices are nearly so is left alone: resampling cuts its corners.
     """
     outer, inner = surface.profile[1 : surface.lip + 1], surface.profile[surface.lip :]
     even = [_even(part, spacing) for part in (outer, inner)]

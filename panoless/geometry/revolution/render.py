@@ -1,7 +1,7 @@
 """What a camera sees in a surface of revolution: radiance averaged over pixels, many reflections deep.
 
 A camera averages light over the area of a pixel, and so does this: over a grid of rays. On a smooth mirror the
-directions in which neighboring pixels see the environment tell those in between,
+directions in which neighboring pixels see the environment determine those in between,
 
 ω(a, b) = ω + a ω_x + b ω_y + ½ a² ω_xx + ½ b² ω_yy + a b ω_xy,
 

@@ -42,7 +42,7 @@ RANK_SHARE = 0.02
 TIP_CELLS = 1.5
 """A profile narrower than this (cells) ends in a tip."""
 BLUNT_CELLS = 4.0
-"""A profile wider than this (cells) may end flat, where silhouettes stop telling its slope."""
+"""A profile wider than this (cells) may end flat, where silhouettes stop determining its slope."""
 WIDEST_WITHIN = 0.6
 """The widest place of the body has a height below this (radii of the object frame)."""
 EDGE_RAD = math.radians(75.0)
@@ -52,7 +52,7 @@ MOST_BEYOND = 0.05
 LEAST_CELLS = 5
 """Fewer cells make no profile."""
 GRAZING_RAD = math.radians(10.0)
-"""Silhouettes don't tell slopes within this angle of the lowest camera's line of sight over an end."""
+"""Silhouettes don't determine slopes within this angle of the lowest camera's line of sight over an end."""
 BENDING = 1e-3
 """Penalty on second differences of a step, in mean diagonals of the normal matrix."""
 LARGEST_TURN_RAD = 0.1
@@ -175,8 +175,8 @@ def _ends(
     radius: Float[np.ndarray, "C"],
     cell: float,
 ) -> list[tuple[int, int]]:
-    """Cells between which silhouettes tell the profile: beyond, it closes as fast as the most level view allows. One to
-    three pairs, the nearest first.
+    """Cells between which silhouettes determine the profile: beyond, it closes as fast as the most level view allows.
+    One to three pairs, the nearest first.
 
     The widest cell belongs to the object, unless few rays pass the heights beyond its ends. The first pair ends before
     anything that falls as steeply: a cone that silhouettes leave beyond a lip, or a stem. The second ends where the

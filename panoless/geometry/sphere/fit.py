@@ -113,14 +113,14 @@ def _second_harmonic(
     return float(np.linalg.norm(np.linalg.solve(moment, weighted.T @ values)))
 
 
-def fit_sphere(views: Views, radius: float = 0.0, *, asked: bool) -> Proposal | None:
-    """The sphere that explains the masks best; None where their outlines are no cones, unless it was `asked` for.
+def fit_sphere(views: Views, radius: float = 0.0, *, requested: bool) -> Proposal | None:
+    """The sphere that explains the masks best; None where their outlines are no cones, unless it was `requested`.
 
     A `radius` that is known, in units of the world, stays as it is; 0: unknown.
     """
     rays = outline_rays(views, longest_only=True)
     cones = Cones.of(rays)
-    if not len(cones.sines) or not (asked or cones.are_of_a_sphere()):
+    if not len(cones.sines) or not (requested or cones.are_of_a_sphere()):
         return None
     known = radius / views.object_frame.radius
     surface = by_outlines_alone(views, SphereUnknowns(cones.sphere(known), known > 0))

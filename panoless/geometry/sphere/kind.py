@@ -24,7 +24,7 @@ from panoless.kernels.cubemap import sample_cubemap
 from shinypartial.core.errors import InputError
 
 WIDEST_FOOTPRINT_RAD = 0.2
-"""Pixels that span more tell the map by their centers only."""
+"""Pixels that span more determine the map by their centers only."""
 OPERATOR_TRUST = 0.01
 """Rays that show who takes the pictures count so little that any other view of their directions decides."""
 
@@ -119,10 +119,10 @@ class SphereFamily(ExactFamily):
     silhouettes_suffice: ClassVar[bool] = True
     by_silhouettes: ClassVar[bool] = True
 
-    def propose(self, views: Views, config: FitConfig, *, asked: bool) -> Proposal | None:
+    def propose(self, views: Views, config: FitConfig, *, requested: bool) -> Proposal | None:
         """Center and radius by outlines."""
-        found = fit_sphere(views, config.sphere.radius, asked=asked)
-        if found is None and asked:
+        found = fit_sphere(views, config.sphere.radius, requested=requested)
+        if found is None and requested:
             raise InputError(
                 expected="masks with an outline, for --model sphere",
                 found="none within the pictures",

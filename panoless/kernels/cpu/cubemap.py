@@ -1,8 +1,8 @@
 """Seamless cubemap lookup, its adjoint and the product of both in Numba.
 
 The faces are first copied, with their ring of neighboring texels, into a padded texture of which four channels lie
-together, so that a ray touches two short runs of memory and never asks where a face ends, and the four texels around it
-are one value of sixteen lanes. The adjoint goes the same way back: fixed shares of the rays add to padded buffers of
+together, so that a ray touches two short runs of memory and needs no test where a face ends, and the four texels around
+it are one value of sixteen lanes. The adjoint goes the same way back: fixed shares of the rays add to padded buffers of
 their own, which are then summed and folded onto the faces in a fixed order, so the result depends neither on the
 scheduling of threads nor on their number.
 

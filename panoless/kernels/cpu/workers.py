@@ -20,7 +20,7 @@ _joining = Lock()
 
 @lru_cache(maxsize=1)
 def _usable_cores(process: int) -> int:
-    """Cores that this process might run on when it first asked."""
+    """Cores that this process may run on, counted once."""
     return len(os.sched_getaffinity(process)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -85,7 +85,7 @@ class _Pool:
 
 
 def _pool() -> _Pool:
-    """The pool is made anew after a fork, because threads do not survive one."""
+    """The pool is made again after a fork, because threads do not survive one."""
     process = os.getpid()
     if process not in _pools:
         _pools.clear()
@@ -96,7 +96,7 @@ def _pool() -> _Pool:
 def run_shared(kernel: Callable[..., None], *arguments: object) -> None:
     """Run `kernel(counter, *arguments)` on every thread at once.
 
-    `counter` is an int64 array that starts at zero: first the tasks that were claimed, then the threads that asked for
+    `counter` is an int64 array that starts at zero: first the tasks that were claimed, then the threads that requested
     a number of their own.
     """
     arguments = (np.zeros(2, np.int64), *arguments)

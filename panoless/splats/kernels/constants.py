@@ -35,7 +35,7 @@ image as its box.
 """
 
 TILE = 16
-"""Edge in pixels of the tiles that `rasterize` can be told to leave out."""
+"""Edge in pixels of the tiles that `rasterize` can leave out."""
 
 CHARBONNIER = 1e-2
 """ε of the photometric term √(‖e‖² + ε²)."""

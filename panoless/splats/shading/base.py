@@ -63,7 +63,7 @@ class Shading(Protocol):
 
     @property
     def restarts_at(self) -> float:
-        """Share of the steps after which materials and map begin anew; 0: they never do."""
+        """Share of the steps after which materials and map begin again; 0: they never do."""
         ...
 
     @property

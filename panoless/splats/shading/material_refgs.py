@@ -28,7 +28,7 @@ class MaterialRefGS(RefGaussian):
 
     learned: ClassVar[frozenset[str]] = RefGaussian.learned - {"indirect_harmonics"}
     traces: bool = False
-    """Surroundings of Gaussians would tell it."""
+    """Surroundings of Gaussians would determine it."""
     restarts_at: float = 0.0
     """Pixels are shaded from the first step on."""
     harmonics_from: float = 3_000 / 50_000

@@ -36,7 +36,7 @@ class ShadedObjective:
         """Of one method, with the weights of a configuration, and what is known already of what hides its map."""
         self._neighbors, self._cameras = nearest_views(views), [view.camera for view in views.train]
         self.occluder = occluder
-        """What hides the map, of the surface as it was when it was last asked for."""
+        """What hides the map, of the surface as it was when it was last requested."""
         self._shading, self._config, self._schedule = shading, config, Schedule(config)
         self.learned = learned_by(shading)
 

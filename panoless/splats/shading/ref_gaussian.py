@@ -1,8 +1,8 @@
 """Ref-Gaussian (Yao et al. 2024): surfels with a base color, a metalness and a roughness, under the split sum.
 
 Primitives are shaded one by one at first, then the pixels that they blend to; between the two, materials and map begin
-anew. Where a mirrored ray meets the object again, as a grid of distances to its surface tells, light that primitives
-hold by direction takes the place of the map's.
+again. Where a mirrored ray meets the object again, as a grid of distances to its surface determines, light that
+primitives hold by direction takes the place of the map's.
 """
 
 from dataclasses import dataclass
@@ -111,7 +111,7 @@ class RefGaussian(Unchanging):
         *,
         indirect: bool = False,
     ) -> Blended:
-        """Diffuse and base color, metalness and roughness, eight channels in that order; if asked for, three more of
+        """Diffuse and base color, metalness and roughness, eight channels in that order; if requested, three more of
         the light that comes to each primitive from the object itself, out of the direction that it mirrors.
         """
         views = seen_from(camera, surfels.means)

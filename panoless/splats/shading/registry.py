@@ -7,7 +7,7 @@ from panoless.splats.shading.ref_gaussian import RefGaussian
 from panoless.splats.shading.reflection_strength import ReflectionStrength
 
 LEFT_OUT: dict[str, tuple[str, ...]] = {
-    "ref-gaussian": ("a smoothness of normals that it asks for on some scenes",),
+    "ref-gaussian": ("a smoothness of normals that it requires on some scenes",),
     "material-refgs": (
         "normals and masks that a network predicts",
         "the perceptual loss",

@@ -39,7 +39,7 @@ class Found:
     environment: Callable[[], Float[np.ndarray, "H 2*H 3"]] | None
     """Linear radiance as a lat-long map of the world."""
     cameras: tuple[Path, ...]
-    """The files that the cameras were read from: they tell one capture from another."""
+    """The files that the cameras were read from: they distinguish one capture from another."""
     left_out: tuple[str, ...] = ()
     """What is missing, with the reason of each."""
 

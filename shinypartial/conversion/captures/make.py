@@ -92,7 +92,8 @@ def import_capture(
 
 
 def _as_begun(output: Path, recipe: dict[str, Any]) -> dict[str, Any]:
-    """The recipe without what tells sources of one name apart, where the version that began the folder stated none."""
+    """The recipe without what distinguishes sources of one name, where the version that began the folder stated
+    none."""
     earlier = recipe | {"import_of": {key: recipe["import_of"][key] for key in ("layout", "name")}}
     return earlier if begun_recipe(output) == earlier else recipe
 

@@ -103,8 +103,8 @@ def _to_world(
 ) -> list[Float[np.ndarray, "3 3"]] | None:
     """What turns the stored normals of each view into the world's axes; None where nothing does.
 
-    Visible surfaces face their camera: it tells whether vectors are in axes of the world or of the camera, and whether
-    these are OpenGL's or OpenCV's.
+    Visible surfaces face their camera: it determines whether vectors are in axes of the world or of the camera, and
+    whether these are OpenGL's or OpenCV's.
     """
     poses = [shot.camera.camera_to_world[:3, :3] for shot in shots]
     candidates = ([np.eye(3)] * len(poses), [pose @ OPENGL_OPENCV[:3, :3] for pose in poses], poses)

@@ -111,7 +111,7 @@ class Perturbation:
 
     @property
     def changes_pictures(self) -> bool:
-        """Whether pictures or masks of the training views are made anew; else they are copied."""
+        """Whether pictures or masks of the training views are made again; else they are copied."""
         views = self.views
         lens = dataclasses.replace(self.sensor, record_distortion=False)
         return self.masks != MaskErrors() or lens != SensorErrors() or views.object_scale < 1 or views.cut > 0

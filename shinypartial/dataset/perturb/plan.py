@@ -57,7 +57,7 @@ def generator(seed: int, what: str, index: int = 0) -> np.random.Generator:
 
 
 def make_plan(dataset: Dataset, options: Perturbation) -> Plan:
-    """Choose views, draw errors and derive cameras; pictures are read only where `views.cut` asks for their masks.
+    """Choose views, draw errors and derive cameras; pictures are read only where `views.cut` requires their masks.
 
     Raises InputError for values out of range, when too few views are there to choose from, and for a distortion that
     folds the picture.

@@ -45,7 +45,7 @@ from shinypartial.io.files import read_json, sha256_of, write_json
 from shinypartial.io.images import EXR, write_exr, write_jpeg, write_png
 
 TRAIN, TEST = "transforms_train.json", "transforms_test.json"
-#: Photographs of these formats become PNG when they are made anew, others become EXR.
+#: Photographs of these formats become PNG when they are made again, others become EXR.
 EIGHT_BIT = (".png", ".jpg", ".jpeg")
 
 
@@ -125,16 +125,16 @@ def _jobs(copy: _Copy) -> Iterator[Job]:
 
 
 def _suffix(frame: Frame, options: Perturbation) -> str:
-    """Format of a photograph that is made anew."""
+    """Format of a photograph that is made again."""
     if options.sensor.jpeg_quality is not None:
         return ".jpg"
     return ".png" if options.sensor.srgb8 or frame.photograph.suffix.lower() in EIGHT_BIT else EXR
 
 
 def _rewritten(copy: _Copy, view: PlannedView) -> Iterator[Job]:
-    """A training view made anew; what lies beside it is copied unless its pixels have moved or turned.
+    """A training view made again; what lies beside it is copied unless its pixels have moved or turned.
 
-    Then normals and self-reflection are made anew, the latter where it is known, which is in an EXR alone.
+    Then normals and self-reflection are made again, the latter where it is known, which is in an EXR alone.
     """
     options, frame = copy.plan.options, view.source
     sensor, views = options.sensor, options.views

@@ -112,6 +112,6 @@ AXES = (
     Axis("turned", "World turned", "", 0, (1,), "--world.random-turn", own_truth=True, kind="further"),
     Axis("matte", "Matte object", "", 0, (1,), "--roughness {level} --metallic 0", rendered=True, kind="anchor"),
 )
-#: Cells of every plan that a verdict has to refuse: a matte object, and cameras that are far off but believed.
+#: Cells of every plan that a verdict has to refuse: a matte object, and cameras that are far off but taken as stated.
 ANCHORS = (("rotation", 2.0), ("matte", 1.0))
 BY_NAME = {axis.name: axis for axis in AXES}

@@ -17,12 +17,12 @@ FAST, DEFAULT, PAPER = (
 )
 METHODS = {"fast": FAST, "default": DEFAULT, "paper": PAPER}
 SCENES = ("vase", "mirror", "sculpture", "pebble", "twisted-column")
-"""Those of a plan that nobody asks for others."""
+"""Those of a plan by default."""
 #: The small plan takes what comes with the package, so that it needs no Blender.
 TINY = "tiny-vase"
 SIMPLE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 SIZE = Size(160, 50, 8)
-"""Of its datasets unless another is asked for."""
+"""Of its datasets unless another is requested."""
 Plans = Literal["core", "all", "clean", "tiny"]
 
 

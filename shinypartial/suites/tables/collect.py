@@ -68,7 +68,7 @@ def _rounded(value: float) -> float:
 
 
 def merged(path: Path, results: Results) -> Results:
-    """The results with those of an earlier file at `path` that are not made anew.
+    """The results with those of an earlier file at `path` that are not made again.
 
     Raises InputError where these are of another size or schedule.
     """

@@ -22,7 +22,7 @@ from shinypartial.suites.tables.published import (
 
 TableName = Literal["main", "fairness", "start", "ablation", "roughness", "matter", "self-reflection", "pose-jitter"]
 SIZE = Size(400, 100, 20)
-"""Of its datasets unless another is asked for; those of the paper have 800 pixels, 100 training and 200 test views."""
+"""Of its datasets unless another is requested; those of the paper have 800 pixels, 100 training and 200 test views."""
 OURS, ORACLE = "ours", "oracle baseline"
 CellKey = tuple[str, str, int]
 """Scene with condition, method, seed."""
@@ -216,7 +216,7 @@ TABLES: dict[TableName, Table] = {
         "Cameras that are turned",
         "Training cameras are turned by an angle about random axes.",
         ("vase",),
-        (PAPERS, Method("ours, poses believed", _fit("default", "--set corrections.poses=off")), DEFAULT),
+        (PAPERS, Method("ours, poses as stated", _fit("default", "--set corrections.poses=off")), DEFAULT),
         (*ENVIRONMENT, *NORMALS[:2], *COST),
         published.JITTER,
         (
@@ -249,7 +249,7 @@ class Cell:
 
     @property
     def key(self) -> CellKey:
-        """What tells its figures from others."""
+        """What distinguishes its figures."""
         return self.condition.of(self.scene), self.method.name, self.seed
 
 
@@ -290,8 +290,8 @@ def make_plan(
     jobs: dict[str, Job] = {}
     for name in tables:
         for cell in _cells(TABLES[name], seeds):
-            asked = (not scenes or cell.scene in scenes) and (not methods or cell.method.slug in methods)
-            if asked and cell.key not in without:
+            requested = (not scenes or cell.scene in scenes) and (not methods or cell.method.slug in methods)
+            if requested and cell.key not in without:
                 cells[cell.name] = cell
                 jobs |= {job.name: job for job in _jobs(cell, size, schedule)}
     return TablePlan(size, schedule, tuple(cells.values()), tuple(jobs.values()))

@@ -1,4 +1,4 @@
-"""In near surroundings rays look where they meet the walls, and what they see there tells how near these are."""
+"""In near surroundings rays look where they meet the walls, and what they see there determines how near these are."""
 
 from dataclasses import replace
 

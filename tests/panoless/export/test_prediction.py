@@ -451,7 +451,7 @@ def test_a_plane_is_described_as_what_it_is(plane_prediction: tuple[Path, Path])
 
 def test_surfels_say_why_they_were_taken(prediction: Path, finished: FinishedFit, tmp_path: Path) -> None:
     """In the words of model selection; no other model lies beside them."""
-    assert read_info(prediction).model == finished.state.selection.sentence == "surfels (asked for)"
+    assert read_info(prediction).model == finished.state.selection.sentence == "surfels (requested)"
     refused = Candidate("plane", Verdict.REFUSED_BY_SILHOUETTES, "misses the silhouettes", 7.0, 0.8)
     chosen = Candidate("surfels", Verdict.CHOSEN, "no simpler kind explains the views")
     acquire_prediction(tmp_path)
@@ -478,8 +478,8 @@ def ball_prediction(tmp_path_factory: pytest.TempPathFactory, sphere_dataset: Da
     middle = -center / radius
     height = float(middle @ axis)
     surface = SurfaceOfRevolution(middle - height * axis, axis, profile + np.array([0.0, height]), sides)
-    asked = Candidate("revolution", Verdict.CHOSEN, "asked for")
-    state = finished_state(RevolutionMirror(surface), ObjectFrame(center, radius), asked)
+    requested = Candidate("revolution", Verdict.CHOSEN, "requested")
+    state = finished_state(RevolutionMirror(surface), ObjectFrame(center, radius), requested)
     folder = tmp_path_factory.mktemp("predictions") / "ball"
     acquire_prediction(folder)
     export_prediction(sphere_dataset, state, tiny_config(), folder)
@@ -510,7 +510,7 @@ def test_a_surface_of_revolution_renders_the_traced_views(ball_prediction: Path,
 def test_a_surface_of_revolution_is_described_as_what_it_is(ball_prediction: Path) -> None:
     """One primitive, the reason in words, and a mesh whose vertices lie on the traced sphere in world units."""
     info = read_info(ball_prediction)
-    assert info.model == "revolution (asked for)"
+    assert info.model == "revolution (requested)"
     assert info.primitives == 1
     assert info.parameter_counts == {"revolution parameters": 5 + 2 * 361, "environment parameters": 6 * 3 * 64 * 64}
     assert not (ball_prediction / "surfels.ply").exists()

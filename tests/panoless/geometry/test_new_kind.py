@@ -137,7 +137,7 @@ def test_photographs_correct_masks(views: Views) -> None:
     shifts = np.random.default_rng(0).uniform(-1, 1, len(views.train))
     train = (with_outline_moved(*each) for each in zip(views.train, (shifts - shifts.mean()).tolist(), strict=True))
     moved = replace(views, train=tuple(train))
-    proposal = FAMILIES["ellipsoid"].propose(moved, Config(), asked=True)
+    proposal = FAMILIES["ellipsoid"].propose(moved, Config(), requested=True)
     assert normal_errors_deg(kind.EllipsoidMirror(proposal.shape), views).mean() > 1
     geometry, _ = choose_geometry(moved, Config(corrections=replace(STATED, masks="auto")))
     assert normal_errors_deg(geometry, views).mean() < 0.1

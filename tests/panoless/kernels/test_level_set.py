@@ -144,7 +144,7 @@ def test_rows_are_those_of_the_definition(hits: dict[str, np.ndarray]) -> None:
 
 
 def test_rows_predict_how_mirrored_light_changes_with_the_surface(hits: dict[str, np.ndarray]) -> None:
-    """Under light that is linear in the direction, against central differences with the rays traced anew."""
+    """Under light that is linear in the direction, against central differences with the rays traced again."""
     rows = mirror_rows(hits["derivatives"], hits["directions"], hits["slopes"])
     origins = hits["places"] - hits["distance"][:, None] * hits["directions"]
     change = np.random.default_rng(4).normal(size=hits["coefficients"].shape)

@@ -45,13 +45,13 @@ def test_of_a_stack_only_the_singular_ones_change() -> None:
 
 @given(st.integers(1, 7), st.integers(0, 100))
 def test_a_solution_of_what_is_told_is_found_beside_what_is_open(rank: int, seed: int) -> None:
-    """H x = b with b in the range of H, whose rank is not full: what is told is met, and the rest stays small."""
+    """H x = b with b in the range of H, whose rank is not full: what is determined is met, and the rest stays small."""
     matrix = of_rank(rank, 8, seed)
-    told = matrix @ np.random.default_rng(seed + 1).normal(size=8)
-    found = np.linalg.solve(regularize(matrix, "x"), told)
+    determined = matrix @ np.random.default_rng(seed + 1).normal(size=8)
+    found = np.linalg.solve(regularize(matrix, "x"), determined)
     # Damping of 1e-9 moves the solution by as much as the smallest eigenvalue that is not zero, 1e-3 here, allows.
-    np.testing.assert_allclose(matrix @ found, told, atol=1e-4 * np.abs(told).max())
-    assert np.linalg.norm(found) < 1e4 * np.linalg.norm(np.linalg.pinv(matrix, hermitian=True) @ told)
+    np.testing.assert_allclose(matrix @ found, determined, atol=1e-4 * np.abs(determined).max())
+    assert np.linalg.norm(found) < 1e4 * np.linalg.norm(np.linalg.pinv(matrix, hermitian=True) @ determined)
 
 
 def test_a_matrix_that_rounding_made_indefinite_becomes_definite() -> None:
@@ -89,7 +89,7 @@ def test_a_regular_sparse_matrix_is_solved_as_a_dense_one_is() -> None:
 
 @pytest.mark.parametrize("held", [0.0, 1e-300, 1e-18, 1e-14])
 def test_a_path_that_nothing_holds_is_solved_and_stays_near_zero(held: float) -> None:
-    """Its constant is open. Forces that sum to zero tell the rest."""
+    """Its constant is open. Forces that sum to zero determine the rest."""
     matrix, forces = chain(40, held), np.random.default_rng(0).normal(size=40)
     forces -= forces.mean()
     found = factorize(matrix, "x")(forces)

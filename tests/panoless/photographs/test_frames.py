@@ -167,7 +167,8 @@ def test_videos_of_high_dynamic_range_are_refused(tmp_path: Path, transfer: int,
 
 @pytest.mark.parametrize(("surroundings", "message"), [("textured", "turntable"), ("plain", None)])
 def test_a_turntable_is_told_by_surroundings_at_rest(tmp_path: Path, surroundings: str, message: str | None) -> None:
-    """An object that turns before a room at rest, with noise and drifting exposure; a plain studio tells nothing."""
+    """An object that turns before a room at rest, with noise and drifting exposure; a plain studio determines
+    nothing."""
     room = TEXTURE if surroundings == "textured" else np.full_like(TEXTURE, 140)
     random = np.random.default_rng(0)
     for index in range(9):

@@ -47,7 +47,7 @@ def solved(kind: str, views: Views, left: Collection[type[Block]] = (), around_i
     """By a kind, from its own proposal, without the blocks that are `left` out."""
     family = FAMILIES[kind]
     source = family if family.refines is None else FAMILIES[family.refines]
-    proposal = source.propose(views, CONFIG, asked=True)
+    proposal = source.propose(views, CONFIG, requested=True)
     assert proposal is not None
     kinds, required = nuisance_kinds(CONFIG)
     with torch.no_grad():

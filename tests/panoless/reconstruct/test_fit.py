@@ -159,7 +159,7 @@ def fit_in_pieces(dataset: Dataset, config: FitConfig, folder: Path, stops: tupl
     return fit(dataset, config, folder)
 
 
-#: One that begins materials anew between the stops, and one of 3D Gaussians.
+#: One that begins materials again between the stops, and one of 3D Gaussians.
 COMPARED = [pytest.param(preset, marks=pytest.mark.slow) for preset in ("ref-gaussian", "3dgs-dr")]
 
 

@@ -217,8 +217,8 @@ def state_at(iteration: int, seconds: float) -> FitState:
 
 
 def test_marks_in_seconds_come_once_however_often_the_fit_is_killed(tmp_path: Path) -> None:
-    """A step may pass several marks, and a resumed fit passes them again, at other iterations. What reading anew passes
-    is taken at the first step.
+    """A step may pass several marks, and a resumed fit passes them again, at other iterations. What reading again
+    passes is taken at the first step.
     """
     marks = SnapshotSchedule(seconds=(0.4, 2.0, 4.0, 4.5, 20.0))
 

@@ -1,4 +1,4 @@
-"""Which kind a scene gets: silhouettes refuse a plane, held-out views tell a bent mirror from a flat one."""
+"""Which kind a scene gets: silhouettes refuse a plane, held-out views determine a bent mirror from a flat one."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -42,7 +42,7 @@ SIZE_PX = 56
 
 
 def coarse_config() -> FitConfig:
-    """As few surfels and steps as tell kinds apart, and maps as coarse as views of these few pixels resolve."""
+    """As few surfels and steps as distinguish kinds, and maps as coarse as views of these few pixels resolve."""
     config = tiny_config(iterations=200, count=200)
     return replace(
         config,
@@ -60,7 +60,7 @@ CONFIG = coarse_config()
 
 @pytest.fixture(autouse=True)
 def few_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Enough to tell kinds apart."""
+    """Enough to distinguish kinds."""
     take_few_rounds(monkeypatch, joint=3, revolutions=1)
 
 
@@ -196,11 +196,11 @@ def test_silhouettes_turn_cameras_where_that_brings_a_shape_near() -> None:
     turns = rng.normal(size=(12, 3))
     turns *= np.radians(0.5) / np.linalg.norm(turns, axis=1, keepdims=True)
     wrong = Poses(turns, np.zeros((12, 3))).moved(views)
-    starts = [begun(RevolutionFamily(), each, FitConfig(), asked=False) for each in (views, wrong)]
+    starts = [begun(RevolutionFamily(), each, FitConfig(), requested=False) for each in (views, wrong)]
     assert all(each is not None for each in starts)
     assert starts[0].poses is None
     assert starts[1].poses is not None
-    raw = RevolutionFamily().propose(wrong, FitConfig(), asked=True)
+    raw = RevolutionFamily().propose(wrong, FitConfig(), requested=True)
     assert raw is not None
     assert starts[1].proposal.silhouette_px < 0.8 * raw.silhouette_px
 
@@ -220,15 +220,15 @@ def test_the_configuration_overrides_both_ways(views: Views) -> None:
     state = begin(framed(0.0), chosen["surfels"])
     assert state.geometry.kind == "surfels"
     assert state.training is not None
-    assert state.selection.sentence == "surfels (asked for)"
+    assert state.selection.sentence == "surfels (requested)"
     for shown in (framed(0.0, 0.3), views):
         geometry, selection = choose_geometry(shown, chosen["plane"])
         assert geometry.kind == "plane"
-        assert selection.sentence == "plane (asked for)"
+        assert selection.sentence == "plane (requested)"
 
 
 def test_what_silhouettes_refuse_altogether_is_an_error_that_says_why() -> None:
-    """Two views determine no plane and nothing else, whether one is asked for or not."""
+    """Two views determine no plane and nothing else, whether one is requested or not."""
     views = framed(0.0)
     two = replace(views, train=views.train[:2])
     with pytest.raises(InputError, match=r"plane: silhouettes determine none.* free_form: .*--model surfels"):
@@ -258,11 +258,11 @@ def plane_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.mark.parametrize("preset", ["default", pytest.param("paper", marks=pytest.mark.slow)])
 def test_a_plane_has_a_solved_map_whatever_the_preset(tmp_path: Path, plane_dataset: Dataset, preset: str) -> None:
     """No steps are taken with it, so what gradient descent left or accumulated online would say nothing."""
-    believed = CorrectionOptions(masks="off", exposure="off", lens="off")
-    config = replace(tiny_config(preset, iterations=4, count=40), model="plane", corrections=believed)
+    weighted = CorrectionOptions(masks="off", exposure="off", lens="off")
+    config = replace(tiny_config(preset, iterations=4, count=40), model="plane", corrections=weighted)
     state = fit(plane_dataset, config, tmp_path / "run")
     assert state.geometry.kind == "plane"
-    assert state.selection.sentence == "plane (asked for)"
+    assert state.selection.sentence == "plane (requested)"
     assert state.environment is not None
     assert state.visibility is not None
     assert state.peak_memory_bytes > 1e7

@@ -1,4 +1,4 @@
-"""A golden mirror is told from a perfect one by held-out views, and its views become those of a perfect one."""
+"""A golden mirror is determined from a perfect one by held-out views, and its views become those of a perfect one."""
 
 from dataclasses import replace
 
@@ -82,8 +82,8 @@ def lacquered(view: TrainView, albedo: float) -> TrainView:
 
 
 def test_a_veil_of_scattered_light_is_taken_off() -> None:
-    """Within what 48 px tell: an albedo of 0.3 is told to 0.1, and views come twice as near to those of a perfect
-    mirror. Without a veil, or where held-out views leave nothing to explain, nothing is done.
+    """Within what 48 px determine: an albedo of 0.3 is determined to 0.1, and views come twice as near to those of a
+    perfect mirror. Without a veil, or where held-out views leave nothing to explain, nothing is done.
     """
     veiled = replace(PERFECT, train=tuple(lacquered(view, 0.3) for view in PERFECT.train))
     material, found = (

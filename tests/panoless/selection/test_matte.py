@@ -36,7 +36,7 @@ def views_with(paint: float) -> Views:
 @pytest.mark.parametrize(("paint", "matte"), [(0.0, False), (0.4, False), (1.0, True)])
 def test_a_painted_ball_is_matte_and_a_mirror_below_thin_paint_is_not(paint: float, matte: bool) -> None:
     views, family, config = views_with(paint), FAMILIES["sphere"], FitConfig()
-    proposal = family.propose(views, config, asked=True)
+    proposal = family.propose(views, config, requested=True)
     assert proposal is not None
     assert is_matte(views, family.as_proposed(proposal, config), config) == matte
 

@@ -1,4 +1,4 @@
-"""A rough mirror is told from a smooth one by held-out views, made by facets that are drawn at random."""
+"""A rough mirror is determined from a smooth one by held-out views, made by facets that are drawn at random."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -97,8 +97,8 @@ def test_a_roughness_that_is_off_or_known_is_not_searched(options: MaterialOptio
     assert needed_blur(views, MIRROR, FitConfig(material=options)) == Blur(roughness=expected)
 
 
-@pytest.mark.parametrize(("sharp", "asked"), [(0.004, 1), (0.04, 4)])
-def test_nothing_else_is_tried_where_a_sharp_map_explains_all(sharp: float, asked: int) -> None:
+@pytest.mark.parametrize(("sharp", "requested"), [(0.004, 1), (0.04, 4)])
+def test_nothing_else_is_tried_where_a_sharp_map_explains_all(sharp: float, requested: int) -> None:
     """Though a rough mirror would explain half of what little is left."""
     found: list[Blur] = []
 
@@ -111,5 +111,5 @@ def test_nothing_else_is_tried_where_a_sharp_map_explains_all(sharp: float, aske
             return 0.1
 
     taken = judged_blur(cast(BlurTrial, Trial()), MaterialOptions())
-    assert taken == (Blur() if asked == 1 else Blur(roughness=0.1))
-    assert len(found) == asked
+    assert taken == (Blur() if requested == 1 else Blur(roughness=0.1))
+    assert len(found) == requested

@@ -1,4 +1,4 @@
-"""A mirror in a room tells how near its walls are before its shape is fitted."""
+"""A mirror in a room determines how near its walls are before its shape is fitted."""
 
 from dataclasses import replace
 
@@ -50,7 +50,7 @@ def in_room(view: TrainView, plane: Plane, radius: float, depth: float | None = 
 
 @pytest.mark.slow
 def test_a_flat_mirror_in_a_room_tells_how_near_it_is() -> None:
-    """Within 5 % of four radii at 48 px, where a fit that believes in a far world explains clearly less."""
+    """Within 5 % of four radii at 48 px, where a fit that assumes a far world explains clearly less."""
     plane = plane_of(RECTANGLE)
     views = replace(FAR_VIEWS, train=tuple(in_room(view, plane, 4.0) for view in FAR_VIEWS.train))
     family = PlaneFamily()

@@ -1,4 +1,4 @@
-"""What is believed: surfels that agree with what others saw, and a map as fine as held-out views can tell."""
+"""What is weighted: surfels that agree with what others saw, and a map as fine as held-out views can determine."""
 
 from dataclasses import replace
 

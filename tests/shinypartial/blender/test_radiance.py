@@ -125,7 +125,7 @@ def test_depth_of_a_tilted_plane_is_along_the_optical_axis(plane: Rendered) -> N
     assert solid.sum() > 100
     # Over a pixel, depth averages to that of the center but for sampling; measured 0.0052 where it recedes fastest.
     np.testing.assert_allclose(plane.view.depth[solid], depth[solid], atol=1e-2)
-    # Distance from the camera would be told apart.
+    # Distance from the camera would be distinguished.
     assert np.abs(distance - depth)[solid].max() > 0.1
     np.testing.assert_allclose(plane.view.normals_world[solid] @ normal, np.linalg.norm(normal), rtol=1e-5)
 

@@ -111,17 +111,17 @@ def test_a_view_that_kills_two_workers_is_named(
 
 
 @posix_only
-def test_how_a_worker_ended_is_told(
+def test_how_a_worker_ended_is_stated(
     spec: SceneSpec, cameras: tuple[Camera, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ask = worker_pool._Worker.ask
+    request = worker_pool._Worker.request
 
     def killed_first(worker, message):
         worker.process.send_signal(signal.SIGKILL)
         worker.process.wait()
-        return ask(worker, message)
+        return request(worker, message)
 
-    monkeypatch.setattr(worker_pool._Worker, "ask", killed_first)
+    monkeypatch.setattr(worker_pool._Worker, "request", killed_first)
     with open_pool(spec, ONE) as pool, pytest.raises(InputError, match="by SIGKILL"):
         pool.render(cameras[0], "a view")
 
@@ -134,7 +134,7 @@ def test_blender_s_refusal_arrives_as_it_was_raised(spec: SceneSpec, cameras: tu
         folder.write_text("Not a folder.")
         with pytest.raises(InputError, match="Not a directory"):
             pool.render(cameras[1], "a view")
-        assert not pool._live, "One that has refused is not asked again."
+        assert not pool._live, "One that has refused is not requested again."
 
 
 def test_a_closed_pool_renders_nothing_and_leaves_nothing(spec: SceneSpec, cameras: tuple[Camera, ...]) -> None:

@@ -1,4 +1,4 @@
-"""Scene files put the light where it came from, by the lookups that each program documents, written out anew here."""
+"""Scene files put the light where it came from, by the lookups that each program documents, written out again here."""
 
 import base64
 import json

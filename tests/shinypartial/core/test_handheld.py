@@ -1,4 +1,4 @@
-"""A hand along a path: a steady one follows it, and the motions of another have the sizes that were asked for."""
+"""A hand along a path: a steady one follows it, and the motions of another have the sizes that were requested."""
 
 from dataclasses import replace
 

@@ -354,7 +354,7 @@ def test_what_lies_beside_a_picture_is_kept_while_its_pixels_stay(shiny: Dataset
 def test_self_reflection_moves_with_the_object_and_is_left_out_where_no_exr_knows_it(
     damaged_dataset: Path, tmp_path: Path
 ) -> None:
-    """A copy of 8 bits keeps the pictures of it, which a move of that copy can't make anew."""
+    """A copy of 8 bits keeps the pictures of it, which a move of that copy can't make again."""
     for frame in open_dataset(damaged_dataset).train:
         channels = read_exr(frame.exr)
         left = np.arange(frame.camera.width) < frame.camera.width / 2

@@ -306,7 +306,7 @@ def test_splits_of_different_size_are_not_pooled(source: Dataset, tmp_path: Path
 
 
 def test_views_of_one_name_in_several_folders_keep_their_poses(source: Dataset, tmp_path: Path) -> None:
-    """Frames are told apart by where their image lies, not by its name alone."""
+    """Frames are distinguished by where their image lies, not by its name alone."""
     root = Path(shutil.copytree(source.root, tmp_path / "ball"))
     for split in SPLITS:
         content = json.loads((root / f"transforms_{split}.json").read_text())

@@ -89,7 +89,7 @@ def first(content: Any) -> Any:
 
 
 def add_self_reflection(value: float) -> Callable[[Path], None]:
-    """A view that has the mask, though the format of its dataset does not ask for it, with one value everywhere."""
+    """A view that has the mask, though the format of its dataset does not require it, with one value everywhere."""
     return edit_frame(lambda c: c.update({"self_reflection.V": np.full_like(c["A"], value)}))
 
 

@@ -15,7 +15,7 @@ from shinypartial.scene import SceneSpec, load_scene, override
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[SceneSpec]:
+def requested(monkeypatch: pytest.MonkeyPatch) -> list[SceneSpec]:
     """The recipes that the command would have rendered."""
     specs: list[SceneSpec] = []
 
@@ -38,19 +38,19 @@ def test_paths_are_those_of_the_recipe() -> None:
     assert typing.get_args(literal) == PATHS
 
 
-def test_options_enter_the_recipe(asked: list[SceneSpec], capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_enter_the_recipe(requested: list[SceneSpec], capsys: pytest.CaptureFixture[str]) -> None:
     arguments = "generate --scene vase --path plus --azimuth-deg -32 32 --elevation-deg -30 40 --train 10"
     assert main(arguments.split()) == 0
-    assert asked[0].camera == dataclasses.replace(
+    assert requested[0].camera == dataclasses.replace(
         load_scene("vase").camera, path="plus", azimuth_deg=(-32, 32), elevation_deg=(-30, 40), train=10
     )
-    assert asked[0].recipe()["camera"]["path"] == "plus"
+    assert requested[0].recipe()["camera"]["path"] == "plus"
     assert "datasets/vase-plus-800" in capsys.readouterr().out
 
 
-def test_without_options_the_recipe_holds(asked: list[SceneSpec]) -> None:
+def test_without_options_the_recipe_holds(requested: list[SceneSpec]) -> None:
     assert main(["generate", "--scene", "vase"]) == 0
-    assert asked == [load_scene("vase")]
+    assert requested == [load_scene("vase")]
 
 
 BAD = {
@@ -65,12 +65,12 @@ BAD = {
 
 @pytest.mark.parametrize(("options", "named"), BAD.values(), ids=BAD.keys())
 def test_bad_options_are_named(
-    options: str, named: str, asked: list[SceneSpec], capsys: pytest.CaptureFixture[str]
+    options: str, named: str, requested: list[SceneSpec], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["generate", "--scene", "vase", *options.split()]) == 2
     out, err = capsys.readouterr()
     assert named in out + err
-    assert asked == []
+    assert requested == []
 
 
 @pytest.mark.parametrize("path", PATHS)

@@ -1,4 +1,5 @@
-"""Making a dataset: it validates, plain readers open it, a killed run continues, and bad surroundings are told."""
+"""Making a dataset: it validates, plain readers open it, a killed run continues, and bad surroundings are
+determined."""
 
 import contextlib
 import json

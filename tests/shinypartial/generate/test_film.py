@@ -64,7 +64,7 @@ def test_the_map_holds_what_lies_below(spec: FilmSpec, tmp_path: Path) -> None:
     np.testing.assert_allclose(environment[: height // 2], direction_colors(height)[: height // 2], atol=5e-3)
     assert np.abs(environment[-2:].mean() - 0.7 * 0.5) < 0.3
     before = {path: path.stat().st_mtime_ns for path in made.root.rglob("*.*") if path.suffix in (".jpg", ".exr")}
-    # Lost files are made anew, and no others.
+    # Lost files are made again, and no others.
     lost = made.root / FRAMES / "frame_00001.jpg"
     content = lost.read_bytes()
     lost.unlink()

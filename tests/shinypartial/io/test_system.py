@@ -24,7 +24,7 @@ print(before - resident_mb())
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere nothing is asked of the C library")
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere nothing is required of the C library")
 def test_freed_pieces_below_one_that_is_held_are_given_back() -> None:
     given_back = float(
         subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, check=True, text=True).stdout

@@ -1,4 +1,5 @@
-"""A release holds its datasets byte for byte, is the same when made again, and tells every damaged byte by name."""
+"""A release holds its datasets byte for byte, is the same when made again, and determines every damaged byte by
+name."""
 
 import importlib.util
 import json

@@ -202,7 +202,7 @@ def test_the_summary_names_numbers_and_what_was_left_out(evaluated: Path) -> Non
 def test_lpips_is_shown_wherever_its_weights_lie(
     tmp_path: Path, sphere_dataset: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With weights in one of their places nothing is asked for: `evaluate` scores, summary and report show."""
+    """With weights in one of their places nothing is requested: `evaluate` scores, summary and report show."""
     monkeypatch.setattr(perceptual, "find_weights", lambda network, folder: tmp_path / network)
     monkeypatch.setattr(perceptual, "has_torch", lambda: True)
     monkeypatch.setattr(perceptual, "load_lpips", lambda network, _: lambda *_: {"alex": 0.125, "vgg": 0.25}[network])

@@ -11,7 +11,7 @@ from panoless.kernels.cpu.workers import run_shared
 
 NUMBERS_PER_CLAIM = 1 << 14
 TENSORS = 8
-"""Tensors are filled up with empty ones to a multiple of this, because each number of them is compiled anew."""
+"""Tensors are filled up with empty ones to a multiple of this, because each number of them is compiled again."""
 f32 = np.float32
 
 

@@ -259,7 +259,7 @@ def test_concavities_are_looked_for_under_lids_where_the_start_has_none(
 def test_a_dish_is_recovered_from_its_visual_hull(dish: tuple[Body, Views]) -> None:
     body = dish[0]
     views = body_views(body, 30, 80)
-    proposal = FreeFormFamily().propose(views, FitConfig(), asked=True)
+    proposal = FreeFormFamily().propose(views, FitConfig(), requested=True)
     assert proposal is not None
     surface = fit_free_form(views, proposal.shape.surface, Schedule(finer=()))[0].surface
     errors = normal_errors_deg(surface, body, views, cameras_around(7, 60)[1::2])

@@ -97,7 +97,7 @@ def normal_errors_deg(surface: LevelSet, body: Body, views: Views, cameras: list
 def ring() -> tuple[Views, FreeFormMirror]:
     """A torus, which sees itself, and its fit."""
     views, family = body_views(torus(), 16, 80), FreeFormFamily()
-    proposal = family.propose(views, CONFIG, asked=False)
+    proposal = family.propose(views, CONFIG, requested=False)
     assert proposal is not None
     geometry, _, _ = family.solve(views, proposal, (), (), CONFIG, lambda _: None)
     assert isinstance(geometry, FreeFormMirror)
@@ -555,7 +555,8 @@ def left_deg(found: Poses, wrong: Poses) -> float:
 
 
 def test_photographs_agree_with_masks_unless_outlines_lie_to_one_side_of_them(linearization: Linearization) -> None:
-    """A surface that is larger by 0.05 px is as near to the masks as theirs may be, but not as one that they tell."""
+    """A surface that is larger by 0.05 px is as near to the masks as theirs may be, but not as one that they
+    determine."""
 
     def apart_px(moved: Linearization) -> float:
         return float(np.median(moved.silhouettes.residual[: len(moved.task.outlines.view)]))
@@ -609,7 +610,7 @@ def test_four_errors_at_once_are_found_together(body: Body) -> None:
     views, family = body_views(body, 25, 80), FreeFormFamily()
     wrong, truth = wronged(views)
     geometry, corrections, decisions = family.solve(
-        wrong, family.propose(wrong, CONFIG, asked=True), BLOCKS, (), CONFIG, lambda _: None
+        wrong, family.propose(wrong, CONFIG, requested=True), BLOCKS, (), CONFIG, lambda _: None
     )
     kept = {each.name for each in decisions if each.kept}
     assert kept >= {"poses", "exposures", "mask offsets", "focal length"}
@@ -625,7 +626,7 @@ def test_four_errors_at_once_are_found_together(body: Body) -> None:
 def test_right_photographs_free_no_block() -> None:
     views, family = body_views(wavy_ball(), 25, 80), FreeFormFamily()
     geometry, corrections, decisions = family.solve(
-        views, family.propose(views, CONFIG, asked=True), BLOCKS, (), CONFIG, lambda _: None
+        views, family.propose(views, CONFIG, requested=True), BLOCKS, (), CONFIG, lambda _: None
     )
     assert not any(each.kept for each in decisions)
     assert len(decisions) == len(BLOCKS) - 1, "all but the walls"

@@ -23,7 +23,7 @@ PLANE = plane_of(RECTANGLE, frame_height=0.08)
 TILTED = apply_plane_step(
     PLANE, np.append([np.radians(0.8), np.radians(-0.6), 0.0, 0.0], np.zeros(PLANE.boundary.size))
 )
-"""By a degree, which photographs of a nearly flat mirror hardly tell."""
+"""By a degree, which photographs of a nearly flat mirror hardly determine."""
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,7 @@ def test_derivatives_of_contour_distances_are_finite_differences(truth: HeightFi
 def test_contours_alone_recover_the_plane_of_the_frame_and_the_height_of_the_edge(
     truth: HeightField, views: Views
 ) -> None:
-    """At 96 px a contour tells a tenth of the degree that was put in, and a tenth of the bumps."""
+    """At 96 px a contour determines a tenth of the degree that was put in, and a tenth of the bumps."""
     height_field = of_edges(views, flat_height_field(TILTED, 4))
     assert np.degrees(np.arccos(height_field.plane.normal @ PLANE.normal)) < 0.15
     middles = (PLANE.boundary + np.roll(PLANE.boundary, -1, 0)) / 2
@@ -152,8 +152,8 @@ def test_a_round_outline_bends_no_mirror() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("rim", [0.0, 0.1])
 def test_what_a_rim_hides_of_the_surroundings_is_left_out(rim: float) -> None:
-    """Outlines tell nothing of a rim that stands back, and mirrored rays that meet it see black. Without one, none is
-    found.
+    """Outlines determine nothing of a rim that stands back, and mirrored rays that meet it see black. Without one, none
+    is found.
     """
     truth = replace(flat_height_field(plane_of(RECTANGLE), 6).domed(0.3), clearance=rim)
     views, camera = height_field_views(truth, arc(16, size=64)), arc(16)[8]

@@ -29,7 +29,7 @@ def test_a_hidden_bottom_is_found_from_a_flat_one(vessel) -> None:
 
 
 def test_a_bottom_is_level_at_the_axis_and_leaves_the_wall_alone(vessel) -> None:
-    """The wall stays as it was, the middle is as high as asked, and the first side is nearly level."""
+    """The wall stays as it was, the middle is as high as requested, and the first side is nearly level."""
     np.testing.assert_array_equal(vessel.profile[-199:], bowl().profile[-199:])
     assert vessel.is_open
     assert vessel.profile[0, 1] == pytest.approx(bowl().profile[0, 1] + RISE)

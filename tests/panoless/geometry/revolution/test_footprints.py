@@ -1,4 +1,4 @@
-"""Pixels as areas: a groove of some pixels, which single rays can't tell, is found by the means of several."""
+"""Pixels as areas: a groove of some pixels, which single rays can't determine, is found by the means of several."""
 
 from dataclasses import replace
 

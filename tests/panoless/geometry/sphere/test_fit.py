@@ -56,7 +56,7 @@ def in_world(views: Views, mirror: SphereMirror) -> tuple[Float[np.ndarray, "3"]
 
 def fitted(views: Views, config: FitConfig = CONFIG) -> SphereMirror:
     family = SphereFamily()
-    proposal = family.propose(views, config, asked=False)
+    proposal = family.propose(views, config, requested=False)
     assert proposal is not None
     geometry, _, _ = family.solve(views, proposal, (), (), config, lambda _: None)
     assert isinstance(geometry, SphereMirror)
@@ -104,7 +104,7 @@ def test_exact_cones_give_the_sphere(seed: int, count: int) -> None:
 def test_an_egg_is_no_sphere_whatever_the_noise_of_masks(
     half_axes: tuple[float, float, float], is_sphere: bool, noise_px: float
 ) -> None:
-    """Three hundredths of an axis are told through a noise of 0.3 px on a radius of 75."""
+    """Three hundredths of an axis are determined through a noise of 0.3 px on a radius of 75."""
     turns = np.radians(np.linspace(-60, 60, 9))
     origins = 4 * np.stack([np.sin(turns), -np.cos(turns), 0.2 + 0 * turns], 1)
     rays = tangent_rays(np.array([0.1, 0.0, 0.2]), np.array(half_axes, float), origins)
@@ -118,7 +118,7 @@ def test_an_egg_is_no_sphere_whatever_the_noise_of_masks(
 def test_outlines_give_center_and_radius(count: int) -> None:
     """0.002 is a thirtieth of a pixel; 5×5 samples a pixel make the masks."""
     views = ball_views(count)
-    found = fit_sphere(views, asked=False)
+    found = fit_sphere(views, requested=False)
     assert found is not None
     center, radius = in_world(views, SphereMirror(found.shape))
     assert np.abs(center).max() < 2e-3
@@ -179,8 +179,8 @@ def test_what_is_seen_is_what_was_seen() -> None:
 
 def test_other_shapes_are_no_spheres() -> None:
     views = revolution_views(goblet(), around(3, 48))
-    assert fit_sphere(views, asked=False) is None
-    assert SphereFamily().propose(views, CONFIG, asked=False) is None
+    assert fit_sphere(views, requested=False) is None
+    assert SphereFamily().propose(views, CONFIG, requested=False) is None
 
 
 def test_views_along_one_line_show_spheres_only(sphere_dataset) -> None:
@@ -209,7 +209,8 @@ def test_of_two_views_none_is_held_out_and_no_error_is_stated() -> None:
 
 
 def test_noise_raises_no_doubt_of_a_sphere() -> None:
-    """Outlines tell it, so no other kind is asked where photographs leave more than right ones do of another."""
+    """Outlines determine it, so no other kind is requested where photographs leave more than right ones do of
+    another."""
     views, noise = ball_views(12), torch.Generator().manual_seed(3)
     noisy = [
         replace(view, radiance=(view.radiance + 0.03 * torch.randn(view.radiance.shape, generator=noise)).clamp(0, 1))

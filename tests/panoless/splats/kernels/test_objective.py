@@ -1,5 +1,5 @@
 """The objective of a mirror, proved thrice: gradcheck of the definition, kernel against definition, finite differences
-of the kernel; and what is not asked for is not there.
+of the kernel; and what is not requested is not there.
 """
 
 import inspect

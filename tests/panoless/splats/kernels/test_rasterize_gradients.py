@@ -184,7 +184,7 @@ def test_block_kernels_are_vector_code(curved: bool):
     pull_back(SCENES[name], "cpu", cotangents(SCENES[name], 1))
     for used in (blend.blend, blend_backward.blend_backward):
         signature = next(each for each in used.signatures if len(each[1].types[0]) == curved)
-        # Compiled anew, because Numba shows no code for functions that come from its disk cache.
+        # Compiled again, because Numba shows no code for functions that come from its disk cache.
         fresh = njit(**{**LANE_CODE, "cache": False})(used.py_func)
         fresh.compile(signature)
         code = fresh.inspect_asm(fresh.signatures[0])
