@@ -6,6 +6,7 @@ Neither is taken for granted: held-out views decide.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -68,7 +69,7 @@ def needed_blur(
     roughnesses: tuple[float, float] = ROUGHNESSES,
     trials: int = TRIALS,
 ) -> Blur:
-    """Roughness of the object or blur of the pictures, if held-out views are clearly better explained by one of them.
+    """Roughness of the object and blur of the pictures, as far as held-out views are clearly better explained by them.
     Views are those of usable pixels.
 
     Four fifths of the views make the maps by which the others are judged: one that is shown as it is, one that a lobe
@@ -94,29 +95,34 @@ def judged_blur(
     roughnesses: tuple[float, float] = ROUGHNESSES,
     trials: int = TRIALS,
 ) -> Blur:
-    """The blur by the held-out errors of a trial.
+    """The blur by the held-out errors of a trial: roughness, blur of the pictures, or one beside the other.
 
-    A lobe averages noise, too, as that of compression. So a map that is shown as it is has to explain less even where
-    the lobe smooths it afterwards, which averages as much. A first value of each decides whether to search on, and for
-    which (Brent 1973). Where the sharp map leaves next to nothing unexplained, nothing else is tried.
+    A lobe averages noise, too, as that of compression. So a map without one has to explain less even where the lobe
+    smooths it afterwards, which averages as much. A first value of each decides whether to search on, and for which
+    (Brent 1973). Where next to nothing is left unexplained, nothing is tried.
     """
-    rounds = JUDGED_ROUNDS
-    sharp = trial.errors(Blur(), rounds)
-    if sharp.mean() < LEAST_UNEXPLAINED:
-        return Blur()
-    smoothing = Blur(roughness=first_roughness)
-    smoothed = trial.errors(Blur(), rounds, smoothing)
-    tried = [smoothing] if options.roughness == "auto" else []
-    if options.blur == "auto":
-        tried.append(Blur(blur_px=FIRST_BLUR_PX))
-    errors = [trial.errors(each, rounds) for each in tried]
-    best = int(np.argmin([each.mean() for each in errors]))
-    is_more_than_smooth = errors[best].mean() < (1 - LEAST_ROUGHNESS_GAIN) * smoothed.mean()
-    if not is_more_than_smooth or not is_clearly_lower(errors[best], sharp, LEAST_ROUGHNESS_GAIN):
-        return Blur()
-    if tried[best].roughness is None:
-        return Blur(blur_px=trial.searched(lambda value: Blur(blur_px=value), BLURS_PX, trials))
-    return Blur(roughness=trial.searched(lambda value: Blur(roughness=value), roughnesses, trials))
+    smoothing, found, rounds = Blur(roughness=first_roughness), Blur(), JUDGED_ROUNDS
+    firsts = {"roughness": (first_roughness, roughnesses), "blur_px": (FIRST_BLUR_PX, BLURS_PX)}
+    left = [name for name, mode in (("roughness", options.roughness), ("blur_px", options.blur)) if mode == "auto"]
+    while left:
+        before = trial.errors(found, rounds)
+        if before.mean() < LEAST_UNEXPLAINED:
+            break
+        smoothed = trial.errors(found, rounds, smoothing)
+        errors = [trial.errors(_with(found, name, firsts[name][0]), rounds) for name in left]
+        best = int(np.argmin([each.mean() for each in errors]))
+        is_more_than_smooth = errors[best].mean() < (1 - LEAST_ROUGHNESS_GAIN) * smoothed.mean()
+        if not is_more_than_smooth or not is_clearly_lower(errors[best], before, LEAST_ROUGHNESS_GAIN):
+            break
+        name = left.pop(best)
+        searched = trial.searched(partial(_with, found, name), firsts[name][1], trials)
+        found = _with(found, name, searched)
+    return found
+
+
+def _with(blur: Blur, name: str, value: float) -> Blur:
+    """With another value of one kind."""
+    return replace(blur, **{name: value})
 
 
 @dataclass(frozen=True)

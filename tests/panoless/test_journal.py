@@ -143,7 +143,7 @@ def test_what_is_returned_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     assert second[1].strides == values.strides
     assert type(second[4]) is np.float32
     assert sum(path.stat().st_size for path in entries(tmp_path)) < 20_000
-    with journal_in(tmp_path), pytest.raises(TypeError, match="not determined by its name"):
+    with journal_in(tmp_path), pytest.raises(TypeError, match="has no name that identifies it"):
         same(Unused())
 
 

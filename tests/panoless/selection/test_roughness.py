@@ -97,8 +97,8 @@ def test_a_roughness_that_is_off_or_known_is_not_searched(options: MaterialOptio
     assert needed_blur(views, MIRROR, FitConfig(material=options)) == Blur(roughness=expected)
 
 
-@pytest.mark.parametrize(("sharp", "requested"), [(0.004, 1), (0.04, 4)])
-def test_nothing_else_is_tried_where_a_sharp_map_explains_all(sharp: float, requested: int) -> None:
+@pytest.mark.parametrize(("sharp", "evaluations"), [(0.004, 1), (0.04, 7)])
+def test_nothing_else_is_tried_where_a_sharp_map_explains_all(sharp: float, evaluations: int) -> None:
     """Though a rough mirror would explain half of what little is left."""
     found: list[Blur] = []
 
@@ -111,5 +111,20 @@ def test_nothing_else_is_tried_where_a_sharp_map_explains_all(sharp: float, requ
             return 0.1
 
     taken = judged_blur(cast(BlurTrial, Trial()), MaterialOptions())
-    assert taken == (Blur() if requested == 1 else Blur(roughness=0.1))
-    assert len(found) == requested
+    assert taken == (Blur() if evaluations == 1 else Blur(roughness=0.1))
+    assert len(found) == evaluations
+
+
+def test_blur_and_roughness_are_found_beside_each_other() -> None:
+    """Errors fall by both; smoothing a map afterwards gains nothing."""
+
+    class Trial:
+        def errors(self, blur: Blur, *_: object) -> np.ndarray:
+            error = 0.04 * (1 if blur.roughness is None else 0.6) * (1 if blur.blur_px is None else 0.8)
+            return np.full(5, error) + np.linspace(0, 1e-6, 5)
+
+        def searched(self, blur: Callable[[float], Blur], bounds: tuple[float, float], trials: int) -> float:
+            return 0.1 if blur(0.1).blur_px is None else 0.7
+
+    found = judged_blur(cast(BlurTrial, Trial()), MaterialOptions())
+    assert found == Blur(roughness=0.1, blur_px=0.7)
