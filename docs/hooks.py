@@ -44,6 +44,19 @@ FORMULA = re.compile(r'<(?P<tag>div|span) class="arithmatex">\\[\[(](?P<latex>.*
 LINK = re.compile(r"(?P<before>\]\()(?P<path>[^)#:\s]+)(?P<anchor>#[^)\s]*)?\)")
 
 
+GALLERY = ROOT / "docs" / "gallery"
+
+
+def gallery_page(path: Path) -> str:
+    """An example as a page: what its docstring says, its picture, and its code."""
+    source = path.read_text(encoding="utf-8")
+    text = ast.get_docstring(ast.parse(source)) or ""
+    code = source.split('"""', 2)[2].strip()
+    shown = sorted((ROOT / "docs" / "images" / "gallery").glob(f"{path.stem}.*"))
+    pictures = "".join(f"![What it makes](../images/gallery/{each.name})\n\n" for each in shown)
+    return f"{text}\n\n{pictures}```python\n{code}\n```\n"
+
+
 def beside() -> dict[Path, str]:
     """Files of the repository outside of `docs`, and their address within the site."""
     found = {ROOT / name: name for name in ("CONTRIBUTING.md", "CHANGELOG.md")}
@@ -58,16 +71,20 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the files beside `docs`."""
     for path, address in beside().items():
         files.append(File.generated(config, address, abs_src_path=str(path)))
+    for path in sorted(GALLERY.glob("*.py")):
+        files.append(File.generated(config, f"gallery/{path.stem}.md", content=gallery_page(path)))
     return files
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Rewrite links between `docs` and the files beside it."""
     known, docs = beside(), Path(config.docs_dir)
-    source = Path(page.file.abs_src_path)
+    source = Path(page.file.abs_src_path or docs / page.file.src_uri)
 
     def rewritten(match: re.Match[str]) -> str:
         target = (source.parent / match["path"]).resolve()
+        if target.parent == GALLERY:
+            return f"{match['before']}{match['path'].removesuffix('.py')}.md)"
         address = known.get(target) or (str(target.relative_to(docs)) if target.is_relative_to(docs) else None)
         if address is None or not target.is_file():
             return match[0]
