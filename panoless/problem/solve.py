@@ -136,7 +136,8 @@ def solve(
         }
         left, decisions = needed(state.nuisance, known, covariances, required)
         needless = [each for each in decisions if not each.kept]
-        if around.coefficients.any() and (walls := [each for each in needless if each.name == Walls.name]):
+        walls = [each for each in needless if each.name == Walls.name]
+        if walls and around.coefficients.any() and not is_past_limit():
             fewer = [kind for kind in kinds if kind is not Walls]
             found = solve(views, surface, fewer, required, begin, rounds, around.without_walls)
             return replace(found, decisions=(*walls, *found.decisions))

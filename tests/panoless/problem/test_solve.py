@@ -20,7 +20,10 @@ from panoless.geometry.revolution.silhouette import contour_rays
 from panoless.geometry.revolution.unknowns import RevolutionUnknowns
 from panoless.problem.blocks import Block, CameraPoses, Exposures, FocalLength, MaskOffsets, Walls
 from panoless.problem.corrected import Corrected
-from panoless.problem.solve import Solved, by_outlines_alone, solve
+from panoless.problem.equations import State
+from panoless.problem.nuisance import Nuisance
+from panoless.problem.parametric import ParametricSurface
+from panoless.problem.solve import Solved, by_outlines, by_outlines_alone, solve
 from panoless.selection.joint import nuisance_kinds
 from tests.support.mirror_body import body_views, sphere
 from tests.support.mirror_height_field import height_field_views
@@ -81,6 +84,21 @@ def test_proposed_walls_that_are_not_needed_leave_no_trace() -> None:
     assert [each.kept for each in found.decisions if each.name == Walls.name] == [False]
     np.testing.assert_array_equal(found.state.surface.shape.center, without.state.surface.shape.center)
     assert found.state.surface.shape.radius == without.state.surface.shape.radius
+
+
+def test_past_the_limit_nothing_is_solved_once_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would end before its first round, and lose what was solved."""
+    begun: list[bool] = []
+
+    def started(views: Views, surface: ParametricSurface, nuisance: Nuisance) -> State:
+        begun.append(bool(nuisance.free))
+        return by_outlines(views, surface, nuisance)
+
+    monkeypatch.setattr("panoless.problem.solve.by_outlines", started)
+    monkeypatch.setattr("panoless.problem.solve.is_past_limit", lambda: True)
+    found = solved("sphere", views_of("sphere", 14, 80), around_it=Surroundings(np.array([0.05])))
+    assert [each.kept for each in found.decisions if each.name == Walls.name] == [False]
+    assert begun.count(True) == 1
 
 
 @pytest.mark.parametrize(("kind", "count", "size"), KINDS[:3])
