@@ -8,7 +8,9 @@ import os
 import runpy
 import shutil
 import sys
+from contextlib import chdir
 from pathlib import Path
+from unittest.mock import patch
 
 from PIL import Image
 
@@ -21,12 +23,9 @@ def run_example(path: Path, folder: Path) -> Path:
     """Run one in a new folder, and return its picture. The programs of this Python come first."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    before, os.environ["PATH"] = Path.cwd(), f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    os.chdir(folder)
-    try:
-        return (folder / runpy.run_path(str(path))["picture"]).resolve(strict=True)
-    finally:
-        os.chdir(before)
+    programs = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    with chdir(folder), patch.dict(os.environ, PATH=programs):
+        return Path(runpy.run_path(str(path))["picture"]).resolve(strict=True)
 
 
 def keep_picture(picture: Path, name: str) -> None:

@@ -134,20 +134,20 @@ def _check_methods(methods: dict[str, str]) -> None:
 
 def _dataset_jobs(scene: str, axis: Axis | None, level: float | None, seed: int, size: Size) -> list[Job]:
     """The jobs that make a dataset, its own last; the first one's name is that of the clean dataset."""
-    render = size.rendering(scene)
+
+    def rendered(name: str, *options: str) -> Job:
+        return Job(f"render/{name}", " ".join((size.rendering(scene), *options, f"--output datasets/{name}")))
+
     if scene == TINY:
         clean = Job(f"perturb/{scene}", f"shinypartial perturb {scene} --output datasets/{scene}")
     else:
-        clean = Job(f"render/{scene}", f"{render} --output datasets/{scene}")
+        clean = rendered(scene)
     if axis is None or level is None:
         return [clean]
     name, options = f"{scene}.{axis.name}-{level:g}", shlex.join(axis.arguments(level))
     if axis.rendered:
-        return [clean, Job(f"render/{name}", f"{render} {options} --output datasets/{name}")]
-    before = [clean]
-    if axis.around:
-        source = f"{scene}.{axis.name}"
-        before.append(Job(f"render/{source}", f"{render} {axis.around} --output datasets/{source}"))
+        return [clean, rendered(name, options)]
+    before = [clean, rendered(f"{scene}.{axis.name}", axis.around)] if axis.around else [clean]
     source, name = before[-1].name.partition("/")[2], f"{name}.{seed}"
     copy = f"shinypartial perturb datasets/{source} --output datasets/{name} --link --seed {seed} {options}"
     return [*before, Job(f"perturb/{name}", copy, (before[-1].name,))]
