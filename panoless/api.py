@@ -277,8 +277,8 @@ def announce_compilation() -> None:
                 self.made = True
                 clear = "\r\x1b[2K" if sys.stderr.isatty() else ""
                 print(clear, end="", file=sys.stderr)
-                time = "some 20 seconds in all if none is there yet; later runs find them on disk"
-                note(f"Compiling kernels for this machine: {time} …")
+                duration = "some 20 seconds in all if none is there yet; later runs find them on disk"
+                note(f"Compiling kernels for this machine: {duration} …")
 
         def on_end(self, event: object) -> None:
             pass

@@ -23,7 +23,7 @@ ENVIRONMENT_HEIGHT = 128
 
 
 def main(source: Path, target: Path) -> None:
-    """Write the folder again."""
+    """Write the folder from scratch."""
     dataset = open_dataset(source)
     shutil.rmtree(target, ignore_errors=True)
     for split in SPLITS:

@@ -40,7 +40,7 @@ class RadianceEncoding:
     def clipped(self, frame: Frame, view: View) -> Float[np.ndarray, "H W 3"]:
         """Radiance of a view, not encoded, without what its range excludes.
 
-        Raises InputError when a high dynamic range is required of an 8-bit image.
+        Raises InputError when a high dynamic range is requested of an 8-bit image.
         """
         if self.high_dynamic_range and not view.high_dynamic_range:
             raise InputError(

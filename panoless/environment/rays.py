@@ -28,7 +28,7 @@ class Rays(Weighted):
     """Observations of the environment: unit world directions and the linear radiance seen along them.
 
     `trust` says how far each is weighted beforehand, in [0, 1]; None: all alike. `incoming` are the unit world
-    directions of the cameras' rays, which determine the angles at which these met the mirror; None: no use needs them.
+    directions of the cameras' rays, which determine the angles at which these met the mirror; None: not needed.
     """
 
     directions: Float[Tensor, "P 3"]

@@ -50,13 +50,13 @@ def sharpened_map(
     environment = environment.clamp(min=LEAST_LIGHT)
     for _ in range(rounds):
         shown = lobe.blurred(environment)
-        requested, found = torch.zeros_like(environment), torch.zeros_like(environment)
+        wanted, found = torch.zeros_like(environment), torch.zeros_like(environment)
         for each in areas:
             seen = each.seen(shown)
             weight = each.weights(seen, saturation, SHARPENING_SCALE, SATURATED)
-            requested += each.spread(weight * each.radiance, resolution)
+            wanted += each.spread(weight * each.radiance, resolution)
             found += each.spread(weight * seen, resolution)
-        ratio = (lobe.gathered(requested) + INERTIA) / (lobe.gathered(found) + INERTIA)
+        ratio = (lobe.gathered(wanted) + INERTIA) / (lobe.gathered(found) + INERTIA)
         environment = environment * ratio**STEP_POWER
     return environment
 

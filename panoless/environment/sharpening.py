@@ -204,7 +204,7 @@ class _Trial:
     ) -> None:
         areas = in_patches(areas, pixels, TRIAL_PATCHES)
         self.kept = [each.without(HELD_OUT, index % HELD_OUT) for index, each in enumerate(areas)]
-        self.requested = [each.every(HELD_OUT, index % HELD_OUT) for index, each in enumerate(areas)]
+        self.tested = [each.every(HELD_OUT, index % HELD_OUT) for index, each in enumerate(areas)]
         self.saturation, self.level = saturation, SATURATED * saturation
         self.is_saturated = any(bool(each.reaches(self.level).any()) for each in areas)
         self._starts: dict[tuple[int, Lamps], Tensor] = {}
@@ -220,9 +220,9 @@ class _Trial:
         return _Tried(*self._errors(environment, lamps))
 
     def _errors(self, environment: Float[Tensor, "6 3 L L"], lamps: Lamps) -> tuple[float, float]:
-        """Of all pixels that are requested, and of the unsaturated ones."""
+        """Of all tested pixels, and of the unsaturated ones."""
         summed = torch.zeros(2, 2)
-        for each in self.requested:
+        for each in self.tested:
             error = each.seen(environment).minimum(self.saturation.to(environment)) - each.radiance
             badly = bounded_error(error, ROBUST_SCALE)
             weight = counting_saturated(each, lamps.saturated_weight, self.level).initial_weight()

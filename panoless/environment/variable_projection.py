@@ -67,9 +67,9 @@ class VariableProjection:
     ) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
         """Gradient and matrix over few unknowns, on which all rays depend by their rows."""
         gradient, matrix = np.zeros(rows.shape[2]), np.zeros((rows.shape[2], rows.shape[2]))
-        for channel, requested in enumerate(residual.T):
+        for channel, error in enumerate(residual.T):
             weighted = self.beyond(rows[:, channel]).T * self.weights
-            gradient += weighted @ requested
+            gradient += weighted @ error
             matrix += weighted @ rows[:, channel]
         return gradient, matrix
 
@@ -82,11 +82,11 @@ class VariableProjection:
     ) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
         """The same over many unknowns, of which each ray depends on those in its columns."""
         gradient, matrix = np.zeros(unknowns), np.zeros((unknowns, unknowns))
-        for channel, requested in enumerate(residual.T):
+        for channel, error in enumerate(residual.T):
             jacobian = jacobian_of_rows(rows[:, channel], columns, unknowns)
-            by_rays, of_rays = normal_equations(jacobian, requested, self.weights)
+            by_rays, of_rays = normal_equations(jacobian, error, self.weights)
             gradient, matrix = gradient + by_rays, matrix + of_rays
-            for means, wanted in self._taken(jacobian, requested):
+            for means, wanted in self._taken(jacobian, error):
                 gradient -= means.T @ wanted
                 matrix -= means.T @ means
         return gradient, matrix

@@ -1,7 +1,7 @@
 """The first surface: the visual hull where silhouettes touch the object, a thin plate where none does.
 
 From cameras on one side, most outlines' rays run on past the object, so the hull bulges there: a can seen over ±55°
-has a wedge in front, with normals up to 35° wrong, and a flat mirror has a roof. Those parts are determined by their
+has a wedge in front, with normals up to 35° wrong, and a flat mirror has a roof. Those parts are recognized by their
 contact with the outlines and replaced by the smoothest surface that continues the parts that are right.
 """
 

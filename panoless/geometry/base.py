@@ -335,7 +335,7 @@ class Family(Protocol):
         ...
 
     def as_proposed(self, proposal: Proposal, config: FitConfig) -> Geometry:
-        """A proposal as a geometry, which determines what is wrong with cameras and masks."""
+        """A proposal as a geometry, which shows what is wrong with cameras and masks."""
         ...
 
     def before_steps(self, views: Views, proposal: Proposal, config: FitConfig) -> Geometry:

@@ -61,7 +61,7 @@ SPECK_PX = 5
 #: Differences of a pixel from the ground, in codes of 1, between which they are counted.
 STEPS = np.array([0.005, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.25])
 #: A point is judged where so large a share of the views shows it.
-LEAST_REQUESTED = 0.3
+LEAST_COUNTED = 0.3
 
 
 @dataclass(frozen=True)
@@ -98,8 +98,8 @@ class Evidence:
     camera: Camera
     shown: Bool[np.ndarray, "H W"]
     """Where the ground is seen for sure: in a whole window."""
-    determined: Bool[np.ndarray, "H W"]
-    """Where the ground's color is known."""
+    predicted: Bool[np.ndarray, "H W"]
+    """Where the ground's color is predicted."""
     left: Float[np.ndarray, "H W"]
     """By how much each pixel differs from the ground that it would show, in codes of 1."""
 
@@ -180,30 +180,30 @@ def evidence_of(
     cv2 = opencv()
     size, homography = (camera.width, camera.height), sheet.to_pixels(camera)
     expected = cv2.warpPerspective(pattern, homography, size, flags=cv2.INTER_LINEAR)
-    determined = cv2.warpPerspective(known.astype(np.uint8) * 255, homography, size, flags=cv2.INTER_LINEAR) == 255
+    predicted = cv2.warpPerspective(known.astype(np.uint8) * 255, homography, size, flags=cv2.INTER_LINEAR) == 255
     color = picture.astype(np.float32) / 255 * gain
     around = np.ones((3, 3), np.uint8)
     low, high = cv2.erode(expected, around), cv2.dilate(expected, around)
     left = np.maximum(np.maximum(low - color, color - high), 0)
-    wide, shown = (determined & _matches(color, expected, left, determined, width) for width in (WIDE_PX, WINDOW_PX))
+    wide, shown = (predicted & _matches(color, expected, left, predicted, width) for width in (WIDE_PX, WINDOW_PX))
     spread = 2 * ((WIDE_PX - WINDOW_PX) // 2 + 1) + 1
     shown &= cv2.dilate(wide.astype(np.uint8), np.ones((spread, spread), np.uint8)) > 0
-    return Evidence(camera, shown, determined, left.max(-1))
+    return Evidence(camera, shown, predicted, left.max(-1))
 
 
 def _matches(
     color: Float[np.ndarray, "H W 3"],
     expected: Float[np.ndarray, "H W 3"],
     left: Float[np.ndarray, "H W 3"],
-    determined: Bool[np.ndarray, "H W"],
+    predicted: Bool[np.ndarray, "H W"],
     width: int,
 ) -> Bool[np.ndarray, "H W"]:
     """Where little is `left` in a window of that width, beside the contrast of what is seen or expected there."""
     cv2 = opencv()
-    share = np.maximum(cv2.blur(determined.astype(np.float32), (width, width)), 1e-6)[..., None]
+    share = np.maximum(cv2.blur(predicted.astype(np.float32), (width, width)), 1e-6)[..., None]
 
     def mean(values: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
-        found: np.ndarray = cv2.blur(np.where(determined[..., None], values, 0), (width, width)) / share
+        found: np.ndarray = cv2.blur(np.where(predicted[..., None], values, 0), (width, width)) / share
         return found
 
     contrast = mean(color**2) - mean(color) ** 2 + mean(expected**2) - mean(expected) ** 2 + NOISE**2
@@ -213,14 +213,14 @@ def _matches(
 
 def cleared(seen: Sequence[Evidence], points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
     """The share of the views that see ground at each point, of those that show it; 1 where few do."""
-    clear, requested = np.zeros(len(points)), np.zeros(len(points))
+    clear, counted = np.zeros(len(points)), np.zeros(len(points))
     for view in seen:
         rows, columns, within, depth = pixels_of(view.camera, points)
         within &= depth > 0
         at = np.where(within, rows, 0), np.where(within, columns, 0)
         clear += within & view.shown[at]
-        requested += within & view.determined[at]
-    return np.where(requested >= LEAST_REQUESTED * len(seen), clear / np.maximum(requested, 1), 1.0)
+        counted += within & view.predicted[at]
+    return np.where(counted >= LEAST_COUNTED * len(seen), clear / np.maximum(counted, 1), 1.0)
 
 
 def ground_masks(
@@ -292,7 +292,7 @@ def odds_of(seen: Sequence[Evidence], outlines: Sequence[Sequence[Bool[np.ndarra
         step = np.searchsorted(STEPS, view.left)
         around = _distance_px(~perhaps)
         for which, where in enumerate((_distance_px(sure) > 3, (around > 4) & (around < 40))):
-            counts[which] += np.bincount(step[where & view.determined], minlength=len(STEPS) + 1)
+            counts[which] += np.bincount(step[where & view.predicted], minlength=len(STEPS) + 1)
     on_object, on_ground = np.log(counts / counts.sum(1, keepdims=True))
     odds: np.ndarray = on_object - on_ground
     return odds
@@ -314,7 +314,7 @@ def _mask(
     """
     cv2 = opencv()
     sure, likely, perhaps = outlines
-    odds = np.where(likely, 1.0, -1.0) + np.where(view.determined, odds_of_step[np.searchsorted(STEPS, view.left)], 0.0)
+    odds = np.where(likely, 1.0, -1.0) + np.where(view.predicted, odds_of_step[np.searchsorted(STEPS, view.left)], 0.0)
     mask = (_distance_px(sure) > 2) | (perhaps & (cv2.GaussianBlur(odds, (0, 0), 1.0) > 0))
     return largest_pieces(cv2.medianBlur(mask.astype(np.uint8), SPECK_PX) > 0, MAIN_SHARE)
 
@@ -329,7 +329,7 @@ def _agreed(
     agreed = []
     for view, mask in zip(seen, masks, strict=True):
         hull = outline(view.camera, points, found.spacing)
-        agreed.append(largest_pieces(np.where(view.determined, mask, hull), MAIN_SHARE))
+        agreed.append(largest_pieces(np.where(view.predicted, mask, hull), MAIN_SHARE))
     return agreed
 
 

@@ -52,7 +52,7 @@ def fit(
     the next fit in that folder goes on from the last checkpoint.
 
     The views, the surfels and the environment are placed on `device` once and stay there; the state that is returned
-    lies in main memory. Raises InputError when another fit is writing to the folder, or snapshots are required of a
+    lies in main memory. Raises InputError when another fit is writing to the folder, or snapshots are requested of a
     finished fit that has none.
     """
     check_config(config)

@@ -69,7 +69,7 @@ def choose_geometry(views: Views, config: FitConfig) -> tuple[Geometry, Selectio
     Raises InputError when a kind is requested and can't be proposed, and when the silhouettes refuse all kinds.
     """
     if config.model != ANY:
-        return _fit_asked(views, config)
+        return _fit_requested(views, config)
     families = list(FAMILIES.values())
     if views.object_frame.depth_is_open:
         families = [family for family in families if not family.needs_depth]
@@ -271,7 +271,7 @@ def _bent(other: Family, geometry: Geometry, start: Start | None, views: Views, 
 
 
 @remembered(lambda _, config: f"Stage 1 of 1: {FAMILIES[config.model].label}")
-def _fit_asked(views: Views, config: FitConfig) -> tuple[Geometry, Selection]:
+def _fit_requested(views: Views, config: FitConfig) -> tuple[Geometry, Selection]:
     family = FAMILIES[config.model]
     if views.object_frame.depth_is_open and family.needs_depth:
         raise along_one_line()
@@ -280,13 +280,13 @@ def _fit_asked(views: Views, config: FitConfig) -> tuple[Geometry, Selection]:
         start = begun_over(family, start, views, config, requested=True)
     assert start is not None, "a kind that is requested is proposed"
     fitted = fit_jointly(family, _source(family), views, start.proposal, config)
-    asked_for = Candidate(
+    requested = Candidate(
         family.kind,
         Verdict.CHOSEN,
         "requested",
         **_found(fitted, views),
     )
-    return fitted.geometry, Selection(family.kind, (asked_for,))
+    return fitted.geometry, Selection(family.kind, (requested,))
 
 
 def along_one_line() -> InputError:

@@ -60,7 +60,7 @@ RIM = "Look at capture/ball.jpg: the circle must lie on the rim of a polished ba
 LEAST_AGREEMENT = 0.1
 """Correlation from which direct and mirrored views agree for sure: random poses give 0.00 ± 0.01 (37 photographs)."""
 #: Light that one color a view leaves unexplained is not distinguished from none below this.
-LEAST_DETERMINED = 1e-3
+LEAST_SHARE_LEFT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def _disagreement(found: Evidence) -> float | None:
     """
     if found.rim_px is None or (found.agreement is None and found.views > 1):
         return None
-    return 2.0 if found.agreement is None else LEAST_AGREEMENT / max(found.agreement, LEAST_DETERMINED)
+    return 2.0 if found.agreement is None else LEAST_AGREEMENT / max(found.agreement, LEAST_SHARE_LEFT)
 
 
 DOUBTS = (
@@ -175,7 +175,7 @@ DOUBTS = (
         EXPOSURE,
     ),
     _Doubt(
-        lambda found: None if found.one_color is None else 1 / max(found.one_color, LEAST_DETERMINED),
+        lambda found: None if found.one_color is None else 1 / max(found.one_color, LEAST_SHARE_LEFT),
         1 / LEAST_ONE_COLOR,
         lambda found: "the photographs show one plain color, so that they don't distinguish one direction from another",
         TEXTURE,

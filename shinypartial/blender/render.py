@@ -177,7 +177,7 @@ def open_renderer(
     """Assemble the scene; its passes go through a temporary folder, inside `folder`, that is removed at the end.
 
     Cycles uses as many `threads` on the CPU, or one for every core. Every pixel is path traced where `path_traced`
-    requests for it, or where samples are many, or the object is no perfect mirror in a far world.
+    requests it, or where samples are many, or the object is no perfect mirror in a far world.
     """
     bpy = import_blender()
     with tempfile.TemporaryDirectory(prefix="shinypartial-", dir=folder) as scratch:

@@ -33,9 +33,9 @@ def main() -> None:
         with open_renderer(start.spec, threads=start.threads, folder=start.folder) as renderer:
             send(replies, Ready(renderer.device))
             while True:
-                requested = cameras.get()
-                backdrop = isinstance(requested, BackdropOf)
-                send(replies, renderer.render_backdrop(requested.camera) if backdrop else renderer.render(requested))
+                message = cameras.get()
+                backdrop = isinstance(message, BackdropOf)
+                send(replies, renderer.render_backdrop(message.camera) if backdrop else renderer.render(message))
     except (InputError, OSError) as error:
         refusal = from_os_error(error) if isinstance(error, OSError) else error
         send(replies, Refused(refusal.expected, refusal.found, refusal.remedy))

@@ -234,7 +234,7 @@ def time_pool(spec: SceneSpec, plan: PoolPlan, frames: int) -> float:
         def one(index: int) -> RenderedView:
             return pool.render(cameras[index % len(cameras)], "a view")
 
-        one(0)  # The first determines its device, after which the others start.
+        one(0)  # The first states its device, after which the others start.
         list(callers.map(one, range(3 * plan.workers)))
         begin = time.perf_counter()
         for each in [callers.submit(one, i) for i in range(frames)]:

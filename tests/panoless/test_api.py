@@ -192,8 +192,6 @@ def test_the_block_of_readme_gives_good_maps_of_the_bundled_vase(
 def test_openblas_gets_one_thread_unless_told_otherwise(given: str | None, found: str) -> None:
     environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
     environment |= {} if given is None else {"OPENBLAS_NUM_THREADS": given}
-    determined = "import os, panoless; print(os.environ['OPENBLAS_NUM_THREADS'])"
-    said = subprocess.run(
-        [sys.executable, "-c", determined], env=environment, capture_output=True, text=True, check=True
-    )
+    program = "import os, panoless; print(os.environ['OPENBLAS_NUM_THREADS'])"
+    said = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
     assert said.stdout.strip() == found

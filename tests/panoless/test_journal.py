@@ -157,7 +157,7 @@ def _of_parts(given: list) -> list:
 
 
 def test_an_object_that_was_given_is_the_same_later(tmp_path: Path) -> None:
-    """A choice between what was there and what is new is often determined by identity."""
+    """A choice between what was there and what is new is often made by identity."""
     for _ in range(2):
         given = Corrections(0.5)
         with journal_in(tmp_path):

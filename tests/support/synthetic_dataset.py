@@ -32,7 +32,7 @@ FIELD_OF_VIEW_RAD = math.radians(36.0)
 ARC_HALF_ANGLE_DEG = 60.0
 SAMPLES_PER_SIDE = 5
 SUN_DIRECTION = np.array([0.6, 0.0, 0.8])
-#: Rows of the lat-long map of datasets that are not requested a larger one.
+#: Rows of the lat-long map of datasets that need no larger one.
 MAP_HEIGHT = 32
 
 

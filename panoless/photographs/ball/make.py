@@ -44,7 +44,7 @@ ROOM = 2.5
 """Radii from the ball's middle within which its mask lies: beside the middle of a picture it is an oval, up to twice as
 wide at 45°."""
 FOCAL_LOGS = np.linspace(-0.3, 0.3, 13)
-"""Logarithms of focal lengths over that stated, which ovals are required of."""
+"""Logarithms of focal lengths over that stated, at which ovals are tested."""
 
 
 @dataclass(frozen=True)

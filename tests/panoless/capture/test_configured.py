@@ -38,18 +38,18 @@ def exposed_dataset(root: Path, factor: float, train: int = 6) -> Dataset:
 
 def test_views_are_as_bright_as_asked_however_they_were_exposed(tmp_path: Path) -> None:
     bright, dark = (exposed_dataset(tmp_path / str(factor), factor) for factor in (UNSATURATED, UNSATURATED / 16))
-    (views, determined), (others, of_others) = (configured_views(each, FitConfig()) for each in (bright, dark))
+    (views, completed), (others, of_others) = (configured_views(each, FitConfig()) for each in (bright, dark))
     mean = torch.cat([view.radiance_at(view.solid) for view in views.train]).mean()
     assert float(mean) == pytest.approx(BRIGHTNESS, rel=1e-5)
-    assert of_others.exposure == pytest.approx(16 * determined.exposure, rel=1e-3)
+    assert of_others.exposure == pytest.approx(16 * completed.exposure, rel=1e-3)
     for view, other in zip(views.train, others.train, strict=True):
         # Half floats in the files keep three digits.
         torch.testing.assert_close(view.radiance, other.radiance, rtol=2e-3, atol=1e-4)
 
 
 def test_photographs_that_are_not_dark_stay_as_they_are(sphere_dataset: Dataset) -> None:
-    views, determined = configured_views(sphere_dataset, FitConfig())
-    assert determined.exposure == 1
+    views, completed = configured_views(sphere_dataset, FitConfig())
+    assert completed.exposure == 1
     for view, other in zip(views.train, load_views(sphere_dataset, FitConfig().crop_margin_px).train, strict=True):
         assert torch.equal(view.radiance, other.radiance)
 
@@ -68,11 +68,11 @@ def test_black_photographs_stay_black(tmp_path: Path) -> None:
 @pytest.mark.parametrize("preset", ["paper", "3dgs-dr"])
 def test_methods_that_work_between_zero_and_one_take_photographs_as_they_are(preset: str, tmp_path: Path) -> None:
     dataset, config = exposed_dataset(tmp_path / "dark", UNSATURATED), replace(PRESETS[preset], crop_margin_px=2)
-    views, determined = configured_views(dataset, config)
+    views, completed = configured_views(dataset, config)
     plain = load_views(dataset, 2, encoding=encoding_of(config))
     assert float(torch.cat([view.radiance_at(view.solid) for view in load_views(dataset, 2).train]).mean()) < DARK
     assert torch.equal(views.train[0].radiance, plain.train[0].radiance)
-    assert determined.exposure == 1
+    assert completed.exposure == 1
 
 
 @pytest.mark.slow

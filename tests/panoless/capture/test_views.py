@@ -144,7 +144,7 @@ def test_views_along_one_line_leave_the_depth_open(sphere_dataset: Dataset) -> N
     frames = [load_views(along, 2, known_radius=radius).object_frame for radius in (0.0, 2.0)]
     assert all(frame.depth_is_open for frame in frames)
     assert not load_views(sphere_dataset, 2).object_frame.depth_is_open
-    # Half a pixel of 32: masks are requested the pixels that they cover at least by half.
+    # Half a pixel of 32: masks count the pixels that they cover at least by half.
     np.testing.assert_allclose(frames[0].center, 0, atol=0.1)
     np.testing.assert_allclose([frame.radius / SPARE for frame in frames], [1.0, 2.0], rtol=0.05)
 

@@ -120,7 +120,7 @@ def test_a_finer_map_explains_more_of_all_pixels_or_of_unsaturated_ones() -> Non
 def test_bright_lamps_are_not_shown_too_large() -> None:
     """Of a window thirty times as bright as what saturates, the map has less than half of the error of one in which
     saturated pixels count like others, and that is lit where it should not be. A window that is little brighter is
-    determined from it.
+    distinguished from it.
     """
     areas = photographed(20_000, 0.0, window=30.0)
     start = solve_environment([areas.rays()], SIZES[-1])
@@ -141,11 +141,11 @@ def test_saturated_pixels_without_footprints_keep_their_say() -> None:
     quarter of the weight would make it dim, which rays get that footprints explain beside hard lamps.
     """
     areas = photographed(10_000, 0.0, window=30.0)
-    determined = areas.directions.mean(1)[:, 2] < 0
-    below = PixelFootprints(areas.directions[determined].contiguous(), areas.radiance[determined])
+    lower = areas.directions.mean(1)[:, 2] < 0
+    below = PixelFootprints(areas.directions[lower].contiguous(), areas.radiance[lower])
     rays = areas.rays()
-    bright = (torch.arange(len(determined)) % 4 > 0)[:, None].float().expand(-1, 3)
-    mixed = replace(rays, radiance=torch.where(determined[:, None], rays.radiance, 0.5 + 0.5 * bright).contiguous())
+    bright = (torch.arange(len(lower)) % 4 > 0)[:, None].float().expand(-1, 3)
+    mixed = replace(rays, radiance=torch.where(lower[:, None], rays.radiance, 0.5 + 0.5 * bright).contiguous())
     found = sharpest_map(Footprints.of([below]), [mixed], SIZES[:1], ONE)
     beyond = cubemap_directions(SIZES[0])[..., 2] > 0.4
     assert float(found.permute(0, 2, 3, 1)[beyond].mean()) > 0.95
@@ -170,12 +170,12 @@ def test_held_out_saturated_pixels_count_as_they_do_in_the_map() -> None:
     """Of a map that is right but for a dark window, they are all of the error."""
     areas = photographed(10_000, 0.0, window=30.0)
     trial = _Trial([areas], ONE)
-    requested = areas.every(HELD_OUT, 0)
-    saturated = requested.reaches(trial.level)
+    tested = areas.every(HELD_OUT, 0)
+    saturated = tested.reaches(trial.level)
     dark = light(cubemap_directions(128), 6.0, 0.0).permute(0, 3, 1, 2).contiguous()
     for lamps in (SOFT, HARD):
         weight = torch.where(saturated, lamps.saturated_weight, 1.0)
-        badly = bounded_error(requested.seen(dark) - requested.radiance, ROBUST_SCALE)
+        badly = bounded_error(tested.seen(dark) - tested.radiance, ROBUST_SCALE)
         every, _ = trial._errors(dark, lamps)
         assert every == pytest.approx(float((weight * badly).sum() / weight.sum()), rel=1e-5)
 
@@ -232,8 +232,8 @@ def test_a_held_out_pixel_has_no_say() -> None:
 
 
 def test_patches_of_the_sky_are_as_dense_as_the_whole() -> None:
-    """A fifth of the pixels: on a texel fall all of them or none, but for those beside borders of patches. No more
-    pixels than are requested stay as they are.
+    """A fifth of the pixels: on a texel fall all of them or none, but for those beside borders of patches. Patches
+    with no more pixels than that stay as they are.
     """
     areas = [photographed(30_000, 0.0), photographed(10_000, 0.0)]
     parts = in_patches(areas, 8_000, 4)

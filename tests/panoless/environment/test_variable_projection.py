@@ -81,11 +81,11 @@ def test_sparse_equations_are_those_of_full_rows(problem: Problem, monkeypatch: 
 
 def test_what_all_rays_of_a_texel_ask_for_moves_nothing_else(problem: Problem) -> None:
     basis = problem.projection.basis
-    requested = basis @ np.random.default_rng(8).normal(size=(basis.shape[1], 3))
-    gradient, _ = problem.projection.equations(problem.rows, requested)
+    representable = basis @ np.random.default_rng(8).normal(size=(basis.shape[1], 3))
+    gradient, _ = problem.projection.equations(problem.rows, representable)
     np.testing.assert_allclose(gradient, 0, atol=1e-12)
-    assert problem.projection.cost(requested) == pytest.approx(0, abs=1e-12)
-    np.testing.assert_allclose(problem.projection.beyond(requested), 0, atol=1e-12)
+    assert problem.projection.cost(representable) == pytest.approx(0, abs=1e-12)
+    np.testing.assert_allclose(problem.projection.beyond(representable), 0, atol=1e-12)
 
 
 def test_rays_of_one_texel_are_together() -> None:

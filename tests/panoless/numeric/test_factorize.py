@@ -47,11 +47,11 @@ def test_of_a_stack_only_the_singular_ones_change() -> None:
 def test_a_solution_of_what_is_told_is_found_beside_what_is_open(rank: int, seed: int) -> None:
     """H x = b with b in the range of H, whose rank is not full: what is determined is met, and the rest stays small."""
     matrix = of_rank(rank, 8, seed)
-    determined = matrix @ np.random.default_rng(seed + 1).normal(size=8)
-    found = np.linalg.solve(regularize(matrix, "x"), determined)
+    right_side = matrix @ np.random.default_rng(seed + 1).normal(size=8)
+    found = np.linalg.solve(regularize(matrix, "x"), right_side)
     # Damping of 1e-9 moves the solution by as much as the smallest eigenvalue that is not zero, 1e-3 here, allows.
-    np.testing.assert_allclose(matrix @ found, determined, atol=1e-4 * np.abs(determined).max())
-    assert np.linalg.norm(found) < 1e4 * np.linalg.norm(np.linalg.pinv(matrix, hermitian=True) @ determined)
+    np.testing.assert_allclose(matrix @ found, right_side, atol=1e-4 * np.abs(right_side).max())
+    assert np.linalg.norm(found) < 1e4 * np.linalg.norm(np.linalg.pinv(matrix, hermitian=True) @ right_side)
 
 
 def test_a_matrix_that_rounding_made_indefinite_becomes_definite() -> None:

@@ -78,14 +78,14 @@ def test_the_first_length_that_helps_is_taken() -> None:
 
 
 def test_finer_models_are_kept_up_to_the_first_that_does_not_pay() -> None:
-    costs, requested = {"coarse": 1.0, "fine": 0.9, "finer": 0.89, "finest": 0.1}, []
+    costs, evaluated = {"coarse": 1.0, "fine": 0.9, "finer": 0.89, "finest": 0.1}, []
 
     def cost(name: str) -> float:
-        requested.append(name)
+        evaluated.append(name)
         return costs[name]
 
     assert keep_if_better(iter(costs), cost, 0.02) == "fine"
-    assert requested == ["coarse", "fine", "finer"]
+    assert evaluated == ["coarse", "fine", "finer"]
     assert keep_if_better(costs, cost, 0.0) == "finest"
     assert keep_if_better(["coarse"], cost) == "coarse"
     assert keep_if_better(["coarse", "fine"], lambda _: np.nan) == "coarse"

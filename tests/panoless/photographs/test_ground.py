@@ -115,7 +115,7 @@ def test_a_view_tells_ground_from_mirror() -> None:
     assert view.shown[mask].mean() < 0.1
     bare = seen_by(CAMERAS[4], ball=False)[0]
     empty = evidence_of(bare, CAMERAS[4], np.ones(3, np.float32), sheet, pattern, known)
-    assert empty.shown[empty.determined].mean() > 0.9
+    assert empty.shown[empty.predicted].mean() > 0.9
     outlines = [seen_by(CAMERAS[4])[1]] * 3
     odds = odds_of([view], [outlines])
     assert odds[0] < -1

@@ -65,7 +65,7 @@ def test_hull_points_are_those_that_all_masks_contain() -> None:
     assert within.sum() == (distances < 0.9 * RADIUS).sum()
     seen[0] = (seen[0][0], np.zeros_like(seen[0][1]))
     left = carve(seen, CENTER, 2 * RADIUS, 32)
-    assert np.linalg.norm(left - CENTER, axis=1).min() > RADIUS  # Beyond that picture, where it determines nothing.
+    assert np.linalg.norm(left - CENTER, axis=1).min() > RADIUS  # Beyond that picture, where it shows nothing.
     assert len(carve(seen, CENTER, 2 * RADIUS, 32, 1)) >= len(points)
     spacing = 4 * RADIUS / 32
     assert overlap(outline(CAMERAS[0], grid[within], spacing), ball(CAMERAS[0], radius=0.9 * RADIUS)) > 0.9

@@ -1,4 +1,4 @@
-"""Which kind a scene gets: silhouettes refuse a plane, held-out views determine a bent mirror from a flat one."""
+"""Which kind a scene gets: silhouettes refuse a plane, held-out views distinguish a bent mirror from a flat one."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A golden mirror is determined from a perfect one by held-out views, and its views become those of a perfect one."""
+"""Held-out views distinguish a golden mirror from a perfect one, and its views become those of a perfect one."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A rough mirror is determined from a smooth one by held-out views, made by facets that are drawn at random."""
+"""A rough mirror is distinguished from a smooth one by held-out views, made by facets that are drawn at random."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What is weighted: surfels that agree with what others saw, and a map as fine as held-out views can determine."""
+"""What is trusted: surfels that agree with what others saw, and a map as fine as held-out views can determine."""
 
 from dataclasses import replace
 

@@ -33,7 +33,7 @@ SINGLE = replace(GOOD, unexplained=None, one_color=None, matte=None, unexplained
 
 
 def test_a_single_photograph_of_a_ball_is_trusted_by_its_rim() -> None:
-    """No view is left to hold out, and it sees one side: the rim and what lies beside it determine."""
+    """No view is left to hold out, and it sees one side: the rim and what lies beside it decide."""
     found = judge(SINGLE)
     assert found.verdict == "trust"
     assert found.reason == (

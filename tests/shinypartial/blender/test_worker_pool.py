@@ -134,7 +134,7 @@ def test_blender_s_refusal_arrives_as_it_was_raised(spec: SceneSpec, cameras: tu
         folder.write_text("Not a folder.")
         with pytest.raises(InputError, match="Not a directory"):
             pool.render(cameras[1], "a view")
-        assert not pool._live, "One that has refused is not requested again."
+        assert not pool._live, "One that has refused is not used again."
 
 
 def test_a_closed_pool_renders_nothing_and_leaves_nothing(spec: SceneSpec, cameras: tuple[Camera, ...]) -> None:

@@ -198,7 +198,7 @@ def test_pixels_without_a_normal_are_holes(tmp_path: Path, sphere_dataset: Datas
 
 
 def test_views_of_which_some_are_overwritten_are_left_out(tmp_path: Path, sphere_dataset: Dataset) -> None:
-    """The paper's code writes training views over its first test views: their photographs determine."""
+    """The paper's code writes training views over its first test views: their photographs decide."""
     run, out = begin(tmp_path / "run"), tmp_path / "out"
     write_views(run, "panoless-paper", sphere_dataset, [2, 0, 1], np.asarray)
     write_png(run / "iteration-30/gt_image/gt_image_000.png", read_png(sphere_dataset.train[0].png))

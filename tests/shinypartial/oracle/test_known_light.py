@@ -169,6 +169,6 @@ def test_the_command_says_which_light_it_is(
 ) -> None:
     words = ["find-light", str(source.root), "--output", str(tmp_path / "lit"), "--worlds"]
     assert main([*words, *(str(path) for path in worlds.values())]) == 0
-    determined = capsys.readouterr().out
-    assert "Lit by right, turned by 130." in determined
-    assert "it shows 1.6" in determined
+    printed = capsys.readouterr().out
+    assert "Lit by right, turned by 130." in printed
+    assert "it shows 1.6" in printed

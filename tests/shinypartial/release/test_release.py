@@ -1,5 +1,4 @@
-"""A release holds its datasets byte for byte, is the same when made again, and determines every damaged byte by
-name."""
+"""A release holds its datasets byte for byte, is the same when made again, and names every damaged byte."""
 
 import importlib.util
 import json

@@ -555,8 +555,8 @@ def left_deg(found: Poses, wrong: Poses) -> float:
 
 
 def test_photographs_agree_with_masks_unless_outlines_lie_to_one_side_of_them(linearization: Linearization) -> None:
-    """A surface that is larger by 0.05 px is as near to the masks as theirs may be, but not as one that they
-    determine."""
+    """A surface that is larger by 0.05 px is as near to the masks as others may be, but lies to one side of
+    them."""
 
     def apart_px(moved: Linearization) -> float:
         return float(np.median(moved.silhouettes.residual[: len(moved.task.outlines.view)]))

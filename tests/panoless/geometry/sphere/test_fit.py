@@ -104,7 +104,7 @@ def test_exact_cones_give_the_sphere(seed: int, count: int) -> None:
 def test_an_egg_is_no_sphere_whatever_the_noise_of_masks(
     half_axes: tuple[float, float, float], is_sphere: bool, noise_px: float
 ) -> None:
-    """Three hundredths of an axis are determined through a noise of 0.3 px on a radius of 75."""
+    """Three hundredths of an axis are detected through a noise of 0.3 px on a radius of 75."""
     turns = np.radians(np.linspace(-60, 60, 9))
     origins = 4 * np.stack([np.sin(turns), -np.cos(turns), 0.2 + 0 * turns], 1)
     rays = tangent_rays(np.array([0.1, 0.0, 0.2]), np.array(half_axes, float), origins)
@@ -209,7 +209,7 @@ def test_of_two_views_none_is_held_out_and_no_error_is_stated() -> None:
 
 
 def test_noise_raises_no_doubt_of_a_sphere() -> None:
-    """Outlines determine it, so no other kind is requested where photographs leave more than right ones do of
+    """Silhouettes suffice, so no other kind is examined where photographs leave more than right ones do of
     another."""
     views, noise = ball_views(12), torch.Generator().manual_seed(3)
     noisy = [

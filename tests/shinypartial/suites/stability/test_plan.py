@@ -120,7 +120,7 @@ def test_unknown_names_are_refused() -> None:
 
 
 def test_any_scene_that_declares_a_split_can_be_asked_for() -> None:
-    """Also one that is not among those of a plan that no use needs them for others."""
+    """Also one that is not among those of a plan by default."""
     cells = make_plan("core", COPY, [0], scenes=["rounded-block", "dish"], axes=["masks-eroded"]).cells
     assert {(cell.scene, cell.split) for cell in cells} == {("rounded-block", "held-out"), ("dish", "development")}
 

@@ -18,12 +18,12 @@ def test_a_dry_run_lists_every_job(tmp_path: Path, capfd: pytest.CaptureFixture[
     words = ["tables", "--tables", "main", "pose-jitter", "--scenes", "vase", "--output", str(tmp_path)]
     words.append("--schedule=--config.iterations 60 --config.downscale 2")
     assert main([*words, "--", "--dry-run"]) == 0
-    determined = "".join(capfd.readouterr())
+    printed = "".join(capfd.readouterr())
     plan = make_plan(["main", "pose-jitter"], [0], scenes=["vase"])
-    assert f"{len(plan.cells)} cells, {len(plan.jobs)} jobs" in determined
+    assert f"{len(plan.cells)} cells, {len(plan.jobs)} jobs" in printed
     for kind in ("render", "perturb", "fit", "score"):
         count = sum(job.name.startswith(f"{kind}/") for job in plan.jobs)
-        assert determined.count(f"rule {kind}:") == count
+        assert printed.count(f"rule {kind}:") == count
     assert not (tmp_path / "records").exists()
     assert "--preset 3dgs-dr --config.iterations 60 --config.downscale 2 --config.seed 0" in (
         tmp_path / "plan.json"
