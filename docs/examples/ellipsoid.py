@@ -14,10 +14,10 @@ from panoless.environment.surroundings import FAR, Surroundings
 from panoless.geometry.base import Geometry, Mesh, Proposal, RayHits
 from panoless.geometry.exact import ExactFamily, SeenByCenters
 from panoless.numeric.gauss_newton import jacobian_of_rows
-from panoless.problem.observations import outline_rays
+from panoless.problem.observations import silhouette_rays
 from panoless.problem.parametric import LEAST_COSINE, MirrorHits, ParametricSurface, Silhouette, motion_rows
 from panoless.problem.rays import PixelRays
-from panoless.problem.solve import by_outlines_alone
+from panoless.problem.solve import by_silhouettes_alone
 from shinypartial.core.camera import Similarity
 from shinypartial.core.errors import InputError
 
@@ -137,12 +137,14 @@ class EllipsoidFamily(ExactFamily):
 
     def propose(self, views: Views, config: FitConfig, *, requested: bool) -> Proposal | None:
         """By silhouettes alone, from a sphere of the radius 0.7 about the origin, where the object has the radius 1."""
-        if len(outline_rays(views, longest_only=True).size):
+        if len(silhouette_rays(views, longest_only=True).size):
             start = EllipsoidUnknowns(Ellipsoid(np.zeros(3), np.eye(3) / 0.7**2))
-            nearest = by_outlines_alone(views, start)
+            nearest = by_silhouettes_alone(views, start)
             return Proposal.of(views, nearest.surface, nearest)
         if requested:
-            raise InputError(expected="masks with an outline", found="none", remedy="Show the object within pictures.")
+            raise InputError(
+                expected="masks with a silhouette", found="none", remedy="Show the object within pictures."
+            )
         return None
 
     def unknowns(self, views: Views, proposal: Proposal, config: FitConfig) -> EllipsoidUnknowns:

@@ -25,7 +25,7 @@ class Corrections:
     """How photographs are corrected before anything else is made of them."""
 
     mask_offset_px: float = 0.0
-    """How far the outlines of all masks are moved outward, in pixels of the views."""
+    """How far the silhouettes of all masks are moved outward, in pixels of the views."""
     gains: Float[np.ndarray, "V"] | None = None
     """Exposure of each view against the mean; None: they are all alike."""
     focal_factor: float = 1.0
@@ -39,7 +39,7 @@ class Corrections:
     balances: Float[np.ndarray, "V 3"] | None = None
     """Gains of each view's channels against its exposure; None: white balance is the same in all views."""
     mask_offsets_px: Float[np.ndarray, "V"] | None = None
-    """How far the outline of the mask of each view is moved beside that of all; None: masks are alike."""
+    """How far the silhouette of the mask of each view is moved beside that of all; None: masks are alike."""
 
     @property
     def exposure_stops(self) -> float | None:
@@ -74,7 +74,7 @@ class Corrections:
             offsets = self.mask_offset_px + (
                 np.zeros(len(train)) if self.mask_offsets_px is None else self.mask_offsets_px
             )
-            train = tuple(with_outline_moved(view, float(by)) for view, by in zip(train, offsets, strict=True))
+            train = tuple(with_silhouette_moved(view, float(by)) for view, by in zip(train, offsets, strict=True))
         if self.channel_gains is not None:
             gains = torch.from_numpy(self.channel_gains).float()[..., None, None]
             encoding, exposed = encoding_of(config), zip(train, gains, strict=True)
@@ -88,11 +88,11 @@ class Corrections:
 NO_CORRECTIONS = Corrections()
 
 
-def with_outline_moved(view: TrainView, offset_px: float) -> TrainView:
+def with_silhouette_moved(view: TrainView, offset_px: float) -> TrainView:
     """A view with the contour of its mask moved outward by so many pixels, inward where that is negative.
 
     With the signed distance d from the contour, positive outside, alpha is clip(½ − d + δ, 0, 1): the share of a pixel
-    inside a straight outline. What the photograph did not show whole does not become solid. A mask of which nothing
+    inside a straight silhouette. What the photograph did not show whole does not become solid. A mask of which nothing
     would be left stays.
     """
     alpha = view.mask.cpu().numpy()

@@ -1,6 +1,6 @@
 """What the lens of all views may be instead of what is said of it: of another focal length, or bent.
 
-**Cameras farther away through a longer lens** leave outlines where they are. With eˢ times the distance from the
+**Cameras farther away through a longer lens** leave silhouettes where they are. With eˢ times the distance from the
 object's center and eˢ times the focal length a camera sees every point where it did, to first order, but from another
 side. Of a camera with the optical axis a the ray o + t d becomes
 
@@ -30,7 +30,7 @@ class LensChange:
 
     focal: float | None = None
     """s where the focal length is said to be e⁻ˢ times what it is: cameras are eˢ as far away and see through a lens of
-    eˢ times the focal length, so that outlines stay where they are.
+    eˢ times the focal length, so that silhouettes stay where they are.
     """
     k1: float | None = None
     """The radial distortion."""

@@ -2,7 +2,7 @@
 
 A segmentation program that takes a lamp's reflection for background leaves a hole or a dent, and one that takes a
 second shiny thing for the object a stray piece. Both cost the whole shape: a hole carves a tunnel through the visual
-hull, and a stray piece has an outline to which no surface can attach.
+hull, and a stray piece has a silhouette to which no surface can attach.
 """
 
 import math
@@ -55,9 +55,9 @@ def with_repaired_masks(views: Views, *, grids: tuple[int, int] = GRIDS) -> View
     say.
 
     What is filled is on the object, but no photograph shows it whole, so it determines no color. Crescents along an
-    outline stay: wrong poses make them, and masks that are too small. Where these are most of what contradicts, nothing
-    is mended. What is missing is filled first: holes in other masks look as if a view showed too much. In each round
-    the mended masks vote on the masks as they were, in the last rounds on a finer grid.
+    silhouette stay: wrong poses make them, and masks that are too small. Where these are most of what contradicts,
+    nothing is mended. What is missing is filled first: holes in other masks look as if a view showed too much. In each
+    round the mended masks vote on the masks as they were, in the last rounds on a finer grid.
     """
     if len(views.train) < LEAST_VIEWS:
         return views

@@ -1,8 +1,8 @@
 """The first surface: the visual hull where silhouettes touch the object, a thin plate where none does.
 
-From cameras on one side, most outlines' rays run on past the object, so the hull bulges there: a can seen over ±55°
+From cameras on one side, most silhouettes' rays run on past the object, so the hull bulges there: a can seen over ±55°
 has a wedge in front, with normals up to 35° wrong, and a flat mirror has a roof. Those parts are recognized by their
-contact with the outlines and replaced by the smoothest surface that continues the parts that are right.
+contact with the silhouettes and replaced by the smoothest surface that continues the parts that are right.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from panoless.capture.views import Views
-from panoless.first_surface.contact import outline_contact
+from panoless.first_surface.contact import silhouette_contact
 from panoless.first_surface.mesh import TriangleMesh
 from panoless.first_surface.visual_hull import Hull
 from panoless.numeric.factorize import factorize
@@ -62,14 +62,14 @@ def trusted_hull(hull: Hull, views: Views) -> TrustedHull:
     """By the contact of silhouettes; a hull that none touches is all that is known."""
     surface = hull_surface(hull)
     pixel = max(hull.pixel, hull.voxel / PIXELS_A_VOXEL)
-    contact = outline_contact(surface, views)
+    contact = silhouette_contact(surface, views)
     touched = contact.trust(CONTACT_PX * pixel)
     trust = (touched if touched.any() else np.ones_like(touched)) + TRUST_FLOOR
     return TrustedHull(hull, surface, trust, pixel)
 
 
 def complete_surface(hull: Hull, views: Views) -> TriangleMesh:
-    """The hull where outlines touch the object, continued as a thin plate that stays inside the hull."""
+    """The hull where silhouettes touch the object, continued as a thin plate that stays inside the hull."""
     return completed(trusted_hull(hull, views))
 
 

@@ -23,9 +23,9 @@ CONTACT_VIEWS = 150
 
 @dataclass(frozen=True)
 class Contact:
-    """How each vertex of a hull meets the outline that comes nearest to it, in normalized units.
+    """How each vertex of a hull meets the silhouette that comes nearest to it, in normalized units.
 
-    `margin` is its distance inside the outline's cone; `offset` its distance, along the ray, from the contour
+    `margin` is its distance inside the silhouette's cone; `offset` its distance, along the ray, from the contour
     generator where that cone touches the object. Both are infinite where no view shows one.
     """
 
@@ -38,8 +38,8 @@ class Contact:
         return np.where(trust < LEAST_TRUST, 0.0, trust)
 
 
-def outline_contact(surface: TriangleMesh, views: Views) -> Contact:
-    """Where along its ray each vertex is touched by the outline that comes nearest to it.
+def silhouette_contact(surface: TriangleMesh, views: Views) -> Contact:
+    """Where along its ray each vertex is touched by the silhouette that comes nearest to it.
 
     Let m(θ) be a point's distance inside the cone of a camera whose direction stands θ over the tangent plane.
     At the contour generator the cone turns about the point itself, m'(0) = 0; at a distance s from the contour
@@ -68,7 +68,7 @@ def outline_contact(surface: TriangleMesh, views: Views) -> Contact:
 def _margin_and_height(
     view: TrainView, surface: TriangleMesh, normals: Float[np.ndarray, "V 3"]
 ) -> tuple[Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:
-    """Margin inside the outline, and height of the camera over the tangent plane (rad)."""
+    """Margin inside the silhouette, and height of the camera over the tangent plane (rad)."""
     points = torch.from_numpy(surface.vertices.astype(np.float32)).to(view.mask.device)
     margin = -mask_distance(view).distances(points).cpu().numpy().astype(np.float64)
     toward = unit(view.position - surface.vertices)

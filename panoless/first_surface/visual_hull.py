@@ -1,4 +1,4 @@
-"""The visual hull below the size of a pixel: where every outline, interpolated between mask pixels, allows the object.
+"""The visual hull below the size of a pixel: where every silhouette, interpolated between pixels, allows the object.
 
 A mask's half level is a curve that lies between pixels. The hull function at a point is its largest signed distance
 over the views, outside these curves, in normalized units; its zero level is the hull. A view does not count for what it
@@ -82,14 +82,14 @@ class Hull:
 
 
 def largest_distances(
-    outlines: Sequence[MaskDistance], points: Float[Tensor, "P 3"], count: int
+    silhouettes: Sequence[MaskDistance], points: Float[Tensor, "P 3"], count: int
 ) -> Float[Tensor, "count P"]:
     """The largest, second largest, … signed distance of each point over the views that count there."""
     blocks = []
     for block in points.split(POINTS_AT_ONCE):
         largest = torch.full((count, len(block)), -math.inf, device=points.device)
-        for outline in outlines:
-            value = outline.distances(block)
+        for silhouette in silhouettes:
+            value = silhouette.distances(block)
             for row in largest:
                 lower = torch.minimum(row, value)
                 torch.maximum(row, value, out=row)
@@ -105,21 +105,21 @@ def carve_hull(views: Views, resolution: int, votes: float) -> Hull:
 
     Where m views may be wrong, the hull function is the (m + 1)-th largest distance, and the hull larger than that of
     all views. A wrong view cuts the hull away from the rays of the others; m is the least with which rays through the
-    outlines come as near to the hull as with the greatest. Where even then most of them pass it by, because all
+    silhouettes come as near to the hull as with the greatest. Where even then most of them pass it by, because all
     cameras are a little off, m is the least with which half of them meet it; but for `votes` of 1, with which all views
     count. Raises InputError when nothing stays, which means masks and poses contradict each other.
     """
-    outlines, half_side, pixel = _outlines_and_cube(views)
+    silhouettes, half_side, pixel = _silhouettes_and_cube(views)
     resolution = math.ceil(resolution * half_side / HULL_HALF_SIDE)
     allowed = math.floor((1 - votes) * len(views.train))
     levels = max(0, round(math.log2(resolution / COARSE_VOXELS)))
-    device = outlines[0].distance_px.device
+    device = silhouettes[0].distance_px.device
     count = math.ceil((resolution - 1) / 2**levels) + 1
     points = _grid_points(np.arange(count**3), count, half_side, device)
-    tested = _points_on_rays(outlines, half_side)
+    tested = _points_on_rays(silhouettes, half_side)
 
     def hulls(most: int) -> Iterator[Hull]:
-        grids = largest_distances(outlines, points, most + 1).view(-1, count, count, count).cpu().numpy()
+        grids = largest_distances(silhouettes, points, most + 1).view(-1, count, count, count).cpu().numpy()
         return (Hull(grid, half_side, pixel) for grid in grids)
 
     wrong, hull = _least_wrong(list(hulls(allowed)), tested)
@@ -129,7 +129,7 @@ def carve_hull(views: Views, resolution: int, votes: float) -> Hull:
         wrong, hull = next(met, (wrong, hull))
     distance = hull.distance
     for _ in range(levels):
-        distance = _refine(distance, half_side, outlines, wrong)
+        distance = _refine(distance, half_side, silhouettes, wrong)
     for axis in range(3):
         # A hull that leaves the cube is cut off there.
         border = np.moveaxis(distance, axis, 0)[[0, -1]]
@@ -144,25 +144,25 @@ def carve_hull(views: Views, resolution: int, votes: float) -> Hull:
 
 
 def contradiction_px(views: Views) -> float:
-    """How far rays through all outlines pass by the hull of all views, in the median and in pixels; at least 0.
+    """How far rays through all silhouettes pass by the hull of all views, in the median and in pixels; at least 0.
 
-    Outlines of one thing that true cameras see touch the hull, whatever its shape. Those that err by themselves, and
+    Silhouettes of one thing that true cameras see touch the hull, whatever its shape. Those that err by themselves, and
     those of wrong cameras, carve it away from each other's rays: the median is about the standard deviation of what
     they err by. What all err by alike, as masks that are too large, contradicts nothing.
     """
-    outlines, half_side, pixel = _outlines_and_cube(views)
+    silhouettes, half_side, pixel = _silhouettes_and_cube(views)
     count = math.ceil(COARSE_VOXELS * half_side / HULL_HALF_SIDE)
-    points = _grid_points(np.arange(count**3), count, half_side, outlines[0].distance_px.device)
-    grid = largest_distances(outlines, points, 1)[0].view(count, count, count).cpu().numpy()
+    points = _grid_points(np.arange(count**3), count, half_side, silhouettes[0].distance_px.device)
+    grid = largest_distances(silhouettes, points, 1)[0].view(count, count, count).cpu().numpy()
     hull = Hull(grid, half_side, pixel)
-    return max(0.0, _passed_by_px(hull, _points_on_rays(outlines, half_side)))
+    return max(0.0, _passed_by_px(hull, _points_on_rays(silhouettes, half_side)))
 
 
-def _outlines_and_cube(views: Views) -> tuple[list[MaskDistance], float, float]:
-    """The outlines of all views, half a side of the cube that holds the object, and the size of a pixel there."""
-    outlines = [mask_distance(view) for view in views.train]
+def _silhouettes_and_cube(views: Views) -> tuple[list[MaskDistance], float, float]:
+    """The silhouettes of all views, half a side of the cube that holds the object, and the size of a pixel there."""
+    silhouettes = [mask_distance(view) for view in views.train]
     half_side = max(HULL_HALF_SIDE, SPARE * views.object_frame.reach)
-    return outlines, half_side, float(np.median([outline.pixel for outline in outlines]))
+    return silhouettes, half_side, float(np.median([silhouette.pixel for silhouette in silhouettes]))
 
 
 def _grid_points(
@@ -176,7 +176,7 @@ def _grid_points(
 def _refine(
     distance: Float[np.ndarray, "N N N"],
     half_side: float,
-    outlines: Sequence[MaskDistance],
+    silhouettes: Sequence[MaskDistance],
     wrong: int,
 ) -> Float[np.ndarray, "M M M"]:
     """The hull function on a grid of half the spacing, evaluated where it is small and else interpolated."""
@@ -192,13 +192,13 @@ def _refine(
     # Signed distances are 1-Lipschitz, up to perspective, and so are their maxima.
     spacing = 2 * half_side / (distance.shape[0] - 1)
     near = np.nonzero(np.abs(fine.ravel()) < BAND_VOXELS * spacing)[0]
-    points = _grid_points(near, count, half_side, outlines[0].distance_px.device)
-    fine.ravel()[near] = largest_distances(outlines, points, wrong + 1)[wrong].cpu().numpy()
+    points = _grid_points(near, count, half_side, silhouettes[0].distance_px.device)
+    fine.ravel()[near] = largest_distances(silhouettes, points, wrong + 1)[wrong].cpu().numpy()
     return fine
 
 
 def _least_wrong(hulls: Sequence[Hull], tested: Float[np.ndarray, "R S 3"]) -> tuple[int, Hull]:
-    """How many views to leave out, and the hull of the others: the fewest with which rays through outlines touch it."""
+    """How many views to leave out, and the hull of the others: the fewest with which silhouettes' rays touch it."""
     gaps = []
     for hull in hulls:
         nearest = hull.at(tested).min(1)
@@ -207,17 +207,17 @@ def _least_wrong(hulls: Sequence[Hull], tested: Float[np.ndarray, "R S 3"]) -> t
 
 
 def _passed_by_px(hull: Hull, tested: Float[np.ndarray, "R S 3"]) -> float:
-    """At which distance from the hull rays through outlines pass, in the median (px); less than 0 if they enter it."""
+    """At which distance from the hull silhouettes' rays pass, in the median (px); less than 0 if they enter it."""
     return float(np.median(hull.at(tested).min(1))) / hull.pixel if len(tested) else 0.0
 
 
-def _points_on_rays(outlines: Sequence[MaskDistance], half_side: float) -> Float[np.ndarray, "R S 3"]:
-    """Points in the cube along the rays of pixels just inside the outlines."""
+def _points_on_rays(silhouettes: Sequence[MaskDistance], half_side: float) -> Float[np.ndarray, "R S 3"]:
+    """Points in the cube along the rays of pixels just inside the silhouettes."""
     points = []
-    rays_a_view = max(1, TESTED_RAYS // len(outlines))
-    for outline in outlines:
-        camera, (rotation, center) = outline.camera, pose_of(outline.camera)
-        distance = outline.distance_px.cpu().numpy()
+    rays_a_view = max(1, TESTED_RAYS // len(silhouettes))
+    for silhouette in silhouettes:
+        camera, (rotation, center) = silhouette.camera, pose_of(silhouette.camera)
+        distance = silhouette.distance_px.cpu().numpy()
         rows, columns = np.nonzero((distance < 0) & (distance > -1))
         chosen = np.linspace(0, len(rows) - 1, min(rays_a_view, len(rows))).round().astype(int)
         rays = camera_rays(camera, columns[chosen] + PIXEL_CENTER, rows[chosen] + PIXEL_CENTER) @ rotation

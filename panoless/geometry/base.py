@@ -25,14 +25,14 @@ from panoless.environment.surroundings import Surroundings
 from panoless.kernels.camera import RasterCamera
 from panoless.problem.blocks import Block
 from panoless.problem.evidence import Decision
-from panoless.problem.observations import outline_rays
+from panoless.problem.observations import silhouette_rays
 from panoless.problem.parametric import ParametricSurface
 
 Numbers = TypeVar("Numbers")
 SOLID_SURFACE_ALPHA = 0.9
 """A pixel with more alpha than this shows the surface."""
 SAMPLES = 4
-"""Rays along a side of a pixel at the outline, for its alpha, and of every pixel, for the mean light over its area."""
+"""Rays along a side of a pixel at a silhouette, for its alpha, and of every pixel, for its mean light."""
 MERIDIANS, RINGS = 128, 64
 _last_usable: MutableMapping["Geometry", tuple[Callable[[], Views | None], Views]] = WeakIdKeyDictionary()
 """The views that were requested last, and the answer."""
@@ -75,7 +75,7 @@ class SurfaceBuffers:
         return reflectance.shown(self.cosines(camera).flatten()[pixels], normals, points)
 
 
-def beside_outline(met: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+def beside_silhouette(met: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     """Pixels among whose eight neighbors and themselves some hit a surface and some miss it."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
@@ -130,7 +130,7 @@ class ClosedForm(Protocol):
 
 
 def buffers_by_hits(surface: ClosedForm, camera: RasterCamera, samples: int = SAMPLES) -> SurfaceBuffers:
-    """Depth and normals of rays through pixel centers; alpha the share of `samples`² rays that hit, at the outline.
+    """Depth and normals of rays through pixel centers; alpha the share of `samples`² rays that hit, at the silhouette.
 
     Where only the center misses, depth and normal are those of where its ray comes nearest.
     """
@@ -138,7 +138,7 @@ def buffers_by_hits(surface: ClosedForm, camera: RasterCamera, samples: int = SA
     everything = np.arange(camera.height * camera.width)
     hits = surface.hits(*pixel_rays(camera, everything))
     alpha = hits.met.astype(np.float64)
-    mixed = np.flatnonzero(beside_outline(hits.met.reshape(shape)))
+    mixed = np.flatnonzero(beside_silhouette(hits.met.reshape(shape)))
     parts = [surface.hits(*pixel_rays(camera, mixed, place)).met for place in parts_of_pixel(samples)]
     alpha[mixed] = np.stack(parts, 1).mean(1)
     covered = alpha > 0
@@ -285,7 +285,7 @@ class Proposal:
     @classmethod
     def of(cls, views: Views, shape: ClosedForm, unknowns: ParametricSurface) -> "Proposal":
         """A shape with medians over the views: distance of contours from its silhouette (px), overlap with masks."""
-        rays = outline_rays(views, longest_only=True)
+        rays = silhouette_rays(views, longest_only=True)
         away = np.abs(unknowns.silhouette(rays).pixels)
         medians = [np.median(away[rays.view == view]) for view in np.unique(rays.view)]
         overlaps = [overlap(buffers_by_hits(shape, view.camera).alpha.to(view.mask), view.mask) for view in views.train]
@@ -318,7 +318,7 @@ class Family(Protocol):
     needs_depth: ClassVar[bool]
     """Whether views have to come from different directions, which determine how far away the object is."""
     silhouettes_suffice: ClassVar[bool]
-    """Whether outlines determine the whole shape, so that what photographs leave unexplained is no doubt of it but
+    """Whether silhouettes determine the whole shape, so that what photographs leave unexplained is no doubt of it but
     noise, or who holds the camera."""
 
     def propose(self, views: Views, config: FitConfig, *, requested: bool) -> Proposal | None:
@@ -360,7 +360,9 @@ class Family(Protocol):
         """
         ...
 
-    def by_outlines(self, views: Views, proposal: Proposal, kinds: Collection[type[Block]], config: FitConfig) -> Poses:
+    def poses_by_silhouettes(
+        self, views: Views, proposal: Proposal, kinds: Collection[type[Block]], config: FitConfig
+    ) -> Poses:
         """Poses of cameras by silhouettes alone."""
         ...
 

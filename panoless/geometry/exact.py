@@ -44,7 +44,7 @@ from panoless.problem.corrected import Corrected
 from panoless.problem.evidence import Decision
 from panoless.problem.nuisance import nuisance_of
 from panoless.problem.parametric import ParametricSurface
-from panoless.problem.solve import FINISH, LEAST_VIEWS, MOST_VIEWS, after_round, by_outlines, solve
+from panoless.problem.solve import FINISH, LEAST_VIEWS, MOST_VIEWS, after_round, by_silhouettes, solve
 from shinypartial.core.camera import Similarity
 
 PROPOSALS = 3
@@ -170,7 +170,7 @@ class ExactFamily:
         """The proposal itself."""
         return proposal
 
-    def outlined(self, views: Views) -> Views:
+    def with_silhouettes(self, views: Views) -> Views:
         """Views with masks whose contours are silhouettes of the kind: themselves."""
         return views
 
@@ -211,7 +211,7 @@ class ExactFamily:
         """The fit to photographs as they are stated where the scene needs none of the blocks; else that to photographs
         which are corrected by what a surface of few numbers leaves to the blocks.
         """
-        views, around = self.outlined(views), proposal.shape.surroundings
+        views, around = self.with_silhouettes(views), proposal.shape.surroundings
         if not LEAST_VIEWS <= len(views.train) <= MOST_VIEWS:
             kinds = ()
         if self.by_silhouettes and not kinds:
@@ -256,18 +256,20 @@ class ExactFamily:
             for _ in range(PROPOSALS):
                 if proposal.silhouette_px <= NEAR_PX:
                     break
-                state = by_outlines(views, self.unknowns(views, proposal, config), nuisance_of(views, kinds))
+                state = by_silhouettes(views, self.unknowns(views, proposal, config), nuisance_of(views, kinds))
                 again = propose(Corrected.by(state.nuisance).applied(views, config))
                 if again is None or again.silhouette_px > LARGEST_SHARE_LEFT * proposal.silhouette_px:
                     break
                 proposal = again.in_surroundings(proposal.shape.surroundings)
         return proposal
 
-    def by_outlines(self, views: Views, proposal: Proposal, kinds: Collection[type[Block]], config: FitConfig) -> Poses:
-        """See `panoless.problem.solve.by_outlines`."""
-        views = self.outlined(views)
+    def poses_by_silhouettes(
+        self, views: Views, proposal: Proposal, kinds: Collection[type[Block]], config: FitConfig
+    ) -> Poses:
+        """See `panoless.problem.solve.by_silhouettes`."""
+        views = self.with_silhouettes(views)
         with torch.no_grad():
-            state = by_outlines(views, self.unknowns(views, proposal, config), nuisance_of(views, kinds))
+            state = by_silhouettes(views, self.unknowns(views, proposal, config), nuisance_of(views, kinds))
         found = Corrected.by(state.nuisance).poses
         assert found is not None, "cameras are unknowns"
         return found

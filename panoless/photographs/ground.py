@@ -3,7 +3,7 @@
 The plane is known, so that each photograph can be laid out on it. What the plane shows is the color on which most of
 them agree; a mirror, and all that stands above the plane, moves against it from view to view. A pixel that shows the
 plane determines that nothing is on its ray: so points of space are cleared away by votes, and what is left over is the
-object. Near its outline each view's own pixels decide.
+object. Near its silhouette each view's own pixels decide.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from panoless.capture.masks import MAIN_SHARE, largest_pieces
-from panoless.photographs.hull import carve, cube, nearest_point, outline, pixels_of
+from panoless.photographs.hull import carve, cube, nearest_point, pixels_of, silhouette
 from panoless.photographs.lens import opencv
 from panoless.photographs.masks import EDGE_PX, HULL_SPARE, HULL_VOXELS, TOLERATED, averaged, enlarged
 from panoless.photographs.posed import GroundPlane
@@ -242,9 +242,9 @@ def ground_masks(
         seen.append(evidence_of(each, camera, gain, sheet, pattern, known))
         progress.advance()
     found = _object_points(seen, ground, sheet)
-    outlines = [[outline(view.camera, points, found.spacing) for points in found.sets] for view in seen]
-    odds = odds_of(seen, outlines)
-    masks = [_mask(view, of_view, odds) for view, of_view in zip(seen, outlines, strict=True)]
+    silhouettes = [[silhouette(view.camera, points, found.spacing) for points in found.sets] for view in seen]
+    odds = odds_of(seen, silhouettes)
+    masks = [_mask(view, of_view, odds) for view, of_view in zip(seen, silhouettes, strict=True)]
     masks = _agreed(seen, masks, found)
     return {name: _at_full_size(mask, whole[name], side) for name, mask in zip(whole, masks, strict=True)}
 
@@ -281,14 +281,16 @@ def _object_points(seen: Sequence[Evidence], ground: GroundPlane, sheet: Sheet) 
     return _Points(sets, 2 * half / count, center, half)
 
 
-def odds_of(seen: Sequence[Evidence], outlines: Sequence[Sequence[Bool[np.ndarray, "_ _"]]]) -> Float[np.ndarray, "_"]:
+def odds_of(
+    seen: Sequence[Evidence], silhouettes: Sequence[Sequence[Bool[np.ndarray, "_ _"]]]
+) -> Float[np.ndarray, "_"]:
     """The logarithm of how much likelier a difference is on the object than on the ground, for each of `STEPS`.
 
-    Counted in these photographs: well within the outline of what is the object for sure, and around that of what is
+    Counted in these photographs: well within the silhouette of what is the object for sure, and around that of what is
     perhaps.
     """
     counts = np.ones((2, len(STEPS) + 1))
-    for view, (sure, _, perhaps) in zip(seen, outlines, strict=True):
+    for view, (sure, _, perhaps) in zip(seen, silhouettes, strict=True):
         step = np.searchsorted(STEPS, view.left)
         around = _distance_px(~perhaps)
         for which, where in enumerate((_distance_px(sure) > 3, (around > 4) & (around < 40))):
@@ -306,14 +308,14 @@ def _distance_px(where: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
 
 
 def _mask(
-    view: Evidence, outlines: Sequence[Bool[np.ndarray, "H W"]], odds_of_step: Float[np.ndarray, "_"]
+    view: Evidence, silhouettes: Sequence[Bool[np.ndarray, "H W"]], odds_of_step: Float[np.ndarray, "_"]
 ) -> Bool[np.ndarray, "H W"]:
-    """Between the outlines of what is the object for sure and of what is perhaps, the pixels of the view decide.
+    """Between the silhouettes of what is the object for sure and of what is perhaps, the pixels of the view decide.
 
     That a place is likely the object counts as a pixel with odds of e; where a pixel shows nothing, this alone counts.
     """
     cv2 = opencv()
-    sure, likely, perhaps = outlines
+    sure, likely, perhaps = silhouettes
     odds = np.where(likely, 1.0, -1.0) + np.where(view.predicted, odds_of_step[np.searchsorted(STEPS, view.left)], 0.0)
     mask = (_distance_px(sure) > 2) | (perhaps & (cv2.GaussianBlur(odds, (0, 0), 1.0) > 0))
     return largest_pieces(cv2.medianBlur(mask.astype(np.uint8), SPECK_PX) > 0, MAIN_SHARE)
@@ -328,7 +330,7 @@ def _agreed(
     points = carve(views, found.center, found.half_side, HULL_VOXELS, allowed)
     agreed = []
     for view, mask in zip(seen, masks, strict=True):
-        hull = outline(view.camera, points, found.spacing)
+        hull = silhouette(view.camera, points, found.spacing)
         agreed.append(largest_pieces(np.where(view.predicted, mask, hull), MAIN_SHARE))
     return agreed
 

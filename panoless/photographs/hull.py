@@ -1,4 +1,4 @@
-"""A visual hull on points, coarse and at once: what masks in some views say of the outline in another."""
+"""A visual hull on points, coarse and at once: what masks in some views say of the silhouette in another."""
 
 from collections.abc import Sequence
 
@@ -77,7 +77,7 @@ def carve(
     return points[missed <= allowed]
 
 
-def outline(camera: Camera, points: Float[np.ndarray, "P 3"], spacing: float) -> Bool[np.ndarray, "H W"]:
+def silhouette(camera: Camera, points: Float[np.ndarray, "P 3"], spacing: float) -> Bool[np.ndarray, "H W"]:
     """Pixels that points of a grid cover, each as large as its cell."""
     cv2 = opencv()
     covered = np.zeros((camera.height, camera.width), np.uint8)

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from panoless.capture.masks import MAIN_SHARE, MASK_LEVEL, cut_sides, estimate_object_frame, largest_pieces
 from panoless.photographs.frames import block_means
-from panoless.photographs.hull import carve, outline, overlap, sighted_ball
+from panoless.photographs.hull import carve, overlap, sighted_ball, silhouette
 from panoless.photographs.lens import opencv
 from shinypartial.core.camera import Camera, project
 from shinypartial.core.errors import InputError
@@ -30,8 +30,8 @@ for a picture of 800 pixels."""
 ROUNDS = 3
 """Rounds of votes of views on masks, and of edges."""
 LEAST_OVERLAP = 0.7
-"""Overlap (intersection over union) of a view's mask and the hull's outline, in the median, below which poses and masks
-contradict each other."""
+"""Overlap (intersection over union) of a view's mask and the hull's silhouette, in the median, below which poses and
+masks contradict each other."""
 HULL_VOXELS = 96
 """Voxels of the visual hull along a side."""
 HULL_SPARE = 1.3
@@ -39,11 +39,11 @@ HULL_SPARE = 1.3
 TOLERATED = 0.1
 """Share of the masks that may be left out of the hull, where the others contradict them."""
 LEAST_FILLED = 0.95
-"""Share of the masks, in the median view, that the outline of their hull must fill."""
+"""Share of the masks, in the median view, that the silhouette of their hull must fill."""
 BAND = 0.03
-"""Half width of the band about an outline in which the edge is looked for, as a share of √area."""
+"""Half width of the band about a silhouette in which the edge is looked for, as a share of √area."""
 BAND_OF_TURN = 0.1
-"""So much more of √area, times the sine of the angle from the neighbor, where an outline is a neighboring view's."""
+"""So much more of √area, times the sine of the angle from the neighbor, where a silhouette is a neighboring view's."""
 VOTERS = 5
 """So many views, itself and its neighbors, decide on a mask before its edge is searched again."""
 CLICK_PX = 2
@@ -104,7 +104,7 @@ class Masks:
     origin: str
     names: tuple[str, ...]
     overlaps: tuple[float, ...]
-    """Of each mask with the outline of the hull of all."""
+    """Of each mask with the silhouette of the hull of all."""
 
 
 def hull_of(views: Sequence[tuple[Camera, Float[np.ndarray, "_ _"]]]) -> tuple[Float[np.ndarray, "P 3"], float]:
@@ -116,7 +116,7 @@ def hull_of(views: Sequence[tuple[Camera, Float[np.ndarray, "_ _"]]]) -> tuple[F
     for wrong in range(int(TOLERATED * len(views)) + 1):
         points = carve(inside, frame.center, half_side, HULL_VOXELS, wrong)
         filled = [
-            np.count_nonzero(outline(camera, points, spacing) & mask) / np.count_nonzero(mask)
+            np.count_nonzero(silhouette(camera, points, spacing) & mask) / np.count_nonzero(mask)
             for camera, mask in inside
         ]
         if np.median(filled) >= LEAST_FILLED:
@@ -142,7 +142,7 @@ def overlaps_of(
         )
     seen = tuple(views.values())
     points, spacing = hull_of(seen)
-    found = tuple(overlap(mask >= MASK_LEVEL, outline(camera, points, spacing)) for camera, mask in seen)
+    found = tuple(overlap(mask >= MASK_LEVEL, silhouette(camera, points, spacing)) for camera, mask in seen)
     if np.median(found) < LEAST_OVERLAP:
         raise InputError(
             expected=f"masks and poses that agree on an object: overlap of at least {LEAST_OVERLAP:.0%}",
@@ -334,7 +334,7 @@ def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
 
 
 def _band(shape: Bool[np.ndarray, "H W"], share: float, least_px: float = 2.0) -> UInt8[np.ndarray, "H W"]:
-    """GrabCut's trimap, which is open within a band about an outline."""
+    """GrabCut's trimap, which is open within a band about a silhouette."""
     cv2 = opencv()
     width = max(least_px, share * float(np.sqrt(np.count_nonzero(shape))))
     inside = cv2.distanceTransform(np.pad(shape, 1, mode="edge").astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]

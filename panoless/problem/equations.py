@@ -22,7 +22,7 @@ from panoless.numeric.gauss_newton import damped_step, normal_equations
 from panoless.numeric.robust import bounded_error, robust_scale, robust_weight
 from panoless.problem.blocks import Exposures, WhiteBalances
 from panoless.problem.nuisance import Nuisance
-from panoless.problem.observations import Pixels, is_saturated, outline_rays, solid_pixels
+from panoless.problem.observations import Pixels, is_saturated, silhouette_rays, solid_pixels
 from panoless.problem.parametric import MirrorHits, ParametricSurface, Silhouette
 from panoless.problem.rays import PixelRays
 from panoless.problem.rows import CHI_MEDIAN, CONTOUR_SIGMA_PX, CORRELATED, rows_of
@@ -37,7 +37,7 @@ LEAST_SIGMA = 0.005
 """Of a pixel (linear radiance)."""
 NOISE_MULTIPLE = 3.0
 """The robust scale of silhouettes is at least so many medians of their distances."""
-OUTLINE_POINTS = 20_000
+SILHOUETTE_POINTS = 20_000
 """Most contour points of all views."""
 INNER_PX = 1.5
 """Pixels nearer to the edge of their mask (px) mix object and background."""
@@ -98,7 +98,7 @@ class Data:
     """What a round is solved for."""
 
     pixels: Pixels | None
-    outlines: PixelRays
+    silhouettes: PixelRays
     cameras: StatedCameras
     settings: Round
     last: bool
@@ -109,8 +109,8 @@ class Data:
         """Of views, with maps of so many texels in the `last` round. Where blocks are `free`, masks may be wrong, and a
         saturated pixel has no radiance to divide by a gain.
         """
-        outlines = outline_rays(views, longest_only=True)
-        chosen = outlines.chosen(slice(None, None, max(1, len(outlines.size) // OUTLINE_POINTS)))
+        silhouettes = silhouette_rays(views, longest_only=True)
+        chosen = silhouettes.chosen(slice(None, None, max(1, len(silhouettes.size) // SILHOUETTE_POINTS)))
         pixels = solid_pixels(views, settings.rays) if settings.resolution else None
         if pixels is not None and free:
             kept = pixels.inner_px > INNER_PX
@@ -273,17 +273,17 @@ class Equations:
                 gradient = gradient - hidden @ (hidden.T @ gradient)
                 matrix = matrix - hidden @ (hidden.T @ matrix)
                 matrix = matrix - (matrix @ hidden) @ hidden.T
-        outlines = nuisance.moved(data.outlines, data.cameras)
-        silhouette = surface.silhouette(outlines)
-        distance = silhouette.pixels - nuisance.offsets_px(outlines.view)
+        silhouettes = nuisance.moved(data.silhouettes, data.cameras)
+        silhouette = surface.silhouette(silhouettes)
+        distance = silhouette.pixels - nuisance.offsets_px(silhouettes.view)
         least = CONTOUR_SCALE_PX if data.settings.resolution else data.settings.robust_scale
         scale = robust_scale(distance[silhouette.weights > 0], least, NOISE_MULTIPLE)
         weights = silhouette.weights * robust_weight(distance, scale) / CONTOUR_SIGMA_PX**2
-        rows, columns = beside(outlines, silhouette.by_motion[:, None], None)
-        by_outlines, of_outlines = normal_equations(
+        rows, columns = beside(silhouettes, silhouette.by_motion[:, None], None)
+        by_silhouettes, of_silhouettes = normal_equations(
             _jacobian(silhouette, rows[:, 0], columns, unknowns), distance, weights
         )
-        gradient, matrix = gradient + by_outlines, matrix + of_outlines
+        gradient, matrix = gradient + by_silhouettes, matrix + of_silhouettes
         start = 0
         for block in by_view:
             for view in range(views):
@@ -326,7 +326,7 @@ class Equations:
             total += 0.0 if seen is None else seen.projection.cost(seen.residual)
         else:
             total += 0.0 if seen is None or traced is None else seen.cost(self.data, state, traced)
-            rays = state.nuisance.moved(self.data.outlines, self.data.cameras)
+            rays = state.nuisance.moved(self.data.silhouettes, self.data.cameras)
             found = state.surface.silhouette(rays)
             distance = found.pixels - state.nuisance.offsets_px(rays.view)
         lost = np.where(found.valid, bounded_error(distance, self.scale_px), 1.0)

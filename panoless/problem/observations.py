@@ -1,4 +1,4 @@
-"""Pixels and outlines of all views as rays in the normalized frame."""
+"""Pixels and silhouettes of all views as rays in the normalized frame."""
 
 from dataclasses import dataclass
 
@@ -50,7 +50,7 @@ def solid_pixels(views: Views, count: int) -> Pixels:
     return Pixels(concatenated(rays), np.concatenate(radiance), np.concatenate(inner))
 
 
-def outline_rays(views: Views, *, longest_only: bool = False) -> PixelRays:
+def silhouette_rays(views: Views, *, longest_only: bool = False) -> PixelRays:
     """Rays through all contours of the masks, or through the longest of each."""
     contours = mask_contours(views, longest_only=longest_only)
     length = np.linalg.norm(contours.rays, axis=1)

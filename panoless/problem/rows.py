@@ -75,11 +75,11 @@ class Linearized:
     """Diagonal blocks of the Gauss–Newton matrix, with the prior: the preconditioner."""
 
     def backward(
-        self, seen: Float[np.ndarray, "P 3"], outlined: Float[np.ndarray, "S 1"], value: Float[np.ndarray, "B M"]
+        self, seen: Float[np.ndarray, "P 3"], of_silhouettes: Float[np.ndarray, "S 1"], value: Float[np.ndarray, "B M"]
     ) -> Float[np.ndarray, "B M"]:
         """Jᵀ W e of both terms, and P times a value."""
         count = len(value)
-        pulled = self.photographs.backward(seen, count) + self.silhouettes.backward(outlined, count)
+        pulled = self.photographs.backward(seen, count) + self.silhouettes.backward(of_silhouettes, count)
         return pulled + np.matmul(self.precision, value[..., None])[..., 0]
 
 

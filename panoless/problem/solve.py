@@ -35,7 +35,7 @@ SHARED_RESOLUTION = 64
 """Texels along a face side from which what all views share is free."""
 LEAST_VIEWS, MOST_VIEWS = 5, 400
 """With fewer, or with more, whose dense equations would need gigabytes, nothing beside the surface is an unknown."""
-OUTLINES = tuple(Round(0, scale, 0, 2) for scale in (4.0, 2.0, 1.0, 0.5))
+SILHOUETTES = tuple(Round(0, scale, 0, 2) for scale in (4.0, 2.0, 1.0, 0.5))
 """By silhouettes alone."""
 ROUNDS = (
     Round(16, 0.5, 30_000, 6),
@@ -82,16 +82,16 @@ def after_round(views: Views, surface: AnySurface, settings: Round, last: int) -
     return cast(AnySurface, take_round(views, State(surface, NO_NUISANCE), settings, last).surface)
 
 
-def by_outlines_alone(views: Views, surface: AnySurface) -> AnySurface:
+def by_silhouettes_alone(views: Views, surface: AnySurface) -> AnySurface:
     """A surface by silhouettes alone, from cameras as stated."""
-    return cast(AnySurface, by_outlines(views, surface, NO_NUISANCE).surface)
+    return cast(AnySurface, by_silhouettes(views, surface, NO_NUISANCE).surface)
 
 
-def by_outlines(views: Views, surface: ParametricSurface, nuisance: Nuisance) -> State:
+def by_silhouettes(views: Views, surface: ParametricSurface, nuisance: Nuisance) -> State:
     """A surface and cameras by silhouettes alone."""
     state = State(surface, nuisance)
     with improving():
-        for settings in OUTLINES:
+        for settings in SILHOUETTES:
             state = take_round(views, state, settings, FINISH.resolution)
     return state
 
@@ -116,7 +116,7 @@ def solve(
 
     progress = Progress("solving for cameras, exposures and masks", len(rounds) + 2)
     usual = [kind for kind in kinds if kind is not Distortion]
-    state = by_outlines(views, surface, nuisance_of(views, usual, around))
+    state = by_silhouettes(views, surface, nuisance_of(views, usual, around))
     if begin is not None:
         state = replace(state, surface=begin(state))
     progress.advance()

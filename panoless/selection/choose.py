@@ -39,17 +39,17 @@ NONE_HELD_OUT = "too few views to hold one out"
 LARGEST_SILHOUETTE_PX = 0.5
 """A candidate's silhouette lies at most this far from the masks' contours: median over views of the median."""
 LEAST_NEAR_OVERLAP = 0.98
-"""Its silhouette and the masks share at least this part of their union: median over views. Both are for outlines
+"""Its silhouette and the masks share at least this part of their union: median over views. Both are for silhouettes
 that agree with each other. Where they contradict each other a candidate may be farther from them by as much."""
 FARTHEST = 4.0
-"""What is farther off than so many times either is not near, however much outlines contradict each other: wrong
+"""What is farther off than so many times either is not near, however much silhouettes contradict each other: wrong
 cameras make them do so, too, and are turned."""
 BENT_EDGE = 2.0
 """What a kind refines may be farther from the masks by this factor: its edge bends, too."""
 LARGEST_ERROR = 0.3
 """A candidate that leaves more of the held-out views unexplained is refused, unless no later kind explains more."""
 DOUBTED_ERROR = 0.15
-"""Where a candidate leaves more, later ones are examined, too, unless outlines determine its whole shape."""
+"""Where a candidate leaves more, later ones are examined, too, unless silhouettes determine its whole shape."""
 DOUBTED_SHARE = 0.5
 """One of those is preferred where it leaves less than this share of that."""
 LEAST_OVERLAP = 0.75
@@ -64,8 +64,8 @@ def choose_geometry(views: Views, config: FitConfig) -> tuple[Geometry, Selectio
 
     Candidates are examined from the simplest on. One is refused when it misses the silhouettes, or when a kind that
     refines it explains held-out views clearly better. One that leaves more than right ones do is taken unless one after
-    it leaves much less, or at once where outlines determine its whole shape. One that leaves too much waits until all
-    others are refused; of those the one that leaves least is taken. `config.model` overrides.
+    it leaves much less, or at once where silhouettes determine its whole shape. One that leaves too much waits until
+    all others are refused; of those the one that leaves least is taken. `config.model` overrides.
     Raises InputError when a kind is requested and can't be proposed, and when the silhouettes refuse all kinds.
     """
     if config.model != ANY:
@@ -203,7 +203,7 @@ def begun_over(
 
 def _turned(source: Family, views: Views, first: Proposal, config: FitConfig) -> Start | None:
     """A proposal under cameras that are turned by silhouettes; None where it is hardly nearer to the masks."""
-    poses = source.by_outlines(views, first, nuisance_kinds(config)[0], config)
+    poses = source.poses_by_silhouettes(views, first, nuisance_kinds(config)[0], config)
     again = proposed(source, poses.moved(views), config)
     if again is None or again.silhouette_px > LARGEST_SHARE_LEFT * first.silhouette_px:
         return None
@@ -213,7 +213,7 @@ def _turned(source: Family, views: Views, first: Proposal, config: FitConfig) ->
 def is_near(start: Start, views: Views, config: FitConfig, *, bent: bool) -> bool:
     """Whether a proposal explains the silhouettes, or would where a kind that refines it bends its edge.
 
-    Outlines that contradict each other miss any shape. By d pixels, they leave the share d · length / area of the
+    Silhouettes that contradict each other miss any shape. By d pixels, they leave the share d · length / area of the
     object to one side alone.
     """
     proposal, farther = start.proposal, BENT_EDGE if bent else 1.0
@@ -224,11 +224,11 @@ def is_near(start: Start, views: Views, config: FitConfig, *, bent: bool) -> boo
     if away > FARTHEST * outside or apart > FARTHEST * missed:
         return False
     error_px = contradiction_px(views if start.poses is None else start.poses.moved(views))
-    return away <= outside + error_px and apart <= missed + error_px * _outline_share(views)
+    return away <= outside + error_px and apart <= missed + error_px * _silhouette_share(views)
 
 
-def _outline_share(views: Views) -> float:
-    """Length of the outline over the area of the object, in pixels: median over views."""
+def _silhouette_share(views: Views) -> float:
+    """Length of the silhouette over the area of the object, in pixels: median over views."""
     shares = [
         float(((distance := silhouette_distance_px(view.mask)) < 0).logical_and(distance > -1).sum())
         / float((distance < 0).sum().clamp(min=1))

@@ -41,7 +41,7 @@ PART_CELLS = 24
 PART_UNEXPLAINED = 0.6
 """A place is not explained from this share of the light on that a matte object would leave unexplained."""
 SHIFT_SCALE_PX = 0.5
-"""Distance of outlines after a shift (px) beyond which they lose their say in it, or…"""
+"""Distance of silhouettes after a shift (px) beyond which they lose their say in it, or…"""
 SHIFT_MEDIANS = 3.0
 """…so many times the median distance."""
 SHIFT_ROUNDS = 5
@@ -112,7 +112,7 @@ class Evidence:
     surplus: float = 0.0
     """Pixels well outside the masks that the fitted surface covers, over those of the masks: mean over views."""
     mask_offset_px: float = 0.0
-    """By which the fit moved the outlines of all masks outward."""
+    """By which the fit moved the silhouettes of all masks outward."""
     exposure_stops: float = 0.0
     """Standard deviation of the exposures of the views, as far as the fit took it back."""
     white_balance_stops: float = 0.0
@@ -188,12 +188,12 @@ def gather_evidence(
 def _rim_px(
     ball: BallEvidence | None, geometry: Geometry, silhouette_px: float, light: dict[str, float | None]
 ) -> float | None:
-    """That of a capture; of a kind that outlines determine and of which no view is held out, how far these are off."""
+    """That of a capture; of a kind that silhouettes determine and without held-out views, how far these are off."""
     if ball is not None:
         return ball.rim_px
     family = FAMILIES.get(geometry.kind)
-    by_outlines = family is not None and family.silhouettes_suffice
-    return silhouette_px if by_outlines and light["unexplained"] is None else None
+    by_silhouettes = family is not None and family.silhouettes_suffice
+    return silhouette_px if by_silhouettes and light["unexplained"] is None else None
 
 
 def _median(values: Float[np.ndarray, "V"]) -> float:
@@ -288,7 +288,7 @@ def _predicting_map(areas: Sequence[PixelFootprints], config: FitConfig) -> Floa
 
 
 class _Silhouette(NamedTuple):
-    """How far the outlines of fit and mask differ in a view."""
+    """How far the silhouettes of fit and mask differ in a view."""
 
     distance_px: float
     """Median of the contours' distances."""
@@ -303,7 +303,7 @@ class _Silhouette(NamedTuple):
 
 
 def _silhouette(view: TrainView, surface: SurfaceBuffers) -> _Silhouette:
-    """What the outlines of fit and mask have in common.
+    """What the silhouettes of fit and mask have in common.
 
     A pixel near the fitted contour has the mask's signed distance less the fitted one; a shift t changes it by n·t.
     Where both fill the picture there is no contour to compare; where one fills it, or is not in it, all is wrong.
@@ -331,7 +331,7 @@ def _silhouette(view: TrainView, surface: SurfaceBuffers) -> _Silhouette:
 
 
 def _shift(normals: Float[np.ndarray, "P 2"], away: Float[np.ndarray, "P"]) -> Float[np.ndarray, "2"]:
-    """min Σ ρ(a − n·t) over shifts t (px): a dent that a wrong mask has in a part of its outline is no shift."""
+    """min Σ ρ(a − n·t) over shifts t (px): a dent that a wrong mask has in a part of its silhouette is no shift."""
     weight, shift = np.ones_like(away), np.zeros(2)
     for _ in range(SHIFT_ROUNDS):
         root = np.sqrt(weight)

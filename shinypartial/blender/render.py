@@ -51,7 +51,7 @@ from shinypartial.scene import BlendFile, SceneSpec
 PROBE_PASSES = (COLOR_CHANNELS[0],)
 #: With more samples every pixel is path traced, which has no limit but time.
 MOST_SAMPLES_OF_MIRRORS = 512
-#: Cosine from which a normal faces away from the camera; at outlines, interpolated normals come to 0.01.
+#: Cosine from which a normal faces away from the camera; at silhouettes, interpolated normals come to 0.01.
 LEAST_AWAY = 0.02
 SPARSE_ATTEMPTS = 3
 
@@ -252,7 +252,7 @@ def _from_passes(passes: Passes, meets_scene: Bool[np.ndarray, "H W"]) -> Render
 def _turned_to(camera: Camera, view: RenderedView) -> RenderedView:
     """The view with each normal that faces away from the middle of aperture and exposure turned until it faces aside.
 
-    Other points of the aperture and moments of the exposure see a little farther around the outline.
+    Other points of the aperture and moments of the exposure see a little farther around the silhouette.
     """
     rays = ray_directions_world(camera)
     away = np.maximum(np.sum(view.normals_world * rays, -1, keepdims=True), 0)

@@ -27,7 +27,7 @@ LEVEL_TOLERANCE = 1
 UNIT_TOLERANCE = 0.05
 #: Interpolated normals may turn a little away from the ray.
 FACING_TOLERANCE = 0.1
-#: Creases and outlines are a small share; normals in another frame or encoding are wrong nearly everywhere.
+#: Creases and silhouettes are a small share; normals in another frame or encoding are wrong nearly everywhere.
 TOLERATED_SHARE = 0.1
 #: What the recipe of a folder names that was made of another one, and the command that made it. A lit copy also keeps
 #: what the recipe of its source names, so the first that is there counts.
@@ -136,7 +136,7 @@ def _check_alpha(root: Path, frame: Frame, view: View) -> Iterator[Violation]:
 
 
 def _check_normals(root: Path, frame: Frame, solid: Bool[np.ndarray, "H W"]) -> Iterator[Violation]:
-    """Unit world normals that face the camera, but at creases and outlines; `read_view` has judged the file."""
+    """Unit world normals that face the camera, but at creases and silhouettes; `read_view` has judged the file."""
     name = _name(root, frame.normal_png)
     decoded: Float[np.ndarray, "P 3"] = read_png(frame.normal_png)[solid][:, :3] * (2 / 255) - 1
     facing = (decoded * ray_directions_world(frame.camera)[solid]).sum(-1)

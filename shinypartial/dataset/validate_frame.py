@@ -22,7 +22,7 @@ from shinypartial.io.images import read_exr, read_png, stack_channels
 
 #: Float32 rounding of a renormalized vector is 1e-7; a normal read from 8 bits would be off by 1e-2.
 UNIT_TOLERANCE = 1e-4
-#: A mean normal at the outline may turn a little away from the ray through the pixel center.
+#: A mean normal at the silhouette may turn a little away from the ray through the pixel center.
 FACING_TOLERANCE = 0.1
 #: Both sides round to 8 bits, one of them from half precision.
 LEVEL_TOLERANCE = 1

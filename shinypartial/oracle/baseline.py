@@ -130,7 +130,7 @@ def _read_rays(data: Dataset, progress: Progress) -> Rays:
 def rays_of_view(frame: Frame) -> Rays:
     """What the pixels of one training view see by mirror reflection at the ground-truth normal.
 
-    Pixels on the outline and, where the dataset knows them, pixels that see the object itself are left out.
+    Pixels on the silhouette and, where the dataset knows them, pixels that see the object itself are left out.
     """
     view = read_view(frame)
     normals = require_normals(frame, view)

@@ -71,15 +71,14 @@ class Candidate:
     """A kind of model that was considered, the evidence for it, and what became of it; None: not measured.
 
     `silhouette_px` is its distance from the silhouettes, `overlap` the intersection over union with the masks,
-    `held_out_error` its error on views that were left out of the fit, `alternative_error` that of the
-    freer kind that it was compared with, `camera_turn_deg` by how much it turned the cameras in the median, where their
-    poses were unknowns, `mask_offset_px` by how much it moved the outlines of all masks outward, and `exposure_stops`
-    the standard deviation of the views' exposures where it found them, `white_balance_stops` that of their channels
-    from the mean of a view. `focal_factor` is the focal length of all views over what is said of it where that was an
-    unknown, `focal_uncertainty` its standard deviation, `k1` and `k1_uncertainty` the same of a radial distortion in
-    OpenCV's model, and `principal_point_px` how far to the right and below of what is said
-    it found the principal point. `mask_spread_px` is the standard deviation of the offsets of single masks, `blocks`
-    lists what was unknown beside the model. `verdict` is a word such as "chosen" or "rejected", `reason` says why.
+    `held_out_error` its error on views that were left out of the fit, `alternative_error` that of the freer kind
+    that it was compared with. Where these were unknowns: `camera_turn_deg` is the median turn of the cameras,
+    `mask_offset_px` the shift outward of the silhouettes of all masks, `mask_spread_px` the standard deviation of
+    single masks' offsets, `exposure_stops` that of the views' exposures, `white_balance_stops` that of their channels
+    from the mean of a view. `focal_factor` is the focal length over the stated one, `focal_uncertainty` its standard
+    deviation; `k1` and `k1_uncertainty` are those of a radial distortion in OpenCV's model; `principal_point_px` is
+    the principal point, right of and below the stated one. `blocks` lists what was unknown beside the model. `verdict`
+    is a word such as "chosen" or "rejected", `reason` says why.
     """
 
     kind: Text

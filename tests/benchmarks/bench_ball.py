@@ -3,7 +3,7 @@
 Each recipe is filmed once (a folder that is there is used as it is); then `panoless capture --object ball` works on 1,
 2, 3, 6 and 12 of its poses, with all exposures of each. What it finds is compared with the truth:
 
-- **outline**: the ball's ellipse by the captured camera against that by the true one, in pixels of the photograph;
+- **silhouette**: the ball's ellipse by the captured camera against that by the true one, in pixels of the photograph;
 - **rotation**: turns between captured and true cameras after the best common rotation, in degrees;
 - **position**: how far cameras are off after that rotation, in radii of the ball;
 - **fit**: scores of `panoless fit` on that dataset, unless `--no-fit`.
@@ -144,7 +144,7 @@ def chosen(poses: list[list[Path]], count: int) -> list[Path]:
 
 
 def ellipse(camera: Camera, radius: float) -> tuple[Float[np.ndarray, "2"], float]:
-    """Center, in pixels, and √(ab) of the outline of a ball about the origin, a and b the half axes.
+    """Center, in pixels, and √(ab) of the silhouette of a ball about the origin, a and b the half axes.
 
     In rays the cone is xᵀ(c cᵀ − (|c|² − r²) I) x = 0, c the ball's center in the camera's frame; C is that of pixels,
     K⁻ᵀ(…)K⁻¹ = [[A, b], [bᵀ, f]]. Its center is −A⁻¹b, and √(ab) = √|f − bᵀA⁻¹b| / |det A|^¼.
@@ -158,7 +158,7 @@ def ellipse(camera: Camera, radius: float) -> tuple[Float[np.ndarray, "2"], floa
     return center, float(np.sqrt(np.abs(f + b @ center)) / np.abs(np.linalg.det(a)) ** 0.25)
 
 
-def outline_errors(aligned: Dataset, truth: Dataset) -> tuple[list[float], list[float]]:
+def silhouette_errors(aligned: Dataset, truth: Dataset) -> tuple[list[float], list[float]]:
     """Of each view: how far the ellipse's center is off, and its radius, in pixels of the true camera's picture."""
     radius = truth.object_radius
     assert radius is not None
@@ -198,7 +198,7 @@ def _compared(name: str, folder: Path, poses: list[list[Path]], count: int, opti
     except InputError as error:
         raise CommandError("align", str(error)) from None
     truth = open_dataset(folder / TRUTH)
-    centers, radii = outline_errors(open_dataset(aligned), truth)
+    centers, radii = silhouette_errors(open_dataset(aligned), truth)
     distances = {frame.stem.name: np.linalg.norm(frame.camera.position_world) for frame in truth.train}
     assert truth.object_radius is not None
     positions = [

@@ -26,7 +26,7 @@ AXES = {"+X": (1, 0, 0), "-X": (-1, 0, 0), "+Y": (0, 1, 0), "-Y": (0, -1, 0), "+
 MEDIAN_TOLERANCE = 0.001
 #: Measured: 0.0161, at the poles only, where Blender blends the first row with the last within half a texel.
 LARGEST_TOLERANCE = 0.02
-#: Away from the poles, measured 0.0048 at the outline, where a pixel spans many directions.
+#: Away from the poles, measured 0.0048 at the silhouette, where a pixel spans many directions.
 AWAY_FROM_POLES_TOLERANCE = 0.008
 
 

@@ -1,4 +1,4 @@
-"""Small surfaces with known normals, and outlines that are not convex."""
+"""Small surfaces with known normals, and silhouettes that are not convex."""
 
 import numpy as np
 

@@ -91,7 +91,7 @@ def dished_jar() -> Vessel:
 
 
 def plate() -> Vessel:
-    """A plate with a wide brim and a flat middle, without a wall that outlines show: its inside slopes by up to 30°."""
+    """A plate with a wide brim and a flat middle, without a wall that silhouettes show: its inside slopes by 30°."""
     outer = np.stack([np.linspace(0.5, 0.9, 80), 0.22 * np.linspace(0, 1, 80) ** 2 - 0.2], 1)
     floor = np.linspace([0.0, -0.2], [0.5, -0.2], 3)
     x = np.linspace(1.0, 0.0, 120)

@@ -94,7 +94,7 @@ class Scored:
 
 @dataclass(frozen=True)
 class Patch:
-    """A part of a surface under which a concavity may lie: its relief, an outline, and the pixels that see it."""
+    """A part of a surface under which a concavity may lie: its relief, its rim, and the pixels that see it."""
 
     relief: Relief
     size: float
@@ -180,7 +180,7 @@ def unexplained_patches(chart: Chart, surface: LevelSet, settled: LevelSet, pixe
     they do nowhere, the whole again if they still disagree in the mean under a surface that is `settled`.
     """
     relief = Relief(surface, chart)
-    size, waves = outline_of(relief)
+    size, waves = rim_of(relief)
     whole = patch_inside(relief, size, waves, pixels)
     if whole is None:
         return
@@ -233,7 +233,7 @@ def chart_about(points: Float[np.ndarray, "P 3"], normals: Float[np.ndarray, "P 
 
 
 def patch_inside(relief: Relief, size: float, waves: Float[np.ndarray, "4"], pixels: Pixels) -> Patch | None:
-    """The part inside an outline that faces the chart; None where too few pixels see it."""
+    """The part inside a rim that faces the chart; None where too few pixels see it."""
     final = FinalRays.of(relief.surface, pixels.rays, 0)
     place = relief.chart.coordinates(final.points)
     share = Concavity.bowl(size, waves, 1.0).share(place[:, 0], place[:, 1])
@@ -245,7 +245,7 @@ def patch_inside(relief: Relief, size: float, waves: Float[np.ndarray, "4"], pix
     return Patch(relief, size, waves, Scored(pixels.rays.chosen(chosen), pixels.radiance[chosen]))
 
 
-def outline_of(relief: Relief) -> tuple[float, Float[np.ndarray, "4"]]:
+def rim_of(relief: Relief) -> tuple[float, Float[np.ndarray, "4"]]:
     """Size and waves of the part about the middle whose normals stay within `LID_ANGLE_DEG` of the chart's."""
     step = 2 * HALF_SIDE / (SIDE - 1)
     slope = np.hypot(*np.gradient(np.where(np.isfinite(relief.heights), relief.heights, -1e3), step))

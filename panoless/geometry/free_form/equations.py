@@ -5,17 +5,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from panoless.geometry.free_form.motions import outline_motion_rows
+from panoless.geometry.free_form.motions import silhouette_motion_rows
 from panoless.geometry.free_form.surface import LEAST_SLOPE, LevelSet
 from panoless.kernels.level_set import add_rows, add_squares, apply_rows, evaluate
 from panoless.numeric.robust import bounded_error, robust_weight
 from panoless.problem.nuisance import Nuisance
 from panoless.problem.rays import PixelRays
 
-OUTLINE_SCALE_PX = 2.0
-"""Robust scale of outlines."""
+SILHOUETTE_SCALE_PX = 2.0
+"""Robust scale of silhouettes."""
 MISS_WEIGHT = 3.0
-"""Weight of a pixel on the object that misses the surface, against an outline's point of gain one."""
+"""Weight of a pixel on the object that misses the surface, against a silhouette's point of gain one."""
 MISS_SCALE_PX = 20.0
 """Its robust scale."""
 GAUGE = 10.0
@@ -58,21 +58,21 @@ def joined_rows(one: Rows, other: Rows) -> Rows:
 
 def silhouette_rows(
     surface: LevelSet,
-    outlines: PixelRays,
+    silhouettes: PixelRays,
     missed: PixelRays,
-    outline_weight: float,
+    silhouette_weight: float,
     miss_weight: float,
     nuisance: Nuisance,
 ) -> tuple[Rows, Float[np.ndarray, "S 1 6"]]:
-    """Outlines, along whose rays the least φ should be δ, and pixels on the object that miss it, for which it should be
-    no more; and how both change with (ω, τ) of their rays.
+    """Silhouettes, along whose rays the least φ should be δ, and pixels on the object that miss it, for which it should
+    be no more; and how both change with (ω, τ) of their rays.
 
     The residual is φ/(‖∇φ‖ a t) − δ where φ is least, in pixels, with a the pixel's angle, t the distance and δ the
     offset of the view's mask.
     """
     parts = []
     for rays, weight, scale, one_sided in (
-        (outlines, outline_weight, OUTLINE_SCALE_PX, False),
+        (silhouettes, silhouette_weight, SILHOUETTE_SCALE_PX, False),
         (missed, miss_weight * MISS_WEIGHT, MISS_SCALE_PX, True),
     ):
         near = surface.nearest(rays.origins, rays.directions)
@@ -84,7 +84,7 @@ def silhouette_rows(
         weights = weight * counted * robust_weight(residual, scale)
         cost = weight * scale**2 * float(np.where(near.met, bounded_error(residual, scale), 1.0).sum())
         distance = np.where(near.met, near.distance, 0.0) / surface.spacing
-        by_motion = outline_motion_rows(near.derivatives[:, 1:4], rays.directions, distance, by_value)
+        by_motion = silhouette_motion_rows(near.derivatives[:, 1:4], rays.directions, distance, by_value)
         by_motion[..., 3:] /= surface.spacing
         parts.append((near.places, by_value, residual, weights, by_motion, cost))
     places, by_value, residual, weights, by_motion = (np.concatenate([part[k] for part in parts]) for k in range(5))

@@ -17,7 +17,7 @@ from panoless.environment.resolution import prediction_error
 from panoless.environment.solve import solve_environment
 from panoless.geometry.free_form.concave import concave_start
 from panoless.geometry.free_form.photometric import INNER_PX, LEAST_COSINE, Linearization, ReflectedRays
-from panoless.geometry.free_form.schedule import OUTLINE_GAIN, Round, Schedule
+from panoless.geometry.free_form.schedule import SILHOUETTE_GAIN, Round, Schedule
 from panoless.geometry.free_form.steps import DAMPING, solved_equations, take_steps, with_noise
 from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.task import make_task
@@ -97,11 +97,11 @@ def fit_free_form(
     nuisance: Nuisance = NO_NUISANCE,
     required: Collection[str] = (),
 ) -> tuple[FitStage, list[Decision]]:
-    """The surface that explains photographs and outlines best, no finer than held-out views want it, with the nuisance
-    blocks that the scene needs; and what was decided of each.
+    """The surface that explains photographs and silhouettes best, no finer than held-out views want it, with the
+    nuisance blocks that the scene needs; and what was decided of each.
 
     Rounds are taken with four fifths of the views as long as the others gain by them, and the last of those once more
-    with all, in which outlines count more where photographs agree with them. After the rounds that are always taken,
+    with all, in which silhouettes count more where photographs agree with them. After the rounds that are always taken,
     concavities are searched, blocks that are not `required` are removed unless they are needed, parts that pixels
     distrust are refitted, and details are searched where much is left. Concavities are searched under the start, and if
     it has none, under the `caps`, other first surfaces.
@@ -277,7 +277,7 @@ def take_round(
     *,
     last: bool = False,
 ) -> FitStage:
-    """A stage after the steps of a round; in the `last` one outlines count more where photographs agree with them."""
+    """A stage after the steps of a round; in the `last` one silhouettes count more if photographs agree with them."""
     surface, nuisance = stage.surface, stage.nuisance
     if settings.robust_scale > SHARED_SCALE:
         stage = replace(stage, nuisance=nuisance.under_coarse(settings.resolution))
@@ -289,8 +289,8 @@ def take_round(
     linearization = Linearization.at(task, surface, stage.trust, stage.environment, FIRST_MAP_ROUNDS, stage.nuisance)
     if stage.nuisance.free:
         linearization = with_noise(linearization)
-    elif last and linearization.outlines_agree:
-        linearization = replace(linearization, task=task.outlined(OUTLINE_GAIN))
+    elif last and linearization.silhouettes_agree:
+        linearization = replace(linearization, task=task.with_silhouette_gain(SILHOUETTE_GAIN))
     linearization, damping = take_steps(linearization, stage.damping, progress)
     found = replace(
         stage,

@@ -165,7 +165,7 @@ class FreeFormMirror(ExactGeometry):
         return free_form_light(self.surface, environment, camera, pixels, normals_camera)
 
     def buffers(self, camera: RasterCamera) -> SurfaceBuffers:
-        """By intersection; alpha by a grid of rays at outlines."""
+        """By intersection; alpha by a grid of rays at silhouettes."""
         return free_form_buffers(self.surface, camera)
 
     def mesh(self, frame: ObjectFrame) -> Mesh:

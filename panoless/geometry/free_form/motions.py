@@ -35,7 +35,7 @@ def pixel_motion_rows(
     return np.concatenate([by_turn, by_shift], 2)
 
 
-def outline_motion_rows(
+def silhouette_motion_rows(
     gradient: Float[np.ndarray, "P 3"],
     directions: Float[np.ndarray, "P 3"],
     distance: Float[np.ndarray, "P"],

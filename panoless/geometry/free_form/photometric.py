@@ -16,7 +16,7 @@ from panoless.geometry.free_form.equations import Rows, gauge_rows, joined_rows,
 from panoless.geometry.free_form.map import smoothed_map, splatted_map
 from panoless.geometry.free_form.motions import pixel_motion_rows
 from panoless.geometry.free_form.surface import Hits, LevelSet
-from panoless.geometry.free_form.task import OUTLINE_SIGMA_PX, RADIANCE_SIGMA, Task
+from panoless.geometry.free_form.task import RADIANCE_SIGMA, SILHOUETTE_SIGMA_PX, Task
 from panoless.geometry.free_form.trust import Trust
 from panoless.kernels.level_set import (
     mirror_rows,
@@ -34,7 +34,7 @@ from panoless.problem.rays import PixelRays
 from panoless.problem.rows import BlockRows, Linearized, rows_of
 
 INNER_PX = 1.5
-"""Pixels nearer to the outline of their mask are left out: they mix two things."""
+"""Pixels nearer to the silhouette of their mask are left out: they mix two things."""
 LEAST_COSINE = 0.12
 """Between the ray and the surface's normal, for a pixel to count for the shape."""
 PHOTON_SHARE = 0.75
@@ -46,8 +46,8 @@ BAND_CELLS = 3.5
 PHOTOGRAPH_CURVATURE = 0.5
 """Factor of the photographs' part of the Gauss–Newton matrix where the surface alone is unknown: their cost bends less
 where the map follows."""
-AGREED_OUTLINE_PX = 0.1
-"""Photographs and masks agree where the outlines are this near to those of the masks…"""
+AGREED_SILHOUETTE_PX = 0.1
+"""Photographs and masks agree where the silhouettes are this near to those of the masks…"""
 AGREED_PULL_PX = 0.01
 """…and pulled no more than this."""
 
@@ -190,7 +190,7 @@ class Linearization:
 
     @property
     def silhouettes(self) -> Rows:
-        """Outlines and missed pixels."""
+        """Silhouettes and missed pixels."""
         return self._silhouettes[0]
 
     @cached_property
@@ -206,33 +206,33 @@ class Linearization:
 
     @cached_property
     def _silhouette_rays(self) -> tuple[PixelRays, PixelRays]:
-        """Of outlines, and of pixels that miss the surface."""
-        outlines = self.nuisance.moved(self.task.outlines, self.task.cameras)
-        return outlines, self.rays.chosen(~self.reflected.hits.met)
+        """Of silhouettes, and of pixels that miss the surface."""
+        silhouettes = self.nuisance.moved(self.task.silhouettes, self.task.cameras)
+        return silhouettes, self.rays.chosen(~self.reflected.hits.met)
 
     @cached_property
     def _silhouettes(self) -> tuple[Rows, Float[np.ndarray, "S 1 6"]]:
-        sigmas = RADIANCE_SIGMA / OUTLINE_SIGMA_PX
+        sigmas = RADIANCE_SIGMA / SILHOUETTE_SIGMA_PX
         return silhouette_rows(
             self.surface,
             *self._silhouette_rays,
-            self.task.outline_weight,
+            self.task.silhouette_weight,
             self.task.photograph_weight * sigmas**2,
             self.nuisance,
         )
 
     @property
-    def outlines_agree(self) -> bool:
-        """Whether outlines lie within `AGREED_OUTLINE_PX` of their masks' in the median, and within `AGREED_PULL_PX` in
-        the median over views of the median with a sign, which wrong masks move.
+    def silhouettes_agree(self) -> bool:
+        """Whether silhouettes lie within `AGREED_SILHOUETTE_PX` of their masks' in the median, and within
+        `AGREED_PULL_PX` in the median over views of the median with a sign, which wrong masks move.
         """
-        view = self.task.outlines.view
+        view = self.task.silhouettes.view
         met = self.silhouettes.weights[: len(view)] > 0
         if not met.any():
             return False
         view, apart = view[met], self.silhouettes.residual[: len(view), 0][met]
         pulled = np.median([np.median(apart[view == each]) for each in np.unique(view)])
-        return bool(np.median(np.abs(apart)) <= AGREED_OUTLINE_PX and abs(pulled) <= AGREED_PULL_PX)
+        return bool(np.median(np.abs(apart)) <= AGREED_SILHOUETTE_PX and abs(pulled) <= AGREED_PULL_PX)
 
     @cached_property
     def gauge(self) -> Rows:
@@ -328,7 +328,7 @@ class Linearization:
             seen = self._surroundings_rows[..., block.surroundings_columns]
         else:
             seen = rows_of(block, self.rays, cameras, self._motion_rows, self._light)
-        return seen, rows_of(block, self._outlined, cameras, self._silhouettes[1])
+        return seen, rows_of(block, self._all_silhouette_rays, cameras, self._silhouettes[1])
 
     @cached_property
     def _surroundings_rows(self) -> Float[np.ndarray, "P 3 D"]:
@@ -336,7 +336,7 @@ class Linearization:
         return self.surface.surroundings.rows(self.slopes, self.points, self.reflected.mirrored)
 
     @cached_property
-    def _outlined(self) -> PixelRays:
+    def _all_silhouette_rays(self) -> PixelRays:
         """The rays of silhouettes in one."""
         return concatenated(list(self._silhouette_rays))
 
@@ -348,9 +348,9 @@ class Linearization:
 
     def _of_views(self, blocks: Sequence[Block]) -> Linearized:
         count = len(blocks[0].values)
-        seen, outlined = (np.concatenate(each, 2) for each in zip(*map(self._rows_of, blocks), strict=True))
+        seen, silhouette_rows = (np.concatenate(each, 2) for each in zip(*map(self._rows_of, blocks), strict=True))
         photographs = BlockRows(self.rays.view, seen, self.photographs.weights)
-        silhouettes = BlockRows(self._outlined.view, outlined, self.silhouettes.weights)
+        silhouettes = BlockRows(self._all_silhouette_rays.view, silhouette_rows, self.silhouettes.weights)
         precision = self.task.prior_factor * block_diagonal([each.precision for each in blocks])
         matrix = photographs.blocks(count) + silhouettes.blocks(count) + precision
         return Linearized(
@@ -359,11 +359,11 @@ class Linearization:
 
     def _of_all(self, blocks: Sequence[Block]) -> Linearized:
         photographs, silhouettes = self.photographs, self.silhouettes
-        seen, outlined = (np.concatenate(each, 2) for each in zip(*map(self._rows_of, blocks), strict=True))
+        seen, silhouette_rows = (np.concatenate(each, 2) for each in zip(*map(self._rows_of, blocks), strict=True))
         seen = seen * (photographs.weights > 0)[:, None, None]
         beyond = np.stack([self.beyond_map(np.ascontiguousarray(column)) for column in np.moveaxis(seen, 2, 0)], 2)
         all_alike = [np.zeros(len(each.weights), int) for each in (photographs, silhouettes)]
-        of_silhouettes = BlockRows(all_alike[1], outlined, silhouettes.weights)
+        of_silhouettes = BlockRows(all_alike[1], silhouette_rows, silhouettes.weights)
         matrix = np.einsum("pck,p,pcl->kl", seen, photographs.weights, beyond) + of_silhouettes.blocks(1)[0]
         precision = self.task.prior_factor * block_diagonal([each.precision for each in blocks])
         value = np.concatenate([each.values for each in blocks], 1)
@@ -375,9 +375,9 @@ class Linearization:
         shape, constrained = self.surface.shape, self.constraints.residual
         total = self.photographs.backward(self._unexplained, shape)
         total += self.constraints.backward(constrained, shape)
-        outlined = self.silhouettes.residual
+        apart = self.silhouettes.residual
         return (total + self.bent) * self.active, [
-            each.backward(self._unexplained, outlined, each.value) for each in self.beside
+            each.backward(self._unexplained, apart, each.value) for each in self.beside
         ]
 
     def product(

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from panoless.capture.rays import pose_of
-from panoless.geometry.base import SurfaceBuffers, beside_outline, buffers_from_arrays
+from panoless.geometry.base import SurfaceBuffers, beside_silhouette, buffers_from_arrays
 from panoless.geometry.exact import shade_centers
 from panoless.geometry.free_form.photometric import ReflectedRays
 from panoless.geometry.free_form.spread import FinalRays
@@ -18,7 +18,7 @@ from panoless.kernels.cubemap import sample_cubemap
 from panoless.problem.rays import PixelRays
 
 SAMPLES = 4
-"""Rays along a side of a pixel at an outline, and where mirrored rays turn far or meet the surface again."""
+"""Rays along a side of a pixel at a silhouette, and where mirrored rays turn far or meet the surface again."""
 DIRECTIONS = 4
 """Mirrored rays over the other pixels."""
 WIDEST_TURN_RAD = 0.15
@@ -39,7 +39,7 @@ def free_form_buffers(surface: LevelSet, camera: RasterCamera) -> SurfaceBuffers
     hits = surface.hits(rays.origins, rays.directions)
     distance, normals = np.where(hits.met, hits.distance, 0.0), hits.normals
     alpha = hits.met.astype(np.float64)
-    mixed = np.flatnonzero(beside_outline(hits.met.reshape(shape)))
+    mixed = np.flatnonzero(beside_silhouette(hits.met.reshape(shape)))
     alpha[mixed] = coverage(surface, camera, mixed)
     missed = mixed[(alpha[mixed] > 0) & ~hits.met[mixed]]
     near = surface.nearest(rays.origins[missed], rays.directions[missed])

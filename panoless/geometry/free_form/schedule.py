@@ -5,8 +5,8 @@ from typing import Literal
 
 from panoless.geometry.free_form.options import FreeFormOptions
 
-OUTLINE_GAIN = 9.0
-"""Factor of the outlines' weight where they count as if they were right to 0.05 px, not 0.15 px."""
+SILHOUETTE_GAIN = 9.0
+"""Factor of the silhouettes' weight where they count as if they were right to 0.05 px, not 0.15 px."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,10 @@ class Round:
     """Whether the change of the surface is to be smooth, in place of the surface: details that it has then stay."""
     silhouette_dominated: bool = False
     """Whether pixels count as if their σ was the robust scale, which is what they err by under a coarse map."""
-    outline_gain: float = 1.0
-    """Factor of the outlines' weight."""
-    outline_points: int = 30_000
-    """Most outline points of all views."""
+    silhouette_gain: float = 1.0
+    """Factor of the silhouettes' weight."""
+    silhouette_points: int = 30_000
+    """Most silhouette points of all views."""
     solver_steps: int = 30
     """Most conjugate-gradient steps for a Gauss–Newton step."""
     under_known_map: bool = False
@@ -44,17 +44,17 @@ class Round:
 
 
 DESCENT = tuple(
-    Round(20, resolution, scale, 1, 8000, 3000.0, 5, increment_prior=True, outline_points=4000)
+    Round(20, resolution, scale, 1, 8000, 3000.0, 5, increment_prior=True, silhouette_points=4000)
     for resolution, scale in ((3, 0.5), (4, 0.5), (6, 0.4), (8, 0.4), (12, 0.3))
 )
 """From a first surface that is far off: under maps so coarse that a normal may be wrong by 20°."""
 COARSE = (
-    Round(20, 16, 0.30, 1, 16_000, 100.0, 5, outline_gain=OUTLINE_GAIN),
-    Round(28, 64, 0.80, 4, 24_000, 30.0, 8, outline_gain=OUTLINE_GAIN),
+    Round(20, 16, 0.30, 1, 16_000, 100.0, 5, silhouette_gain=SILHOUETTE_GAIN),
+    Round(28, 64, 0.80, 4, 24_000, 30.0, 8, silhouette_gain=SILHOUETTE_GAIN),
     Round(28, 64, 0.15, 4, 32_000, 30.0, 4, solver_steps=20),
 )
 """Always taken. The first texels are as wide as a ray turns when its normal does by 2.8°. In the second round nearly
-all pixels keep their weight, so flat faces turn as fast as others. In the third a gain of outlines would hide that
+all pixels keep their weight, so flat faces turn as fast as others. In the third a gain of silhouettes would hide that
 masks are too small."""
 CLOSING_RAYS = (20_000, 40_000, 40_000)
 """Pixels of these rounds where no finer one comes after them."""

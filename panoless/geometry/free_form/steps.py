@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from panoless.geometry.free_form.photometric import Linearization
-from panoless.geometry.free_form.schedule import OUTLINE_GAIN
+from panoless.geometry.free_form.schedule import SILHOUETTE_GAIN
 from panoless.geometry.free_form.task import RADIANCE_SIGMA
 from panoless.geometry.free_form.trust import Trust
 from panoless.numeric.conjugate_gradients import solve_by_products
@@ -51,8 +51,8 @@ def with_noise(linearization: Linearization) -> Linearization:
     size = np.linalg.norm(linearization.residual[clear], axis=1)
     sigma = float(np.median(size)) / CHI_MEDIAN if len(size) else 0.0
     factor = max(sigma / RADIANCE_SIGMA, 1.0) ** 2
-    weight = task.outline_weight / task.settings.outline_gain * OUTLINE_GAIN * factor
-    return replace(linearization, task=replace(task, prior_factor=CORRELATED * factor, outline_weight=weight))
+    weight = task.silhouette_weight / task.settings.silhouette_gain * SILHOUETTE_GAIN * factor
+    return replace(linearization, task=replace(task, prior_factor=CORRELATED * factor, silhouette_weight=weight))
 
 
 def take_steps(

@@ -10,15 +10,15 @@ from panoless.capture.views import Views
 from panoless.geometry.free_form.schedule import Round
 from panoless.problem.blocks import Exposures, WhiteBalances
 from panoless.problem.nuisance import NO_NUISANCE, Nuisance
-from panoless.problem.observations import Pixels, is_saturated, outline_rays, solid_pixels
+from panoless.problem.observations import Pixels, is_saturated, silhouette_rays, solid_pixels
 from panoless.problem.rays import PixelRays
 
 COUNTED_RAYS = 100_000.0
 """The photographs weigh as much as so many pixels, however many take part."""
 RADIANCE_SIGMA = 0.02
 """Standard deviation of a pixel of mean brightness (linear radiance)."""
-OUTLINE_SIGMA_PX = 0.15
-"""Standard deviation of an outline's point."""
+SILHOUETTE_SIGMA_PX = 0.15
+"""Standard deviation of a silhouette's point."""
 LEAST_BRIGHTNESS = 1e-6
 """Photographs that are black count as this bright (linear radiance)."""
 MAP_ROUNDS = 2
@@ -34,11 +34,11 @@ class Task:
     """What one round of steps is solved for."""
 
     pixels: Pixels
-    outlines: PixelRays
+    silhouettes: PixelRays
     photograph_weight: float
     """Of a pixel, in units of 1/σ²."""
-    outline_weight: float
-    """Of an outline's point."""
+    silhouette_weight: float
+    """Of a silhouette's point."""
     settings: Round
     cameras: StatedCameras
     """Of all views."""
@@ -59,27 +59,29 @@ class Task:
         """Rays of zero residual in the mean of a texel."""
         return KNOWN if self.settings.under_known_map else TEXEL_PRIOR
 
-    def outlined(self, gain: float) -> "Task":
-        """The same with another factor of the outlines' weight."""
-        settings = replace(self.settings, outline_gain=gain)
-        return replace(self, settings=settings, outline_weight=self.outline_weight * gain / self.settings.outline_gain)
+    def with_silhouette_gain(self, gain: float) -> "Task":
+        """The same with another factor of the silhouettes' weight."""
+        settings = replace(self.settings, silhouette_gain=gain)
+        return replace(
+            self, settings=settings, silhouette_weight=self.silhouette_weight * gain / self.settings.silhouette_gain
+        )
 
 
 def make_task(views: Views, settings: Round, nuisance: Nuisance = NO_NUISANCE) -> Task:
-    """The pixels and outlines of a round, weighted as if `COUNTED_RAYS` pixels took part.
+    """The pixels and silhouettes of a round, weighted as if `COUNTED_RAYS` pixels took part.
 
     Under coarse maps pixels are wrong by the robust scale s, not by their noise σ: where silhouettes dominate, they
     count (s/σ)² times as much.
     """
-    pixels, outlines = solid_pixels(views, settings.rays), outline_rays(views)
+    pixels, silhouettes = solid_pixels(views, settings.rays), silhouette_rays(views)
     total = max(views.num_solid, 1)
-    chosen = outlines.chosen(slice(None, None, max(1, -(-len(outlines.size) // settings.outline_points))))
+    chosen = silhouettes.chosen(slice(None, None, max(1, -(-len(silhouettes.size) // settings.silhouette_points))))
     if {Exposures.name, WhiteBalances.name} & set(nuisance.free):
         # A saturated pixel has no radiance to divide by a gain.
         pixels = replace(pixels, inner_px=np.where(is_saturated(pixels.radiance), 0.0, pixels.inner_px))
     share = COUNTED_RAYS / RADIANCE_SIGMA**2 / max(len(pixels.inner_px), 1)
-    density = COUNTED_RAYS / total * len(outlines.size) / max(len(chosen.size), 1)
+    density = COUNTED_RAYS / total * len(silhouettes.size) / max(len(chosen.size), 1)
     dominance = (settings.robust_scale / RADIANCE_SIGMA) ** 2 if settings.silhouette_dominated else 1.0
-    outlined = settings.outline_gain * dominance * density / OUTLINE_SIGMA_PX**2
+    of_silhouettes = settings.silhouette_gain * dominance * density / SILHOUETTE_SIGMA_PX**2
     brightness = max(float(pixels.radiance.mean()), LEAST_BRIGHTNESS)
-    return Task(pixels, chosen, share, outlined, settings, StatedCameras.of(views), brightness)
+    return Task(pixels, chosen, share, of_silhouettes, settings, StatedCameras.of(views), brightness)

@@ -84,7 +84,7 @@ class HeightFieldFamily(WithinOneBoundary):
 
     def refitted(self, views: Views, fitted: HeightFieldMirror, config: FitConfig) -> Geometry:
         """Heights, plane and boundary after one more round."""
-        return fitted.with_shape(refined(self.outlined(views), fitted.height_field))
+        return fitted.with_shape(refined(self.with_silhouettes(views), fitted.height_field))
 
     def finished(self, views: Views, solved: HeightFieldMirror, config: FitConfig) -> HeightFieldMirror:
         """With the height that reflected rays have to pass at the rim."""

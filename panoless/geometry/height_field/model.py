@@ -72,7 +72,7 @@ class HeightField:
     coefficients: Float[np.ndarray, "M N"]
     clearance: float = 0.0
     """Mirrored rays have to pass the boundary at this height over the plane, if it is above that of the frame: a round
-    rim is higher than outlines determine.
+    rim is higher than silhouettes determine.
     """
 
     @property

@@ -48,7 +48,7 @@ class PanesFamily(HeightFieldFamily):
         self, views: Views, proposal: Proposal, config: FitConfig, *, requested: bool = False
     ) -> Proposal | None:
         """Panes by the slopes of tiles. Of smooth slopes None, or one pane for a user who wants panes."""
-        panes = panes_over(self.outlined(views), proposal.shape)
+        panes = panes_over(self.with_silhouettes(views), proposal.shape)
         if panes is None and requested:
             panes = one_pane(views, proposal.shape)
         return None if panes is None else replace(proposal, shape=panes)
@@ -92,4 +92,4 @@ class PanesFamily(HeightFieldFamily):
         """Heights and joints by silhouettes and photographs together."""
         panes = cast(Panes, fitted.height_field)
         with torch.no_grad():
-            return cast(Geometry, fitted.with_shape(fit_panes(self.outlined(views), panes)))
+            return cast(Geometry, fitted.with_shape(fit_panes(self.with_silhouettes(views), panes)))

@@ -58,7 +58,7 @@ class PlaneMirror(SeenByCenters):
 class WithinOneBoundary(ExactFamily):
     """A kind whose silhouette is one polygon: gaps between pieces of masks, such as bars, are closed."""
 
-    def outlined(self, views: Views) -> Views:
+    def with_silhouettes(self, views: Views) -> Views:
         """With masks without gaps."""
         return without_gaps(views)
 
@@ -74,7 +74,7 @@ class PlaneFamily(WithinOneBoundary):
     def propose(self, views: Views, config: FitConfig, *, requested: bool) -> Proposal | None:
         """Plane, boundary and frame by silhouettes."""
         try:
-            found = fit_plane(self.outlined(views), thorough=requested)
+            found = fit_plane(self.with_silhouettes(views), thorough=requested)
         except InputError:
             if requested:
                 raise

@@ -90,7 +90,7 @@ def plane_buffers(plane: Plane, camera: RasterCamera) -> SurfaceBuffers:
 
     Where a pixel's center lies beside the plane, its depth stays within the depths of the boundary. All is zero where
     alpha is, and everywhere for a camera behind the mirror. With a frame, alpha is the smaller of the coverages of the
-    boundary and of the frame, which is exact but for pixels that both outlines cut.
+    boundary and of the frame, which is exact but for pixels that both silhouettes cut.
     """
     rotation, center = pose_of(camera)
     height_above = float(plane.normal @ center) - plane.offset

@@ -38,7 +38,7 @@ from panoless.geometry.revolution.silhouette import (
 from panoless.geometry.revolution.unknowns import RevolutionUnknowns
 from panoless.journal import remembered
 from panoless.numeric.gauss_newton import keep_if_better
-from panoless.problem.solve import by_outlines_alone
+from panoless.problem.solve import by_silhouettes_alone
 from shinypartial.io.progress import Progress
 
 LARGEST_START_COST = 0.6
@@ -136,7 +136,7 @@ def _propose(
     surface = refine_outer(rays, start if lid >= base else start.turned_over(), extent)
     if surface is None:
         return None
-    surface = by_outlines_alone(views, RevolutionUnknowns(surface, rays.pixel)).settled().surface
+    surface = by_silhouettes_alone(views, RevolutionUnknowns(surface, rays.pixel)).settled().surface
     found = silhouette_residuals(rays, surface, rays.pixel)
     distance = np.where(found.side >= 0, np.abs(found.pixels), np.inf)
     medians = np.array([np.median(distance[rays.view == view]) for view in np.unique(rays.view)])

@@ -64,7 +64,7 @@ class Grid:
     columns: int
     rows: int
     above: int
-    """Rows above the lip: a wall may rise on where outlines end."""
+    """Rows above the lip: a wall may rise on where silhouettes end."""
 
 
 @remembered()

@@ -76,7 +76,7 @@ RING_POINTS = 2000
 
 
 def tip_shift(contours: ContourRays, surface: SurfaceOfRevolution, scale_px: float) -> Float[np.ndarray, "2"]:
-    """How (ρ, h) of the lip has to move for the outlines: one robust Gauss–Newton step; zero when hardly any see it."""
+    """How (ρ, h) of the lip has to move for the silhouettes: one robust Gauss–Newton step; 0 if few see it."""
     found = silhouette_residuals(contours, surface, contours.pixel)
     tip = surface.profile[surface.lip]
     radius = np.maximum(np.hypot(found.points[:, 0], found.points[:, 1]), 1e-9)
@@ -97,7 +97,7 @@ def tip_shift(contours: ContourRays, surface: SurfaceOfRevolution, scale_px: flo
 
 
 def open_at_lip(contours: ContourRays, closed: SurfaceOfRevolution) -> SurfaceOfRevolution | None:
-    """The outside of a closed surface as a wall without thickness that ends where outlines put its lip.
+    """The outside of a closed surface as a wall without thickness that ends where silhouettes put its lip.
 
     Up to there the profile goes on as a cubic through its last good vertex, fitted to those before it and to the lip.
     None where the outside is no longer than what is fitted, or doesn't rise to its lip.
@@ -155,7 +155,7 @@ def _end_at(
 
 
 def place_lip(contours: ContourRays, surface: SurfaceOfRevolution, spacing: float) -> SurfaceOfRevolution:
-    """A thin wall with its lip where outlines put it, and its last pixels led there as the wall before them goes.
+    """A thin wall with its lip where silhouettes put it, and its last pixels led there as the wall before them goes.
 
     Others are returned as they are, and so is a wall that is no longer than what the end is fitted to.
     """

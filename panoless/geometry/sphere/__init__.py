@@ -1,1 +1,1 @@
-"""A mirror ball: center and radius by its outlines. Imports no other kind."""
+"""A mirror ball: center and radius by its silhouettes. Imports no other kind."""

@@ -1,4 +1,4 @@
-"""A sphere by outlines: a cone for each view, all cones in one linear system, then all contour points together.
+"""A sphere by silhouettes: a cone for each view, all cones in one linear system, then all contour points together.
 
 The rays that touch a sphere form a circular cone about the camera. Its axis a and half angle α put the center at
 c = o + ρ a/sin α from the camera at o, which is linear in c and ρ: two views determine both, one leaves open how far
@@ -17,9 +17,9 @@ from panoless.geometry.sphere.unknowns import SphereUnknowns
 from panoless.numeric.cones import nearest_cone
 from panoless.numeric.factorize import regularize
 from panoless.numeric.robust import robust_weight
-from panoless.problem.observations import outline_rays
+from panoless.problem.observations import silhouette_rays
 from panoless.problem.rays import PixelRays
-from panoless.problem.solve import by_outlines_alone
+from panoless.problem.solve import by_silhouettes_alone
 
 LARGEST_CONE_PX = 0.5
 """Where the median contour point of the median view is farther from the best cone (px), the object is no sphere."""
@@ -114,14 +114,14 @@ def _second_harmonic(
 
 
 def fit_sphere(views: Views, radius: float = 0.0, *, requested: bool) -> Proposal | None:
-    """The sphere that explains the masks best; None where their outlines are no cones, unless it was `requested`.
+    """The sphere that explains the masks best; None where their silhouettes are no cones, unless it was `requested`.
 
     A `radius` that is known, in units of the world, stays as it is; 0: unknown.
     """
-    rays = outline_rays(views, longest_only=True)
+    rays = silhouette_rays(views, longest_only=True)
     cones = Cones.of(rays)
     if not len(cones.sines) or not (requested or cones.are_of_a_sphere()):
         return None
     known = radius / views.object_frame.radius
-    surface = by_outlines_alone(views, SphereUnknowns(cones.sphere(known), known > 0))
+    surface = by_silhouettes_alone(views, SphereUnknowns(cones.sphere(known), known > 0))
     return Proposal.of(views, surface.sphere, surface)

@@ -104,7 +104,7 @@ def _spans(corners: Float[np.ndarray, "P 4 3"]) -> Float[np.ndarray, "P"]:
 
 
 def _trust_by_span(corners: Float[np.ndarray, "P 4 3"]) -> Float[np.ndarray, "P"]:
-    """1/(1 + a/ā) of the square angles a of pixels with the median ā: beside the outline one spans a wide strip."""
+    """1/(1 + a/ā) of the square angles a of pixels with the median ā: beside the silhouette one spans a wide strip."""
     spans = _spans(corners)
     return 1 / (1 + spans / np.median(spans)) if len(spans) else spans
 
@@ -120,11 +120,11 @@ class SphereFamily(ExactFamily):
     by_silhouettes: ClassVar[bool] = True
 
     def propose(self, views: Views, config: FitConfig, *, requested: bool) -> Proposal | None:
-        """Center and radius by outlines."""
+        """Center and radius by silhouettes."""
         found = fit_sphere(views, config.sphere.radius, requested=requested)
         if found is None and requested:
             raise InputError(
-                expected="masks with an outline, for --model sphere",
+                expected="masks with a silhouette, for --model sphere",
                 found="none within the pictures",
                 remedy="Check that the ball lies within the pictures.",
             )

@@ -203,6 +203,6 @@ def hidden(ball: FoundBall) -> Bool[np.ndarray, "H W"]:
     circle = ball.rim.circle
     for start, stop in ball.rim.gaps:
         beyond, ends = circle.points(np.linspace(start, stop, 48), 1.1), circle.points(np.array([stop, start]))
-        outline = np.concatenate([beyond, ends])
-        opencv().fillPoly(cover, [np.rint(outline).astype(np.int32)], 1)
+        silhouette = np.concatenate([beyond, ends])
+        opencv().fillPoly(cover, [np.rint(silhouette).astype(np.int32)], 1)
     return cover > 0

@@ -1,4 +1,4 @@
-"""Wrong masks: outlines moved, holes, blobs. An alpha is the share of each pixel that the mask covers."""
+"""Wrong masks: silhouettes moved, holes, blobs. An alpha is the share of each pixel that the mask covers."""
 
 import math
 
@@ -11,14 +11,14 @@ from shinypartial.core.conventions import PIXEL_CENTER
 RING_STEP_PX = 0.5
 #: Radius of holes and blobs as a share of that of a disk with the object's area; the last ones are smaller.
 BLOB_RADIUS = 0.15
-#: Standard deviation of the Gaussian that smooths what an outline wanders by: it changes sign every 20 pixels or so.
+#: Standard deviation of the Gaussian that smooths what a silhouette wanders by: it changes sign every 20 pixels or so.
 WOBBLE_LENGTH_PX = 6.0
 
 
 def eroded(alpha: Float[np.ndarray, "H W"], radius_px: float) -> Float[np.ndarray, "H W"]:
-    """Smallest alpha within a disk about each pixel, bilinear between pixels; the border of the picture is no outline.
+    """Smallest alpha within a disk about each pixel, bilinear between pixels; the picture's border is no silhouette.
 
-    The outline moves inward by the radius, which may be fractional.
+    The silhouette moves inward by the radius, which may be fractional.
     """
     reach = math.ceil(radius_px) + 1
     padded, smallest = np.pad(alpha, reach, mode="edge"), alpha
@@ -47,7 +47,7 @@ def dilated(alpha: Float[np.ndarray, "H W"], radius_px: float) -> Float[np.ndarr
 
 def wobbling(alpha: Float[np.ndarray, "H W"], sigma_px: float, random: np.random.Generator) -> Float[np.ndarray, "H W"]:
     """The mask by a smooth random shift of each pixel, whose parts have this standard deviation: so has that along the
-    normal of an outline.
+    normal of a silhouette.
     """
     from scipy.ndimage import gaussian_filter, map_coordinates
 
@@ -89,6 +89,6 @@ def _blobs(
 
 
 def _disk(shape: tuple[int, ...], center: Float[np.ndarray, "2"], radius: float) -> Float[np.ndarray, "H W"]:
-    """A disk with an outline one pixel wide, at least its middle pixel."""
+    """A disk with a silhouette one pixel wide, at least its middle pixel."""
     row, column = np.indices(shape) + PIXEL_CENTER
     return np.clip(radius + 0.5 - np.hypot(row - center[0], column - center[1]), 0, 1)

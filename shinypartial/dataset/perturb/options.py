@@ -31,14 +31,14 @@ class MaskErrors:
     """Wrong masks of the training views. What a larger mask takes in is black unless the source has a background."""
 
     erode_px: NonNegative = 0.0
-    """Move the outline inward by this many pixels."""
+    """Move the silhouette inward by this many pixels."""
     dilate_px: NonNegative = 0.0
-    """Move the outline outward by this many pixels, after the erosion."""
+    """Move the silhouette outward by this many pixels, after the erosion."""
     offset_px: NonNegative = 0.0
-    """Move the outline of each view by a distance drawn evenly up to this many pixels, inward or outward."""
+    """Move the silhouette of each view by a distance drawn evenly up to this many pixels, inward or outward."""
     wobble_px: NonNegative = 0.0
-    """Standard deviation in pixels by which the outline of each view then wanders in and out, over some 20 pixels, as
-    outlines of segmenters and by hand do."""
+    """Standard deviation in pixels by which the silhouette of each view then wanders in and out, over some 20 pixels,
+    as silhouettes of segmenters and by hand do."""
     holes: Annotated[float, Meta(ge=0, le=0.9)] = 0.0
     """Share of the object's area that round holes take away."""
     stray: Share = 0.0

@@ -141,10 +141,10 @@ def masked_wrongly(picture: Picture, options: MaskErrors, is_empty: bool, random
         alpha = masks.dilated(alpha, offset) if offset > 0 else masks.eroded(alpha, -offset)
     if options.wobble_px:
         alpha = masks.wobbling(alpha, options.wobble_px, wobble)
-    outlined = alpha
+    alpha_before = alpha
     if options.holes:
-        alpha = masks.with_holes(outlined, options.holes, random)
-    if options.stray:  # Blobs lie outside of the outline, so none fills a hole.
-        alpha = alpha + masks.with_stray_blobs(outlined, options.stray, random) - outlined
+        alpha = masks.with_holes(alpha_before, options.holes, random)
+    if options.stray:  # Blobs lie outside of the silhouette, so none fills a hole.
+        alpha = alpha + masks.with_stray_blobs(alpha_before, options.stray, random) - alpha_before
     alpha = np.zeros_like(alpha) if is_empty else alpha.clip(0, 1).astype(np.float32)
     return replace(picture, alpha=alpha)

@@ -1,4 +1,4 @@
-"""Corrections undo what was done to photographs: outlines that were moved, exposures that differ."""
+"""Corrections undo what was done to photographs: silhouettes that were moved, exposures that differ."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import pytest
 import torch
 from skimage.measure import find_contours
 
-from panoless.capture.corrections import NO_CORRECTIONS, Corrections, with_outline_moved
+from panoless.capture.corrections import NO_CORRECTIONS, Corrections, with_silhouette_moved
 from panoless.capture.encoding import encoding_of
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.views import TrainView, Views
@@ -33,10 +33,10 @@ def views_of(*train: TrainView) -> Views:
 
 
 @pytest.mark.parametrize("offset_px", [-4.0, -1.3, 0.6, 3.5])
-def test_a_disk_with_its_outline_moved_is_a_larger_or_smaller_disk(offset_px: float) -> None:
+def test_a_disk_with_its_silhouette_moved_is_a_larger_or_smaller_disk(offset_px: float) -> None:
     """Its contour lies within 0.2 px of the circle's, as that of such a disk does to 0.12; its area is right to 2 %."""
     before, after = disk(12.0), disk(12.0 + offset_px)
-    moved = with_outline_moved(before, offset_px)
+    moved = with_silhouette_moved(before, offset_px)
     (curve,) = find_contours(moved.mask.double().numpy(), 0.5)
     radius = np.hypot(*(curve + 0.5 - [23.3, 24.1]).T)
     assert np.abs(radius - 12.0 - offset_px).max() < 0.2
@@ -47,11 +47,11 @@ def test_a_disk_with_its_outline_moved_is_a_larger_or_smaller_disk(offset_px: fl
 @pytest.mark.parametrize("offset_px", [-2.0, 2.0])
 def test_only_what_a_photograph_shows_whole_is_solid(offset_px: float) -> None:
     before = disk(12.0)
-    moved = with_outline_moved(before, offset_px)
+    moved = with_silhouette_moved(before, offset_px)
     assert torch.isin(moved.solid, before.solid).all()
     assert torch.equal(moved.solid, torch.nonzero(moved.mask.flatten() > SOLID_ALPHA)[:, 0])
     # Shrunk by more than the disk's radius, the mask stays.
-    assert with_outline_moved(before, -20.0) is before
+    assert with_silhouette_moved(before, -20.0) is before
 
 
 def test_gains_are_divided_out_but_for_saturated_pixels() -> None:

@@ -64,7 +64,7 @@ def test_a_hole_in_one_mask_is_filled_and_tells_no_color(ring: Views) -> None:
 
 @pytest.mark.parametrize("attached", [False, True])
 def test_a_stray_piece_is_left_out(ring: Views, attached: bool) -> None:
-    """But for two pixels beside the outline where it hangs on the object; with the half pixels of its rim."""
+    """But for two pixels beside the silhouette where it hangs on the object; with the half pixels of its rim."""
     before = ring.train[9].mask
     rows, columns = np.nonzero(before.numpy() >= MASK_LEVEL)
     row, column = (int(rows[columns.argmin()]), int(columns.min()) - 6) if attached else (7, 7)
@@ -79,7 +79,7 @@ def test_a_stray_piece_is_left_out(ring: Views, attached: bool) -> None:
 
 @pytest.mark.parametrize("turn_deg", [0.5, 1.0])
 def test_masks_of_turned_cameras_stay(ring: Views, turn_deg: float) -> None:
-    """They contradict each other along whole outlines."""
+    """They contradict each other along whole silhouettes."""
     turns = np.random.default_rng(1).normal(size=(len(ring.train), 3))
     turns *= np.radians(turn_deg) / np.linalg.norm(turns, axis=1, keepdims=True)
     assert with_repaired_masks(Poses(turns, 0 * turns).moved(ring)).repairs == MaskRepairs()
@@ -91,7 +91,7 @@ def test_few_views_contradict_nothing(ring: Views) -> None:
     assert with_repaired_masks(few) is few
 
 
-def test_a_finer_grid_fills_a_dent_up_to_the_outline(ring: Views) -> None:
+def test_a_finer_grid_fills_a_dent_up_to_the_silhouette(ring: Views) -> None:
     """A coarse one with 4 px between its points leaves a third of it."""
     before = ring.train[5].mask >= MASK_LEVEL
     rows, columns = np.nonzero(before.numpy())

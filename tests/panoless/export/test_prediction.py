@@ -133,7 +133,7 @@ def test_one_picture_shows_photograph_normals_environment_and_visibility(
         picture = np.asarray(opened)
     expected = (
         (photograph, to_display(truth.radiance)[window], 3.0),
-        # A second of fitting leaves normals wrong by 3°, and surfels reach over the outline.
+        # A second of fitting leaves normals wrong by 3°, and surfels reach over the silhouette.
         (normals, 127.5 * (truth.normals_world + 1)[window] * (truth.alpha[window] > 0.5)[..., None], 12.0),
         (environment, picture, 3.0),
         (visibility, np.repeat(255 * known[..., None], 3, 2), 3.0),

@@ -1,4 +1,4 @@
-"""The first surface is the object's own where outlines touch it, and bends no more than it must where none does."""
+"""The first surface is the object's own where silhouettes touch it, and bends no more than it must where none does."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import torch
 
 from panoless.capture.views import TrainView, Views
 from panoless.first_surface.completion import complete_surface, completed, hull_surface, thin_plate, trusted_hull
-from panoless.first_surface.contact import Contact, outline_contact
+from panoless.first_surface.contact import Contact, silhouette_contact
 from panoless.first_surface.mesh import TriangleMesh
 from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.first_surface.visual_hull import HULL_HALF_SIDE, Hull, carve_hull
@@ -118,7 +118,7 @@ def test_the_offset_of_a_contact_is_the_distance_from_the_rim(views: Views) -> N
     """In front, the hull of the sphere is a wedge between the cones of the two cameras that stand furthest out."""
     center, radius = sphere_of(views)
     surface = hull_surface(carve_hull(views, 48, votes=1.0))
-    contact = outline_contact(surface, views)
+    contact = silhouette_contact(surface, views)
     offset = surface.vertices - center
     azimuth, level = np.arctan2(offset[:, 1], offset[:, 0]), np.abs(offset[:, 2]) < 0.2 * radius
     last = max(np.arctan2(*(view.position - center)[[1, 0]]) for view in views.train)
@@ -139,7 +139,7 @@ def test_trust_falls_with_the_distance_from_rim_and_cone() -> None:
     assert trust[3] == 0
 
 
-def test_the_completed_surface_has_the_normals_of_the_sphere_where_no_outline_touches_it(views: Views) -> None:
+def test_the_completed_surface_has_the_normals_of_the_sphere_where_no_silhouette_touches_it(views: Views) -> None:
     """In front, between the rims of the first and the last camera, those of the hull are off by degrees."""
     hull = carve_hull(views, 48, votes=1.0)
     center, _ = sphere_of(views)
@@ -241,7 +241,7 @@ HULLS = {
 @pytest.mark.parametrize("name", HULLS)
 @pytest.mark.parametrize("is_touched", [True, False])
 def test_a_thin_or_torn_hull_has_a_surface_within_its_cube(name: str, is_touched: bool, views: Views) -> None:
-    """Also where no outline comes near it, because masks are of something else."""
+    """Also where no silhouette comes near it, because masks are of something else."""
     line = np.linspace(-HULL_HALF_SIDE, HULL_HALF_SIDE, 48)
     points = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1)
     hull = Hull(HULLS[name](points), HULL_HALF_SIDE, VOXEL)
@@ -255,7 +255,7 @@ def test_a_thin_or_torn_hull_has_a_surface_within_its_cube(name: str, is_touched
         assert hull.at(surface.vertices).max() < VOXEL
 
 
-def test_a_hull_that_no_outline_touches_is_all_that_is_known(views: Views) -> None:
+def test_a_hull_that_no_silhouette_touches_is_all_that_is_known(views: Views) -> None:
     line = np.linspace(-HULL_HALF_SIDE, HULL_HALF_SIDE, 48)
     points = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1)
     hull = Hull(np.linalg.norm(points, axis=-1) - 2 * VOXEL, HULL_HALF_SIDE, VOXEL / 20)

@@ -1,4 +1,4 @@
-"""The hull is as exact as outlines, not as its voxels, and leaves out views only where they contradict each other."""
+"""The hull is as exact as silhouettes, not as its voxels, and leaves out views only where they contradict."""
 
 import math
 from dataclasses import replace
@@ -51,7 +51,7 @@ def view_of_sphere(direction: np.ndarray) -> TrainView:
 
 @pytest.fixture(scope="module")
 def all_around() -> Views:
-    """Sixty cameras spread over the sphere of directions by the golden angle, so that outlines touch everywhere."""
+    """Sixty cameras spread over the sphere of directions by the golden angle, so that silhouettes touch everywhere."""
     count = 60
     z = 0.97 * (1 - (2 * np.arange(count) + 1) / count)
     turn = np.arange(count) * math.pi * (3 - math.sqrt(5))
@@ -81,8 +81,8 @@ def with_masks(views: Views, change) -> Views:
 
 
 @pytest.mark.parametrize("sigma_px", [1.0, 2.0])
-def test_outlines_contradict_each_other_by_what_they_err_by(all_around: Views, sigma_px: float) -> None:
-    """Right outlines don't, nor do those that are all too large. Measured: 0.89 and 2.30 px."""
+def test_silhouettes_contradict_each_other_by_what_they_err_by(all_around: Views, sigma_px: float) -> None:
+    """Right silhouettes don't, nor do those that are all too large. Measured: 0.89 and 2.30 px."""
     assert contradiction_px(all_around) == 0
     assert contradiction_px(with_masks(all_around, lambda _, mask: dilated(mask, sigma_px))) == 0
     wandering = with_masks(all_around, lambda index, mask: wobbling(mask, sigma_px, np.random.default_rng(index)))
@@ -133,7 +133,7 @@ def test_a_mask_that_lacks_a_half_is_outvoted(all_around: Views) -> None:
 
 
 def test_cameras_that_are_all_a_little_off_leave_the_hull_as_large_as_its_object(all_around: Views) -> None:
-    """Turned by 2°, each by its own axis, outlines are a quarter of the radius off: 58 of 60 votes leave half of it."""
+    """Turned by 2°, each by its own axis, silhouettes are a quarter of the radius off: 58 of 60 votes leave half."""
     rng = np.random.default_rng(0)
 
     def turned(view: TrainView) -> TrainView:
@@ -150,14 +150,14 @@ def test_cameras_that_are_all_a_little_off_leave_the_hull_as_large_as_its_object
 
 
 def test_the_completed_surface_stays_inside_the_hull(all_around: Views) -> None:
-    """Seen from one side only, too, where the plate has to continue over what no outline touches."""
+    """Seen from one side only, too, where the plate has to continue over what no silhouette touches."""
     front = tuple(view for view in all_around.train if view.position[0] > 1.0)
     views = replace(all_around, train=front)
     hull = carve_hull(views, RESOLUTION, votes=1.0)
     assert hull.at(complete_surface(hull, views).vertices).max() < 0.25 * hull.pixel
 
 
-def test_outline_distances_are_those_of_the_curve_between_pixels() -> None:
+def test_silhouette_distances_are_those_of_the_curve_between_pixels() -> None:
     """For an edge at any place below a pixel, to a twelfth of a pixel."""
     columns = np.arange(20) + 0.5
     for edge in (8.0, 8.2, 8.5, 8.7, 8.95):

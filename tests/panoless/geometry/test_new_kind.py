@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
-from panoless.capture.corrections import with_outline_moved
+from panoless.capture.corrections import with_silhouette_moved
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import pixel_rays
 from panoless.capture.views import Views
@@ -17,7 +17,7 @@ from panoless.config import FitConfig, Model
 from panoless.environment.options import SurroundingsOptions
 from panoless.geometry.base import Family, Geometry
 from panoless.geometry.registry import FAMILIES
-from panoless.problem.solve import by_outlines_alone
+from panoless.problem.solve import by_silhouettes_alone
 from panoless.selection.candidates import Verdict
 from panoless.selection.choose import choose_geometry
 from panoless.selection.options import CorrectionOptions
@@ -114,7 +114,7 @@ def test_silhouettes_lead_back_from_other_starts(views: Views) -> None:
     for seed in range(3):
         rng = np.random.default_rng(seed)
         start = kind.EllipsoidUnknowns(kind.Ellipsoid(np.zeros(3), 2 * np.eye(3))).stepped(rng.normal(size=9) / 5)
-        found = by_outlines_alone(views, start).surface
+        found = by_silhouettes_alone(views, start).surface
         np.testing.assert_allclose(found.center, truth.center, atol=2e-3)
         np.testing.assert_allclose(np.linalg.inv(found.matrix), np.linalg.inv(truth.matrix), atol=5e-3)
 
@@ -133,9 +133,9 @@ def test_a_fit_finds_the_normals(views: Views) -> None:
 
 
 def test_photographs_correct_masks(views: Views) -> None:
-    """Outlines that are moved by up to a pixel turn normals by 1.5° in the mean, unless the joint solve frees them."""
+    """Silhouettes that are moved by up to a pixel turn normals by 1.5° in the mean, unless the solve frees them."""
     shifts = np.random.default_rng(0).uniform(-1, 1, len(views.train))
-    train = (with_outline_moved(*each) for each in zip(views.train, (shifts - shifts.mean()).tolist(), strict=True))
+    train = (with_silhouette_moved(*each) for each in zip(views.train, (shifts - shifts.mean()).tolist(), strict=True))
     moved = replace(views, train=tuple(train))
     proposal = FAMILIES["ellipsoid"].propose(moved, Config(), requested=True)
     assert normal_errors_deg(kind.EllipsoidMirror(proposal.shape), views).mean() > 1

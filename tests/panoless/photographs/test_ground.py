@@ -69,7 +69,7 @@ def test_a_mirror_ball_is_found_without_a_hint(photographed) -> None:
     cameras, truth, folder = photographed
     found = ground_masks(cameras, folder, GROUND, folder / "ground.png")
     overlaps = [overlap(found[name] >= 128, mask) for name, mask in zip(cameras, truth, strict=True)]
-    # The ball is 56 pixels wide: a pixel of its outline is 7 % of it.
+    # The ball is 56 pixels wide: a pixel of its silhouette is 7 % of it.
     assert np.median(overlaps) > 0.88
     assert min(overlaps) > 0.75
     assert read_png(folder / "ground.png").shape == (200, 200, 3)
@@ -116,8 +116,8 @@ def test_a_view_tells_ground_from_mirror() -> None:
     bare = seen_by(CAMERAS[4], ball=False)[0]
     empty = evidence_of(bare, CAMERAS[4], np.ones(3, np.float32), sheet, pattern, known)
     assert empty.shown[empty.predicted].mean() > 0.9
-    outlines = [seen_by(CAMERAS[4])[1]] * 3
-    odds = odds_of([view], [outlines])
+    silhouettes = [seen_by(CAMERAS[4])[1]] * 3
+    odds = odds_of([view], [silhouettes])
     assert odds[0] < -1
     assert odds[-1] > 2
 

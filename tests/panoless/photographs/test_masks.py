@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from panoless.photographs import masks as masks_module
-from panoless.photographs.hull import carve, nearest_point, outline, overlap
+from panoless.photographs.hull import carve, nearest_point, overlap, silhouette
 from panoless.photographs.masks import (
     MORE_HINTS,
     Hint,
@@ -41,7 +41,7 @@ def named(cameras: Sequence[Camera], masks: Sequence[np.ndarray]) -> dict[str, t
     return {f"v_{i}": (c, m.astype(float)) for i, (c, m) in enumerate(zip(cameras, masks, strict=True))}
 
 
-def test_the_hull_of_true_masks_has_their_outline() -> None:
+def test_the_hull_of_true_masks_has_their_silhouette() -> None:
     overlaps = overlaps_of(named(CAMERAS, TRUTH))
     assert min(overlaps) > 0.95  # A voxel is 1.5 pixels.
 
@@ -68,7 +68,7 @@ def test_hull_points_are_those_that_all_masks_contain() -> None:
     assert np.linalg.norm(left - CENTER, axis=1).min() > RADIUS  # Beyond that picture, where it shows nothing.
     assert len(carve(seen, CENTER, 2 * RADIUS, 32, 1)) >= len(points)
     spacing = 4 * RADIUS / 32
-    assert overlap(outline(CAMERAS[0], grid[within], spacing), ball(CAMERAS[0], radius=0.9 * RADIUS)) > 0.9
+    assert overlap(silhouette(CAMERAS[0], grid[within], spacing), ball(CAMERAS[0], radius=0.9 * RADIUS)) > 0.9
 
 
 def test_the_point_that_cameras_look_at() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from panoless.capture.corrections import with_outline_moved
+from panoless.capture.corrections import with_silhouette_moved
 from panoless.capture.lens import with_focal_factor
 from panoless.capture.poses import Poses
 from panoless.capture.views import Views
@@ -23,7 +23,7 @@ from panoless.problem.corrected import Corrected
 from panoless.problem.equations import State
 from panoless.problem.nuisance import Nuisance
 from panoless.problem.parametric import ParametricSurface
-from panoless.problem.solve import Solved, by_outlines, by_outlines_alone, solve
+from panoless.problem.solve import Solved, by_silhouettes, by_silhouettes_alone, solve
 from panoless.selection.joint import nuisance_kinds
 from tests.support.mirror_body import body_views, sphere
 from tests.support.mirror_height_field import height_field_views
@@ -92,9 +92,9 @@ def test_past_the_limit_nothing_is_solved_once_more(monkeypatch: pytest.MonkeyPa
 
     def started(views: Views, surface: ParametricSurface, nuisance: Nuisance) -> State:
         begun.append(bool(nuisance.free))
-        return by_outlines(views, surface, nuisance)
+        return by_silhouettes(views, surface, nuisance)
 
-    monkeypatch.setattr("panoless.problem.solve.by_outlines", started)
+    monkeypatch.setattr("panoless.problem.solve.by_silhouettes", started)
     monkeypatch.setattr("panoless.problem.solve.is_past_limit", lambda: True)
     found = solved("sphere", views_of("sphere", 14, 80), around_it=Surroundings(np.array([0.05])))
     assert [each.kept for each in found.decisions if each.name == Walls.name] == [False]
@@ -112,7 +112,7 @@ def test_turns_exposures_and_masks_are_found_together(kind: str, count: int, siz
     offsets = rng.uniform(-1, 1, count)
     views = Poses(turns, np.zeros((count, 3))).moved(views_of(kind, count, size))
     train = (
-        with_outline_moved(replace(view, radiance=view.radiance * float(gain)), float(offset))
+        with_silhouette_moved(replace(view, radiance=view.radiance * float(gain)), float(offset))
         for view, gain, offset in zip(views.train, gains, offsets, strict=True)
     )
     found = solved(kind, replace(views, train=tuple(train)))
@@ -147,7 +147,7 @@ def test_silhouettes_put_an_end_that_is_too_low_where_it_is() -> None:
     outer = true.profile[1 : true.lip + 1]
     low = closed_profile(outer[outer[:, 1] < true.profile[true.lip, 1] - 1.2 * pixel])
     start = replace(true, profile=low, lip=len(low) - 2)
-    found = by_outlines_alone(views, RevolutionUnknowns(start, pixel)).surface
+    found = by_silhouettes_alone(views, RevolutionUnknowns(start, pixel)).surface
     before, after = (np.linalg.norm(each.profile[each.lip] - true.profile[true.lip]) for each in (start, found))
     assert before > 1.2 * pixel
     assert after < 0.3 * pixel

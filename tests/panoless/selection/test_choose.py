@@ -92,8 +92,8 @@ def test_a_flat_mirror_takes_the_plane_and_a_bent_one_in_the_same_boundary_does_
     assert plane.normal @ NORMAL > np.cos(np.radians(0.2))
 
 
-def test_outlines_that_contradict_each_other_refuse_no_kind_for_what_they_err_by() -> None:
-    """A boundary 1.3 px beside wandering outlines is near them, beside right ones it is not; nor is one that is 9 px
+def test_silhouettes_that_contradict_each_other_refuse_no_kind_for_what_they_err_by() -> None:
+    """A boundary 1.3 px beside wandering silhouettes is near them, beside right ones it is not; nor is one that is 9 px
     away.
     """
     right = framed(0.0)

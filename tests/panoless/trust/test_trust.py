@@ -126,8 +126,8 @@ def test_what_the_shape_has_too_much_is_measured_and_named(views: Views, clean: 
     assert "outside the masks" in verdict.reason
 
 
-def test_a_mirror_that_fills_all_pictures_misses_no_outline() -> None:
-    """Its outline lies outside of them; what a smaller one leaves bare of them is still missed."""
+def test_a_mirror_that_fills_all_pictures_misses_no_silhouette() -> None:
+    """Its silhouette lies outside of them; what a smaller one leaves bare of them is still missed."""
     wide = plane_of(10 * RECTANGLE)
     views = reflecting_views(wide, arc(6, 20.0, size=32))
     assert all(view.mask.min() == 1 for view in views.train)

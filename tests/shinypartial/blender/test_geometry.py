@@ -267,20 +267,20 @@ def test_a_sphere_is_closed_and_its_normals_are_its_points() -> None:
 
 def test_the_spline_goes_through_its_points_and_is_level_at_the_axis() -> None:
     vase = load_scene("vase").object
-    (outline,) = profile_outlines(replace(vase, rings=20_000))
+    (silhouette,) = profile_outlines(replace(vase, rings=20_000))
     for radius, z in vase.profile:
-        distance = np.hypot(outline.points[:, 0] - radius, outline.points[:, 1] - z - vase.offset_z).min()
+        distance = np.hypot(silhouette.points[:, 0] - radius, silhouette.points[:, 1] - z - vase.offset_z).min()
         assert distance < 1e-4  # half the spacing of the samples
-    np.testing.assert_allclose(outline.normals[0], [0, -1], atol=1e-12)
-    assert (outline.points[1:, 0] > 0).all()
+    np.testing.assert_allclose(silhouette.normals[0], [0, -1], atol=1e-12)
+    assert (silhouette.points[1:, 0] > 0).all()
 
 
 def test_spline_normals_are_perpendicular_to_the_curve() -> None:
-    (outline,) = profile_outlines(replace(load_scene("vase").object, rings=20_000))
-    tangents = np.gradient(outline.points, axis=0)[1:-1]
+    (silhouette,) = profile_outlines(replace(load_scene("vase").object, rings=20_000))
+    tangents = np.gradient(silhouette.points, axis=0)[1:-1]
     tangents /= np.linalg.norm(tangents, axis=-1, keepdims=True)
     # Central differences at this spacing are good to 2e-6; the knots, where the third derivative jumps, to 1e-4.
-    assert np.abs(np.sum(tangents * outline.normals[1:-1], -1)).max() < 1e-4
+    assert np.abs(np.sum(tangents * silhouette.normals[1:-1], -1)).max() < 1e-4
 
 
 def test_a_plane_has_its_size_and_a_level_side() -> None:

@@ -152,7 +152,7 @@ def test_the_picture_is_that_of_path_tracing(lit: SceneSpec) -> None:
 
 
 def test_a_wide_view_is_the_middle_of_a_square_one(lit: SceneSpec) -> None:
-    """As a film has it, before and after one of the recipe's size; pixels at the outline are path traced, by chance."""
+    """As a film has it, before and after one of the recipe's size; silhouettes are path traced, by chance."""
     square = camera_of(lit)
     wide = replace(square, cy=square.cy - 5, height=square.height - 10)
     with open_renderer(replace(lit, props=())) as renderer:
@@ -180,7 +180,7 @@ def test_picked_pixels_are_those_of_the_whole_view(lit: SceneSpec) -> None:
             picked = render_sparse(renderer.bpy, renderer.scratch / "picked.exr", chosen, depth)
         assert whole.name != "picked"
     assert set(PASSES) <= picked.keys()
-    # Both sample 128 times: at the outline, alpha differs by about 0.02 a pixel.
+    # Both sample 128 times: at the silhouette, alpha differs by about 0.02 a pixel.
     np.testing.assert_allclose(picked["Combined.A"], view.alpha[chosen], atol=0.1)
     assert picked["Combined.A"].mean() == pytest.approx(view.alpha[chosen].mean(), abs=1e-3)
     green = np.clip(picked["Combined.G"], 0, 1), np.clip(view.radiance[chosen][:, 1], 0, 1)

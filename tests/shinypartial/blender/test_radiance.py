@@ -103,11 +103,11 @@ def test_normals_are_those_of_the_smooth_surface(vase: Rendered) -> None:
 
     surface = vase.spec.object
     assert isinstance(surface, SurfaceOfRevolution)
-    (outline,) = profile_outlines(replace(surface, rings=100_000))
+    (silhouette,) = profile_outlines(replace(surface, rings=100_000))
     points = vase.center_depth_to_points[vase.solid]
     radius = np.hypot(points[:, 0], points[:, 1])
-    _, nearest = cKDTree(outline.points).query(np.stack([radius, points[:, 2]], -1))
-    outward, upward = outline.normals[nearest].T
+    _, nearest = cKDTree(silhouette.points).query(np.stack([radius, points[:, 2]], -1))
+    outward, upward = silhouette.normals[nearest].T
     exact = np.column_stack([outward[:, None] * points[:, :2] / radius[:, None], upward])
     found = vase.view.normals_world[vase.solid]
     exact *= np.sign(np.sum(exact * found, -1, keepdims=True))  # The inside of the vase is seen too.

@@ -91,7 +91,7 @@ def test_seen_from_the_center_the_room_is_the_stored_map(sphere: SceneSpec, opti
         camera, view = views(tiny, surroundings_distance=distance, **options)[0]
         mirrored = reflect(ray_directions_world(camera), view.normals_world)
         error = np.abs(view.radiance - (mirrored + 1) / 2)[view.alpha > SOLID_ALPHA]
-        # Curvature within a pixel adds 0.01 at the outline.
+        # Curvature within a pixel adds 0.01 at the silhouette.
         assert np.quantile(error, 0.95) < limit if limit else error.max() > 0.1
 
 
@@ -104,8 +104,8 @@ def test_inverse_distances_of_a_box_by_hand() -> None:
     assert not box.holds(np.array([[3.0, 1.0, -7.0]]), 1.1)
 
 
-def assert_same_outline(first: RenderedView, second: RenderedView) -> None:
-    """All but noise of the pixels on the outline; 16 samples have a standard deviation of up to 1/8."""
+def assert_same_silhouette(first: RenderedView, second: RenderedView) -> None:
+    """All but noise of the pixels on the silhouette; 16 samples have a standard deviation of up to 1/8."""
     assert first.alpha.sum() == pytest.approx(second.alpha.sum(), rel=3e-3)
     np.testing.assert_allclose(first.alpha, second.alpha, atol=0.45)
 
@@ -136,11 +136,11 @@ def test_the_operator_is_mirrored_at_each_camera_and_never_seen_directly(sphere:
         assert 20 < expected.sum() < 200
         assert expected[31:33, 31:33].all(), "The ray through the middle comes straight back."
         found = view.radiance[..., 0] > 4.5
-        assert (found != expected).sum() <= 8, "All but pixels on the figure's outline."
+        assert (found != expected).sum() <= 8, "All but pixels on the figure's silhouette."
         # One sample through the center of each pixel, on a mesh and not the exact ellipsoid.
         assert (view.self_reflection != expected).sum() <= 2
         np.testing.assert_allclose(view.radiance[found & expected & (view.self_reflection > 0)].max(), 9.0, rtol=1e-4)
-        assert_same_outline(view, alone)
+        assert_same_silhouette(view, alone)
         assert (view.radiance[view.alpha == 0] == 0).all()
 
 
@@ -165,7 +165,7 @@ def edge_moments(view: RenderedView, left: bool) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("focus", [2.5, 8.0])
-def test_an_outline_is_blurred_over_the_circle_of_confusion(plane: SceneSpec, focus: float) -> None:
+def test_an_silhouette_is_blurred_over_the_circle_of_confusion(plane: SceneSpec, focus: float) -> None:
     """Diameter c = A f |1/z − 1/z_f| with aperture A = 50 mm/N; a uniform disk has the variance c²/16 across."""
     ((camera, view),) = views(plane, f_number=0.1, focus_distance=focus, samples=256)
     diameter = 0.5 * camera.fx * abs(1 / 4.0 - 1 / focus)
@@ -200,11 +200,11 @@ def test_motion_spreads_an_edge_over_the_way_that_it_goes(plane: SceneSpec) -> N
         assert np.ptp(path) > 5
 
 
-def test_a_sphere_at_the_target_keeps_its_outline_in_motion_and_the_operator_moves_along(sphere: SceneSpec) -> None:
+def test_a_sphere_at_the_target_keeps_its_silhouette_in_motion_and_the_operator_moves_along(sphere: SceneSpec) -> None:
     figure = {"operator_height": 4.0, "operator_radiance": 9.0}
     pairs = zip(views(sphere, **figure), views(sphere, **figure, motion_deg=20.0), strict=True)
     for (camera, still), (_, moving) in pairs:
-        assert_same_outline(moving, still)
+        assert_same_silhouette(moving, still)
         assert np.sum(moving.normals_world * ray_directions_world(camera), -1).max() < 1e-5
         for light in (still, moving):  # The head covers most of these four pixels; at rest, it would sweep across five.
             assert light.radiance[31:33, 31:33].mean() > 6

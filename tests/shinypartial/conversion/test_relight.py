@@ -24,7 +24,7 @@ OPTIONS = PictureOptions(resolution=64, samples=4, threads=1)
 
 
 def test_the_mirror_ball_shows_the_light_at_the_camera(tmp_path: Path) -> None:
-    """The middle of its outline mirrors the way back, whose color is (d + 1)/2; where no object is, alpha is 0."""
+    """The middle of its silhouette mirrors the way back, whose color is (d + 1)/2; where no object is, alpha is 0."""
     write_exr_rgb(tmp_path / "light.exr", direction_colors(64))
     picture = render_in_lights(None, {"light": tmp_path / "light.exr"}, OPTIONS)["light"]
     high = np.array([1.6, 0.5, 0.5])
@@ -41,7 +41,7 @@ def test_the_mirror_ball_shows_the_light_at_the_camera(tmp_path: Path) -> None:
 
 
 def test_an_object_of_a_gltf_file_mirrors_the_map(tmp_path: Path) -> None:
-    """A perfect mirror in a gray world is gray; in a dark one it is dark and keeps its outline."""
+    """A perfect mirror in a gray world is gray; in a dark one it is dark and keeps its silhouette."""
     ball(tmp_path, rows=12)
     surface = surface_of(tmp_path)
     assert surface is not None

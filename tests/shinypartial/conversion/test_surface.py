@@ -86,22 +86,22 @@ def test_a_glb_holds_the_surface_with_y_up(tmp_path: Path) -> None:
     assert material == {"baseColorFactor": [*TINT, 1.0], "metallicFactor": 1.0, "roughnessFactor": 0.0}
 
 
-@pytest.mark.parametrize("outline", [L_SHAPE, spiral()], ids=["L", "spiral"])
-def test_a_polygon_is_cut_into_triangles_of_its_area_and_turn(tmp_path: Path, outline: np.ndarray) -> None:
+@pytest.mark.parametrize("silhouette", [L_SHAPE, spiral()], ids=["L", "spiral"])
+def test_a_polygon_is_cut_into_triangles_of_its_area_and_turn(tmp_path: Path, silhouette: np.ndarray) -> None:
     tilt = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     tilt *= np.linalg.det(tilt)
-    vertices = np.pad(outline, ((0, 0), (0, 1))) @ tilt.T
-    surface = surface_of(prediction(tmp_path / "p", vertices, np.arange(len(outline))[None]))
+    vertices = np.pad(silhouette, ((0, 0), (0, 1))) @ tilt.T
+    surface = surface_of(prediction(tmp_path / "p", vertices, np.arange(len(silhouette))[None]))
     np.testing.assert_allclose(surface.normals, np.broadcast_to(tilt[:, 2], vertices.shape), atol=1e-9)
-    corners = outline[triangles_of(surface)]
+    corners = silhouette[triangles_of(surface)]
     (x, y), (u, v) = (
         np.moveaxis(corners[:, 1] - corners[:, 0], -1, 0),
         np.moveaxis(corners[:, 2] - corners[:, 0], -1, 0),
     )
-    (a, b), (c, d) = outline.T, np.roll(outline, -1, 0).T
+    (a, b), (c, d) = silhouette.T, np.roll(silhouette, -1, 0).T
     assert (x * v - y * u > 0).all()
     assert (x * v - y * u).sum() == pytest.approx((a * d - b * c).sum(), rel=1e-9)
-    assert len(corners) == len(outline) - 2
+    assert len(corners) == len(silhouette) - 2
 
 
 def test_triangles_without_area_are_left_out(tmp_path: Path) -> None:

@@ -324,7 +324,7 @@ def test_a_larger_mask_is_black_without_a_background_and_shows_one_that_is_there
         np.testing.assert_allclose(view.radiance[ring], gray, rtol=0.01)
 
 
-def test_outlines_move_by_view_within_their_bound(sphere_dataset: Dataset, tmp_path: Path) -> None:
+def test_silhouettes_move_by_view_within_their_bound(sphere_dataset: Dataset, tmp_path: Path) -> None:
     """Of a disk of area A, the radius √(A/π) changes by the drawn distance."""
     perturb(sphere_dataset.root, tmp_path / "copy", Perturbation(masks=MaskErrors(offset_px=0.8)))
     pairs = zip(open_dataset(tmp_path / "copy").train, sphere_dataset.train, strict=True)

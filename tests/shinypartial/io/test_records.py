@@ -48,7 +48,7 @@ class Recipe:
     seconds: dict[str, NonNegative] = field(default_factory=dict)
     curves: dict[str, list[float]] = field(default_factory=dict)
     config: dict[str, Any] = field(default_factory=dict)
-    outline: NonEmpty[tuple[float, float]] = ((0.0, 1.0),)
+    silhouette: NonEmpty[tuple[float, float]] = ((0.0, 1.0),)
     shape: Ball | Box = Ball()
     parts: tuple[Ball | Box, ...] = ()
     options: Options = field(default_factory=Options)
@@ -65,7 +65,7 @@ recipes = st.builds(
     gain=st.none() | shares,
     steps=st.lists(st.floats(0, 1e300)).map(tuple),
     curves=st.dictionaries(st.text(), st.lists(st.floats(allow_nan=False, allow_infinity=False))),
-    outline=st.lists(st.tuples(shares, shares), min_size=1).map(tuple),
+    silhouette=st.lists(st.tuples(shares, shares), min_size=1).map(tuple),
     shape=st.builds(Ball, radius=shares) | st.builds(Box, size=st.tuples(shares, shares)),
     parts=st.lists(st.builds(Ball, radius=shares) | st.just(Box())).map(tuple),
     options=st.builds(Options, rays=st.integers(8, 100), decay=st.floats(0, 0.99)),
@@ -100,9 +100,9 @@ REFUSED: dict[str, tuple[dict[str, Any], str, str, str]] = {
     "choice": ({"mode": "slow"}, "`mode`", "one of fast, best", "'slow'"),
     "blank": ({"name": " "}, "`name`", "a text that is not empty", "' '"),
     "no path": ({"folder": 3}, "`folder`", "a path", "3"),
-    "length": ({"outline": [[0, 1], [1, 2, 3]]}, "`outline.1`", "2 values", "3"),
-    "no list": ({"outline": "ab"}, "`outline`", "a list", "'ab'"),
-    "empty list": ({"outline": []}, "`outline`", "a list that is not empty", "an empty list"),
+    "length": ({"silhouette": [[0, 1], [1, 2, 3]]}, "`silhouette.1`", "2 values", "3"),
+    "no list": ({"silhouette": "ab"}, "`silhouette`", "a list", "'ab'"),
+    "empty list": ({"silhouette": []}, "`silhouette`", "a list that is not empty", "an empty list"),
     "in a tuple of a union": ({"shape": {"kind": "box", "size": [0, 2]}}, "`shape.size.1`", "from 0 to 1", "2"),
     "kind": ({"parts": [{"kind": "cone"}]}, "`parts.0.kind`", "one of ball, box", "'cone'"),
     "no kind": ({"parts": [{}]}, "`parts.0.kind`", "one of ball, box", "None"),

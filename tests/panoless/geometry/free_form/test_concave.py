@@ -28,7 +28,7 @@ from tests.support.mirror_body import (
 
 OUTER, CONCAVITY_MIDDLE, CONCAVITY_AXES = (0.8, 1.0, 0.9), (0.75, 0.1, -0.05), (0.7, 0.7, 0.55)
 RIM = 0.57
-"""Height along x at which the two ellipsoids meet, about: the cap that outlines see."""
+"""Height along x at which the two ellipsoids meet, about: the cap that silhouettes see."""
 QUICK = {
     "RAYS": 12_000,
     "PIXELS": 1_000,
@@ -178,7 +178,7 @@ def hollow_errors_deg(surface: LevelSet, body: Body, views: Views) -> np.ndarray
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_concavity_that_no_outline_shows_is_found(dish: tuple[Body, Views]) -> None:
+def test_a_concavity_that_no_silhouette_shows_is_found(dish: tuple[Body, Views]) -> None:
     body, views = dish
     lidded = Body(lambda x: np.maximum(ellipsoid(OUTER).value(x), x[:, 0] - RIM))
     start = level_set_of(lidded, views)

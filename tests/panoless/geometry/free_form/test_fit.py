@@ -9,7 +9,7 @@ import torch
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from panoless.capture.corrections import NO_CORRECTIONS, with_outline_moved
+from panoless.capture.corrections import NO_CORRECTIONS, with_silhouette_moved
 from panoless.capture.lens import with_focal_factor
 from panoless.capture.poses import Poses, StatedCameras
 from panoless.capture.views import Views, views_of
@@ -17,7 +17,7 @@ from panoless.config import FitConfig
 from panoless.environment.surroundings import FAR, Floor, Surroundings
 from panoless.first_surface.options import FirstSurfaceOptions
 from panoless.geometry.free_form import fit, start, steps
-from panoless.geometry.free_form.equations import OUTLINE_SCALE_PX, silhouette_rows
+from panoless.geometry.free_form.equations import SILHOUETTE_SCALE_PX, silhouette_rows
 from panoless.geometry.free_form.fit import (
     HELD_OUT_RAYS,
     FitStage,
@@ -41,7 +41,7 @@ from panoless.kernels.level_set import seen_with_slopes
 from panoless.kernels.reference.cubemap import padded_texels
 from panoless.problem.blocks import BLOCKS, Block, Exposures, MaskOffsets, Walls
 from panoless.problem.nuisance import NO_NUISANCE, Nuisance, nuisance_of
-from panoless.problem.observations import outline_rays, solid_pixels
+from panoless.problem.observations import silhouette_rays, solid_pixels
 from shinypartial.core.camera import Camera, Similarity
 from tests.support.mirror_body import (
     Body,
@@ -260,7 +260,7 @@ def test_a_step_with_the_map_solved_again_gains_what_its_equations_promise(linea
 
 
 def test_the_gradient_is_that_of_finite_differences(linearization: Linearization) -> None:
-    """Of outlines and gauge; outlines near to zero hardly feel the slope that their distances are divided by."""
+    """Of silhouettes and gauge; silhouettes near to zero hardly feel the slope that their distances are divided by."""
     parts = linearization.silhouettes, linearization.gauge
     gradient = sum(rows.backward(rows.residual, linearization.surface.shape) for rows in parts) * linearization.active
     change, costs = 1e-3 * gradient / np.abs(gradient).max(), []
@@ -417,7 +417,7 @@ def test_rows_of_a_block_are_those_of_finite_differences(linearization: Lineariz
         expected, found = expected[bright], found[bright]
     assert len(expected) > 100
     assert np.median(np.abs(found - expected)) <= 0.02 * np.median(np.abs(expected))
-    count = len(linearization.task.outlines.size)
+    count = len(linearization.task.silhouettes.size)
     expected = ((sides[0].silhouettes.residual - sides[1].silhouettes.residual) / 2)[:count]
     found = silhouettes.forward(change)[:count]
     assert np.median(np.abs(found - expected)) <= 0.01 * np.median(np.abs(expected))
@@ -494,7 +494,7 @@ def test_a_refused_step_is_tried_again_with_more_damping(
 
 
 @pytest.mark.slow
-def test_flat_faces_that_no_outline_shows_are_found_by_a_descent() -> None:
+def test_flat_faces_that_no_silhouette_shows_are_found_by_a_descent() -> None:
     """The corner of a block faces the cameras. By the median of normals a start that descended is wrong by 1.6°, the
     plain one by 22°.
     """
@@ -554,12 +554,12 @@ def left_deg(found: Poses, wrong: Poses) -> float:
     return float(np.degrees(np.median((left.mean().inv() * left).magnitude())))
 
 
-def test_photographs_agree_with_masks_unless_outlines_lie_to_one_side_of_them(linearization: Linearization) -> None:
+def test_photographs_agree_with_masks_unless_silhouettes_lie_to_one_side_of_them(linearization: Linearization) -> None:
     """A surface that is larger by 0.05 px is as near to the masks as others may be, but lies to one side of
     them."""
 
     def apart_px(moved: Linearization) -> float:
-        return float(np.median(moved.silhouettes.residual[: len(moved.task.outlines.view)]))
+        return float(np.median(moved.silhouettes.residual[: len(moved.task.silhouettes.view)]))
 
     def larger(cells: float) -> Linearization:
         surface = replace(linearization.surface, coefficients=linearization.surface.coefficients - cells)
@@ -567,22 +567,22 @@ def test_photographs_agree_with_masks_unless_outlines_lie_to_one_side_of_them(li
 
     cells_a_pixel = 0.01 / (apart_px(larger(0.0)) - apart_px(larger(0.01)))
     level = apart_px(linearization) * cells_a_pixel
-    assert larger(level).outlines_agree
+    assert larger(level).silhouettes_agree
     for off_px in (-0.2, -0.05, 0.05, 0.2):
-        assert not larger(level + off_px * cells_a_pixel).outlines_agree
+        assert not larger(level + off_px * cells_a_pixel).silhouettes_agree
 
 
 def test_rays_that_pass_the_box_of_a_surface_cost_as_outliers(ring: tuple[Views, FreeFormMirror]) -> None:
     """So a camera that turns away from the object gains nothing."""
     views, geometry = ring
     away = turned_by(views, 60.0, 0)
-    outlines = outline_rays(views)
+    silhouettes = silhouette_rays(views)
     costs = [
         silhouette_rows(geometry.surface, rays, rays.chosen(slice(0)), 1.0, 1.0, NO_NUISANCE)[0].cost
-        for rays in (outlines, outlines.moved(away))
+        for rays in (silhouettes, silhouettes.moved(away))
     ]
     assert costs[1] > 10 * costs[0]
-    assert costs[1] > 0.49 * len(outlines.size) * OUTLINE_SCALE_PX**2
+    assert costs[1] > 0.49 * len(silhouettes.size) * SILHOUETTE_SCALE_PX**2
 
 
 def wronged(views: Views) -> tuple[Views, dict[str, np.ndarray]]:
@@ -595,7 +595,7 @@ def wronged(views: Views) -> tuple[Views, dict[str, np.ndarray]]:
     }
     seen = turned_by(views, 0.3, 1).moved(views)
     train = [
-        with_outline_moved(
+        with_silhouette_moved(
             replace(with_focal_factor(view, 1.01), radiance=(view.radiance * float(np.exp(gain))).clamp(max=1)), offset
         )
         for view, gain, offset in zip(seen.train, truth["gains"], truth["masks"], strict=True)

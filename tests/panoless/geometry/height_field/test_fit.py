@@ -1,4 +1,4 @@
-"""Heights from outlines and from what is mirrored: derivatives, what cannot be known, and what is recovered."""
+"""Heights from silhouettes and from what is mirrored: derivatives, what cannot be known, and what is recovered."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from panoless.geometry.plane.model import Plane
 from panoless.geometry.plane.silhouette import apply_plane_step
 from panoless.problem.equations import Data, Equations, Photographs, Round, State, Traced
 from panoless.problem.nuisance import NO_NUISANCE
-from panoless.problem.solve import ROUNDS, by_outlines_alone, solve
+from panoless.problem.solve import ROUNDS, by_silhouettes_alone, solve
 from tests.support.mirror_height_field import bumpy, height_field_views, normal_errors_deg
 from tests.support.mirror_plane import RECTANGLE, arc, disc, plane_of
 
@@ -38,7 +38,7 @@ def views(truth: HeightField) -> Views:
 
 def of_edges(views: Views, start: HeightField) -> HeightField:
     """By silhouettes alone."""
-    return by_outlines_alone(views, HeightFieldUnknowns(start, STIFF)).height_field
+    return by_silhouettes_alone(views, HeightFieldUnknowns(start, STIFF)).height_field
 
 
 def fitted(views: Views, plane: Plane, cells: int = 16, rounds: int = len(ROUNDS)) -> HeightField:
@@ -98,7 +98,7 @@ def linearized(data: Data, height_field: HeightField) -> Equations:
 
 def of_photographs(data: Data, height_field: HeightField) -> tuple[np.ndarray, np.ndarray]:
     """Gradient and matrix over the coefficients, without silhouettes, which have no contour point there."""
-    silent = replace(data, outlines=data.outlines.chosen(slice(0, 0)))
+    silent = replace(data, silhouettes=data.silhouettes.chosen(slice(0, 0)))
     found, first = linearized(silent, height_field), -height_field.coefficients.size
     return found.gradient[first:], found.matrix[first:, first:]
 
@@ -141,7 +141,7 @@ def test_a_dome_and_a_bowl_are_found_from_a_flat_start(slope: float) -> None:
     assert np.mean(normal_errors_deg(found, truth, camera)) < 0.5
 
 
-def test_a_round_outline_bends_no_mirror() -> None:
+def test_a_round_silhouette_bends_no_mirror() -> None:
     """What a polygon of few sides misses of a circle, more than a pixel here, is not put down to heights."""
     views = height_field_views(flat_height_field(plane_of(disc(256)), 16), arc(12, size=96))
     height_field = of_edges(views, flat_height_field(plane_of(disc(16)), 16))
@@ -152,8 +152,8 @@ def test_a_round_outline_bends_no_mirror() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("rim", [0.0, 0.1])
 def test_what_a_rim_hides_of_the_surroundings_is_left_out(rim: float) -> None:
-    """Outlines determine nothing of a rim that stands back, and mirrored rays that meet it see black. Without one, none
-    is found.
+    """Silhouettes determine nothing of a rim that stands back, and mirrored rays that meet it see black. Without one,
+    none is found.
     """
     truth = replace(flat_height_field(plane_of(RECTANGLE), 6).domed(0.3), clearance=rim)
     views, camera = height_field_views(truth, arc(16, size=64)), arc(16)[8]
@@ -201,7 +201,7 @@ def test_no_step_raises_the_cost(truth: HeightField, views: Views, factor: float
     third; at the true ones a step of noise is refused or helps.
     """
     data = data_of(views, 32)
-    silent = replace(data, outlines=data.outlines.chosen(slice(0, 0)))
+    silent = replace(data, silhouettes=data.silhouettes.chosen(slice(0, 0)))
     found = linearized(silent, replace(truth, coefficients=factor * truth.coefficients))
     moved, fall, traced = found.after_step()
     before, after = (found.cost(state, np.zeros(state.surface.count), traced) for state in (found.state, moved))

@@ -160,7 +160,7 @@ def test_only_planes_do_not_bend() -> None:
     assert abs(tilt @ curved.bending() @ tilt) < 1e-12
 
 
-def test_the_mesh_lies_on_the_height_field_within_the_outline() -> None:
+def test_the_mesh_lies_on_the_height_field_within_the_silhouette() -> None:
     height_field = bumpy(plane_of(L_SHAPE), 0.02)
     points, faces = height_field.quadrilaterals()
     assert np.allclose(points @ NORMAL - height_field.plane.offset, height_field.heights(coordinates_of(points))[0])

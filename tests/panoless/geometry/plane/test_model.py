@@ -1,4 +1,4 @@
-"""One plane from silhouettes: coverage is area, depth lies on the plane, and outlines alone give the normal."""
+"""One plane from silhouettes: coverage is area, depth lies on the plane, and silhouettes alone give the normal."""
 
 from dataclasses import replace
 
@@ -41,7 +41,7 @@ def test_buffers_are_those_of_the_plane(frame_height: float) -> None:
     buffers = plane_buffers(plane, camera)
     fine = seen(plane, camera, 16).reshape(SIZE_PX, 16, SIZE_PX, 16).mean((1, 3))
     difference = np.abs(buffers.alpha.numpy() - fine)
-    # With a frame, pixels that both outlines cut are approximate; where the two outlines cross there are a few.
+    # With a frame, pixels that both silhouettes cut are approximate; where the two silhouettes cross there are a few.
     assert np.quantile(difference, 0.999) < 0.05
     assert difference.max() < (0.05 if frame_height == 0 else 0.3)
     rotation, center = pose_of(camera)
@@ -83,7 +83,7 @@ def flat_fit() -> PlaneFit:
     return fit_plane(mirror_views(plane_of(L_SHAPE), arc(12)))
 
 
-def test_outlines_give_the_normal(flat_fit: PlaneFit) -> None:
+def test_silhouettes_give_the_normal(flat_fit: PlaneFit) -> None:
     """From masks alone, with pixels of 0.023 units, 23° between the mean view and the normal."""
     plane = flat_fit.plane
     assert angle_deg(plane.normal, NORMAL) < 0.1
@@ -94,7 +94,7 @@ def test_outlines_give_the_normal(flat_fit: PlaneFit) -> None:
     assert float(flat_fit.iou.min()) > 0.995
 
 
-def test_the_outline_is_that_of_the_mirror(flat_fit: PlaneFit) -> None:
+def test_the_silhouette_is_that_of_the_mirror(flat_fit: PlaneFit) -> None:
     """The L's six corners and no others, each within a tenth of a pixel."""
     found, true = (p.points(p.boundary) for p in (flat_fit.plane, plane_of(L_SHAPE)))
     gaps = np.linalg.norm(found[:, None] - true[None], axis=-1)
@@ -179,7 +179,7 @@ def test_a_round_mirror_needs_only_so_many_vertices() -> None:
 
 
 def test_a_sphere_is_no_plane(views: Views, flat_fit: PlaneFit) -> None:
-    """Its outlines are circles from everywhere, which no plane carries into each other."""
+    """Its silhouettes are circles from everywhere, which no plane carries into each other."""
     fit = fit_plane(views)
     assert float(np.median(fit.median_px)) > 5 * float(np.median(flat_fit.median_px))
     assert float(fit.iou.mean()) < 0.95

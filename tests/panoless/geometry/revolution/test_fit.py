@@ -113,7 +113,7 @@ def test_a_deep_cup_is_open_though_no_ray_leaves_it_at_once() -> None:
 
 @pytest.mark.slow
 def test_the_inside_of_a_plate_is_found_by_steps_under_coarse_maps() -> None:
-    """No outline shows it. Measured: 1.0° in the median; 11° without these steps."""
+    """No silhouette shows it. Measured: 1.0° in the median; 11° without these steps."""
     photographs = photograph(plate(), VIEWS, 96, elevations_deg=(20.0, 35.0, 50.0, 60.0))
     closed = outside(photographs.views)
     with torch.no_grad():

@@ -76,7 +76,7 @@ def test_equations_are_the_derivatives_of_the_mean_of_rays() -> None:
     views = averaged_views(goblet(), 6)
     surface = resample_profile(replace(goblet(), origin=goblet().origin + 0.01), 0.02)
     scene, splines = environment(128), ProfileSplines.of(surface, 0.1)
-    # Away from outlines and edges, where no ray of a pixel comes or goes.
+    # Away from silhouettes and edges, where no ray of a pixel comes or goes.
     pixels = []
     for view in views.train:
         hits = surface.hits(*rays_of(view.camera))

@@ -1,4 +1,4 @@
-"""The lip of a wall without thickness is where outlines put it."""
+"""The lip of a wall without thickness is where silhouettes put it."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def contours():
     return contour_rays(revolution_views(bowl(), around(12)))
 
 
-def test_the_outlines_place_the_rim(contours) -> None:
+def test_the_silhouettes_place_the_rim(contours) -> None:
     """From a lip two pixels off in radius and height: to a tenth of a pixel."""
     truth = bowl()
     for shift in ([2.0, -1.0], [0.5, 1.5]):

@@ -1,4 +1,4 @@
-"""Surfaces of revolution: rays meet them where they are, outlines give axis and profile, reflections the rest."""
+"""Surfaces of revolution: rays meet them where they are, silhouettes give axis and profile, reflections the rest."""
 
 from dataclasses import replace
 
@@ -132,7 +132,7 @@ def goblet_fit():
     return propose_revolution(revolution_views(goblet(), around(12)))
 
 
-def test_outlines_give_axis_and_profile(goblet_fit) -> None:
+def test_silhouettes_give_axis_and_profile(goblet_fit) -> None:
     """A tilted axis to a tenth of a degree, toward the end that cameras look into, and the outside to a tenth of a
     pixel (0.02 units), from masks alone.
     """
@@ -150,7 +150,7 @@ def test_outlines_give_axis_and_profile(goblet_fit) -> None:
 
 
 def test_a_body_that_is_not_round_is_refused() -> None:
-    """A square pillar: no axis makes its outlines agree to half a pixel, or overlap by 98 %."""
+    """A square pillar: no axis makes its silhouettes agree to half a pixel, or overlap by 98 %."""
     from tests.support.mirror_revolution import pillar_views
 
     found = propose_revolution(pillar_views(around(16)))
@@ -209,7 +209,7 @@ def test_a_search_finds_the_funnel_inside() -> None:
     assert float(np.median(np.abs(seen[:, 1] - expected))) < 0.03
 
 
-def test_a_search_rises_above_the_end_of_the_outlines() -> None:
+def test_a_search_rises_above_the_end_of_the_silhouettes() -> None:
     """The wall rises by 0.04 within the lip before it goes down: the cheapest inside does so, to a pixel (0.02)."""
     body = goblet()
     radius = body.profile[-2, 0]
@@ -225,7 +225,7 @@ def test_a_search_rises_above_the_end_of_the_outlines() -> None:
     assert float(np.median(np.abs(seen[:, 1] - expected))) < 0.02
 
 
-def test_outlines_go_on_beyond_a_thin_stem() -> None:
+def test_silhouettes_go_on_beyond_a_thin_stem() -> None:
     """A cup on a stem that is three pixels thick, and a foot, around an axis that is turned by 6°."""
     height = np.linspace(-0.8, 0.8, 300)
     cup = 0.45 * np.sqrt(np.clip(1 - ((height - 0.45) / 0.4) ** 2, 0, 1))

@@ -30,7 +30,7 @@ def covered(surface: SurfaceOfRevolution, camera: RasterCamera) -> torch.Tensor:
 
 
 def test_a_pixel_of_a_ball_is_the_mean_of_its_rays() -> None:
-    """Against the analytic sphere at 16×16 rays a pixel, inside its outline: a hundredth of what single rays miss."""
+    """Against the analytic sphere at 16×16 rays a pixel, inside its silhouette: 1 % of what single rays miss."""
     surface, scene, camera = ball(), environment(), around(3, 40)[2]
     pixels = covered(surface, camera)
     inner = pixels[revolution_buffers(surface, camera).alpha.flatten()[pixels] == 1]

@@ -1,4 +1,4 @@
-"""A mirror ball from outlines, against one that is traced in closed form by `tests.support.synthetic_dataset`."""
+"""A mirror ball from silhouettes, against one that is traced in closed form by `tests.support.synthetic_dataset`."""
 
 from dataclasses import replace
 
@@ -115,7 +115,7 @@ def test_an_egg_is_no_sphere_whatever_the_noise_of_masks(
 
 
 @pytest.mark.parametrize("count", [2, 3, 9])
-def test_outlines_give_center_and_radius(count: int) -> None:
+def test_silhouettes_give_center_and_radius(count: int) -> None:
     """0.002 is a thirtieth of a pixel; 5×5 samples a pixel make the masks."""
     views = ball_views(count)
     found = fit_sphere(views, requested=False)
