@@ -28,13 +28,15 @@ from panoless.numeric.gauss_newton import keep_if_better
 from panoless.problem.blocks import CameraPoses, Distortion, Walls
 from panoless.problem.evidence import Decision, needed
 from panoless.problem.nuisance import NO_NUISANCE, Nuisance, nuisance_of
-from panoless.problem.observations import solid_pixels
+from panoless.problem.observations import silhouette_rays, solid_pixels
 from shinypartial.io.progress import Progress
 
 SHARED_SCALE = 0.2
 """Robust scale above which what all views share stays: its derivative under a coarse map has the wrong sign."""
 LAST_RAYS = 2.5
-"""Factor of the pixels of the last round, which all views take: those before lead to where it starts."""
+"""Factor of the pixels of the last round, which all views take: those before lead to where it starts…"""
+MOST_RAYS = 300_000
+"""…and the most of them."""
 JUDGED_RAYS = 40_000
 """Pixels by which blocks are judged."""
 VARIANCE_STEPS = 60
@@ -93,6 +95,7 @@ def fit_free_form(
     start: LevelSet,
     schedule: Schedule,
     *,
+    hull: LevelSet | None = None,
     caps: Sequence[LevelSet] = (),
     nuisance: Nuisance = NO_NUISANCE,
     required: Collection[str] = (),
@@ -103,15 +106,17 @@ def fit_free_form(
     Rounds are taken with four fifths of the views as long as the others gain by them, and the last of those once more
     with all, in which silhouettes count more where photographs agree with them. After the rounds that are always taken,
     concavities are searched, blocks that are not `required` are removed unless they are needed, parts that pixels
-    distrust are refitted, and details are searched where much is left. Concavities are searched under the start, and if
-    it has none, under the `caps`, other first surfaces.
+    distrust are refitted, and where much is left, details are searched from the `hull`. Concavities are searched under
+    the start, and if it has none, under the `caps`, other first surfaces.
     """
     kept, others = split_held_out(range(len(views.train)))
     if not kept or not others:
         kept, others = list(range(len(views.train))), []
     solved, tested = (replace(views, train=tuple(views.train[number] for number in part)) for part in (kept, others))
     rounds = *schedule.coarse, *schedule.finer
-    again = max(settings.steps for settings in (schedule.coarse[-1], *schedule.finer, *schedule.detailed[-1:]))
+    again = max(
+        settings.steps for settings in (schedule.coarse[-1], *schedule.finer, *schedule.detailed, *schedule.finest)
+    )
     progress = Progress("fitting a free-form surface", sum(settings.steps for settings in rounds) + again)
 
     known: MutableMapping[FitStage, float] = WeakIdKeyDictionary()
@@ -135,7 +140,7 @@ def fit_free_form(
             if concave is not None:
                 plain, deeper = stage, coarse_stage(solved, concave, schedule.concave, nuisance=stage.nuisance)
                 stage = best((plain, deeper))
-                begun = start if stage is plain else concave
+                begun, hull = (start, hull) if stage is plain else (concave, None)
             stage, decisions = _needed(solved, stage, required)
             if not all(each.kept for each in decisions.values()):
                 # A surface that gave way to blocks does not come back from them by further steps.
@@ -144,12 +149,19 @@ def fit_free_form(
                 begun = replace(begun, surroundings=stage.surface.surroundings)
                 stage = coarse_stage(solved, begun, rounds, nuisance=stage.nuisance)
             stage = best(refitted_stages(solved, stage, schedule.refit))
+            finest = list[Round]()
             if others and schedule.detailed and error(stage) > DETAILED_ERROR:
                 details = Progress("looking for details", sum(each.steps for each in schedule.detailed))
-                stage = best((stage, coarse_stage(solved, begun, schedule.detailed, details, stage.nuisance)))
+                outer = replace(hull or begun, surroundings=stage.surface.surroundings)
+                detailed = coarse_stage(solved, outer, schedule.detailed, details, stage.nuisance)
+                stage = best((stage, detailed))
+                finest = [each for each in schedule.finest if stage is detailed and _is_seen(views, stage, each)]
             stage = best(_stages(solved, stage, schedule.finer, progress), LEAST_FINER_GAIN)
             stage, later = _needed(solved, _with_distortion(solved, stage), required)
             decisions |= later
+            if finest:
+                sharper = Progress("sharpening details", sum(each.steps for each in finest))
+                stage = best(_stages(solved, stage, finest, sharper), LEAST_FINER_GAIN)
         if stage.settings is None:
             return FitStage.begun(start, nuisance), []
         skipped = progress.total - progress.done - stage.last.steps
@@ -158,10 +170,17 @@ def fit_free_form(
         if others:
             unseen = predicted(solved, tested, stage)
             stage = replace(stage, nuisance=joined(stage.nuisance, unseen, len(views.train)))
-        settings = replace(stage.last, rays=round(LAST_RAYS * stage.last.rays))
+        settings = replace(stage.last, rays=min(round(LAST_RAYS * stage.last.rays), MOST_RAYS))
         with improving():
             stage = take_round(views, stage, settings, progress, last=True)
         return stage, list(decisions.values())
+
+
+def _is_seen(views: Views, stage: FitStage, settings: Round) -> bool:
+    """Whether the cells of a round are at least as wide as pixels at the object."""
+    rays = silhouette_rays(views)
+    pixel = rays.size * np.linalg.norm(rays.origins, axis=1)
+    return float(stage.surface.extent.max()) / settings.cells >= float(np.median(pixel))
 
 
 def _concave_start(views: Views, caps: Sequence[LevelSet], surface: LevelSet) -> LevelSet | None:
@@ -191,9 +210,9 @@ def _with_distortion(views: Views, stage: FitStage) -> FitStage:
 
 def continued_fit(views: Views, fitted: FitStage, schedule: Schedule) -> FitStage:
     """What an earlier fit led to after its last round was taken again, with views that changed a little."""
-    rounds = [*schedule.detailed, *schedule.coarse, *schedule.finer]
+    rounds = [*schedule.detailed, *schedule.coarse, *schedule.finer, *schedule.finest]
     last = next((each for each in reversed(rounds) if each.cells == fitted.surface.cells), rounds[-1])
-    stage, settings = replace(fitted, settings=last), replace(last, rays=round(LAST_RAYS * last.rays))
+    stage, settings = replace(fitted, settings=last), replace(last, rays=min(round(LAST_RAYS * last.rays), MOST_RAYS))
     with torch.no_grad():
         return take_round(views, stage, settings, Progress("fitting on", settings.steps), last=True)
 

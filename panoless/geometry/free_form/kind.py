@@ -229,7 +229,9 @@ class FreeFormFamily(ExactFamily):
         schedule, first = Schedule.of(config.free_form), proposal.shape
         start, nuisance = started(views, first, schedule, nuisance_of(views, kinds, first.surroundings))
         caps = () if np.array_equal(start.coefficients, first.plain.coefficients) else (first.surface,)
-        stage, decisions = fit_free_form(views, start, schedule, caps=caps, nuisance=nuisance, required=required)
+        stage, decisions = fit_free_form(
+            views, start, schedule, hull=first.hull, caps=caps, nuisance=nuisance, required=required
+        )
         if stage.settings is None:  # The time limit came before the first round.
             return _mirror(stage.surface, stage.trust, None, config), NO_CORRECTIONS, []
         with torch.no_grad():

@@ -78,18 +78,20 @@ REFIT = (
 )
 """Of parts of the surface that pixels distrust, as long as held-out views gain by it."""
 DETAILED = (
-    Round(36, 4, 0.80, 1, 20_000, 30.0, 10),
-    Round(36, 6, 0.80, 1, 20_000, 30.0, 10),
-    Round(36, 8, 0.80, 1, 20_000, 10.0, 10),
-    Round(36, 12, 0.80, 1, 20_000, 10.0, 10),
-    Round(44, 16, 0.50, 1, 40_000, 5.0, 6),
-    Round(44, 32, 0.40, 4, 60_000, 5.0, 6),
-    Round(60, 16, 0.50, 1, 60_000, 2.0, 8),
-    Round(60, 32, 0.40, 4, 80_000, 2.0, 8),
-    Round(60, 64, 0.30, 4, 80_000, 2.0, 8),
+    Round(60, 4, 0.80, 1, 20_000, 10.0, 6),
+    Round(60, 8, 0.80, 1, 20_000, 10.0, 6),
+    Round(60, 16, 0.50, 1, 40_000, 3.0, 6),
+    Round(60, 32, 0.50, 4, 60_000, 1.0, 6),
+    Round(84, 32, 0.30, 4, 100_000, 0.3, 5),
 )
-"""From the first surface, in place of the rounds before, where these leave much unexplained: the normals of small
-details turn by far more than the texels of their maps, and they are narrower than their cells."""
+"""From the hull, in place of the rounds before, where these leave much unexplained: coarse grids and smoothing lose
+what is thin, the normals of small details turn by far more than a texel, and their pixels mirror more than one."""
+FINEST = (
+    Round(120, 32, 0.30, 4, 160_000, 0.1, 5),
+    Round(120, 64, 0.20, 4, 160_000, 0.1, 5),
+    Round(160, 64, 0.20, 4, 240_000, 0.1, 4),
+)
+"""After these, each taken if held-out views gain by the one before it, down to cells as wide as pixels."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,7 @@ class Schedule:
     concave: tuple[Round, ...] = CONCAVE
     refit: tuple[Round, ...] = REFIT
     detailed: tuple[Round, ...] = DETAILED
+    finest: tuple[Round, ...] = FINEST
 
     @classmethod
     def of(cls, options: FreeFormOptions) -> "Schedule":
@@ -116,6 +119,7 @@ class Schedule:
             CONCAVE if options.concavities else (),
             _up_to(options.finest_cells, REFIT),
             DETAILED if options.starts else (),
+            FINEST if options.starts else (),
         )
 
 

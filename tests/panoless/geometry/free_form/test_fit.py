@@ -166,7 +166,7 @@ def test_parts_that_pixels_distrust_are_refitted(dented: tuple[Body, Views, FitS
 def test_waves_narrower_than_the_first_cells_are_found_under_coarse_maps() -> None:
     """Their normals turn by 15° and more. Measured: 0.3° in the median; 8.3° without the rounds that look for them."""
     body, cameras = wavy_ball(0.03, 9.0), cameras_around(16, 64)
-    short = tuple(replace(DETAILED[index], rays=8_000, steps=4) for index in (0, 2, 4, 5))
+    short = tuple(replace(each, rays=8_000, steps=4) for each in DETAILED[:4])
     schedule = replace(FEW_PIXELS, refit=(), detailed=short)
     views = body_views(body, len(cameras), 64)
     assert np.median(normal_errors_deg(fitted(views, schedule), body, views, cameras[::5])) < 0.6
@@ -189,6 +189,21 @@ def test_rounds_that_look_for_details_are_refused_where_held_out_views_gain_noth
     taken = fit_free_form(views, first, finer)[0].surface
     np.testing.assert_array_equal(refused.coefficients, alone.coefficients)
     assert (alone.cells, taken.cells) == (FIRST_ROUND.cells, details.cells)
+
+
+@pytest.mark.slow
+def test_details_begin_at_the_hull_and_end_at_cells_as_wide_as_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounds without steps leave a surface where it begins; held-out views are made to accept any."""
+    views, still = body_views(sphere(), 10, 40), Round(24, 4, 0.8, 1, 2_000, 30.0, 0)
+    first = first_surfaces(views, CONFIG)
+    hull = replace(first.plain, coefficients=first.plain.coefficients + 0.5)
+    finest = replace(still, cells=26), replace(still, cells=400)
+    schedule = replace(FEW_PIXELS, coarse=(replace(FIRST_ROUND, steps=1),), refit=(), detailed=(still,), finest=finest)
+    monkeypatch.setattr(fit, "DETAILED_ERROR", -1.0)
+    monkeypatch.setattr(fit, "LEAST_GAIN", -99.0)
+    monkeypatch.setattr(fit, "LEAST_FINER_GAIN", -99.0)
+    found = fit_free_form(views, first.plain, schedule, hull=hull)[0].surface
+    np.testing.assert_allclose(found.coefficients, hull.resampled(24).resampled(26).coefficients, atol=1e-9)
 
 
 def test_what_pixels_trust_is_not_refitted() -> None:
