@@ -14,6 +14,8 @@ from shinypartial.core.conventions import SOLID_ALPHA
 
 SATURATED = 0.97
 """Share of the largest radiance from which a pixel is taken for saturated."""
+BACKGROUND_PX = 3.0
+"""Masks err by less."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,15 @@ def inner_distance_px(mask: Float[Tensor, "H W"]) -> Float[np.ndarray, "P"]:
     return found
 
 
+@remembered
+def outer_distance_px(mask: Float[Tensor, "H W"]) -> Float[np.ndarray, "P"]:
+    """How far each pixel lies from the nearest one that shows the object."""
+    from scipy.ndimage import distance_transform_edt
+
+    found: np.ndarray = distance_transform_edt(mask.cpu().numpy() <= 0).astype(np.float32).ravel()
+    return found
+
+
 def solid_pixels(views: Views, count: int) -> Pixels:
     """About `count` solid pixels of all views, evenly."""
     rays, radiance, inner = [], [], []
@@ -48,6 +59,16 @@ def solid_pixels(views: Views, count: int) -> Pixels:
         radiance.append(view.radiance_at(pixels).cpu().numpy().astype(np.float64))
         inner.append(inner_distance_px(view.mask)[index])
     return Pixels(concatenated(rays), np.concatenate(radiance), np.concatenate(inner))
+
+
+def background_rays(views: Views, count: int) -> PixelRays:
+    """Rays of pixels more than `BACKGROUND_PX` outside of their masks, as dense as `count` solid ones are."""
+    stride = max(views.num_solid // count, 1)
+    rays = []
+    for number, view in enumerate(views.train):
+        outside = np.flatnonzero(outer_distance_px(view.mask) > BACKGROUND_PX)
+        rays.append(PixelRays.centers(view.camera, outside[number % stride :: stride], number))
+    return concatenated(rays)
 
 
 def silhouette_rays(views: Views, *, longest_only: bool = False) -> PixelRays:

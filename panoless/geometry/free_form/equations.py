@@ -60,26 +60,28 @@ def silhouette_rows(
     surface: LevelSet,
     silhouettes: PixelRays,
     missed: PixelRays,
+    surplus: PixelRays,
     silhouette_weight: float,
     miss_weight: float,
     nuisance: Nuisance,
 ) -> tuple[Rows, Float[np.ndarray, "S 1 6"]]:
-    """Silhouettes, along whose rays the least φ should be δ, and pixels on the object that miss it, for which it should
-    be no more; and how both change with (ω, τ) of their rays.
+    """Silhouettes, along whose rays the least φ should be δ, pixels on the object that miss it, for which it should be
+    no more, and pixels beside it that do not, for which it should be no less; and how all change with (ω, τ).
 
     The residual is φ/(‖∇φ‖ a t) − δ where φ is least, in pixels, with a the pixel's angle, t the distance and δ the
     offset of the view's mask.
     """
     parts = []
-    for rays, weight, scale, one_sided in (
-        (silhouettes, silhouette_weight, SILHOUETTE_SCALE_PX, False),
-        (missed, miss_weight * MISS_WEIGHT, MISS_SCALE_PX, True),
+    for rays, weight, scale, side in (
+        (silhouettes, silhouette_weight, SILHOUETTE_SCALE_PX, 0),
+        (missed, miss_weight * MISS_WEIGHT, MISS_SCALE_PX, 1),
+        (surplus, miss_weight * MISS_WEIGHT, MISS_SCALE_PX, -1),
     ):
         near = surface.nearest(rays.origins, rays.directions)
         slope = np.maximum(np.linalg.norm(near.derivatives[:, 1:4], axis=1), LEAST_SLOPE)
         by_value = near.met / (slope * rays.size * np.where(near.met, near.distance / surface.spacing, 1.0))
         residual = near.derivatives[:, 0] * by_value - near.met * nuisance.offsets_px(rays.view)
-        counted = near.met & (residual > 0) if one_sided else near.met
+        counted = near.met & (side * residual >= 0)
         residual = residual * counted
         weights = weight * counted * robust_weight(residual, scale)
         cost = weight * scale**2 * float(np.where(near.met, bounded_error(residual, scale), 1.0).sum())

@@ -190,7 +190,7 @@ class Linearization:
 
     @property
     def silhouettes(self) -> Rows:
-        """Silhouettes and missed pixels."""
+        """Silhouettes, and pixels that err about them."""
         return self._silhouettes[0]
 
     @cached_property
@@ -205,10 +205,13 @@ class Linearization:
         return rows
 
     @cached_property
-    def _silhouette_rays(self) -> tuple[PixelRays, PixelRays]:
-        """Of silhouettes, and of pixels that miss the surface."""
-        silhouettes = self.nuisance.moved(self.task.silhouettes, self.task.cameras)
-        return silhouettes, self.rays.chosen(~self.reflected.hits.met)
+    def _silhouette_rays(self) -> tuple[PixelRays, PixelRays, PixelRays]:
+        """Of silhouettes, of pixels on the object that miss the surface, and of those beside it that do not."""
+        silhouettes, beside = (
+            self.nuisance.moved(rays, self.task.cameras) for rays in (self.task.silhouettes, self.task.background)
+        )
+        met = self.surface.meets(beside.origins, beside.directions)
+        return silhouettes, self.rays.chosen(~self.reflected.hits.met), beside.chosen(met)
 
     @cached_property
     def _silhouettes(self) -> tuple[Rows, Float[np.ndarray, "S 1 6"]]:

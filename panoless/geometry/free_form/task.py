@@ -10,7 +10,7 @@ from panoless.capture.views import Views
 from panoless.geometry.free_form.schedule import Round
 from panoless.problem.blocks import Exposures, WhiteBalances
 from panoless.problem.nuisance import NO_NUISANCE, Nuisance
-from panoless.problem.observations import Pixels, is_saturated, silhouette_rays, solid_pixels
+from panoless.problem.observations import Pixels, background_rays, is_saturated, silhouette_rays, solid_pixels
 from panoless.problem.rays import PixelRays
 
 COUNTED_RAYS = 100_000.0
@@ -35,6 +35,8 @@ class Task:
 
     pixels: Pixels
     silhouettes: PixelRays
+    background: PixelRays
+    """Of pixels outside of the masks."""
     photograph_weight: float
     """Of a pixel, in units of 1/σ²."""
     silhouette_weight: float
@@ -84,4 +86,5 @@ def make_task(views: Views, settings: Round, nuisance: Nuisance = NO_NUISANCE) -
     dominance = (settings.robust_scale / RADIANCE_SIGMA) ** 2 if settings.silhouette_dominated else 1.0
     of_silhouettes = settings.silhouette_gain * dominance * density / SILHOUETTE_SIGMA_PX**2
     brightness = max(float(pixels.radiance.mean()), LEAST_BRIGHTNESS)
-    return Task(pixels, chosen, share, of_silhouettes, settings, StatedCameras.of(views), brightness)
+    background = background_rays(views, settings.rays)
+    return Task(pixels, chosen, background, share, of_silhouettes, settings, StatedCameras.of(views), brightness)

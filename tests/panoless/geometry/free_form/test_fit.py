@@ -41,7 +41,7 @@ from panoless.kernels.level_set import seen_with_slopes
 from panoless.kernels.reference.cubemap import padded_texels
 from panoless.problem.blocks import BLOCKS, Block, Exposures, MaskOffsets, Walls
 from panoless.problem.nuisance import NO_NUISANCE, Nuisance, nuisance_of
-from panoless.problem.observations import silhouette_rays, solid_pixels
+from panoless.problem.observations import background_rays, silhouette_rays, solid_pixels
 from shinypartial.core.camera import Camera, Similarity
 from tests.support.mirror_body import (
     Body,
@@ -592,12 +592,27 @@ def test_rays_that_pass_the_box_of_a_surface_cost_as_outliers(ring: tuple[Views,
     views, geometry = ring
     away = turned_by(views, 60.0, 0)
     silhouettes = silhouette_rays(views)
+    none = silhouettes.chosen(slice(0))
     costs = [
-        silhouette_rows(geometry.surface, rays, rays.chosen(slice(0)), 1.0, 1.0, NO_NUISANCE)[0].cost
+        silhouette_rows(geometry.surface, rays, none, none, 1.0, 1.0, NO_NUISANCE)[0].cost
         for rays in (silhouettes, silhouettes.moved(away))
     ]
     assert costs[1] > 10 * costs[0]
     assert costs[1] > 0.49 * len(silhouettes.size) * SILHOUETTE_SCALE_PX**2
+
+
+def test_what_shows_beside_its_mask_is_pulled_back(ring: tuple[Views, FreeFormMirror]) -> None:
+    """A ring that is 6 px too thick, by the pixels that should not see it; the right one costs nothing."""
+    views, geometry = ring
+    surface, beside = geometry.surface, background_rays(views, 4_000)
+    none, pixel = beside.chosen(slice(0)), np.median(beside.size) * np.linalg.norm(beside.origins[0]) / surface.spacing
+    for thicker_px, least, most in ((0.0, 0, 0), (6.0, 50, len(beside.size))):
+        thicker = replace(surface, coefficients=surface.coefficients - thicker_px * pixel)
+        met = beside.chosen(thicker.meets(beside.origins, beside.directions))
+        rows, _ = silhouette_rows(thicker, none, none, met, 1.0, 1.0, NO_NUISANCE)
+        assert least <= np.count_nonzero(rows.weights) <= most
+        change = np.ones(surface.shape)
+        assert ((rows.forward(change) * rows.residual).sum() < 0) == (thicker_px > 0)
 
 
 def wronged(views: Views) -> tuple[Views, dict[str, np.ndarray]]:
