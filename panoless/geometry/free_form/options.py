@@ -12,8 +12,8 @@ class FreeFormOptions:
     concavities: bool = True
     """Whether concavities that no silhouette shows are looked for."""
     starts: bool = True
-    """Whether several first surfaces descend under coarse maps, and fine grids are tried from the first one on where
-    much stays unexplained. Else the usual rounds begin at the surface whose pixels disagree least."""
+    """Whether several first surfaces descend under coarse maps, and details are searched from the hull where much stays
+    unexplained. Else the usual rounds begin at the surface whose pixels disagree least."""
     finest_cells: Count = 60
     """Cells along the longest side of the finest grid of the usual rounds. Rounds with more are left out, but for the
-    first."""
+    first. Below 60, no grid has more than 60."""

@@ -110,6 +110,7 @@ class Schedule:
     def of(cls, options: FreeFormOptions) -> "Schedule":
         """The rounds that options leave."""
         finer = _up_to(options.finest_cells, FINER)
+        whole = finer == FINER
         pixels = [each.rays for each in COARSE] if finer else CLOSING_RAYS
         coarse = tuple(replace(each, rays=rays) for each, rays in zip(COARSE, pixels, strict=True))
         return cls(
@@ -118,8 +119,8 @@ class Schedule:
             finer,
             CONCAVE if options.concavities else (),
             _up_to(options.finest_cells, REFIT),
-            DETAILED if options.starts else (),
-            FINEST if options.starts else (),
+            (DETAILED if whole else DETAILED[:-1]) if options.starts else (),
+            FINEST if options.starts and whole else (),
         )
 
 
