@@ -1,10 +1,9 @@
 """Which explanations a fit gives for one error and for two at once: `python -m tests.benchmarks.bench_confusion`.
 
-A development scene is rendered, spoiled by one of twelve errors or by two of them, and fitted by `panoless fit`. A row
-of the table is what was wrong, its columns are what the fit states: nuisance blocks that were kept, roughness and blur.
+A development scene is rendered, spoiled by one of twelve errors or by two of them, and fitted by `panoless fit`. A case
+is right if the fit states what was wrong and nothing else: nuisance blocks that were kept, roughness and blur.
 Noise and JPEG compression are controls, which nothing should explain. `--errors poses exposures` is a short run.
-Folders
-that are complete are used as they are, so a run that was stopped goes on.
+Folders that are complete are used as they are, so a run that was stopped goes on.
 """
 
 import subprocess
@@ -141,13 +140,32 @@ def _row(result: dict[str, Any]) -> str:
 
 
 def _table(results: list[dict[str, Any]]) -> list[str]:
-    right = sum(not each["missed"] and not each["false"] for each in results)
-    head = ["| What is wrong | Stated | Missed | Normals | Verdict |", "|---|---|---|---|---|"]
+    """A matrix of the errors of normals, with the singles on its diagonal, and the rows that are not right."""
+    by_case = {frozenset(each["errors"]): each for each in results}
+    wrong = [each for each in results if each["missed"] or each["false"]]
+    names = [name for name in EXPLAINED if any(name in case for case in by_case)]
+
+    def cell(row: str, column: str) -> str:
+        found = by_case.get(frozenset((row, column))) if names.index(row) <= names.index(column) else None
+        return (
+            ""
+            if found is None
+            else f"**{found['normals_deg']:.2f}**"
+            if found in wrong
+            else f"{found['normals_deg']:.2f}"
+        )
+
+    clean = by_case.get(frozenset())
     return [
-        f"{right} of {len(results)} cases end with their explanations and no others; false ones are bold.",
+        f"{len(results) - len(wrong)} of {len(results)} cases end with their explanations and no others; "
+        "the rest is bold." + (f" Without an error: {clean['normals_deg']:.2f}°." if clean else ""),
         "",
-        *head,
-        *map(_row, results),
+        "| Normals, degrees | " + " | ".join(names) + " |",
+        "|---" * (len(names) + 1) + "|",
+        *("| " + " | ".join([row, *(cell(row, column) for column in names)]) + " |" for row in names),
+        "",
+        *(["| What is wrong | Stated | Missed | Normals | Verdict |", "|---|---|---|---|---|"] if wrong else []),
+        *map(_row, wrong),
     ]
 
 
