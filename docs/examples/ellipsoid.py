@@ -142,9 +142,7 @@ class EllipsoidFamily(ExactFamily):
             nearest = by_silhouettes_alone(views, start)
             return Proposal.of(views, nearest.surface, nearest)
         if requested:
-            raise InputError(
-                expected="masks with a silhouette", found="none", remedy="Show the object within pictures."
-            )
+            raise InputError(expected="masks with a silhouette", found="none", remedy="Show the whole object.")
         return None
 
     def unknowns(self, views: Views, proposal: Proposal, config: FitConfig) -> EllipsoidUnknowns:
