@@ -146,14 +146,11 @@ def _table(results: list[dict[str, Any]]) -> list[str]:
     names = [name for name in EXPLAINED if any(name in case for case in by_case)]
 
     def cell(row: str, column: str) -> str:
-        found = by_case.get(frozenset((row, column))) if names.index(row) <= names.index(column) else None
-        return (
-            ""
-            if found is None
-            else f"**{found['normals_deg']:.2f}**"
-            if found in wrong
-            else f"{found['normals_deg']:.2f}"
-        )
+        found = by_case.get(frozenset((row, column)))
+        if found is None or names.index(row) > names.index(column):
+            return ""
+        degrees = f"{found['normals_deg']:.2f}"
+        return f"**{degrees}**" if found in wrong else degrees
 
     clean = by_case.get(frozenset())
     return [

@@ -155,7 +155,10 @@ def fit_free_form(
                 outer = replace(hull or begun, surroundings=stage.surface.surroundings)
                 detailed = coarse_stage(solved, outer, schedule.detailed, details, stage.nuisance)
                 stage = best((stage, detailed))
-                finest = [each for each in schedule.finest if stage is detailed and _is_seen(views, stage, each)]
+                if stage is detailed:
+                    rays = silhouette_rays(views)
+                    pixel = float(np.median(rays.size * np.linalg.norm(rays.origins, axis=1)))
+                    finest = [each for each in schedule.finest if stage.surface.extent.max() / each.cells >= pixel]
             stage = best(_stages(solved, stage, schedule.finer, progress), LEAST_FINER_GAIN)
             stage, later = _needed(solved, _with_distortion(solved, stage), required)
             decisions |= later
@@ -170,17 +173,15 @@ def fit_free_form(
         if others:
             unseen = predicted(solved, tested, stage)
             stage = replace(stage, nuisance=joined(stage.nuisance, unseen, len(views.train)))
-        settings = replace(stage.last, rays=min(round(LAST_RAYS * stage.last.rays), MOST_RAYS))
+        settings = _with_more_rays(stage.last)
         with improving():
             stage = take_round(views, stage, settings, progress, last=True)
         return stage, list(decisions.values())
 
 
-def _is_seen(views: Views, stage: FitStage, settings: Round) -> bool:
-    """Whether the cells of a round are at least as wide as pixels at the object."""
-    rays = silhouette_rays(views)
-    pixel = rays.size * np.linalg.norm(rays.origins, axis=1)
-    return float(stage.surface.extent.max()) / settings.cells >= float(np.median(pixel))
+def _with_more_rays(settings: Round) -> Round:
+    """A round as all views take it at the end."""
+    return replace(settings, rays=min(round(LAST_RAYS * settings.rays), MOST_RAYS))
 
 
 def _concave_start(views: Views, caps: Sequence[LevelSet], surface: LevelSet) -> LevelSet | None:
@@ -212,7 +213,7 @@ def continued_fit(views: Views, fitted: FitStage, schedule: Schedule) -> FitStag
     """What an earlier fit led to after its last round was taken again, with views that changed a little."""
     rounds = [*schedule.detailed, *schedule.coarse, *schedule.finer, *schedule.finest]
     last = next((each for each in reversed(rounds) if each.cells == fitted.surface.cells), rounds[-1])
-    stage, settings = replace(fitted, settings=last), replace(last, rays=min(round(LAST_RAYS * last.rays), MOST_RAYS))
+    stage, settings = replace(fitted, settings=last), _with_more_rays(last)
     with torch.no_grad():
         return take_round(views, stage, settings, Progress("fitting on", settings.steps), last=True)
 

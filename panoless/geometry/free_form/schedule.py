@@ -110,7 +110,7 @@ class Schedule:
     def of(cls, options: FreeFormOptions) -> "Schedule":
         """The rounds that options leave."""
         finer = _up_to(options.finest_cells, FINER)
-        whole = finer == FINER
+        most = FINEST[-1].cells if finer == FINER else FINER[-1].cells
         pixels = [each.rays for each in COARSE] if finer else CLOSING_RAYS
         coarse = tuple(replace(each, rays=rays) for each, rays in zip(COARSE, pixels, strict=True))
         return cls(
@@ -119,8 +119,8 @@ class Schedule:
             finer,
             CONCAVE if options.concavities else (),
             _up_to(options.finest_cells, REFIT),
-            (DETAILED if whole else DETAILED[:-1]) if options.starts else (),
-            FINEST if options.starts and whole else (),
+            _up_to(most, DETAILED) if options.starts else (),
+            _up_to(most, FINEST) if options.starts else (),
         )
 
 
