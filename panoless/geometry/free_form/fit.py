@@ -106,8 +106,8 @@ def fit_free_form(
     Rounds are taken with four fifths of the views as long as the others gain by them, and the last of those once more
     with all, in which silhouettes count more where photographs agree with them. After the rounds that are always taken,
     concavities are searched, blocks that are not `required` are removed unless they are needed, parts that pixels
-    distrust are refitted, and where much is left, details are searched from the `hull`. Concavities are searched under
-    the start, and if it has none, under the `caps`, other first surfaces.
+    distrust are refitted, and where much is left, details are searched from the `hull`, with all blocks free again.
+    Concavities are searched under the start, and if it has none, under the `caps`, other first surfaces.
     """
     kept, others = split_held_out(range(len(views.train)))
     if not kept or not others:
@@ -152,8 +152,8 @@ def fit_free_form(
             finest = list[Round]()
             if others and schedule.detailed and error(stage) > DETAILED_ERROR:
                 details = Progress("looking for details", sum(each.steps for each in schedule.detailed))
-                outer = replace(hull or begun, surroundings=stage.surface.surroundings)
-                detailed = coarse_stage(solved, outer, schedule.detailed, details, stage.nuisance)
+                outer = replace(hull or begun, surroundings=start.surroundings)
+                detailed = coarse_stage(solved, outer, schedule.detailed, details, usual)
                 stage = best((stage, detailed))
                 if stage is detailed:
                     rays = silhouette_rays(views)

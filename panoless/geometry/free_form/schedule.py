@@ -82,7 +82,7 @@ DETAILED = (
     Round(60, 8, 0.80, 1, 20_000, 10.0, 6),
     Round(60, 16, 0.50, 1, 40_000, 3.0, 6),
     Round(60, 32, 0.50, 4, 60_000, 1.0, 6),
-    Round(84, 32, 0.30, 4, 100_000, 0.3, 5),
+    Round(84, 32, 0.20, 4, 100_000, 0.3, 5),
 )
 """From the hull, in place of the rounds before, where these leave much unexplained: coarse grids and smoothing lose
 what is thin, the normals of small details turn by far more than a texel, and their pixels mirror more than one."""
