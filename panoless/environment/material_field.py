@@ -101,16 +101,20 @@ class MaterialPixels:
         light: Float[np.ndarray, "P 3"],
         residual: Float[np.ndarray, "P 3"],
     ) -> MaterialField:
-        """min Σ w ‖y − E Δs − Δd‖² + λ Σ ‖Δ(v) − Δ(v′)‖² + μ Σ ‖Δ(v)‖², with Geman–McClure weights w.
+        """As `fitted`; where more than a share of the error is left at a vertex, both changes are zero."""
+        found = self.fitted(light, residual)
+        changes = np.stack([found.share, found.scattered])
+        left = residual - self._shown(changes, light)
+        before, after = (self.adjoint @ bounded_error(each, JUDGED_SCALE) for each in (residual, left))
+        changes *= (after < LARGEST_SHARE_LEFT * before)[:, None]
+        return MaterialField(self.cells, self.vertices, changes[0], changes[1])
 
-        Where more than a share of the error is left at a vertex, both changes are zero.
-        """
+    def fitted(self, light: Float[np.ndarray, "P 3"], residual: Float[np.ndarray, "P 3"]) -> MaterialField:
+        """min Σ w ‖y − E Δs − Δd‖² + λ Σ ‖Δ(v) − Δ(v′)‖² + μ Σ ‖Δ(v)‖², with Geman–McClure weights w."""
         changes, left = np.zeros((2, len(self.vertices), 3)), residual
         for scale in ROBUST_SCALES:
             changes = changes + self._step(changes, left, light, robust_weight(left, scale)[:, None])
             left = residual - self._shown(changes, light)
-        before, after = (self.adjoint @ bounded_error(each, JUDGED_SCALE) for each in (residual, left))
-        changes *= (after < LARGEST_SHARE_LEFT * before)[:, None]
         return MaterialField(self.cells, self.vertices, changes[0], changes[1])
 
     def _step(

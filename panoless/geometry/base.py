@@ -204,6 +204,11 @@ class Geometry(Protocol):
         """The same surface with the cameras there."""
         ...
 
+    @property
+    def reflectance(self) -> Reflectance | None:
+        """That with which the shape was solved; None: as a perfect mirror's."""
+        ...
+
     def corrected(self, views: Views) -> Views:
         """The views with their cameras where the poses have them; as they are where they are fixed."""
         ...

@@ -19,6 +19,7 @@ from panoless.deadline import improving
 from panoless.environment.direct import scaled_to_map
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays, normalize_confidence
+from panoless.environment.reflectance import Reflectance
 from panoless.environment.resolution import RESOLUTIONS, densest_resolution
 from panoless.environment.sharpening import sharpest_map
 from panoless.environment.solve import merged, solve_environment
@@ -67,6 +68,11 @@ class ExactGeometry:
     def shape(self) -> Any:
         """The surface: the first field of the kind."""
         return getattr(self, fields(self)[1].name)
+
+    @property
+    def reflectance(self) -> Reflectance | None:
+        """That with which the shape was solved; None: as a perfect mirror's."""
+        return None
 
     @property
     def num_parameters(self) -> int:

@@ -115,7 +115,7 @@ class Data:
         if pixels is not None and free:
             kept = pixels.inner_px > INNER_PX
             if {Exposures.name, WhiteBalances.name} & set(free):
-                kept &= ~is_saturated(pixels.radiance)
+                kept &= ~is_saturated(pixels.radiance).any(1)
             pixels = pixels.chosen(kept)
         return cls(pixels, chosen, StatedCameras.of(views), settings, settings.resolution >= last)
 

@@ -96,7 +96,7 @@ def dual(pairs: Float[np.ndarray, "P 2 3"]) -> Float[np.ndarray, "P 2 3"]:
     return np.stack([(bb * first - ab * second) / area, (aa * second - ab * first) / area], 1)
 
 
-def is_saturated(radiance: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, "P"]:
-    """Whether a channel of a pixel has the largest radiance of all, but for little."""
-    found: np.ndarray = (radiance >= SATURATED * radiance.max(0, initial=0.0)).any(1)
+def is_saturated(radiance: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, "P 3"]:
+    """Whether channels of pixels have the largest radiance of all, but for little."""
+    found: np.ndarray = radiance >= SATURATED * radiance.max(0, initial=0.0)
     return found

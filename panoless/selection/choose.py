@@ -17,7 +17,7 @@ from panoless.capture.views import Views, held_out_parts
 from panoless.config import FitConfig
 from panoless.deadline import improving, is_past_limit
 from panoless.first_surface.visual_hull import contradiction_px
-from panoless.geometry.base import Family, Geometry, Proposal, usable_views
+from panoless.geometry.base import Family, Geometry, Proposal
 from panoless.geometry.exact import LARGEST_SHARE_LEFT
 from panoless.geometry.registry import FAMILIES
 from panoless.journal import remembered
@@ -26,6 +26,7 @@ from panoless.selection.candidates import MATTE, Candidate, Selection, Verdict, 
 from panoless.selection.fitted import Fitted, is_refined, missed_share
 from panoless.selection.held_out import LEAST_GAIN, held_out_errors, is_matte
 from panoless.selection.joint import fit_jointly, nuisance_kinds, proposed, refitted
+from panoless.selection.material import usable_as_perfect_mirror
 from panoless.selection.surroundings import explains_clearly_more
 from shinypartial.core.errors import InputError
 
@@ -329,7 +330,7 @@ def _examine(family: Family, start: Start | None, views: Views, config: FitConfi
     fitted = fit_jointly(family, _source(family), views, start.proposal, config)
     geometry, found = fitted.geometry, _found(fitted, views)
     views = fitted.corrections.applied(views, config)
-    errors = held_out_errors(usable_views(views, geometry), config, geometry)
+    errors = held_out_errors(usable_as_perfect_mirror(views, geometry, config), config, geometry)
     if errors is None:
         return Candidate(family.kind, Verdict.CHOSEN, NONE_HELD_OUT, *evidence, **found), geometry
     error = float(errors.mean())

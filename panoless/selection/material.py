@@ -80,10 +80,13 @@ def earned_reflectance(views: Views, geometry: Geometry, config: FitConfig) -> R
     that differs from place to place clearly better than either.
 
     Four fifths of the views determine it and the map by which the others are judged, then all views determine it.
-    Nothing is determined where a tint is given, or in a high dynamic range.
+    Nothing is determined where the shape was solved with its material, where a tint is given, or in a high dynamic
+    range.
     """
     options, encoding = config.material, encoding_of(config)
     resolution = config.environment.trial_resolution(RESOLUTION)
+    if geometry.reflectance is not None:
+        return geometry.reflectance
     if options.reflectance == "off" or encoding.high_dynamic_range or config.tint != NO_TINT:
         return None
     with torch.no_grad():
@@ -247,6 +250,14 @@ def _without(
     return replace(view, radiance=changed, solid=view.solid[dim.flatten()[view.solid] == 0])
 
 
+def usable_as_perfect_mirror(views: Views, geometry: Geometry, config: FitConfig) -> Views:
+    """Usable pixels of views, as a perfect mirror would have shown them where the shape was solved with a material."""
+    usable = usable_views(views, geometry)
+    if geometry.reflectance is None:
+        return usable
+    return usable_views(as_perfect_mirror(views, usable, geometry, geometry.reflectance, encoding_of(config)), geometry)
+
+
 def as_perfect_mirror(
     views: Views, posed: Views, geometry: Geometry, reflectance: Reflectance, encoding: RadianceEncoding
 ) -> Views:
@@ -268,7 +279,7 @@ def without_scattered_light(
     `corrected` are the same views as the geometry was fitted to. They determine the light and where the cameras stand;
     what their exposures and their lens differ by is small beside what is scattered, and is left to the next choice.
     """
-    if config.material.scattering == "off" or error < LEAST_SCATTERING_ERROR:
+    if geometry.reflectance is not None or config.material.scattering == "off" or error < LEAST_SCATTERING_ERROR:
         return None
     usable = usable_views(corrected, geometry)
     found = earned_reflectance(usable, geometry, config)

@@ -65,6 +65,11 @@ class SurfelMirror:
         return cls(surfels, splats.surfels.curved, splats.albedo, splats.loss.roughness_weighted)
 
     @property
+    def reflectance(self) -> None:
+        """None: of an even mirror."""
+        return None
+
+    @property
     def num_parameters(self) -> int:
         """Center, rotation, radii and opacity of each, and what else is learned."""
         return (3 + 4 + 2 + 1 + 3 * self.albedo + 3 * self.curved + self.roughness) * self.surfels.count

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
@@ -13,9 +13,11 @@ from panoless.capture.poses import StatedCameras
 from panoless.capture.views import Views, split_held_out
 from panoless.deadline import check_time, improving
 from panoless.environment.rays import Rays
-from panoless.environment.resolution import prediction_error
+from panoless.environment.resolution import ERROR_SCALE
 from panoless.environment.solve import solve_environment
 from panoless.geometry.free_form.concave import concave_start
+from panoless.geometry.free_form.map import Mirrored
+from panoless.geometry.free_form.material import Material
 from panoless.geometry.free_form.photometric import INNER_PX, LEAST_COSINE, Linearization, ReflectedRays
 from panoless.geometry.free_form.schedule import SILHOUETTE_GAIN, Round, Schedule
 from panoless.geometry.free_form.steps import DAMPING, solved_equations, take_steps, with_noise
@@ -23,8 +25,10 @@ from panoless.geometry.free_form.surface import LevelSet
 from panoless.geometry.free_form.task import make_task
 from panoless.geometry.free_form.trust import Trust, full_trust
 from panoless.journal import remembered
+from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.factorize import regularize
 from panoless.numeric.gauss_newton import keep_if_better
+from panoless.numeric.robust import bounded_error
 from panoless.problem.blocks import CameraPoses, Distortion, Walls
 from panoless.problem.evidence import Decision, needed
 from panoless.problem.nuisance import NO_NUISANCE, Nuisance, nuisance_of
@@ -77,11 +81,13 @@ class FitStage:
     """Of the round that led here."""
     nuisance: Nuisance = NO_NUISANCE
     """Cameras, exposures and masks, where these are unknown."""
+    material: Material | None = None
+    """What places mirror and scatter; None: they are perfect mirrors."""
 
     @classmethod
-    def begun(cls, surface: LevelSet, nuisance: Nuisance = NO_NUISANCE) -> "FitStage":
+    def begun(cls, surface: LevelSet, nuisance: Nuisance = NO_NUISANCE, material: Material | None = None) -> "FitStage":
         """A surface that is trusted everywhere, before its first round."""
-        return cls(surface, full_trust(surface), nuisance=nuisance)
+        return cls(surface, full_trust(surface), nuisance=nuisance, material=material)
 
     @property
     def last(self) -> Round:
@@ -99,15 +105,17 @@ def fit_free_form(
     caps: Sequence[LevelSet] = (),
     nuisance: Nuisance = NO_NUISANCE,
     required: Collection[str] = (),
+    materials: Sequence[Material | None] = (None,),
 ) -> tuple[FitStage, list[Decision]]:
     """The surface that explains photographs and silhouettes best, no finer than held-out views want it, with the
     nuisance blocks that the scene needs; and what was decided of each.
 
     Rounds are taken with four fifths of the views as long as the others gain by them, and the last of those once more
     with all, in which silhouettes count more where photographs agree with them. After the rounds that are always taken,
-    concavities are searched, blocks that are not `required` are removed unless they are needed, parts that pixels
-    distrust are refitted, and where much is left, details are searched from the `hull`, with all blocks free again.
-    Concavities are searched under the start, and if it has none, under the `caps`, other first surfaces.
+    concavities are searched, blocks that are not `required` are removed unless they are needed, and parts that pixels
+    distrust are refitted. Where much is left, details are searched from the `hull`, with all blocks free again, under
+    each of the `materials`. Concavities are searched under the start, and if it has none, under the `caps`, other first
+    surfaces.
     """
     kept, others = split_held_out(range(len(views.train)))
     if not kept or not others:
@@ -151,11 +159,13 @@ def fit_free_form(
             stage = best(refitted_stages(solved, stage, schedule.refit))
             finest = list[Round]()
             if others and schedule.detailed and error(stage) > DETAILED_ERROR:
-                details = Progress("looking for details", sum(each.steps for each in schedule.detailed))
+                details = Progress(
+                    "looking for details", len(materials) * sum(each.steps for each in schedule.detailed)
+                )
                 outer = replace(hull or begun, surroundings=start.surroundings)
-                detailed = coarse_stage(solved, outer, schedule.detailed, details, usual)
-                stage = best((stage, detailed))
-                if stage is detailed:
+                for material in materials:
+                    stage = best((stage, coarse_stage(solved, outer, schedule.detailed, details, usual, material)))
+                if stage.settings is schedule.detailed[-1]:
                     rays = silhouette_rays(views)
                     pixel = float(np.median(rays.size * np.linalg.norm(rays.origins, axis=1)))
                     finest = [each for each in schedule.finest if stage.surface.extent.max() / each.cells >= pixel]
@@ -224,9 +234,10 @@ def coarse_stage(
     rounds: Sequence[Round],
     progress: Progress | None = None,
     nuisance: Nuisance = NO_NUISANCE,
+    material: Material | None = None,
 ) -> FitStage:
-    """What rounds lead to from a first surface and from nuisance blocks."""
-    stage = FitStage.begun(start, nuisance)
+    """What rounds lead to from a first surface, from nuisance blocks and from a material."""
+    stage = FitStage.begun(start, nuisance, material)
     with improving():
         for settings in rounds:
             stage = take_round(views, stage, settings, progress)
@@ -247,10 +258,10 @@ def predicted(solved: Views, views: Views, stage: FitStage) -> Nuisance:
     if not nuisance.free:
         return nuisance
     settings = replace(stage.last, rays=min(stage.last.rays, JUDGED_RAYS))
-    known = make_task(solved, settings, stage.nuisance)
+    known = make_task(solved, settings, stage.nuisance, stage.material)
     under = Linearization.at(known, stage.surface, stage.trust, None, FIRST_MAP_ROUNDS, stage.nuisance)
     settings = replace(settings, rays=JUDGED_RAYS // 4, steps=POSE_STEPS, under_known_map=True)
-    task = make_task(views, settings, nuisance)
+    task = make_task(views, settings, nuisance, stage.material)
     linearization = Linearization.at(task, stage.surface, stage.trust, under.environment, 0, nuisance)
     return take_steps(with_noise(linearization), stage.damping, still=True)[0].nuisance
 
@@ -303,7 +314,7 @@ def take_round(
         stage = replace(stage, nuisance=nuisance.under_coarse(settings.resolution))
     if stage.settings is None or stage.settings.cells != settings.cells:
         surface = surface.resampled(settings.cells)
-    task = make_task(views, settings, stage.nuisance)
+    task = make_task(views, settings, stage.nuisance, stage.material)
     if settings.increment_prior:
         task = replace(task, reference=surface.coefficients)
     linearization = Linearization.at(task, surface, stage.trust, stage.environment, FIRST_MAP_ROUNDS, stage.nuisance)
@@ -320,6 +331,7 @@ def take_round(
         damping=damping,
         settings=settings,
         nuisance=linearization.nuisance.freed(nuisance.free),
+        material=linearization.task.material,
     )
     common, moved = found.nuisance.without_common(task.cameras)
     if common is None or CameraPoses.name not in linearization.nuisance.free:
@@ -338,7 +350,7 @@ def variances(views: Views, stage: FitStage) -> dict[str, Float[np.ndarray, "B M
     found: dict[str, np.ndarray] = {}
     if not by_view and not shared:
         return found
-    task = make_task(views, stage.last, stage.nuisance)
+    task = make_task(views, stage.last, stage.nuisance, stage.material)
     linearization = Linearization.at(task, stage.surface, stage.trust, None, FIRST_MAP_ROUNDS, stage.nuisance)
     linearization = with_noise(linearization)
     converged = replace(linearization.task, settings=replace(stage.last, solver_steps=VARIANCE_STEPS))
@@ -362,19 +374,43 @@ def variances(views: Views, stage: FitStage) -> dict[str, Float[np.ndarray, "B M
 
 def held_out_error(solved: Views, tested: Views, stage: FitStage) -> float:
     """Mean ‖e‖²/(‖e‖² + s²) over rays of views that neither surface nor map have seen, under a map as fine as any, and
-    1 for those that miss the surface.
+    1 for those that miss the surface. What is saturated may be any brighter.
     """
-    known, _ = _rays(solved, stage.surface, stage.nuisance)
-    unknown, missed = _rays(tested, stage.surface, predicted(solved, tested, stage))
-    error = prediction_error([unknown], solve_environment([known], HELD_OUT_RESOLUTION))
-    return (len(unknown.directions) * error + missed) / max(len(unknown.directions) + missed, 1)
+    known, unknown = _Seen.of(solved, stage, stage.nuisance), _Seen.of(tested, stage, predicted(solved, tested, stage))
+    environment = solve_environment([known.rays], HELD_OUT_RESOLUTION)
+    error = unknown.share * (sample_cubemap(environment, unknown.rays.directions) - unknown.rays.radiance)
+    error = torch.where(unknown.brighter, error.clamp(max=0), error)
+    summed = float(bounded_error(error, ERROR_SCALE).sum()) + unknown.missed
+    return summed / max(len(error) + unknown.missed, 1)
 
 
-def _rays(views: Views, surface: LevelSet, nuisance: Nuisance) -> tuple[Rays, int]:
-    """Of pixels well inside the masks: those that see the surroundings, and how many miss the surface."""
-    pixels, cameras = solid_pixels(views, HELD_OUT_RAYS), StatedCameras.of(views)
-    rays = nuisance.moved(pixels.rays, cameras)
-    reflected, inner = ReflectedRays.of(surface, rays, 1, LEAST_COSINE), pixels.inner_px > INNER_PX
-    radiance, clear = nuisance.equalized(pixels.radiance, rays.view), reflected.clear & inner
-    outgoing, seen = (torch.from_numpy(values[clear]).float() for values in (reflected.outgoing[:, 0], radiance))
-    return Rays(outgoing, seen), int((inner & ~reflected.hits.met).sum())
+@dataclass(frozen=True)
+class _Seen:
+    """Pixels well inside the masks that see the surroundings as a perfect mirror would, the share that they mirror,
+    which are saturated, and how many others miss the surface.
+    """
+
+    rays: Rays
+    share: Float[Tensor, "P 3"]
+    brighter: Bool[Tensor, "P 3"]
+    missed: int
+
+    @classmethod
+    def of(cls, views: Views, stage: FitStage, nuisance: Nuisance) -> "_Seen":
+        surface, pixels = stage.surface, solid_pixels(views, HELD_OUT_RAYS)
+        rays = nuisance.moved(pixels.rays, StatedCameras.of(views))
+        reflected, inner = ReflectedRays.of(surface, rays, 1, LEAST_COSINE), pixels.inner_px > INNER_PX
+        clear = reflected.clear & inner
+        facing, points = -(reflected.hits.normals * rays.directions).sum(1), surface.points(reflected.hits.places)
+        mirrored = Mirrored.by(
+            stage.material, pixels.radiance, nuisance.equalized(pixels.radiance, rays.view), points, facing
+        )
+        outgoing, seen, share = (
+            torch.from_numpy(values[clear]).float()
+            for values in (reflected.outgoing[:, 0], mirrored.radiance, mirrored.share)
+        )
+        bright = torch.from_numpy(mirrored.brighter[clear])
+        if stage.environment is not None:
+            seen = torch.where(bright, seen.maximum(sample_cubemap(stage.environment, outgoing)), seen)
+        missed = int((inner & ~reflected.hits.met).sum())
+        return cls(Rays(outgoing, seen, share.amax(1) ** 2), share, bright, missed)

@@ -12,12 +12,14 @@ from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
 from panoless.capture.corrections import NO_CORRECTIONS, Corrections
+from panoless.capture.encoding import NO_TINT, encoding_of
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.poses import Poses
 from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays
+from panoless.environment.reflectance import Reflectance
 from panoless.geometry.base import (
     Geometry,
     Mesh,
@@ -30,6 +32,7 @@ from panoless.geometry.base import (
 )
 from panoless.geometry.exact import ExactFamily, ExactGeometry
 from panoless.geometry.free_form.fit import FitStage, continued_fit, fit_free_form, variances
+from panoless.geometry.free_form.material import EVEN, Material
 from panoless.geometry.free_form.photometric import BAND_CELLS, ReflectedRays
 from panoless.geometry.free_form.rendering import free_form_buffers, free_form_light
 from panoless.geometry.free_form.schedule import Schedule
@@ -89,6 +92,13 @@ class FreeFormMirror(ExactGeometry):
     trust: Trust
     occlusion_test: bool = True
     """Whether pixels that see the object again are left out."""
+    material: Material | None = None
+    """What places mirror and scatter, where the shape was solved with it. A saved state has it as its reflectance."""
+
+    @property
+    def reflectance(self) -> Reflectance | None:
+        """Of that material."""
+        return None if self.material is None else Reflectance(np.ones(3), field=self.material.field)
 
     @property
     def num_parameters(self) -> int:
@@ -209,8 +219,9 @@ class FreeFormFamily(ExactFamily):
 
     def refitted(self, views: Views, fitted: FreeFormMirror, config: FitConfig) -> Geometry:
         """After its last round once more."""
-        found = continued_fit(views, FitStage(fitted.surface, fitted.trust), Schedule.of(config.free_form))
-        return _mirror(found.surface, found.trust, None, config)
+        begun = FitStage(fitted.surface, fitted.trust, material=fitted.material)
+        found = continued_fit(views, begun, Schedule.of(config.free_form))
+        return replace(_mirror(found.surface, found.trust, None, config), material=found.material)
 
     def solve(
         self,
@@ -229,8 +240,17 @@ class FreeFormFamily(ExactFamily):
         schedule, first = Schedule.of(config.free_form), proposal.shape
         start, nuisance = started(views, first, schedule, nuisance_of(views, kinds, first.surroundings))
         caps = () if np.array_equal(start.coefficients, first.plain.coefficients) else (first.surface,)
+        mixed = config.material.scattering != "off" and config.tint == NO_TINT
+        mixed = mixed and not encoding_of(config).high_dynamic_range
         stage, decisions = fit_free_form(
-            views, start, schedule, hull=first.hull, caps=caps, nuisance=nuisance, required=required
+            views,
+            start,
+            schedule,
+            hull=first.hull,
+            caps=caps,
+            nuisance=nuisance,
+            required=required,
+            materials=(None, EVEN) if mixed else (None,),
         )
         if stage.settings is None:  # The time limit came before the first round.
             return _mirror(stage.surface, stage.trust, None, config), NO_CORRECTIONS, []
@@ -240,7 +260,8 @@ class FreeFormFamily(ExactFamily):
         surface, trust = stage.surface.scaled(found.scale), stage.trust.scaled(found.scale)
         gone = [each for each in decisions if not each.kept]
         kept = [scored(each, known[each.name]) for each in stage.nuisance.blocks]
-        return _mirror(surface, trust, found.poses, config), found.corrections, [*gone, *kept]
+        mirror = replace(_mirror(surface, trust, found.poses, config), material=stage.material)
+        return mirror, found.corrections, [*gone, *kept]
 
 
 def _mirror(surface: LevelSet, trust: Trust, poses: Poses | None, config: FitConfig) -> FreeFormMirror:

@@ -1,17 +1,27 @@
 """The map that a fit works with: weighted least squares of pixels as means of a few rays, from the one before."""
 
-from jaxtyping import Float
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from panoless.environment.cubemap import by_face, by_texel
+from panoless.environment.cubemap import by_face, by_texel, resample
 from panoless.environment.fill import fill_unobserved, texel_neighbors
 from panoless.environment.footprints import PixelFootprints, splat
+from panoless.geometry.free_form.material import LEAST_SHARE, Material
 from panoless.numeric.conjugate_gradients import conjugate_gradients
+from panoless.numeric.robust import robust_weight
+from panoless.problem.observations import is_saturated
 
 SMOOTHNESS = 0.05
 """Weight λ of squared differences of neighboring texels, in rays."""
 STEPS = 6
 """Conjugate-gradient steps of a robust round."""
+PHOTON_SHARE = 0.75
+"""Share of a pixel's variance that grows with its light."""
 
 
 def splatted_map(pixels: PixelFootprints, weights: Float[Tensor, "P"], resolution: int) -> Float[Tensor, "6 3 L L"]:
@@ -41,3 +51,82 @@ def smoothed_map(
     diagonal = total + 4 * SMOOTHNESS
     found = conjugate_gradients(product, environment, light - product(environment), 1 / diagonal, STEPS)
     return found.clamp(min=0)
+
+
+def photon_gain(seen: Float[np.ndarray, "P 3"], brightness: float) -> Float[np.ndarray, "P"]:
+    """By how much a residual counts more than at the mean brightness m: 1/√(1 − s + s E/m), with E what is seen.
+
+    The share s of the variance grows with the light, as that of photons does and that of what a map gets wrong: so a
+    dark ground under a bright sky counts, too. E is the prediction, not the pixel, whose own error would weigh it.
+    """
+    light = np.maximum(seen.mean(1), 0.0)
+    gain: Float[np.ndarray, "P"] = 1 / np.sqrt(1 - PHOTON_SHARE + PHOTON_SHARE * light / brightness)
+    return gain
+
+
+@dataclass(frozen=True)
+class Mirrored:
+    """What a perfect mirror would have shown in place of pixels, the share of it that they mirror, and which channels
+    are saturated, so that this may be any brighter.
+    """
+
+    radiance: Float[np.ndarray, "P 3"]
+    share: Float[np.ndarray, "P 3"]
+    brighter: Bool[np.ndarray, "P 3"]
+
+    @classmethod
+    def by(
+        cls,
+        material: Material | None,
+        taken: Float[np.ndarray, "P 3"],
+        radiance: Float[np.ndarray, "P 3"],
+        points: Float[np.ndarray, "P 3"],
+        facing: Float[np.ndarray, "P"],
+    ) -> "Mirrored":
+        """Of pixels at equal exposures that were `taken` at their own, and see points where cos θ is `facing`. Under no
+        material what is saturated is as bright as it looks.
+        """
+        if material is None:
+            return cls(radiance, np.ones_like(radiance), np.zeros(radiance.shape, dtype=bool))
+        return cls(*material.mirrored(radiance, points, facing), is_saturated(taken))
+
+    def areas(self, outgoing: Float[np.ndarray, "P K 3"]) -> PixelFootprints:
+        """As areas that are mirrored in those directions."""
+        return PixelFootprints(torch.from_numpy(outgoing).float(), torch.from_numpy(self.radiance).float())
+
+    def gain(self, light: Float[np.ndarray, "P 3"], brightness: float) -> Float[np.ndarray, "P 3"]:
+        """By how much the residuals of a light count."""
+        counted = self.share * photon_gain(light, brightness)[:, None]
+        return np.where(self.brighter & (light > self.radiance), 0.0, counted)
+
+    def first_map(
+        self, areas: PixelFootprints, weights: Float[Tensor, "P"], start: Float[Tensor, "6 3 M M"] | None, size: int
+    ) -> Float[Tensor, "6 3 L L"]:
+        """Another map at that size, or that of all pixels."""
+        if start is None:
+            return splatted_map(areas, weights * self._shares.amax(1) ** 2, size)
+        return start if start.shape[-1] == size else resample(start, size)
+
+    def next_map(
+        self,
+        environment: Float[Tensor, "6 3 L L"],
+        areas: PixelFootprints,
+        weights: Float[Tensor, "P"],
+        robust_scale: float,
+        brightness: float,
+    ) -> Float[Tensor, "6 3 L L"]:
+        """A robust round of a map.
+
+        A channel that is mirrored less than another counts less: it is drawn to what the map has already.
+        """
+        seen, most = areas.seen(environment), self._shares.amax(1)
+        shown = torch.where(torch.from_numpy(self.brighter), areas.radiance.maximum(seen), areas.radiance)
+        gain = torch.from_numpy(photon_gain(seen.double().numpy(), brightness)).float()
+        agreed = robust_weight((seen - shown) * gain[:, None] * self._shares, robust_scale)
+        unknown = 1 - (self._shares / most[:, None].clamp(min=LEAST_SHARE)) ** 2
+        drawn = replace(areas, radiance=shown + unknown * (seen - shown))
+        return smoothed_map(environment, drawn, weights * (most * gain) ** 2 * agreed)
+
+    @cached_property
+    def _shares(self) -> Float[Tensor, "P 3"]:
+        return torch.from_numpy(self.share).float()

@@ -10,10 +10,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from panoless.capture.views import concatenated
-from panoless.environment.cubemap import resample
-from panoless.environment.footprints import PixelFootprints
 from panoless.geometry.free_form.equations import Rows, gauge_rows, joined_rows, silhouette_rows
-from panoless.geometry.free_form.map import smoothed_map, splatted_map
+from panoless.geometry.free_form.map import Mirrored, photon_gain
 from panoless.geometry.free_form.motions import pixel_motion_rows
 from panoless.geometry.free_form.surface import Hits, LevelSet
 from panoless.geometry.free_form.task import RADIANCE_SIGMA, SILHOUETTE_SIGMA_PX, Task
@@ -37,8 +35,6 @@ INNER_PX = 1.5
 """Pixels nearer to the silhouette of their mask are left out: they mix two things."""
 LEAST_COSINE = 0.12
 """Between the ray and the surface's normal, for a pixel to count for the shape."""
-PHOTON_SHARE = 0.75
-"""Share of a pixel's variance that grows with its light."""
 WIDE_TEXELS = 4.0
 """A pixel that mirrors so many texels has half the weight."""
 BAND_CELLS = 3.5
@@ -91,17 +87,6 @@ class ReflectedRays:
         return cls(hits, outgoing.mean(1), looked_up, turn, clear)
 
 
-def photon_gain(seen: Float[np.ndarray, "P 3"], brightness: float) -> Float[np.ndarray, "P"]:
-    """By how much a residual counts more than at the mean brightness m: 1/√(1 − s + s E/m), with E what is seen.
-
-    The share s of the variance grows with the light, as that of photons does and that of what a map gets wrong: so a
-    dark ground under a bright sky counts, too. E is the prediction, not the pixel, whose own error would weigh it.
-    """
-    light = np.maximum(seen.mean(1), 0.0)
-    gain: Float[np.ndarray, "P"] = 1 / np.sqrt(1 - PHOTON_SHARE + PHOTON_SHARE * light / brightness)
-    return gain
-
-
 @dataclass(frozen=True)
 class Linearization:
     """A surface, the map that explains the pixels best with it, and what both cost."""
@@ -111,7 +96,8 @@ class Linearization:
     reflected: ReflectedRays
     trust: Trust
     environment: Float[Tensor, "6 3 L L"]
-    gain: Float[np.ndarray, "P"]
+    gain: Float[np.ndarray, "P 3"]
+    """By how much residuals count; what is saturated may be any brighter."""
     residual: Float[np.ndarray, "P 3"]
     """What is seen less what was, times the gain."""
     slopes: Float[np.ndarray, "P 3 3"]
@@ -119,6 +105,8 @@ class Linearization:
     texels: Int[np.ndarray, "P"]
     free: Float[np.ndarray, "P"]
     """Weights of the pixels without trust and robust weights."""
+    light: Float[np.ndarray, "P 3"]
+    """Of the map, where pixels look into it."""
     nuisance: Nuisance = NO_NUISANCE
     """Cameras, exposures and masks, where these are unknown."""
 
@@ -131,39 +119,57 @@ class Linearization:
         start: Float[Tensor, "6 3 M M"] | None,
         rounds: int,
         nuisance: Nuisance = NO_NUISANCE,
+        reflected: ReflectedRays | None = None,
     ) -> "Linearization":
-        """With the map solved in so many robust rounds from another one, or from nothing."""
+        """With the map solved in so many robust rounds from another one, or from nothing; rays that are `reflected`
+        already are not traced.
+        """
         settings, surface = task.settings, replace(surface, surroundings=nuisance.around(surface.surroundings))
         rays = nuisance.moved(task.pixels.rays, task.cameras)
         radiance = nuisance.equalized(task.pixels.radiance, rays.view)
-        reflected = ReflectedRays.of(surface, rays, settings.samples, LEAST_COSINE)
+        if reflected is None:
+            reflected = ReflectedRays.of(surface, rays, settings.samples, LEAST_COSINE)
         clear = reflected.clear & (task.pixels.inner_px > INNER_PX)
         texel = np.pi / 2 / settings.resolution
         free = clear / (1 + (reflected.turn / (WIDE_TEXELS * texel)) ** 2)
-        weights = free * trust.at(surface.points(reflected.hits.places))
-        areas = PixelFootprints(torch.from_numpy(reflected.outgoing).float(), torch.from_numpy(radiance).float())
-        if start is None:
-            environment = splatted_map(areas, torch.from_numpy(weights).float(), settings.resolution)
-        else:
-            environment = start if start.shape[-1] == settings.resolution else resample(start, settings.resolution)
-
+        facing, points = -(reflected.hits.normals * rays.directions).sum(1), surface.points(reflected.hits.places)
+        mirrored = Mirrored.by(task.material, task.pixels.radiance, radiance, points, facing)
+        weights = torch.from_numpy(free * trust.at(points)).float()
+        areas = mirrored.areas(reflected.outgoing)
+        environment = mirrored.first_map(areas, weights, start, settings.resolution)
         for _ in range(rounds):
-            seen = areas.seen(environment)
-            gain = torch.from_numpy(photon_gain(seen.double().numpy(), task.brightness)).float()
-            agreed = robust_weight((seen - areas.radiance) * gain[:, None], settings.robust_scale)
-            votes = torch.from_numpy(weights).float() * gain**2 * agreed
-            environment = smoothed_map(environment, areas, votes)
+            environment = mirrored.next_map(environment, areas, weights, settings.robust_scale, task.brightness)
         length = settings.resolution + 2
         padded = padded_texels(environment).reshape(6, length, length, 3).double().numpy()
         light, slopes, texels = seen_with_slopes(padded, reflected.outgoing)
-        counted = photon_gain(light, task.brightness)
-        residual, slopes = (light - radiance) * counted[:, None], slopes * counted[:, None, None]
-        return cls(task, surface, reflected, trust, environment, counted, residual, slopes, texels, free, nuisance)
+        counted = mirrored.gain(light, task.brightness)
+        residual, slopes = (light - mirrored.radiance) * counted, slopes * counted[..., None]
+        return cls(
+            task, surface, reflected, trust, environment, counted, residual, slopes, texels, free, light, nuisance
+        )
 
     @cached_property
     def rays(self) -> PixelRays:
         """Of the pixels, from where their cameras are."""
         return self.nuisance.moved(self.task.pixels.rays, self.task.cameras)
+
+    @property
+    def radiance(self) -> Float[np.ndarray, "P 3"]:
+        """Of the pixels at equal exposures."""
+        return self.nuisance.equalized(self.task.pixels.radiance, self.rays.view)
+
+    @property
+    def light_shown(self) -> Float[np.ndarray, "P 3"]:
+        """What pixels are predicted to show."""
+        if self.task.material is None:
+            return self.light
+        share, scattered = self.task.material.at(self.points, self.facing)
+        return share * self.light + scattered
+
+    @property
+    def facing(self) -> Float[np.ndarray, "P"]:
+        """cos θ."""
+        return -(self.reflected.hits.normals * self.rays.directions).sum(1)
 
     @cached_property
     def weights(self) -> Float[np.ndarray, "P"]:
@@ -291,7 +297,7 @@ class Linearization:
         A pixel that no longer sees the surroundings costs what it did before, so it is not lost for gain.
         """
         scale = self.task.settings.robust_scale
-        residual = self.residual * (before.gain / self.gain)[:, None]
+        residual = self.residual * (before.gain / np.maximum(self.gain, 1e-12))
         residual = np.where(self.reflected.clear[:, None], residual, before.residual)
         photographs = scale**2 * float((before.weights * bounded_error(residual, scale)).sum()) / 2
         prior = self.prior(before)
@@ -346,8 +352,7 @@ class Linearization:
     @cached_property
     def _light(self) -> Float[np.ndarray, "P 3"]:
         """The prediction, times the gain of residuals."""
-        radiance = self.nuisance.equalized(self.task.pixels.radiance, self.rays.view)
-        return self.residual + radiance * self.gain[:, None]
+        return self.residual + self.radiance * photon_gain(self.light, self.task.brightness)[:, None]
 
     def _of_views(self, blocks: Sequence[Block]) -> Linearized:
         count = len(blocks[0].values)
@@ -408,6 +413,12 @@ class Linearization:
         by_view = moved.pop(0) if self.nuisance.free_blocks(by_view=True) else None
         nuisance = self.nuisance.stepped(by_view, moved[0][0] if moved else None)
         return Linearization.at(self.task, surface, self.trust, self.environment, self.task.map_rounds, nuisance)
+
+    def under(self, task: Task) -> "Linearization":
+        """Of another task with the same pixels, with the map computed again."""
+        return Linearization.at(
+            task, self.surface, self.trust, self.environment, task.map_rounds, self.nuisance, self.reflected
+        )
 
     def diagonal(self, smoothing_diagonal: float) -> Float[np.ndarray, "A B C"]:
         """The matrix's diagonal, but for what the map takes over; at least a millionth of its largest."""

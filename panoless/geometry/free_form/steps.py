@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from panoless.geometry.free_form.material import measured_material
 from panoless.geometry.free_form.photometric import Linearization
 from panoless.geometry.free_form.schedule import SILHOUETTE_GAIN
 from panoless.geometry.free_form.task import RADIANCE_SIGMA
@@ -29,6 +30,8 @@ TRIALS = 4
 """Lengths that are tried."""
 SOLVER_TOLERANCE = 1e-5
 """Conjugate-gradient steps end when the preconditioned residual's energy has fallen to this share."""
+MATERIAL_ROUNDS = 3
+"""In which material and map are determined in turn before the first step of a round; before others in one."""
 LONGEST_STEP_CELLS = 1.0
 """No coefficient moves by more in one step."""
 
@@ -64,6 +67,8 @@ def take_steps(
     settings = linearization.task.settings
     for index in range(settings.steps):
         if not still:
+            for _ in range(MATERIAL_ROUNDS if index == 0 else 1):
+                linearization = with_material(linearization)
             linearization = replace(linearization, trust=measured_trust(linearization))
         before = linearization
         linearization, shortened = _accepted(linearization, gauss_newton_step(linearization, damping, still=still))
@@ -149,6 +154,13 @@ def solved_equations(
             SOLVER_TOLERANCE,
         )
     )
+
+
+def with_material(linearization: Linearization) -> Linearization:
+    """With the material measured, where places differ, and the map computed again."""
+    if linearization.task.material is None:
+        return linearization
+    return linearization.under(replace(linearization.task, material=measured_material(linearization)))
 
 
 def measured_trust(linearization: Linearization) -> Trust:

@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from panoless.capture.poses import StatedCameras
 from panoless.capture.views import Views
+from panoless.geometry.free_form.material import Material
 from panoless.geometry.free_form.schedule import Round
 from panoless.problem.blocks import Exposures, WhiteBalances
 from panoless.problem.nuisance import NO_NUISANCE, Nuisance
@@ -50,6 +51,8 @@ class Task:
     """Coefficients the change from which is to be smooth; None: the surface is."""
     prior_factor: float = 1.0
     """Of the precision of nuisance blocks, in whose units pixels count more than they are worth."""
+    material: Material | None = None
+    """What places mirror and scatter; None: they are perfect mirrors."""
 
     @property
     def map_rounds(self) -> int:
@@ -69,7 +72,9 @@ class Task:
         )
 
 
-def make_task(views: Views, settings: Round, nuisance: Nuisance = NO_NUISANCE) -> Task:
+def make_task(
+    views: Views, settings: Round, nuisance: Nuisance = NO_NUISANCE, material: Material | None = None
+) -> Task:
     """The pixels and silhouettes of a round, weighted as if `COUNTED_RAYS` pixels took part.
 
     Under coarse maps pixels are wrong by the robust scale s, not by their noise σ: where silhouettes dominate, they
@@ -78,13 +83,14 @@ def make_task(views: Views, settings: Round, nuisance: Nuisance = NO_NUISANCE) -
     pixels, silhouettes = solid_pixels(views, settings.rays), silhouette_rays(views)
     total = max(views.num_solid, 1)
     chosen = silhouettes.chosen(slice(None, None, max(1, -(-len(silhouettes.size) // settings.silhouette_points))))
-    if {Exposures.name, WhiteBalances.name} & set(nuisance.free):
+    if material is None and {Exposures.name, WhiteBalances.name} & set(nuisance.free):
         # A saturated pixel has no radiance to divide by a gain.
-        pixels = replace(pixels, inner_px=np.where(is_saturated(pixels.radiance), 0.0, pixels.inner_px))
+        pixels = replace(pixels, inner_px=np.where(is_saturated(pixels.radiance).any(1), 0.0, pixels.inner_px))
     share = COUNTED_RAYS / RADIANCE_SIGMA**2 / max(len(pixels.inner_px), 1)
     density = COUNTED_RAYS / total * len(silhouettes.size) / max(len(chosen.size), 1)
     dominance = (settings.robust_scale / RADIANCE_SIGMA) ** 2 if settings.silhouette_dominated else 1.0
     of_silhouettes = settings.silhouette_gain * dominance * density / SILHOUETTE_SIGMA_PX**2
     brightness = max(float(pixels.radiance.mean()), LEAST_BRIGHTNESS)
     background = background_rays(views, settings.rays)
-    return Task(pixels, chosen, background, share, of_silhouettes, settings, StatedCameras.of(views), brightness)
+    cameras = StatedCameras.of(views)
+    return Task(pixels, chosen, background, share, of_silhouettes, settings, cameras, brightness, material=material)

@@ -421,7 +421,7 @@ def test_rows_of_a_block_are_those_of_finite_differences(linearization: Lineariz
         radiance = linearization.task.pixels.radiance * np.exp(-side.nuisance.log_gains(side.rays.view))
         left.append(seen_with_slopes(padded, reflected.outgoing)[0] - radiance)
     clear &= photographs.weights > 0
-    expected = ((left[0] - left[1]) / 2 * moved.gain[:, None])[clear]
+    expected = ((left[0] - left[1]) / 2 * moved.gain)[clear]
     found = photographs.forward(change)[clear]
     if block.gain_rows() is not None:
         # By the light of the map, in place of the pixel's.
