@@ -13,6 +13,7 @@ import tyro
 from panoless.config import FitConfig, renamed_arguments, with_overrides
 from panoless.export.extension import Extension
 from panoless.photographs.options import LEAST_VIEWS, CaptureOptions
+from panoless.photographs.print_board import PrintBoard
 from panoless.presets import PRESETS
 from shinypartial.core.command_line import command_line
 from shinypartial.core.errors import InputError
@@ -371,26 +372,6 @@ class Light(LongCommand):
         report_result(made_of | files, made.lines, verdict=_stated(made.reconstruction))
 
 
-@dataclass(frozen=True)
-class PrintBoard:
-    """Write the board that lies under the object while photographs are taken, at its true size."""
-
-    output: Path = Path("board.pdf")
-    """File to write: .pdf or .svg."""
-    paper: Literal["A4", "Letter", "A3"] = "A4"
-    """The larger, the better: the object must not hide most of it."""
-
-    def run(self) -> None:
-        """Write the file and say how to print it."""
-        from panoless.photographs.board import write_board
-        from shinypartial.core.board import BOARDS
-
-        board = BOARDS[self.paper]
-        write_board(board, self.output)
-        print(f"Print {self.output} at 100 % and measure: five squares are {5 * board.square_mm:g} mm.")
-        print("Then: panoless capture FOLDER")
-
-
 def _say_captured(dataset: Path, picture: str, lines: Sequence[str], *options: str) -> None:
     """What a capture made of photographs, and how a fit goes on."""
     print("\n".join(lines))
@@ -435,6 +416,15 @@ PROGRAM = Program(
     {
         "From photographs": {"light": Light, "capture": Capture, "board": PrintBoard},
         "From a dataset": {"fit": Fit, "view": View, "export": Export, "extension": Extension},
+    },
+    {
+        "light": "IMG_0001.jpg IMG_0002.jpg IMG_0003.jpg",
+        "capture": "photographs --focal-mm 26 --board A4",
+        "board": "--paper A3",
+        "fit": "datasets/vase --preset best --device cuda",
+        "view": "predictions/vase-default",
+        "export": "runs/vase-default",
+        "extension": "--output panoless-blender.zip",
     },
 )
 

@@ -26,7 +26,7 @@ MARKERS = (tyro.conf.DisallowNone,)
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """Commands by title of their group and by name: dataclasses that run themselves.
+    """Commands by title of their group and by name: dataclasses that run themselves. `examples` are words for each.
 
     `FIRST`, if a command has it, names the fields that `--help` shows, with dots where they are nested, between spaces.
     `--help-all` shows all of them.
@@ -35,6 +35,7 @@ class Program:
     name: str
     description: str
     groups: Mapping[str, Mapping[str, type]]
+    examples: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def main(self, arguments: Sequence[str], defaults: Mapping[str, Any] | None = None) -> int:
         """Parse and run; return 0, 2 for bad usage or bad input, 130 when interrupted.
@@ -85,7 +86,8 @@ class Program:
         with contextlib.redirect_stdout(page), contextlib.suppress(SystemExit):
             tyro.cli(kind, prog=f"{self.name} {name}", args=["--help"], config=MARKERS, **settings)
         page.seek(0)
-        return (BETWEEN_BOXES.sub("", page.read()) if shown else page.read()).rstrip()
+        text = (BETWEEN_BOXES.sub("", page.read()) if shown else page.read()).rstrip()
+        return f"{text}\nexample: {self.name} {name} {self.examples[name]}" if name in self.examples else text
 
     def overview(self) -> str:
         """All commands with a line each, or two."""

@@ -80,3 +80,12 @@ def test_a_terminal_that_knows_ascii_alone_is_no_error() -> None:
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, check=False)
     assert (done.returncode, done.stderr) == (0, b"")
     assert len(done.stdout.splitlines()) <= SCREEN_LINES
+
+
+@pytest.mark.parametrize(("program", "name", "kind"), COMMANDS)
+def test_the_example_of_a_command_is_shown_and_understood(
+    program: Program, name: str, kind: type, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = program.examples[name]
+    assert lines_of_help(program, [name, "--help"], capsys)[-1] == f"example: {program.name} {name} {words}"
+    assert isinstance(program.parse([name, *words.split()]), kind)
