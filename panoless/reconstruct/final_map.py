@@ -35,7 +35,8 @@ def complete(state: FitState, views: Views, config: FitConfig) -> tuple[Views, F
     The map is solved in closed form, unless the configuration keeps that of an iterative fit, which knows no material.
     It is that of photographs as they were taken: exposed more, their robust scales would leave out what is beside a
     lamp, which counts most in a map.
-    Only kinds in closed form have a roughness: wrong normals blur a map as well.
+    Only kinds in closed form have a roughness: wrong normals blur a map as well, and so does a material that was solved
+    with the shape.
     """
     usable, exposure = usable_views(views, state.geometry), encoding_of(config).exposure
     if config.environment.solve or state.training is None:
@@ -48,7 +49,7 @@ def complete(state: FitState, views: Views, config: FitConfig) -> tuple[Views, F
         config = replace(config, tint=state.reflectance.tint)
         state.reflectance = state.reflectance.exposed(1 / exposure)
     blur = Blur()
-    if state.training is None:
+    if state.training is None and state.geometry.reflectance is None:
         with improving():
             blur = needed_blur(usable, state.geometry, config)
     state.roughness, state.blur_px = blur.roughness, blur.blur_px

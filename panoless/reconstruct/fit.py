@@ -165,7 +165,9 @@ def assess(state: FitState, views: Views, config: FitConfig, ball: BallEvidence 
     assert state.visibility is not None
     corrections = state.selection.corrections
     with torch.no_grad():
-        found = gather_evidence(views, state.geometry, state.visibility, config, corrections, state.roughness, ball)
+        found = gather_evidence(
+            views, state.geometry, state.visibility, config, corrections, state.roughness, ball, state.reflectance
+        )
     return judge(found)
 
 

@@ -24,6 +24,7 @@ from panoless.capture.silhouettes import mask_distance_px, silhouette_distance_p
 from panoless.capture.views import TrainView, Views, at_most_pixels, split_held_out
 from panoless.config import FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints, thinned
+from panoless.environment.reflectance import Reflectance
 from panoless.environment.resolution import ERROR_SCALE, densest_resolution
 from panoless.environment.sharpening import HARD, MIDDLE, SMOOTHNESS, TRIAL_STEPS, deblur_map
 from panoless.environment.solve import solve_environment
@@ -141,9 +142,11 @@ def gather_evidence(
     corrections: Corrections = NO_CORRECTIONS,
     roughness: float | None = None,
     ball: BallEvidence | None = None,
+    reflectance: Reflectance | None = None,
 ) -> Evidence:
     """The evidence for a geometry in the views that it was fitted to, after their corrections, which are listed along
-    as the roughness is; `visibility` is that of the final map.
+    as the roughness is; `visibility` is that of the final map. Where the `reflectance` differs from place to place,
+    what a perfect mirror would have shown errs by more than the photograph: by that over the mirrored share.
 
     The shape and the cameras of a `ball` that was captured are known before. So held-out light counts where the map is
     rather sure than not: what stands near the ball, and who photographs it, is left to the visibility.
@@ -154,7 +157,8 @@ def gather_evidence(
     views, usable = replace(views, train=seen), replace(views, train=tuple(found[index] for index in used))
     solid, kept = (max(each.num_solid, 1) for each in (views, usable))
     surfaces = surfaces_of(usable, geometry, VIEWS)
-    light = _light(usable, surfaces, geometry, visibility, config, by_confidence=ball is not None)
+    uneven = reflectance if reflectance is not None and reflectance.field is not None else None
+    light = _light(usable, surfaces, geometry, visibility, config, uneven, by_confidence=ball is not None)
     silhouettes = [_silhouette(*each) for part in surfaces for each in part]
     distance, shift, overlap, missed, surplus = np.array(silhouettes).reshape(-1, 5).T
     focal = np.array([view.camera.fx for part in surfaces for view, _ in part])
@@ -223,6 +227,7 @@ def _light(
     geometry: Geometry,
     visibility: Float[Tensor, "6 L L"],
     config: FitConfig,
+    uneven: Reflectance | None,
     *,
     by_confidence: bool,
 ) -> dict[str, float | None]:
@@ -237,7 +242,7 @@ def _light(
     contrast = Contrast.of(views)
     parts = Cells.empty(PART_CELLS, 1, views.train[0].mask.device)
     plain = WithoutMirror.of(views, kept, held_out, contrast, RAYS)
-    errors, confidence, explained = [], [], Mean()
+    errors, confidence, explained, of_places = [], [], Mean(), Mean()
     saturation = encoding_of(config).saturation.to(environment)
     for areas in _seen_areas(tested, geometry, config):
         rays, seen = areas.rays(), areas.seen(environment).minimum(saturation)
@@ -251,13 +256,16 @@ def _light(
         normals = surface.normals_camera.flatten(1)[:, pixels]
         shaded = geometry.shade(environment, view.camera, pixels, normals).minimum(saturation)
         shown = contrast.shown(shaded) - radiance
+        if uneven is not None:
+            shown *= surface.shown(uneven, view.camera, pixels)[0]
+            of_places.add(bounded_error(shown, ERROR_SCALE), torch.ones_like(shown[:, 0]))
         parts.add(view, surface, pixels, bounded_error(shown, ERROR_SCALE)[:, None])
     if explained.weight <= 0:
         return nothing
     every, sure = torch.cat(errors), torch.cat(confidence)
     noise = float(np.median([_noise(view) for view in contrast.applied(views).train]))
     return {
-        "unexplained": explained.value,
+        "unexplained": explained.value if uneven is None else of_places.value,
         "one_color": plain.one_color,
         "matte": plain.matte,
         "unexplained_part": parts.share_above(PART_UNEXPLAINED * plain.matte),

@@ -11,6 +11,8 @@ from torch.nn.functional import max_pool2d, normalize
 from panoless.capture.views import TrainView, Views
 from panoless.config import EnvironmentConfig, FitConfig
 from panoless.environment.footprints import Footprints, PixelFootprints
+from panoless.environment.material_field import MaterialField
+from panoless.environment.reflectance import Reflectance
 from panoless.geometry.plane.kind import PlaneMirror
 from panoless.kernels.cubemap import cubemap_directions
 from panoless.trust.evidence import VIEWED_WITHIN_RAD, Evidence, gather_evidence
@@ -203,6 +205,24 @@ def test_gold_is_judged_by_where_its_channels_end(views: Views) -> None:
     assert found.unexplained is not None
     assert of_no_color.unexplained is not None
     assert found.unexplained < of_no_color.unexplained / 3
+
+
+def test_where_places_differ_residuals_count_by_the_share_that_they_mirror(views: Views) -> None:
+    """Noise of photographs that was divided by a quarter, with a material that mirrors a quarter, is what it was."""
+    rng, vertices = np.random.default_rng(0), np.arange(9**3)
+    field = MaterialField(8, vertices, np.full((len(vertices), 3), -0.75), np.zeros((len(vertices), 3)))
+    dim = Reflectance(np.ones(3), field=field)
+    noise = [torch.from_numpy(rng.normal(scale=0.05, size=view.radiance.shape)).float() for view in views.train]
+    of_mirror, of_dim = (
+        each(views, lambda index, view, factor=factor: replace(view, radiance=view.radiance + factor * noise[index]))
+        for factor in (1, 4)
+    )
+    expected, wrong = evidence(of_mirror).unexplained, evidence(of_dim).unexplained
+    found = gather_evidence(of_dim, MIRROR, VISIBILITY, CONFIG, reflectance=dim).unexplained
+    assert expected is not None
+    assert wrong is not None
+    assert found == pytest.approx(expected, rel=0.25)
+    assert wrong > 2 * expected
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
