@@ -64,9 +64,11 @@ EVEN = Material(MaterialField(CELLS, np.zeros(1, np.int64), np.zeros((1, 3)), np
 
 
 def measured_material(linearization: "Linearization") -> Material:
-    """By the light of the map that a linearization has."""
+    """By the light of the map that a linearization has; a perfect mirror where no pixel sees the surroundings."""
     chosen = np.flatnonzero(linearization.free > 0)
-    chosen = chosen[:: -(-len(chosen) // PIXELS) or 1]
+    if not len(chosen):
+        return EVEN
+    chosen = chosen[:: -(-len(chosen) // PIXELS)]
     points, light = linearization.points[chosen], linearization.light[chosen]
     radiance, facing = linearization.radiance[chosen], linearization.facing[chosen]
     pale = 1 - (1 - np.clip(facing, 0, 1))[:, None] ** 5
@@ -79,6 +81,6 @@ def measured_material(linearization: "Linearization") -> Material:
     mean = share.mean(1)
     best = mean >= np.percentile(mean, BEST)
     whole, most = 1 + found.share, np.maximum(np.median(share[best], axis=0), LEAST_SHARE)
-    # E = α F − β: the best mirrors have s α = 1 and d = s β.
+    # With E = (F − d₀)/s₀ of the best mirrors, c = s F/s₀ + d − s d₀/s₀.
     shift = np.median(scattered[best] / np.maximum(share[best], LEAST_SHARE), axis=0)
     return Material(replace(found, share=whole / most - 1, scattered=np.maximum(found.scattered - whole * shift, 0.0)))

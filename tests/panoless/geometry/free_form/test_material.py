@@ -73,6 +73,7 @@ def test_paint_is_measured_beside_chrome() -> None:
     assert found.task.material is not None
     seen = found.points[found.free > 0]
     share, scattered = found.task.material.at(seen, np.ones(len(seen)))
+    assert measured_material(replace(found, free=np.zeros_like(found.free))) == EVEN
     paint, chrome = seen[:, 2] > 0.1, seen[:, 2] < -0.1
     assert np.median(share[chrome], axis=0) == pytest.approx(np.ones(3), abs=0.1)
     assert np.median(share[paint], axis=0) == pytest.approx(np.full(3, SHARE), abs=0.1)
