@@ -158,7 +158,12 @@ def fit_free_form(
                 stage = coarse_stage(solved, begun, rounds, nuisance=stage.nuisance)
             stage = best(refitted_stages(solved, stage, schedule.refit))
             finest = list[Round]()
-            if others and schedule.detailed and error(stage) > DETAILED_ERROR:
+            unclear = bool(others and schedule.detailed) and error(stage) > DETAILED_ERROR
+            for mixed in [each for each in materials if unclear and each is not None]:
+                # Paint on a smooth body needs no details.
+                rounds = schedule.coarse if begun is start else schedule.concave
+                stage = best((stage, coarse_stage(solved, begun, rounds, nuisance=usual, material=mixed)))
+            if unclear and error(stage) > DETAILED_ERROR:
                 details = Progress(
                     "looking for details", len(materials) * sum(each.steps for each in schedule.detailed)
                 )
