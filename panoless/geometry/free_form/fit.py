@@ -160,8 +160,8 @@ def fit_free_form(
             finest = list[Round]()
             unclear = bool(others and schedule.detailed) and error(stage) > DETAILED_ERROR
             for mixed in [each for each in materials if unclear and each is not None]:
-                # Paint on a smooth body needs no details.
-                rounds = schedule.coarse if begun is start else schedule.concave
+                # Paint on a smooth body needs no details, but many pixels.
+                rounds = schedule.concave or schedule.coarse
                 stage = best((stage, coarse_stage(solved, begun, rounds, nuisance=usual, material=mixed)))
             if unclear and error(stage) > DETAILED_ERROR:
                 details = Progress(
@@ -406,7 +406,7 @@ class _Seen:
         rays = nuisance.moved(pixels.rays, StatedCameras.of(views))
         reflected, inner = ReflectedRays.of(surface, rays, 1, LEAST_COSINE), pixels.inner_px > INNER_PX
         clear = reflected.clear & inner
-        facing, points = -(reflected.hits.normals * rays.directions).sum(1), surface.points(reflected.hits.places)
+        facing, points = reflected.hits.facing(rays.directions), surface.points(reflected.hits.places)
         mirrored = Mirrored.by(
             stage.material, pixels.radiance, nuisance.equalized(pixels.radiance, rays.view), points, facing
         )

@@ -132,7 +132,7 @@ class Linearization:
         clear = reflected.clear & (task.pixels.inner_px > INNER_PX)
         texel = np.pi / 2 / settings.resolution
         free = clear / (1 + (reflected.turn / (WIDE_TEXELS * texel)) ** 2)
-        facing, points = -(reflected.hits.normals * rays.directions).sum(1), surface.points(reflected.hits.places)
+        facing, points = reflected.hits.facing(rays.directions), surface.points(reflected.hits.places)
         mirrored = Mirrored.by(task.material, task.pixels.radiance, radiance, points, facing)
         weights = torch.from_numpy(free * trust.at(points)).float()
         areas = mirrored.areas(reflected.outgoing)
@@ -169,7 +169,7 @@ class Linearization:
     @property
     def facing(self) -> Float[np.ndarray, "P"]:
         """cos θ."""
-        return -(self.reflected.hits.normals * self.rays.directions).sum(1)
+        return self.reflected.hits.facing(self.rays.directions)
 
     @cached_property
     def weights(self) -> Float[np.ndarray, "P"]:

@@ -44,6 +44,11 @@ class Hits:
         gradient = self.derivatives[:, 1:4]
         return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
 
+    def facing(self, directions: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
+        """cos θ between the normals and rays of those directions; zero for a miss."""
+        found: Float[np.ndarray, "P"] = -(self.normals * directions).sum(1)
+        return found
+
 
 @dataclass(frozen=True)
 class LevelSet:
