@@ -43,6 +43,8 @@ class Block:
     """Standard deviation of an unknown by errors of surface, map and masks, which noise does not show."""
     sigma: ClassVar[float] = 1.0
     """Standard deviation of the prior of an unknown."""
+    most_deviations: ClassVar[float] = math.inf
+    """Root mean square of its unknowns, in standard deviations of the prior, above which something else is wrong."""
     moves_silhouettes: ClassVar[bool] = False
     """Whether its numbers are pixels by which silhouettes of masks lie outside of those of the object."""
     values: Float[np.ndarray, "B M"]
@@ -65,6 +67,11 @@ class Block:
     def rms(self) -> float:
         """Root mean square of the unknowns that have the unit."""
         return self.scale * float(np.sqrt((self.values[:, self.measured] ** 2).mean()))
+
+    @property
+    def prior_score(self) -> float:
+        """1/n Σ xᵀ P x, of the prior."""
+        return float(np.einsum("bi,bij,bj", self.values, self.precision, self.values)) / self.values.size
 
     @property
     def size(self) -> int:
@@ -129,9 +136,10 @@ class Block:
 
 
 class Lens(Block):
-    """An unknown of the lens of all views."""
+    """An unknown of the lens of all views, for which lenses are made within five standard deviations of its prior."""
 
     by_view = False
+    most_deviations = 5.0
 
     @property
     def lens(self) -> LensChange:

@@ -12,6 +12,9 @@ blocks that follow it, the sum is xᵀ C⁻¹ x (Wald's statistic): exposures th
 map takes over, and mean nothing. Of a level set the σᵢ are those of each view: a turn and a shift that cancel each
 other are known well, and the first to bend for a surface that is still too coarse. Held-out views do not decide: a
 pose that makes up for such a surface explains views that took no part better, too.
+
+A lens explains nothing for which no lens is made: focal length and distortion are not needed beyond five standard
+deviations of their priors. Masks that are wrong alike in all views are explained best by k₁ = 17.
 """
 
 import math
@@ -51,9 +54,10 @@ def decided(
     *,
     required: bool = False,
 ) -> Decision:
-    """Whether a block is needed; one that is `required` is kept."""
+    """Whether a block is needed and its prior allows it; one that is `required` is kept."""
     found = scored(block, variances, covariance)
-    return replace(found, kept=required or found.score > found.bound)
+    is_possible = block.prior_score <= block.most_deviations**2
+    return replace(found, kept=required or (is_possible and found.score > found.bound))
 
 
 def needed(

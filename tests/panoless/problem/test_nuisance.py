@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from panoless.environment.surroundings import Floor, Surroundings
-from panoless.problem.blocks import BLOCKS, Block, FocalLength
+from panoless.problem.blocks import BLOCKS, Block, FocalLength, Lens
 from panoless.problem.corrected import Corrected
 from panoless.problem.evidence import decided
 from panoless.problem.nuisance import Nuisance, nuisance_of
@@ -101,7 +101,7 @@ def test_a_block_is_needed_where_its_values_exceed_their_noise(kind: type[Block]
     """Of a hundred of noise at most three, of those five times as large nearly all, or half of single numbers."""
     block, rng = nuisance.get(kind), np.random.default_rng(4)
     assert block is not None
-    sigmas = 0.01 * rng.uniform(0.5, 2.0, block.values.shape)
+    sigmas = 0.002 * rng.uniform(0.5, 2.0, block.values.shape)
     kept = {1: 0, 5: 0}
     for factor in kept:
         for _ in range(100):
@@ -110,6 +110,16 @@ def test_a_block_is_needed_where_its_values_exceed_their_noise(kind: type[Block]
             kept[factor] += decided(of, sigmas**2).kept
     assert kept[1] <= 3
     assert kept[5] >= {1: 40, 3: 85}.get(block.values.size, 97)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in BLOCKS if issubclass(kind, Lens)], ids=lambda kind: kind.name)
+def test_no_lens_explains_what_lenses_are_not_made_as(kind: type[Lens], nuisance: Nuisance) -> None:
+    block, variances = nuisance.get(kind), np.full((1, 1), 1e-8)
+    assert block is not None
+    for deviations, kept in ((4.0, True), (6.0, False)):
+        of = replace(block, values=np.full((1, 1), deviations * kind.sigma))
+        assert decided(of, variances).kept is kept
+        assert decided(of, variances, required=True).kept
 
 
 def test_what_is_decided_is_left_out_and_what_is_required_stays(nuisance: Nuisance) -> None:
