@@ -11,6 +11,7 @@ from torch import Tensor
 
 from panoless.capture.background import Background
 from panoless.capture.encoding import LDR, RadianceEncoding
+from panoless.capture.ground import Ground, SeenGround, ground_of, seen_ground
 from panoless.capture.masks import MASK_LEVEL, estimate_object_frame, without_specks
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import pose_of, raster_camera, unit_rays_camera
@@ -18,7 +19,7 @@ from panoless.kernels.camera import RasterCamera
 from shinypartial.core.camera import Camera
 from shinypartial.core.conventions import SOLID_ALPHA
 from shinypartial.core.errors import InputError
-from shinypartial.dataset.read import read_view
+from shinypartial.dataset.read import read_focal_sigma, read_ground, read_view, read_whole_view
 from shinypartial.dataset.schema import Dataset
 from shinypartial.io.progress import Progress
 
@@ -115,6 +116,10 @@ class Views:
     """Standard deviation of a Gaussian that blurred the pictures, in pixels of the views."""
     background: Background | None = None
     """What was seen past the object, where that is data for the map, too."""
+    ground: Ground | None = None
+    """What the object stands on, where that is stated."""
+    focal_sigma: float | None = None
+    """Standard deviation of the stated focal length, as a share of it; None: it is not stated."""
 
     @property
     def num_solid(self) -> int:
@@ -130,7 +135,9 @@ class Views:
     def to(self, device: torch.device) -> "Views":
         """The same views on a device."""
         background = None if self.background is None else self.background.to(device)
-        return replace(self, train=tuple(view.to(device) for view in self.train), background=background)
+        ground = None if self.ground is None else replace(self.ground, light=self.ground.light.to(device))
+        train = tuple(view.to(device) for view in self.train)
+        return replace(self, train=train, background=background, ground=ground)
 
 
 def load_views(
@@ -147,14 +154,20 @@ def load_views(
     Raises InputError for unreadable images and for masks that are all empty.
     """
     progress = Progress("reading views", len(dataset.train))
-    photographs, empty = [], []
+    photographs, empty, plane = list[Photograph](), list[str](), read_ground(dataset)
+    seen = list[SeenGround]()
     downscale = max(1, min(downscale, int(_object_px(dataset) / least_object_px))) if least_object_px else downscale
     for frame in dataset.train:
-        view = read_view(frame)
+        view, color, shown = read_whole_view(frame)
         alpha = _block_means(np.clip(view.alpha, 0, 1), downscale)
         if (alpha >= MASK_LEVEL).any():
             radiance = encoding.encoded(_block_means(encoding.clipped(frame, view), downscale), alpha)
-            photograph = cropped(frame.camera.downscaled(downscale), radiance, alpha, crop_margin_px)
+            camera = frame.camera.downscaled(downscale)
+            if plane is not None:
+                whole = replace(view, radiance=color, alpha=shown)
+                light = encoding.encoded(_block_means(encoding.clipped(frame, whole), downscale))
+                seen.append(seen_ground(camera, light, alpha, _block_means(shown, downscale), plane))
+            photograph = cropped(camera, radiance, alpha, crop_margin_px)
             photographs.append(replace(photograph, pose_covariance=frame.pose_covariance))
         else:
             empty.append(frame.name)
@@ -166,7 +179,8 @@ def load_views(
             found=f"{len(empty)} of {len(dataset.train)} masks empty: {', '.join(empty[:NAMED_VIEWS])}{more}",
             remedy="Correct these masks, or remove their frames from transforms_train.json.",
         )
-    return views_of(photographs, known_radius)
+    views = replace(views_of(photographs, known_radius), focal_sigma=read_focal_sigma(dataset))
+    return views if plane is None else replace(views, ground=ground_of(plane, views.object_frame, seen))
 
 
 def _object_px(dataset: Dataset) -> float:

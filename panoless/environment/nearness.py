@@ -93,7 +93,9 @@ def upward(rights: Float[np.ndarray, "V 3"], ups: Float[np.ndarray, "V 3"]) -> F
     return up if (ups @ up).sum() > 0 else -up
 
 
-def with_floor(seen: LeavingRays, up: Float[np.ndarray, "3"]) -> tuple[Surroundings, float]:
+def with_floor(
+    seen: LeavingRays, up: Float[np.ndarray, "3"], depths: Sequence[float] = FLOOR_DEPTHS
+) -> tuple[Surroundings, float]:
     """A level disk below the object in a far world: of a grid of depths and reaches, what explains the rays best; and
     the share of the cost in a far world that it leaves.
     """
@@ -103,7 +105,7 @@ def with_floor(seen: LeavingRays, up: Float[np.ndarray, "3"]) -> tuple[Surroundi
         environment = solve_environment([rays], FLOOR_RESOLUTION)
         return _cost(radiance_of(environment, rays.directions.numpy().astype(np.float64)) - seen.radiance)
 
-    grid = product(FLOOR_DEPTHS, FLOOR_REACHES)
+    grid = product(depths, FLOOR_REACHES)
     tried = [Surroundings(np.zeros(1), Floor(up, depth, reach)) for depth, reach in grid]
     costs = [cost(each) for each in tried]
     best = int(np.argmin(costs))
@@ -111,13 +113,15 @@ def with_floor(seen: LeavingRays, up: Float[np.ndarray, "3"]) -> tuple[Surroundi
 
 
 def found_surroundings(
-    seen: LeavingRays, start: Surroundings, resolutions: Sequence[int] = RESOLUTIONS
+    seen: LeavingRays, start: Surroundings, resolutions: Sequence[int] = RESOLUTIONS, *, known_floor: bool = False
 ) -> Surroundings:
-    """After a step under a map of each of the resolutions. A floor stays level: wrong normals would tilt it."""
+    """After a step under a map of each of the resolutions. A floor stays level, as wrong normals would tilt it, and one
+    that is known stays where it is.
+    """
     for resolution in resolutions:
         free = np.ones(start.num_unknowns, bool)
         if start.floor is not None:
-            free[len(start.coefficients) : -1] = False
+            free[len(start.coefficients) : None if known_floor else -1] = False
         change = np.zeros(start.num_unknowns)
         change[free] = Linearized.at(seen, start, resolution, free).step()
         start = start.after(STRETCH * change)

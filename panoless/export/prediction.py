@@ -273,7 +273,7 @@ def _near_surroundings(surroundings: Surroundings, frame: ObjectFrame) -> NearSu
     """What the prediction states of surroundings that are not far."""
     if surroundings.is_far:
         return None
-    inverse, level = float(surroundings.coefficients[0]), surroundings.floor
+    inverse, level = float(surroundings.coefficients[:1].sum()), surroundings.floor
     radii = 1 / inverse if inverse > 0 else None
     distance = None if radii is None else radii * frame.radius
     floor = None

@@ -16,7 +16,7 @@ from panoless.capture.rays import pixel_rays, reflect, unit_rays_camera
 from panoless.capture.views import TrainView, Views, at_most_pixels
 from panoless.config import FitConfig
 from panoless.deadline import improving
-from panoless.environment.direct import scaled_to_map
+from panoless.environment.direct import direct_rays
 from panoless.environment.footprints import Footprints, PixelFootprints
 from panoless.environment.rays import Rays, normalize_confidence
 from panoless.environment.reflectance import Reflectance
@@ -121,8 +121,7 @@ class ExactGeometry:
         """
         rays = normalize_confidence(merged(observe_views(views, cast(Geometry, self), config.environment.rays)))
         resolution, encoding = config.environment.solve_resolution, encoding_of(config)
-        if views.background is not None:
-            rays = [*rays, scaled_to_map(views.background, rays)]
+        rays += direct_rays(views, self.surroundings, rays)
         footprints = None if encoding.high_dynamic_range else self.footprints(views, config.environment.rays)
         if footprints is None or not footprints.smooth:
             return solve_environment(rays, resolution or densest_resolution(rays)), rays
@@ -220,7 +219,7 @@ class ExactFamily:
         views, around = self.with_silhouettes(views), proposal.shape.surroundings
         if not LEAST_VIEWS <= len(views.train) <= MOST_VIEWS:
             kinds = ()
-        if self.by_silhouettes and not kinds:
+        if (self.by_silhouettes or self.silhouettes_suffice) and not kinds:
             return self.finished(views, self.as_proposed(proposal, config), config), NO_CORRECTIONS, []
         start = proposal
         with torch.no_grad():

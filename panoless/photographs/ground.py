@@ -18,10 +18,10 @@ from panoless.capture.masks import MAIN_SHARE, largest_pieces
 from panoless.photographs.hull import carve, cube, nearest_point, pixels_of, silhouette
 from panoless.photographs.lens import opencv
 from panoless.photographs.masks import EDGE_PX, HULL_SPARE, HULL_VOXELS, TOLERATED, averaged, enlarged
-from panoless.photographs.posed import GroundPlane
 from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import tangents
+from shinypartial.dataset.schema import GroundPlane
 from shinypartial.io.images import write_png
 from shinypartial.io.progress import Progress
 

@@ -114,7 +114,7 @@ def capture(request: Request) -> Captured:
             Frame(f"train/{view.name}", view.camera, train / view.name, pose_covariance=view.pose_covariance)
             for view in poses.views
         ]
-        write_transforms(request.output, "train", listed)
+        write_transforms(request.output, "train", listed, ground=poses.ground, focal_sigma=poses.focal_error)
     return Captured(frames, poses, masks)
 
 

@@ -12,6 +12,7 @@ from panoless.photographs.lens import Lens
 from panoless.photographs.options import LEAST_VIEWS
 from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
+from shinypartial.dataset.schema import GroundPlane
 
 LEAST_POSED = 0.5
 """Share of the frames that must get a pose: with fewer, those that do are likely to be wrong."""
@@ -45,15 +46,6 @@ class PosedView:
     def camera(self) -> Camera:
         """That of the undistorted picture."""
         return self.lens.pinhole(np.array(self.camera_to_world))
-
-
-@dataclass(frozen=True)
-class GroundPlane:
-    """What the object stands on: points x of the world with n · x = offset."""
-
-    normal: tuple[float, float, float]
-    """n, of length 1, toward the cameras."""
-    offset: float
 
 
 LEVEL = GroundPlane((0.0, 0.0, 1.0), 0.0)

@@ -163,6 +163,12 @@ class FocalLength(Lens):
     model_error = 0.002
     sigma = 0.02
 
+    @classmethod
+    def of(cls, views: Views, around: Surroundings) -> "FocalLength":
+        """As stated, and as far as that is known."""
+        sigma = cls.sigma if views.focal_sigma is None else math.hypot(views.focal_sigma, cls.model_error)
+        return cls(np.zeros((1, 1)), np.full((1, 1, 1), 1 / sigma**2))
+
     @property
     def lens(self) -> LensChange:
         """Of that focal length."""
@@ -318,6 +324,8 @@ class Ground(Block):
     unit = "radii"
     model_error = 0.01
     sigma = 0.1
+    stated_sigma: ClassVar[float] = 0.005
+    """The same where photographs of the ground state it."""
     floor_now: Floor
 
     @classmethod
@@ -325,7 +333,8 @@ class Ground(Block):
         """As proposed; None where there is no floor."""
         if around.floor is None:
             return None
-        return cls(np.zeros((1, cls.count)), np.eye(cls.count)[None] / cls.sigma**2, around.floor)
+        sigma = cls.sigma if views.ground is None else cls.stated_sigma
+        return cls(np.zeros((1, cls.count)), np.eye(cls.count)[None] / sigma**2, around.floor)
 
     @property
     def surroundings_columns(self) -> slice:

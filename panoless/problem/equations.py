@@ -7,16 +7,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Num
 from torch import Tensor
 
 from panoless.capture.poses import StatedCameras
 from panoless.capture.views import Views
+from panoless.environment.direct import direct_rays
 from panoless.environment.mirrored import MirroredRays, slopes_of
-from panoless.environment.rays import Rays
+from panoless.environment.rays import Rays, joined_rays
 from panoless.environment.solve import solve_environment
 from panoless.environment.surroundings import Surroundings
 from panoless.environment.variable_projection import VariableProjection
+from panoless.kernels.cubemap import sample_cubemap
 from panoless.numeric.factorize import regularize
 from panoless.numeric.gauss_newton import damped_step, normal_equations
 from panoless.numeric.robust import bounded_error, robust_scale, robust_weight
@@ -47,6 +49,8 @@ LEAST_CLEAR = 50
 """Fewer rays that see the surroundings have no weight."""
 DAMPINGS = (1e-6, 1e-3, 1e-1, 10.0)
 """Of a step, in shares of the matrix' diagonal (Levenberg and Marquardt), tried in turn."""
+NORMAL_MEDIAN = 0.6745
+"""Median absolute value of a normal number with a standard deviation of one."""
 CONTOUR_SCALE_PX = 0.5
 """Robust scale of silhouettes beside photographs (px)."""
 
@@ -103,6 +107,8 @@ class Data:
     settings: Round
     last: bool
     """Whether photographs under this map determine all of the surface."""
+    views: Views
+    """For what is seen past the object."""
 
     @classmethod
     def of(cls, views: Views, settings: Round, last: int, free: Collection[str] = ()) -> "Data":
@@ -117,7 +123,7 @@ class Data:
             if {Exposures.name, WhiteBalances.name} & set(free):
                 kept &= ~is_saturated(pixels.radiance).any(1)
             pixels = pixels.chosen(kept)
-        return cls(pixels, chosen, StatedCameras.of(views), settings, settings.resolution >= last)
+        return cls(pixels, chosen, StatedCameras.of(views), settings, settings.resolution >= last, views)
 
 
 @dataclass(frozen=True)
@@ -149,6 +155,9 @@ class Photographs:
     residual: Float[np.ndarray, "Q 3"]
     sigma: float
     projection: VariableProjection
+    """Of the pixels, then of what is seen past the object."""
+    direct: Float[np.ndarray, "D 3"]
+    """Residuals of the latter."""
 
     @classmethod
     def at(cls, data: Data, state: State, traced: Traced, *, estimated: bool) -> "Photographs | None":
@@ -161,7 +170,9 @@ class Photographs:
         radiance = state.nuisance.equalized(data.pixels.radiance[chosen], rays.view)
         mirrored = MirroredRays(rays.directions, hits.normals, hits.points, state.around)
         directions, seen = (torch.from_numpy(each).float() for each in (mirrored.looked_up, radiance))
-        environment = solve_environment([Rays(directions, seen)], data.settings.resolution)
+        rays_seen = [Rays(directions, seen)]
+        past = joined_rays([*direct_rays(data.views, state.around, rays_seen), rays_seen[0].kept(slice(0))])
+        environment = solve_environment([*rays_seen, past], data.settings.resolution)
         light = mirrored.light(environment)
         residual = light - radiance
         sigma = RADIANCE_SIGMA
@@ -170,8 +181,13 @@ class Photographs:
         weights = robust_weight(residual, data.settings.robust_scale) / sigma**2
         if estimated:
             weights *= min(COUNTED_RAYS / len(chosen), 1.0)
-        projection = VariableProjection.of(mirrored.looked_up, weights, data.settings.resolution)
-        return cls(chosen, rays, hits, mirrored, environment, light, residual, sigma, projection)
+        direct = (sample_cubemap(environment, past.directions) - past.radiance).double().numpy()
+        counted = past.initial_weight().double().numpy() * robust_weight(direct, data.settings.robust_scale)
+        if len(direct):
+            weights = np.concatenate([weights, counted * np.median(weights)])
+        looked_up = np.concatenate([mirrored.looked_up, past.directions.double().numpy()])
+        projection = VariableProjection.of(looked_up, weights, data.settings.resolution)
+        return cls(chosen, rays, hits, mirrored, environment, light, residual, sigma, projection, direct)
 
     @cached_property
     def by_normal(self) -> Float[np.ndarray, "Q 3 3"]:
@@ -200,6 +216,15 @@ class Photographs:
         slopes = slopes_of(self.environment, self.mirrored.looked_up)
         return self.mirrored.surroundings.rows(slopes, self.mirrored.points, self.mirrored.mirrored)
 
+    def with_direct(self, values: Num[np.ndarray, "Q *K"]) -> Num[np.ndarray, "P *K"]:
+        """Of pixels, and zeros of what is seen past the object, which depends on no unknown."""
+        return np.concatenate([values, np.zeros((len(self.direct), *values.shape[1:]), values.dtype)])
+
+    @property
+    def all_residuals(self) -> Float[np.ndarray, "P 3"]:
+        """Of pixels, and of what is seen past the object."""
+        return np.concatenate([self.residual, self.direct])
+
     def cost(self, data: Data, state: State, traced: Traced) -> float:
         """½ Σ w ‖(1 − Π) e‖² of another state, under this map. A ray that no longer sees the surroundings costs what it
         did before, so it is not lost for gain.
@@ -209,7 +234,8 @@ class Photographs:
         mirrored = MirroredRays(rays.directions, hits.normals[chosen], hits.points[chosen], state.around)
         radiance = state.nuisance.equalized(data.pixels.radiance[chosen], rays.view)
         residual = mirrored.light(self.environment) - radiance
-        return self.projection.cost(np.where(hits.clear[chosen, None], residual, self.residual))
+        residual = np.where(hits.clear[chosen, None], residual, self.residual)
+        return self.projection.cost(np.concatenate([residual, self.direct]))
 
 
 def chosen_hits(hits: MirrorHits, chosen: Int[np.ndarray, "Q"]) -> MirrorHits:
@@ -227,6 +253,8 @@ class Equations:
     silhouette: Silhouette
     distance_px: Float[np.ndarray, "S"]
     scale_px: float
+    sigma_px: float
+    """Standard deviation of a silhouette's point; what residuals show, where blocks are free."""
     gradient: Float[np.ndarray, "D"]
     matrix: Float[np.ndarray, "D D"]
     regularizing: Float[np.ndarray, "_ _"]
@@ -263,10 +291,10 @@ class Equations:
             by_motion = photographs.motion_rows() if free else np.zeros((len(rays.view), 3, 6))
             rows, columns = beside(rays, by_motion, photographs)
             gradient, matrix = photographs.projection.sparse_equations(
-                np.concatenate([np.matmul(photographs.by_normal, hits.rows), rows], 2),
-                np.concatenate([hits.columns, columns], 1),
+                photographs.with_direct(np.concatenate([np.matmul(photographs.by_normal, hits.rows), rows], 2)),
+                photographs.with_direct(np.concatenate([hits.columns, columns], 1)),
                 unknowns,
-                photographs.residual,
+                photographs.all_residuals,
             )
             if surface.unseen is not None and not data.last:
                 hidden = np.concatenate([surface.unseen, np.zeros((unknowns - count, surface.unseen.shape[1]))])
@@ -278,7 +306,8 @@ class Equations:
         distance = silhouette.pixels - nuisance.offsets_px(silhouettes.view)
         least = CONTOUR_SCALE_PX if data.settings.resolution else data.settings.robust_scale
         scale = robust_scale(distance[silhouette.weights > 0], least, NOISE_MULTIPLE)
-        weights = silhouette.weights * robust_weight(distance, scale) / CONTOUR_SIGMA_PX**2
+        sigma = max(_deviation(distance[silhouette.weights > 0]), CONTOUR_SIGMA_PX) if free else CONTOUR_SIGMA_PX
+        weights = silhouette.weights * robust_weight(distance, scale) / sigma**2
         rows, columns = beside(silhouettes, silhouette.by_motion[:, None], None)
         by_silhouettes, of_silhouettes = normal_equations(
             _jacobian(silhouette, rows[:, 0], columns, unknowns), distance, weights
@@ -309,6 +338,7 @@ class Equations:
             silhouette,
             distance,
             scale,
+            sigma,
             gradient,
             matrix,
             found.matrix,
@@ -323,14 +353,14 @@ class Equations:
             total += float(value @ self.regularizing @ value) / 2
         seen, found, distance = self.photographs, self.silhouette, self.distance_px
         if state is self.state:
-            total += 0.0 if seen is None else seen.projection.cost(seen.residual)
+            total += 0.0 if seen is None else seen.projection.cost(seen.all_residuals)
         else:
             total += 0.0 if seen is None or traced is None else seen.cost(self.data, state, traced)
             rays = state.nuisance.moved(self.data.silhouettes, self.data.cameras)
             found = state.surface.silhouette(rays)
             distance = found.pixels - state.nuisance.offsets_px(rays.view)
         lost = np.where(found.valid, bounded_error(distance, self.scale_px), 1.0)
-        return total + (self.scale_px / CONTOUR_SIGMA_PX) ** 2 * float(self.silhouette.weights @ lost) / 2
+        return total + (self.scale_px / self.sigma_px) ** 2 * float(self.silhouette.weights @ lost) / 2
 
     def after_step(self) -> tuple[State, float, Traced | None]:
         """The state after the least damped of the tried steps that lowers the cost, by which share of it, and its
@@ -368,6 +398,11 @@ class Equations:
             where = slice(start, start + block.size)
             found[block.name], start = whole[where, where], start + block.size
         return found
+
+
+def _deviation(values: Float[np.ndarray, "S"]) -> float:
+    """The standard deviation of normal numbers with the median absolute value of these; 0 of none."""
+    return float(np.median(np.abs(values))) / NORMAL_MEDIAN if len(values) else 0.0
 
 
 def _jacobian(

@@ -57,8 +57,8 @@ def refitted(family: Family, views: Views, fitted: Geometry, around: Surrounding
 
 
 def fit_jointly(family: Family, source: Family, views: Views, start: Proposal, config: FitConfig) -> Fitted:
-    """A fit whose walls start where the proposal has them, above the floor that it shows, if held-out views are
-    clearly better explained than without one. `source` makes the proposals of the kind.
+    """A fit whose walls start where the proposal has them, above the ground that is stated, or above the floor that it
+    shows, if held-out views are clearly better explained than without one. `source` makes the proposals of the kind.
     """
 
     def again(corrected: Views) -> Proposal | None:
@@ -77,7 +77,7 @@ def fit_jointly(family: Family, source: Family, views: Views, start: Proposal, c
 
     around = proposed_surroundings(family, views, start, config)
     found = solved(around)
-    if around.floor is None or config.surroundings.mode == "on":
+    if around.floor is None or views.ground is not None or config.surroundings.mode == "on":
         return found
     corrected = found.corrections.applied(views, config)
     far = refitted(family, corrected, found.geometry, FAR, config)

@@ -48,7 +48,7 @@ def proposed_surroundings(
     family: Family, views: Views, proposal: Proposal, config: FitConfig, *, rays_taken: int = RAYS
 ) -> Surroundings:
     """A sphere around the proposed shape, or a floor below it before a sphere, where one lowers the cost; else a far
-    world.
+    world. A ground that is stated is the floor.
 
     Far worlds pay for one linearized step and a few floors under coarse maps. A wrong shape may show either, too: walls
     are a block that is removed where it is not needed, and a fit above a floor is compared with one in a far world.
@@ -62,9 +62,12 @@ def proposed_surroundings(
         few = joined(leaving_rays(some, geometry, CHECKED_RAYS))
         near = Linearized.at(few, FAR.with_degree(0), CHECKED_RESOLUTION).pull() >= LEAST_PULL
         floored = options.floor == "auto" and with_floor(few, _up(views))[1] < LARGEST_FLOOR_COST
-        if options.mode == "auto" and not near and not floored:
+        if options.mode == "auto" and not near and not floored and views.ground is None:
             return FAR
         rays = joined(leaving_rays(views, geometry, rays_taken))
+        if views.ground is not None and options.floor == "auto":
+            level, _ = with_floor(rays, views.ground.up, (views.ground.depth,))
+            return found_surroundings(rays, level.with_degree(options.degree), known_floor=True)
         best = found_surroundings(rays, FAR.with_degree(0))
         if options.degree > 0:
             best = found_surroundings(rays, best.with_degree(options.degree))

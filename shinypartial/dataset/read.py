@@ -27,6 +27,7 @@ from shinypartial.dataset.schema import (
     BallEvidence,
     Dataset,
     Frame,
+    GroundPlane,
     View,
 )
 from shinypartial.dataset.transforms import read_frames
@@ -44,6 +45,8 @@ from shinypartial.io.images import (
 from shinypartial.io.records import read_record
 
 DEFAULT_FOLDER = Path("datasets")
+NORMAL_ERROR = 1e-4
+"""By which the length of a stated normal may differ from one."""
 
 
 def newest_dataset(parent: Path = DEFAULT_FOLDER) -> Path:
@@ -295,6 +298,37 @@ def read_ball_evidence(dataset: Dataset) -> BallEvidence | None:
     path = dataset.root / "transforms_train.json"
     stated = read_table(path, "the cameras of the train split").get("ball")
     return None if stated is None else read_record(BallEvidence, stated, f"`ball` of {path}", allow_unknown=True)
+
+
+def read_focal_sigma(dataset: Dataset) -> float | None:
+    """The standard deviation of the focal length as a share of it, where the cameras of the train split state it."""
+    path = dataset.root / "transforms_train.json"
+    stated = read_table(path, "the cameras of the train split").get("focal_sigma")
+    if stated is None:
+        return None
+    if not isinstance(stated, int | float) or not 0 <= stated < np.inf:
+        raise InputError(
+            expected=f"`focal_sigma` of {path}: the standard deviation of the focal length as a share of it, 0 or more",
+            found=repr(stated),
+            remedy="Correct it, or leave it out.",
+        )
+    return float(stated)
+
+
+def read_ground(dataset: Dataset) -> GroundPlane | None:
+    """What the object stands on, where the cameras of the train split state it; InputError for what is no plane."""
+    path = dataset.root / "transforms_train.json"
+    stated = read_table(path, "the cameras of the train split").get("ground")
+    if stated is None:
+        return None
+    found = read_record(GroundPlane, stated, f"`ground` of {path}", allow_unknown=True)
+    if not np.isfinite([*found.normal, found.offset]).all() or abs(np.linalg.norm(found.normal) - 1) > NORMAL_ERROR:
+        raise InputError(
+            expected=f"`ground` of {path} with a normal of length 1 and a finite offset: points x with n · x = offset",
+            found=f"normal {list(found.normal)}, offset {found.offset}",
+            remedy="Correct it, or leave `ground` out.",
+        )
+    return found
 
 
 def read_background(dataset: Dataset) -> tuple[Float[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]]:

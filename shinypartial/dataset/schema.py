@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from msgspec import Meta
 
-from shinypartial.core.camera import Camera
+from shinypartial.core.camera import Camera, Similarity
 from shinypartial.io.images import EXR, PICTURE_SUFFIXES
 from shinypartial.io.records import NonNegative, Share
 
@@ -115,6 +115,20 @@ class Frame:
         Frames of rendered datasets also have `self_png`.
         """
         return (self.png, self.alpha_png, self.normal_png, self.exr)
+
+
+@dataclass(frozen=True)
+class GroundPlane:
+    """What the object stands on: points x of the world with n · x = offset, as `transforms_train.json` states it."""
+
+    normal: tuple[float, float, float]
+    """n, of length 1, toward the cameras."""
+    offset: float
+
+    def moved(self, by: Similarity) -> "GroundPlane":
+        """In another world."""
+        x, y, z = map(float, by.rotation @ np.array(self.normal))
+        return GroundPlane((x, y, z), by.scale * self.offset + float(np.array((x, y, z)) @ by.shift))
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ from shinypartial.dataset.schema import (
     SELF_REFLECTION_CHANNEL,
     BallEvidence,
     Frame,
+    GroundPlane,
     View,
 )
 from shinypartial.io.files import PARTIAL_PREFIX, read_table, sha256_of, write_json, write_text
@@ -141,7 +142,14 @@ def encode_normals(normals: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H 
     return encode_unit((normals + 1) / 2)
 
 
-def write_transforms(root: Path, split: str, frames: Sequence[Frame], ball: BallEvidence | None = None) -> None:
+def write_transforms(
+    root: Path,
+    split: str,
+    frames: Sequence[Frame],
+    ball: BallEvidence | None = None,
+    ground: GroundPlane | None = None,
+    focal_sigma: float | None = None,
+) -> None:
     """Write `transforms_SPLIT.json` with OpenGL poses, as NeRF-synthetic and nerfstudio readers expect.
 
     Intrinsics of the first frame stand for all; frames that differ from it have their own. Extensions of pictures and
@@ -160,7 +168,11 @@ def write_transforms(root: Path, split: str, frames: Sequence[Frame], ball: Ball
         if frame.mask is not None:
             entry["mask_path"] = Path(os.path.relpath(frame.mask, root)).as_posix()
         entries.append(entry if own == shared else {**entry, **own})
-    stated = {} if ball is None else {"ball": write_record(ball)}
+    stated: dict[str, Any] = {
+        name: write_record(each) for name, each in (("ball", ball), ("ground", ground)) if each is not None
+    }
+    if focal_sigma is not None:
+        stated["focal_sigma"] = focal_sigma
     write_json(root / f"transforms_{split}.json", {**shared, **stated, "frames": entries})
 
 

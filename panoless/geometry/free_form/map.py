@@ -8,13 +8,18 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from panoless.environment.cubemap import by_face, by_texel, resample
+from panoless.capture.views import Views
+from panoless.environment.cubemap import by_face, by_texel, resample, texels_at
+from panoless.environment.direct import direct_rays
 from panoless.environment.fill import fill_unobserved, texel_neighbors
 from panoless.environment.footprints import PixelFootprints, splat
+from panoless.environment.rays import Rays, joined_rays
+from panoless.environment.surroundings import Surroundings
 from panoless.geometry.free_form.material import LEAST_SHARE, Material
 from panoless.numeric.conjugate_gradients import conjugate_gradients
 from panoless.numeric.robust import robust_weight
 from panoless.problem.observations import is_saturated
+from shinypartial.core.sphere import directions_to_cube
 
 SMOOTHNESS = 0.05
 """Weight λ of squared differences of neighboring texels, in rays."""
@@ -90,43 +95,75 @@ class Mirrored:
             return cls(radiance, np.ones_like(radiance), np.zeros(radiance.shape, dtype=bool))
         return cls(*material.mirrored(radiance, points, facing), is_saturated(taken))
 
-    def areas(self, outgoing: Float[np.ndarray, "P K 3"]) -> PixelFootprints:
-        """As areas that are mirrored in those directions."""
-        return PixelFootprints(torch.from_numpy(outgoing).float(), torch.from_numpy(self.radiance).float())
+    def beside(self, direct: Rays) -> "Mirrored":
+        """With light that is seen directly."""
+        ones = np.ones((len(direct.radiance), 3))
+        return Mirrored(
+            np.concatenate([self.radiance, direct.radiance.double().numpy()]),
+            np.concatenate([self.share, ones]),
+            np.concatenate([self.brighter, ones < 1]),
+        )
 
     def gain(self, light: Float[np.ndarray, "P 3"], brightness: float) -> Float[np.ndarray, "P 3"]:
         """By how much the residuals of a light count."""
         counted = self.share * photon_gain(light, brightness)[:, None]
         return np.where(self.brighter & (light > self.radiance), 0.0, counted)
 
-    def first_map(
-        self, areas: PixelFootprints, weights: Float[Tensor, "P"], start: Float[Tensor, "6 3 M M"] | None, size: int
-    ) -> Float[Tensor, "6 3 L L"]:
+
+@dataclass(frozen=True)
+class MapData:
+    """What a map is solved from: pixels that mirror it, then what is seen past the object."""
+
+    mirrored: Mirrored
+    areas: PixelFootprints
+    weights: Float[Tensor, "P"]
+    direct: Rays
+
+    @classmethod
+    def of(
+        cls,
+        mirrored: Mirrored,
+        outgoing: Float[np.ndarray, "P K 3"],
+        weights: Float[Tensor, "P"],
+        views: Views | None,
+        surroundings: Surroundings,
+    ) -> "MapData":
+        """Of pixels as areas that are mirrored in those directions."""
+        areas = PixelFootprints(*(torch.from_numpy(each).float() for each in (outgoing, mirrored.radiance)))
+        rays = replace(areas, trust=weights).rays()
+        direct = joined_rays([rays.kept(slice(0)), *(direct_rays(views, surroundings, [rays]) if views else ())])
+        beside = PixelFootprints(direct.directions[:, None].expand(-1, outgoing.shape[1], 3), direct.radiance)
+        weights = torch.cat([weights, direct.initial_weight()])
+        return cls(mirrored.beside(direct), PixelFootprints.joined([areas, beside]), weights, direct)
+
+    def first_map(self, start: Float[Tensor, "6 3 M M"] | None, size: int) -> Float[Tensor, "6 3 L L"]:
         """Another map at that size, or that of all pixels."""
         if start is None:
-            return splatted_map(areas, weights * self._shares.amax(1) ** 2, size)
+            return splatted_map(self.areas, self.weights * self._shares.amax(1) ** 2, size)
         return start if start.shape[-1] == size else resample(start, size)
 
     def next_map(
-        self,
-        environment: Float[Tensor, "6 3 L L"],
-        areas: PixelFootprints,
-        weights: Float[Tensor, "P"],
-        robust_scale: float,
-        brightness: float,
+        self, environment: Float[Tensor, "6 3 L L"], robust_scale: float, brightness: float
     ) -> Float[Tensor, "6 3 L L"]:
         """A robust round of a map.
 
         A channel that is mirrored less than another counts less: it is drawn to what the map has already.
         """
+        areas = self.areas
         seen, most = areas.seen(environment), self._shares.amax(1)
-        shown = torch.where(torch.from_numpy(self.brighter), areas.radiance.maximum(seen), areas.radiance)
+        shown = torch.where(torch.from_numpy(self.mirrored.brighter), areas.radiance.maximum(seen), areas.radiance)
         gain = torch.from_numpy(photon_gain(seen.double().numpy(), brightness)).float()
         agreed = robust_weight((seen - shown) * gain[:, None] * self._shares, robust_scale)
         unknown = 1 - (self._shares / most[:, None].clamp(min=LEAST_SHARE)) ** 2
         drawn = replace(areas, radiance=shown + unknown * (seen - shown))
-        return smoothed_map(environment, drawn, weights * (most * gain) ** 2 * agreed)
+        return smoothed_map(environment, drawn, self.weights * (most * gain) ** 2 * agreed)
+
+    def known(self, resolution: int) -> Float[np.ndarray, "T"]:
+        """Weights of what is seen directly of each texel."""
+        texels = texels_at(*directions_to_cube(self.direct.directions.double().numpy()), resolution)
+        weights = self.direct.initial_weight().double().numpy()
+        return np.bincount(texels, weights, 6 * resolution**2).astype(np.float64)
 
     @cached_property
     def _shares(self) -> Float[Tensor, "P 3"]:
-        return torch.from_numpy(self.share).float()
+        return torch.from_numpy(self.mirrored.share).float()

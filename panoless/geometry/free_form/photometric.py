@@ -11,7 +11,7 @@ from torch import Tensor
 
 from panoless.capture.views import concatenated
 from panoless.geometry.free_form.equations import Rows, gauge_rows, joined_rows, silhouette_rows
-from panoless.geometry.free_form.map import Mirrored, photon_gain
+from panoless.geometry.free_form.map import MapData, Mirrored, photon_gain
 from panoless.geometry.free_form.motions import pixel_motion_rows
 from panoless.geometry.free_form.surface import Hits, LevelSet
 from panoless.geometry.free_form.task import RADIANCE_SIGMA, SILHOUETTE_SIGMA_PX, Task
@@ -107,6 +107,8 @@ class Linearization:
     """Weights of the pixels without trust and robust weights."""
     light: Float[np.ndarray, "P 3"]
     """Of the map, where pixels look into it."""
+    known: Float[np.ndarray, "T"]
+    """Weights of what is seen directly of each texel."""
     nuisance: Nuisance = NO_NUISANCE
     """Cameras, exposures and masks, where these are unknown."""
 
@@ -135,18 +137,18 @@ class Linearization:
         facing, points = reflected.hits.facing(rays.directions), surface.points(reflected.hits.places)
         mirrored = Mirrored.by(task.material, task.pixels.radiance, radiance, points, facing)
         weights = torch.from_numpy(free * trust.at(points)).float()
-        areas = mirrored.areas(reflected.outgoing)
-        environment = mirrored.first_map(areas, weights, start, settings.resolution)
+        seen = MapData.of(mirrored, reflected.outgoing, weights, task.views, surface.surroundings)
+        environment = seen.first_map(start, settings.resolution)
         for _ in range(rounds):
-            environment = mirrored.next_map(environment, areas, weights, settings.robust_scale, task.brightness)
+            environment = seen.next_map(environment, settings.robust_scale, task.brightness)
         length = settings.resolution + 2
         padded = padded_texels(environment).reshape(6, length, length, 3).double().numpy()
         light, slopes, texels = seen_with_slopes(padded, reflected.outgoing)
         counted = mirrored.gain(light, task.brightness)
         residual, slopes = (light - mirrored.radiance) * counted, slopes * counted[..., None]
-        return cls(
-            task, surface, reflected, trust, environment, counted, residual, slopes, texels, free, light, nuisance
-        )
+        known = seen.known(settings.resolution)
+        found = task, surface, reflected, trust, environment, counted, residual, slopes, texels, free, light, known
+        return cls(*found, nuisance)
 
     @cached_property
     def rays(self) -> PixelRays:
@@ -308,7 +310,8 @@ class Linearization:
     def _texel_total(self) -> Float[np.ndarray, "T"]:
         count = 6 * self.task.settings.resolution**2
         total = np.bincount(self.texels, self.photographs.weights, count)
-        return np.maximum(total + self.task.texel_prior * self.task.photograph_weight, np.finfo(float).tiny)
+        known = (self.task.texel_prior + self.known) * self.task.photograph_weight
+        return np.maximum(total + known, np.finfo(float).tiny)
 
     def beyond_map(self, residual: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
         """(1 − Π) e: what the map does not take over."""

@@ -51,6 +51,8 @@ class Task:
     """Coefficients the change from which is to be smooth; None: the surface is."""
     prior_factor: float = 1.0
     """Of the precision of nuisance blocks, in whose units pixels count more than they are worth."""
+    views: Views | None = None
+    """For what is seen past the object; None: nothing is."""
     material: Material | None = None
     """What places mirror and scatter; None: they are perfect mirrors."""
 
@@ -93,4 +95,6 @@ def make_task(
     brightness = max(float(pixels.radiance.mean()), LEAST_BRIGHTNESS)
     background = background_rays(views, settings.rays)
     cameras = StatedCameras.of(views)
-    return Task(pixels, chosen, background, share, of_silhouettes, settings, cameras, brightness, material=material)
+    return Task(
+        pixels, chosen, background, share, of_silhouettes, settings, cameras, brightness, views=views, material=material
+    )

@@ -117,7 +117,6 @@ class SphereFamily(ExactFamily):
     label: ClassVar[str] = "a sphere"
     needs_depth: ClassVar[bool] = False
     silhouettes_suffice: ClassVar[bool] = True
-    by_silhouettes: ClassVar[bool] = True
 
     def propose(self, views: Views, config: FitConfig, *, requested: bool) -> Proposal | None:
         """Center and radius by silhouettes."""

@@ -9,10 +9,11 @@ from panoless.photographs import ground
 from panoless.photographs.ground import evidence_of, gains_of, ground_masks, laid_out, odds_of, pattern_of, sheet_about
 from panoless.photographs.hull import overlap
 from panoless.photographs.lens import Lens
-from panoless.photographs.posed import GroundPlane, PosedView, Poses, as_rows, find_ground
+from panoless.photographs.posed import PosedView, Poses, as_rows, find_ground
 from panoless.photographs.structure import upright_world
 from shinypartial.core.camera import Camera, ray_directions_world
 from shinypartial.core.errors import InputError
+from shinypartial.dataset.schema import GroundPlane
 from shinypartial.io.images import read_png, write_png
 from tests.support.photographed_planes import arc
 
