@@ -27,7 +27,7 @@ from panoless.problem.nuisance import Nuisance
 from panoless.problem.observations import Pixels, is_saturated, silhouette_rays, solid_pixels
 from panoless.problem.parametric import MirrorHits, ParametricSurface, Silhouette
 from panoless.problem.rays import PixelRays
-from panoless.problem.rows import CHI_MEDIAN, CONTOUR_SIGMA_PX, CORRELATED, rows_of
+from panoless.problem.rows import CHI_MEDIAN, CONTOUR_SIGMA_PX, CORRELATED, contour_sigma_px, rows_of
 from shinypartial.core.sphere import tangents
 
 if TYPE_CHECKING:
@@ -49,8 +49,6 @@ LEAST_CLEAR = 50
 """Fewer rays that see the surroundings have no weight."""
 DAMPINGS = (1e-6, 1e-3, 1e-1, 10.0)
 """Of a step, in shares of the matrix' diagonal (Levenberg and Marquardt), tried in turn."""
-NORMAL_MEDIAN = 0.6745
-"""Median absolute value of a normal number with a standard deviation of one."""
 CONTOUR_SCALE_PX = 0.5
 """Robust scale of silhouettes beside photographs (px)."""
 
@@ -306,7 +304,7 @@ class Equations:
         distance = silhouette.pixels - nuisance.offsets_px(silhouettes.view)
         least = CONTOUR_SCALE_PX if data.settings.resolution else data.settings.robust_scale
         scale = robust_scale(distance[silhouette.weights > 0], least, NOISE_MULTIPLE)
-        sigma = max(_deviation(distance[silhouette.weights > 0]), CONTOUR_SIGMA_PX) if free else CONTOUR_SIGMA_PX
+        sigma = contour_sigma_px(distance[silhouette.weights > 0]) if free else CONTOUR_SIGMA_PX
         weights = silhouette.weights * robust_weight(distance, scale) / sigma**2
         rows, columns = beside(silhouettes, silhouette.by_motion[:, None], None)
         by_silhouettes, of_silhouettes = normal_equations(
@@ -398,11 +396,6 @@ class Equations:
             where = slice(start, start + block.size)
             found[block.name], start = whole[where, where], start + block.size
         return found
-
-
-def _deviation(values: Float[np.ndarray, "S"]) -> float:
-    """The standard deviation of normal numbers with the median absolute value of these; 0 of none."""
-    return float(np.median(np.abs(values))) / NORMAL_MEDIAN if len(values) else 0.0
 
 
 def _jacobian(

@@ -11,42 +11,11 @@ from panoless.photographs.hull import overlap
 from panoless.photographs.lens import Lens
 from panoless.photographs.posed import PosedView, Poses, as_rows, find_ground
 from panoless.photographs.structure import upright_world
-from shinypartial.core.camera import Camera, ray_directions_world
+from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.schema import GroundPlane
 from shinypartial.io.images import read_png, write_png
-from tests.support.photographed_planes import arc
-
-GROUND = GroundPlane((0.0, 0.0, 1.0), 0.0)
-RADIUS, CENTER = 0.3, np.array([0.05, 0.0, 0.3])
-CAMERAS = arc(14, 3.0, (160, 120), 260.0, (0.0, 0.0, 0.2))
-TILES = np.random.default_rng(5).integers(20, 236, (400, 400, 3))
-TILE = 0.09
-
-
-def tiles(places: np.ndarray) -> np.ndarray:
-    """Colors of the sheet at points (…, 2)."""
-    column, row = np.moveaxis(np.floor(places / TILE).astype(int) % 400, -1, 0)
-    return TILES[row, column]
-
-
-def seen_by(camera: Camera, ball: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """What a pinhole sees of sheet and mirror ball, and where the ball is: the middle of each pixel."""
-    directions = ray_directions_world(camera)
-    origin = camera.position_world
-    away = origin - CENTER
-    half_b = directions @ away
-    root = half_b**2 - (away @ away - RADIUS**2)
-    hit = (root > 0) & ball
-    distance = -half_b - np.sqrt(np.maximum(root, 0))
-    normal = (origin + distance[..., None] * directions - CENTER) / RADIUS
-    start = np.where(hit[..., None], origin + distance[..., None] * directions, origin)
-    ray = np.where(hit[..., None], directions - 2 * (directions * normal).sum(-1, keepdims=True) * normal, directions)
-    down = ray[..., 2] < -1e-3
-    length = np.where(down, -start[..., 2] / np.where(down, ray[..., 2], 1), 0)
-    sky = 120 + 100 * np.sin(3 * ray + [0, 1, 2])
-    color = np.where(down[..., None], tiles((start + length[..., None] * ray)[..., :2]), sky)
-    return color.clip(0, 255).astype(np.uint8), hit
+from tests.support.ball_on_tiles import CAMERAS, CENTER, GROUND, TILE, seen_by, tiles
 
 
 @pytest.fixture
