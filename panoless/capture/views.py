@@ -19,7 +19,7 @@ from panoless.kernels.camera import RasterCamera
 from shinypartial.core.camera import Camera
 from shinypartial.core.conventions import SOLID_ALPHA
 from shinypartial.core.errors import InputError
-from shinypartial.dataset.read import read_focal_sigma, read_ground, read_view, read_whole_view
+from shinypartial.dataset.read import read_ground, read_statement, read_view, read_whole_view
 from shinypartial.dataset.schema import Dataset
 from shinypartial.io.progress import Progress
 
@@ -118,6 +118,8 @@ class Views:
     """What was seen past the object, where that is data for the map, too."""
     ground: Ground | None = None
     """What the object stands on, where that is stated."""
+    mask_sigma_px: float = 0.0
+    """Standard deviation of the masks' contours, where they are stated as rough."""
     focal_sigma: float | None = None
     """Standard deviation of the stated focal length, as a share of it; None: it is not stated."""
 
@@ -179,7 +181,9 @@ def load_views(
             found=f"{len(empty)} of {len(dataset.train)} masks empty: {', '.join(empty[:NAMED_VIEWS])}{more}",
             remedy="Correct these masks, or remove their frames from transforms_train.json.",
         )
-    views = replace(views_of(photographs, known_radius), focal_sigma=read_focal_sigma(dataset))
+    stated = read_statement(dataset)
+    sigma_px = stated.mask_sigma_px / downscale
+    views = replace(views_of(photographs, known_radius), focal_sigma=stated.focal_sigma, mask_sigma_px=sigma_px)
     return views if plane is None else replace(views, ground=ground_of(plane, views.object_frame, seen))
 
 

@@ -31,11 +31,6 @@ def robust_scale(error: np.ndarray, scale: float, multiple: float) -> float:
     return max(scale, multiple * float(np.median(np.abs(error)))) if len(error) else scale
 
 
-def deviation(values: np.ndarray) -> float:
-    """The standard deviation of normal numbers with the median absolute value of these (P,); 0 of none."""
-    return float(np.median(np.abs(values))) / NORMAL_MEDIAN if len(values) else 0.0
-
-
 def _squared(error: Residuals) -> Residuals:
     squared: Residuals = error * error
     return squared if error.ndim == 1 else squared.sum(-1)

@@ -2,8 +2,9 @@
 
 The plane is known, so that each photograph can be laid out on it. What the plane shows is the color on which most of
 them agree; a mirror, and all that stands above the plane, moves against it from view to view. A pixel that shows the
-plane determines that nothing is on its ray: so points of space are cleared away by votes, and what is left over is the
-object. Near its silhouette each view's own pixels decide.
+plane determines that nothing is on its ray: points of space are cleared away where all of a few adjacent views show it.
+What is left is moved at its silhouettes to where pixels are likelier the object than the ground in the mean over all
+views that see its edge there. Last each view draws its own edge near by, at the least total variation.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,13 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy import ndimage
 
 from panoless.capture.masks import MAIN_SHARE, largest_pieces
-from panoless.photographs.hull import carve, cube, nearest_point, pixels_of, silhouette
+from panoless.photographs.hull import cube, nearest_point, pixels_of, silhouette
 from panoless.photographs.lens import opencv
-from panoless.photographs.masks import EDGE_PX, HULL_SPARE, HULL_VOXELS, TOLERATED, averaged, enlarged
+from panoless.photographs.masks import EDGE_PX, HULL_SPARE, HULL_VOXELS, averaged, enlarged
 from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import tangents
@@ -35,10 +36,8 @@ CANDIDATES = 8
 """Views of which each texel takes the one with which most others agree."""
 DIFFERENCE = 0.1
 """Codes of one place of the ground differ by less, of 1, between views that agree."""
-AGREEING = 4
+AGREEING = 3
 """So many views must agree on a texel of the ground."""
-AGREEING_SHARE = 0.15
-"""So must this share of the views that reach it; what the object hides in most views is known from the others."""
 WINDOW_PX = 7
 """Side of a window that shows the ground, or does not."""
 WIDE_PX = 17
@@ -47,9 +46,43 @@ NOISE = 0.06
 """Contrast, in codes of 1, that a plain window counts as having."""
 LARGEST_LEFT = 0.1
 """A window shows the ground where less than this share of the contrast is left."""
-CLEARED = (0.12, 0.15, 0.3)
-"""A point of space is the object for sure, likely, or perhaps, where ground is seen at it in a smaller share of the
-views."""
+CLEARED_BESIDE = 0.1
+"""Pixels in such a window that differ by less, in codes of 1, show the ground, too."""
+ADJACENT = 5
+"""Views nearest in direction that all show ground at a point where nothing is."""
+LEAST_COUNTED = 0.3
+"""A point is judged where so large a share of the views shows it."""
+MATCHED = 0.05
+"""A pixel that differs from the ground by less, in codes of 1, may be the ground…"""
+LEAST_DIFFERING = 0.25
+"""Share of an object's pixels that differ more, in the median view: of bare ground, one in sixteen does."""
+USUALLY = 0.94, 0.2
+"""…as so many pixels of the ground do, and so many of a mirror, where few of a view say more…"""
+FEW = 20.0
+"""…which are so many."""
+NEAR_SHARE = 0.06
+"""Standard deviation of the region that determines these shares about a pixel, in √area of the object."""
+EDGE_BAND_PX = 2.5
+"""Pixels so near to a silhouette move it."""
+MOST_ODDS = 3.0
+"""Largest logarithm of odds of a pixel."""
+MOVES, LEARNED_EVERY = 40, 5
+"""Moves of the silhouettes, by a point of the grid each; shares are counted again every so many."""
+LEAST_PULL = 0.1
+"""Mean of the logarithms of odds by which a point changes sides."""
+ROUNDING = 0.8
+"""Standard deviation of a blur that rounds the object after each move, in points of the grid."""
+TENSION = 2.0
+"""Length of an edge that counts as much as a pixel with odds of e, where colors do not change…"""
+EDGE_CONTRAST = 0.15
+"""…and less by the exponential of their slope in units of this…"""
+LEAST_TENSION = 0.15
+"""…down to this share."""
+OWN_SHARE, HULL_SHARE = 0.5, 0.5
+"""Weights of a pixel's own odds, and of those of the common silhouette: one at 2 px beside it, three at most."""
+SETTLED_PX = 15.0
+"""Pixels farther from the common silhouette stay on its side."""
+VARIATION_STEPS = 100
 
 GIVE_MASKS = (
     "Give a folder of masks (--masks), a model (--segmenter), a rectangle about the object in a frame or two "
@@ -58,10 +91,6 @@ GIVE_MASKS = (
 #: One texel of this many determines how bright a view is.
 SPARSE = 4
 SPECK_PX = 5
-#: Differences of a pixel from the ground, in codes of 1, between which they are counted.
-STEPS = np.array([0.005, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.25])
-#: A point is judged where so large a share of the views shows it.
-LEAST_COUNTED = 0.3
 
 
 @dataclass(frozen=True)
@@ -102,6 +131,13 @@ class Evidence:
     """Where the ground's color is predicted."""
     left: Float[np.ndarray, "H W"]
     """By how much each pixel differs from the ground that it would show, in codes of 1."""
+
+    @property
+    def cleared(self) -> Bool[np.ndarray, "H W"]:
+        """Where nothing is before the ground: pixels of a window that shows it, but for those that differ much."""
+        around = opencv().dilate(self.shown.astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX), np.uint8)) > 0
+        found: np.ndarray = around & (self.left < CLEARED_BESIDE) & self.predicted
+        return found
 
 
 def sheet_about(cameras: Sequence[Camera], ground: GroundPlane) -> Sheet:
@@ -150,7 +186,7 @@ def pattern_of(
             total += np.where(near[..., None], color, 0)
         better = count > most
         pattern[better], most[better] = (total / np.maximum(count, 1)[..., None])[better], count[better]
-    return pattern, (most >= AGREEING) & (most >= AGREEING_SHARE * seen.sum(0))
+    return pattern, most >= AGREEING
 
 
 def gains_of(colors: Float[np.ndarray, "V N N 3"], seen: Bool[np.ndarray, "V N N"]) -> Float[np.ndarray, "V 3"]:
@@ -211,18 +247,6 @@ def _matches(
     return matched
 
 
-def cleared(seen: Sequence[Evidence], points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
-    """The share of the views that see ground at each point, of those that show it; 1 where few do."""
-    clear, counted = np.zeros(len(points)), np.zeros(len(points))
-    for view in seen:
-        rows, columns, within, depth = pixels_of(view.camera, points)
-        within &= depth > 0
-        at = np.where(within, rows, 0), np.where(within, columns, 0)
-        clear += within & view.shown[at]
-        counted += within & view.predicted[at]
-    return np.where(counted >= LEAST_COUNTED * len(seen), clear / np.maximum(counted, 1), 1.0)
-
-
 def ground_masks(
     whole: Mapping[str, Camera], folder: Path, ground: GroundPlane, picture: Path
 ) -> dict[str, UInt8[np.ndarray, "_ _"]]:
@@ -241,98 +265,181 @@ def ground_masks(
     for each, camera, gain in zip(pictures, cameras, gains, strict=True):
         seen.append(evidence_of(each, camera, gain, sheet, pattern, known))
         progress.advance()
-    found = _object_points(seen, ground, sheet)
-    silhouettes = [[silhouette(view.camera, points, found.spacing) for points in found.sets] for view in seen]
-    odds = odds_of(seen, silhouettes)
-    masks = [_mask(view, of_view, odds) for view, of_view in zip(seen, silhouettes, strict=True)]
-    masks = _agreed(seen, masks, found)
+    points, spacing = object_points(seen, ground, sheet)
+    common = [silhouette(view.camera, points, spacing) for view in seen]
+    masks = [drawn_edge(*each) for each in zip(seen, common, pictures, strict=True)]
     return {name: _at_full_size(mask, whole[name], side) for name, mask in zip(whole, masks, strict=True)}
 
 
-@dataclass(frozen=True)
-class _Points:
-    """Grid points that are the object for sure, likely, and perhaps; each set holds the one before."""
-
-    sets: tuple[Float[np.ndarray, "_ 3"], ...]
-    spacing: float
-    center: Float[np.ndarray, "3"]
-    half_side: float
-
-
-def _object_points(seen: Sequence[Evidence], ground: GroundPlane, sheet: Sheet) -> _Points:
-    """What stands on the ground and is not cleared away: the largest piece, on a grid about it."""
+def object_points(
+    seen: Sequence[Evidence], ground: GroundPlane, sheet: Sheet
+) -> tuple[Float[np.ndarray, "P 3"], float]:
+    """Points of a grid that are the object, and their spacing; InputError where nothing stands on the ground."""
     normal, count, half = np.array(ground.normal), HULL_VOXELS, sheet.half_side / 2
     center = sheet.center + half * normal
     for last in (False, True):
         points = cube(center, half, count)
-        share = np.where(points @ normal > ground.offset, cleared(seen, points), 1.0)
-        pieces, found = ndimage.label((share < CLEARED[-1]).reshape(count, count, count))
-        if not found:
+        above = points @ normal > ground.offset
+        inside = largest_part(above & ~is_cleared(seen, points, center), count)
+        if differing_share(seen, points[inside], 2 * half / count) < LEAST_DIFFERING:
             raise InputError(
                 expected="an object that stands before the ground in most photographs",
                 found="nothing that moves against the ground",
                 remedy=GIVE_MASKS,
             )
-        largest = (pieces == 1 + np.argmax(np.bincount(pieces.ravel())[1:])).ravel()
-        sets = tuple(points[largest & (share < limit)] for limit in CLEARED)
         if not last:
-            low, high = sets[-1].min(0), sets[-1].max(0)
+            low, high = points[inside].min(0), points[inside].max(0)
             center, half = (low + high) / 2, HULL_SPARE / 2 * float((high - low).max())
-    return _Points(sets, 2 * half / count, center, half)
+    inside = largest_part(moved_edges(seen, points, inside, above), count)
+    return points[inside], 2 * half / count
 
 
-def odds_of(
-    seen: Sequence[Evidence], silhouettes: Sequence[Sequence[Bool[np.ndarray, "_ _"]]]
-) -> Float[np.ndarray, "_"]:
-    """The logarithm of how much likelier a difference is on the object than on the ground, for each of `STEPS`.
-
-    Counted in these photographs: well within the silhouette of what is the object for sure, and around that of what is
-    perhaps.
-    """
-    counts = np.ones((2, len(STEPS) + 1))
-    for view, (sure, _, perhaps) in zip(seen, silhouettes, strict=True):
-        step = np.searchsorted(STEPS, view.left)
-        around = _distance_px(~perhaps)
-        for which, where in enumerate((_distance_px(sure) > 3, (around > 4) & (around < 40))):
-            counts[which] += np.bincount(step[where & view.predicted], minlength=len(STEPS) + 1)
-    on_object, on_ground = np.log(counts / counts.sum(1, keepdims=True))
-    odds: np.ndarray = on_object - on_ground
-    return odds
+def differing_share(seen: Sequence[Evidence], points: Float[np.ndarray, "P 3"], spacing: float) -> float:
+    """Of the pixels that show some points before ground: how many differ from it, in the median view; 0 of none."""
+    shares = [0.0]
+    for view in seen:
+        where = silhouette(view.camera, points, spacing) & view.predicted
+        if where.any():
+            shares.append(float((view.left[where] > MATCHED).mean()))
+    return float(np.median(shares))
 
 
-def _distance_px(where: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
-    """How far each pixel is from those outside; what is beyond the picture is outside."""
-    cv2 = opencv()
-    found: np.ndarray = cv2.distanceTransform(np.pad(where, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+def largest_part(inside: Bool[np.ndarray, "P"], count: int) -> Bool[np.ndarray, "P"]:
+    """The largest connected part on a grid of count³ points."""
+    parts, _ = ndimage.label(inside.reshape(count, count, count))
+    sizes = np.bincount(parts.ravel())
+    found: np.ndarray = inside & (parts.ravel() == 1 + np.argmax(sizes[1:], axis=0)) if len(sizes) > 1 else inside
     return found
 
 
-def _mask(
-    view: Evidence, silhouettes: Sequence[Bool[np.ndarray, "H W"]], odds_of_step: Float[np.ndarray, "_"]
-) -> Bool[np.ndarray, "H W"]:
-    """Between the silhouettes of what is the object for sure and of what is perhaps, the pixels of the view decide.
+def is_cleared(
+    seen: Sequence[Evidence], points: Float[np.ndarray, "P 3"], center: Float[np.ndarray, "3"]
+) -> Bool[np.ndarray, "P"]:
+    """Where all of some adjacent views show ground, or where few views would."""
+    clear, counted = np.zeros((len(seen), len(points)), bool), np.zeros((len(seen), len(points)), bool)
+    for number, view in enumerate(seen):
+        places, within = _places(view.camera, points)
+        counted[number], clear[number] = within & view.predicted[places], within & view.cleared[places]
+    away = np.stack([view.camera.position_world - center for view in seen])
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    found = counted.sum(0) < LEAST_COUNTED * len(seen)
+    for group in np.argsort(-(away @ away.T), axis=1)[:, :ADJACENT]:
+        found |= (clear[group].sum(0) == counted[group].sum(0)) & (counted[group].sum(0) > len(group) / 2)
+    return found
 
-    That a place is likely the object counts as a pixel with odds of e; where a pixel shows nothing, this alone counts.
+
+def moved_edges(
+    seen: Sequence[Evidence],
+    points: Float[np.ndarray, "P 3"],
+    inside: Bool[np.ndarray, "P"],
+    above: Bool[np.ndarray, "P"],
+) -> Bool[np.ndarray, "P"]:
+    """The object after its silhouettes moved to where pixels are as likely the object as the ground.
+
+    A point near the object's edge changes sides by the mean, over views that see it near their silhouette, of the
+    logarithms of odds there; each move is rounded.
+    """
+    cv2, count = opencv(), round(len(points) ** (1 / 3))
+    spacing = float(points[1, 2] - points[0, 2])
+    odds: list[np.ndarray] = []
+    for move in range(MOVES):
+        common = [silhouette(view.camera, points[inside], spacing) for view in seen]
+        if move % LEARNED_EVERY == 0:
+            odds = [
+                cv2.GaussianBlur(log_odds(*each), (0, 0), 1.0).clip(-MOST_ODDS, MOST_ODDS)
+                for each in zip(seen, common, strict=True)
+            ]
+        solid = inside.reshape(count, count, count)
+        edge = np.flatnonzero((ndimage.binary_dilation(solid) & ~ndimage.binary_erosion(solid)).ravel() & above)
+        pull, views = np.zeros(len(edge)), np.ones(len(edge))
+        for view, of_view, where in zip(seen, odds, common, strict=True):
+            places, within = _places(view.camera, points[edge])
+            near = within & (np.abs(signed_distance_px(where)[places]) < EDGE_BAND_PX) & view.predicted[places]
+            pull += np.where(near, of_view[places], 0)
+            views += near
+        moved = inside.copy()
+        moved[edge[pull > LEAST_PULL * views]] = True
+        moved[edge[pull < -LEAST_PULL * views]] = False
+        rounded = ndimage.gaussian_filter(moved.reshape(solid.shape).astype(np.float32), ROUNDING) > 0.5
+        rounded = rounded.ravel() & above
+        if not rounded.any() or (rounded == inside).all():
+            break
+        inside = rounded
+    return inside
+
+
+def log_odds(view: Evidence, where: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    """How much likelier each pixel is on the object than on the ground, as a logarithm; 0 where no ground is predicted.
+
+    By whether it matches the ground: how often pixels do is counted in the region about it, well within the silhouette
+    and around it. A mirror of the ground matches it more often than one of the sky.
     """
     cv2 = opencv()
-    sure, likely, perhaps = silhouettes
-    odds = np.where(likely, 1.0, -1.0) + np.where(view.predicted, odds_of_step[np.searchsorted(STEPS, view.left)], 0.0)
-    mask = (_distance_px(sure) > 2) | (perhaps & (cv2.GaussianBlur(odds, (0, 0), 1.0) > 0))
-    return largest_pieces(cv2.medianBlur(mask.astype(np.uint8), SPECK_PX) > 0, MAIN_SHARE)
+    matched, distance = view.left < MATCHED, signed_distance_px(where)
+    sigma = max(NEAR_SHARE * float(np.sqrt(np.count_nonzero(where))), 3.0)
+
+    def share(region: Bool[np.ndarray, "H W"], usually: float) -> Float[np.ndarray, "H W"]:
+        counted = (region & view.predicted).astype(np.float32)
+        area = 2 * np.pi * sigma**2
+        many, all_of_them = (area * cv2.GaussianBlur(each, (0, 0), sigma) for each in (counted * matched, counted))
+        found: np.ndarray = (many + FEW * usually) / (all_of_them + FEW)
+        return found
+
+    of_object = share(distance > 3, USUALLY[1]).clip(0.02, 0.97)
+    of_ground = np.maximum(share((distance < -2) & (distance > -40), USUALLY[0]).clip(0.5, 0.98), of_object + 0.01)
+    odds = np.where(matched, np.log(of_object / of_ground), np.log((1 - of_object) / (1 - of_ground)))
+    return np.where(view.predicted, odds, 0.0).astype(np.float32)
 
 
-def _agreed(
-    seen: Sequence[Evidence], masks: Sequence[Bool[np.ndarray, "_ _"]], found: _Points
-) -> list[Bool[np.ndarray, "_ _"]]:
-    """Masks by the hull of these where the view itself shows nothing, as before the far end of the room."""
-    views = [(view.camera, mask) for view, mask in zip(seen, masks, strict=True)]
-    allowed = int(TOLERATED * len(views))
-    points = carve(views, found.center, found.half_side, HULL_VOXELS, allowed)
-    agreed = []
-    for view, mask in zip(seen, masks, strict=True):
-        hull = silhouette(view.camera, points, found.spacing)
-        agreed.append(largest_pieces(np.where(view.predicted, mask, hull), MAIN_SHARE))
-    return agreed
+def signed_distance_px(where: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    """Distance from the edge of a region, positive inside; the border of the picture is no edge."""
+    cv2 = opencv()
+    inside, outside = (cv2.distanceTransform(each.astype(np.uint8), cv2.DIST_L2, 3) for each in (where, ~where))
+    found: np.ndarray = np.where(where, inside - 0.5, 0.5 - outside)
+    return found
+
+
+def drawn_edge(
+    view: Evidence, common: Bool[np.ndarray, "H W"], picture: UInt8[np.ndarray, "H W 3"]
+) -> Bool[np.ndarray, "H W"]:
+    """The view's own edge near the common silhouette: the region u of least Σ g ‖∇u‖ + f u (Chan, Esedoglu and
+    Nikolova 2006), with f the logarithm of the odds of the ground, by own pixels and by the common silhouette, and g
+    smaller where colors change.
+    """
+    distance = signed_distance_px(common)
+    f = -(OWN_SHARE * log_odds(view, common) + HULL_SHARE * (distance / 2).clip(-3, 3))
+    f = np.where(np.abs(distance) > SETTLED_PX, -5 * np.sign(distance), f).astype(np.float32)
+    smooth = opencv().GaussianBlur(picture.astype(np.float32) / 255, (0, 0), 0.7)
+    slopes = [np.abs(np.diff(smooth, axis=axis, append=smooth.take([-1], axis))).max(-1) for axis in (0, 1)]
+    g = TENSION * (LEAST_TENSION + np.exp(-np.hypot(*slopes) / EDGE_CONTRAST))
+    found = least_variation(f, g.astype(np.float32)) > 0.5
+    return largest_pieces(found, MAIN_SHARE) if found.any() else common
+
+
+def least_variation(f: Float[np.ndarray, "H W"], g: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    """u in [0, 1] of least Σ g ‖∇u‖ + f u, by the steps of Chambolle and Pock (2011)."""
+    step = 1 / np.sqrt(8)
+    u = (f < 0).astype(np.float32)
+    ahead, dual = u.copy(), np.zeros((2, *f.shape), np.float32)
+    for _ in range(VARIATION_STEPS):
+        dual[0, :-1] += step * np.diff(ahead, axis=0)
+        dual[1, :, :-1] += step * np.diff(ahead, axis=1)
+        dual /= np.maximum(1, np.hypot(*dual) / g)
+        divergence = dual.sum(0)
+        divergence[1:] -= dual[0, :-1]
+        divergence[:, 1:] -= dual[1, :, :-1]
+        moved = np.clip(u + step * (divergence - f), 0, 1)
+        ahead, u = 2 * moved - u, moved
+    return u
+
+
+def _places(
+    camera: Camera, points: Float[np.ndarray, "P 3"]
+) -> tuple[tuple[Int[np.ndarray, "P"], Int[np.ndarray, "P"]], Bool[np.ndarray, "P"]]:
+    """Row and column of each point, and whether the picture shows it."""
+    rows, columns, within, depth = pixels_of(camera, points)
+    within &= depth > 0
+    return (np.where(within, rows, 0), np.where(within, columns, 0)), within
 
 
 def _at_full_size(mask: Bool[np.ndarray, "_ _"], camera: Camera, side: int) -> UInt8[np.ndarray, "H W"]:

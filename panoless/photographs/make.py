@@ -1,7 +1,7 @@
 """Photographs to a dataset folder, stage by stage: frames, poses, masks, cameras."""
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -32,7 +32,7 @@ from shinypartial.core.board import BOARDS, Paper
 from shinypartial.core.errors import InputError
 from shinypartial.core.trajectory import Trajectory
 from shinypartial.dataset.camera_plot import plot_cameras
-from shinypartial.dataset.schema import Frame
+from shinypartial.dataset.schema import Frame, Statement
 from shinypartial.dataset.write import write_transforms
 from shinypartial.io.files import folder_lock, sha256_of
 from shinypartial.io.images import read_as_stored, read_png, read_upright, to_bytes, unit_values, write_png
@@ -43,6 +43,7 @@ from shinypartial.io.threads import in_threads
 
 #: What the stages found, beside the dataset proper.
 WORK = "capture"
+ALPHA = "alpha channels"
 SHEET_PICTURES = 12
 
 
@@ -114,7 +115,8 @@ def capture(request: Request) -> Captured:
             Frame(f"train/{view.name}", view.camera, train / view.name, pose_covariance=view.pose_covariance)
             for view in poses.views
         ]
-        write_transforms(request.output, "train", listed, ground=poses.ground, focal_sigma=poses.focal_error)
+        statement = Statement(poses.focal_error, masks.sigma_px)
+        write_transforms(request.output, "train", listed, ground=poses.ground, statement=statement)
     return Captured(frames, poses, masks)
 
 
@@ -290,7 +292,7 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
             for name, mask in find_masks(cameras, train, hints).items():
                 write_png(train / f"{name}_alpha.png", mask)
         elif own or poses.ground is None:
-            origin = "alpha channels"
+            origin = ALPHA
         else:
             origin, remedy = "what moves against the ground", GIVE_MASKS
             found = ground_masks(cameras, train, poses.ground, work / "ground.png")
@@ -300,9 +302,18 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
         judged = {name: (cameras[name], mask) for name, mask in masks.items()}
         overlaps = overlaps_of(judged, remedy)
         _write_mask_sheet(work / "masks.jpg", train, masks, dict(zip(masks, overlaps, strict=True)))
-        return Masks(origin, tuple(masks), overlaps)
+        sigma = 0.0 if (given_masks and not request.segmenter) or origin == ALPHA else contour_sigma_px(masks, overlaps)
+        return Masks(origin, tuple(masks), overlaps, sigma)
 
     return stage(work, "masks", given, Masks, work_on)
+
+
+def contour_sigma_px(masks: Mapping[str, np.ndarray], overlaps: Sequence[float]) -> float:
+    """How far contours are off, in pixels: of a disk of area A, whose edge is off by σ in the mean, (1 − o) √(A/π)/2
+    of the overlap o; the median over views.
+    """
+    radii = [float(np.sqrt(mask.sum() / np.pi)) for mask in masks.values()]
+    return float(np.median([(1 - each) * radius / 2 for each, radius in zip(overlaps, radii, strict=True)]))
 
 
 def _no_mask(view: PosedView) -> InputError:

@@ -105,6 +105,8 @@ class Masks:
     names: tuple[str, ...]
     overlaps: tuple[float, ...]
     """Of each mask with the silhouette of the hull of all."""
+    sigma_px: float = 0.0
+    """Standard deviation of contours, of masks that are found here."""
 
 
 def hull_of(views: Sequence[tuple[Camera, Float[np.ndarray, "_ _"]]]) -> tuple[Float[np.ndarray, "P 3"], float]:

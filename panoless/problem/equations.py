@@ -27,7 +27,7 @@ from panoless.problem.nuisance import Nuisance
 from panoless.problem.observations import Pixels, is_saturated, silhouette_rays, solid_pixels
 from panoless.problem.parametric import MirrorHits, ParametricSurface, Silhouette
 from panoless.problem.rays import PixelRays
-from panoless.problem.rows import CHI_MEDIAN, CONTOUR_SIGMA_PX, CORRELATED, contour_sigma_px, rows_of
+from panoless.problem.rows import CHI_MEDIAN, CONTOUR_SIGMA_PX, CORRELATED, rows_of
 from shinypartial.core.sphere import tangents
 
 if TYPE_CHECKING:
@@ -252,7 +252,7 @@ class Equations:
     distance_px: Float[np.ndarray, "S"]
     scale_px: float
     sigma_px: float
-    """Standard deviation of a silhouette's point; what residuals show, where blocks are free."""
+    """Standard deviation of a silhouette's point."""
     gradient: Float[np.ndarray, "D"]
     matrix: Float[np.ndarray, "D D"]
     regularizing: Float[np.ndarray, "_ _"]
@@ -304,7 +304,7 @@ class Equations:
         distance = silhouette.pixels - nuisance.offsets_px(silhouettes.view)
         least = CONTOUR_SCALE_PX if data.settings.resolution else data.settings.robust_scale
         scale = robust_scale(distance[silhouette.weights > 0], least, NOISE_MULTIPLE)
-        sigma = contour_sigma_px(distance[silhouette.weights > 0]) if free else CONTOUR_SIGMA_PX
+        sigma = float(np.hypot(CONTOUR_SIGMA_PX, data.views.mask_sigma_px))
         weights = silhouette.weights * robust_weight(distance, scale) / sigma**2
         rows, columns = beside(silhouettes, silhouette.by_motion[:, None], None)
         by_silhouettes, of_silhouettes = normal_equations(

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from panoless.capture.poses import StatedCameras
-from panoless.numeric.robust import deviation
 from panoless.problem.blocks import Block
 from panoless.problem.rays import PixelRays
 
@@ -17,16 +16,8 @@ CHI_MEDIAN = 1.538
 CONTOUR_SIGMA_PX = 0.05
 """Standard deviation of a contour point (px): less than its error, because errors of the map are common to all rays of
 a texel."""
-CONTOUR_ERROR_PX = 0.15
-"""What contours of right masks are off at most, in the median over 0.6745, by pixels that are areas."""
 CORRELATED = 16.0
 """Pixels that err alike under a map that is too coarse, or a surface that is wrong: patches of 4 × 4."""
-
-
-def contour_sigma_px(apart: Float[np.ndarray, "S"]) -> float:
-    """√(σ² + max(e² − e₀², 0)), in pixels, of contours that are off by e: that of right masks, and what others show."""
-    beyond = max(deviation(apart) ** 2 - CONTOUR_ERROR_PX**2, 0.0)
-    return float(np.hypot(CONTOUR_SIGMA_PX, np.sqrt(beyond)))
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from shinypartial.dataset.schema import (
     Dataset,
     Frame,
     GroundPlane,
+    Statement,
     View,
 )
 from shinypartial.dataset.transforms import read_frames
@@ -45,6 +46,7 @@ from shinypartial.io.images import (
 from shinypartial.io.records import read_record
 
 DEFAULT_FOLDER = Path("datasets")
+STATED = ("focal_sigma", "mask_sigma_px")
 NORMAL_ERROR = 1e-4
 """By which the length of a stated normal may differ from one."""
 
@@ -300,19 +302,12 @@ def read_ball_evidence(dataset: Dataset) -> BallEvidence | None:
     return None if stated is None else read_record(BallEvidence, stated, f"`ball` of {path}", allow_unknown=True)
 
 
-def read_focal_sigma(dataset: Dataset) -> float | None:
-    """The standard deviation of the focal length as a share of it, where the cameras of the train split state it."""
+def read_statement(dataset: Dataset) -> Statement:
+    """How sure focal length and masks are, as far as the cameras of the train split state it."""
     path = dataset.root / "transforms_train.json"
-    stated = read_table(path, "the cameras of the train split").get("focal_sigma")
-    if stated is None:
-        return None
-    if not isinstance(stated, int | float) or not 0 <= stated < np.inf:
-        raise InputError(
-            expected=f"`focal_sigma` of {path}: the standard deviation of the focal length as a share of it, 0 or more",
-            found=repr(stated),
-            remedy="Correct it, or leave it out.",
-        )
-    return float(stated)
+    table = read_table(path, "the cameras of the train split")
+    known = {name: table[name] for name in STATED if name in table}
+    return read_record(Statement, known, str(path), remedy="Correct it, or leave it out.")
 
 
 def read_ground(dataset: Dataset) -> GroundPlane | None:

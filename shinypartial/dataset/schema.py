@@ -132,6 +132,16 @@ class GroundPlane:
 
 
 @dataclass(frozen=True)
+class Statement:
+    """How sure a capture is, as `transforms_train.json` states it."""
+
+    focal_sigma: NonNegative | None = None
+    """Standard deviation of the focal length, as a share of it; None: it is not stated."""
+    mask_sigma_px: NonNegative = 0.0
+    """That of the contours of masks, in pixels, beyond the error of right ones."""
+
+
+@dataclass(frozen=True)
 class BallEvidence:
     """What a capture of a mirror ball knows of itself, as `transforms_train.json` states it."""
 

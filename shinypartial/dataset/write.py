@@ -32,6 +32,7 @@ from shinypartial.dataset.schema import (
     BallEvidence,
     Frame,
     GroundPlane,
+    Statement,
     View,
 )
 from shinypartial.io.files import PARTIAL_PREFIX, read_table, sha256_of, write_json, write_text
@@ -148,7 +149,7 @@ def write_transforms(
     frames: Sequence[Frame],
     ball: BallEvidence | None = None,
     ground: GroundPlane | None = None,
-    focal_sigma: float | None = None,
+    statement: Statement | None = None,
 ) -> None:
     """Write `transforms_SPLIT.json` with OpenGL poses, as NeRF-synthetic and nerfstudio readers expect.
 
@@ -171,8 +172,8 @@ def write_transforms(
     stated: dict[str, Any] = {
         name: write_record(each) for name, each in (("ball", ball), ("ground", ground)) if each is not None
     }
-    if focal_sigma is not None:
-        stated["focal_sigma"] = focal_sigma
+    if statement is not None:
+        stated |= write_record(statement)
     write_json(root / f"transforms_{split}.json", {**shared, **stated, "frames": entries})
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from shinypartial.core.camera import Camera, ray_directions_world
 from shinypartial.core.color import srgb_to_linear
-from shinypartial.dataset.schema import Frame, GroundPlane
+from shinypartial.dataset.schema import Frame, GroundPlane, Statement
 from shinypartial.dataset.write import write_transforms
 from shinypartial.io.images import write_png
 from tests.support.photographed_planes import arc
@@ -60,5 +60,5 @@ def write_ball_on_tiles(folder: Path, lacked_px: int = 0) -> Path:
         write_png(stem.with_name(f"{stem.name}.png"), picture)
         write_png(stem.with_name(f"{stem.name}_alpha.png"), mask.astype(np.uint8) * 255)
         frames.append(Frame(f"train/{stem.name}", camera, stem))
-    write_transforms(folder, "train", frames, ground=GROUND, focal_sigma=0.001)
+    write_transforms(folder, "train", frames, ground=GROUND, statement=Statement(0.001))
     return folder

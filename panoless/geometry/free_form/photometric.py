@@ -233,12 +233,6 @@ class Linearization:
         )
 
     @property
-    def silhouettes_apart(self) -> Float[np.ndarray, "S"]:
-        """By how many pixels silhouettes are off those of the masks, where they are met."""
-        count = len(self.task.silhouettes.view)
-        return self.silhouettes.residual[:count, 0][self.silhouettes.weights[:count] > 0]
-
-    @property
     def silhouettes_agree(self) -> bool:
         """Whether silhouettes lie within `AGREED_SILHOUETTE_PX` of their masks' in the median, and within
         `AGREED_PULL_PX` in the median over views of the median with a sign, which wrong masks move.

@@ -8,11 +8,12 @@ from jaxtyping import Float
 
 from panoless.geometry.free_form.material import measured_material
 from panoless.geometry.free_form.photometric import Linearization
-from panoless.geometry.free_form.task import RADIANCE_SIGMA, SILHOUETTE_SIGMA_PX
+from panoless.geometry.free_form.schedule import SILHOUETTE_GAIN
+from panoless.geometry.free_form.task import RADIANCE_SIGMA
 from panoless.geometry.free_form.trust import Trust
 from panoless.numeric.conjugate_gradients import solve_by_products
 from panoless.numeric.factorize import regularize
-from panoless.problem.rows import CHI_MEDIAN, CORRELATED, contour_sigma_px
+from panoless.problem.rows import CHI_MEDIAN, CORRELATED
 from shinypartial.io.progress import Progress
 
 THIRD_DIFFERENCE_DIAGONAL = 3 * 20 + 6 * 3 * 12 + 6 * 8
@@ -47,14 +48,13 @@ def with_noise(linearization: Linearization) -> Linearization:
     """With priors and silhouettes in the units of the noise that residuals show, in place of the nominal one.
 
     A pixel of variance σ² where e has σₑ² counts (σₑ/σ)² too much; errors of a map and of a surface are alike in about
-    `CORRELATED` pixels. Silhouettes count by what they are off.
+    `CORRELATED` pixels.
     """
     task, clear = linearization.task, linearization.free > 0
     size = np.linalg.norm(linearization.residual[clear], axis=1)
     sigma = float(np.median(size)) / CHI_MEDIAN if len(size) else 0.0
     factor = max(sigma / RADIANCE_SIGMA, 1.0) ** 2
-    gain = (SILHOUETTE_SIGMA_PX / contour_sigma_px(linearization.silhouettes_apart)) ** 2
-    weight = task.silhouette_weight / task.settings.silhouette_gain * gain * factor
+    weight = task.silhouette_weight / task.settings.silhouette_gain * SILHOUETTE_GAIN * factor
     return replace(linearization, task=replace(task, prior_factor=CORRELATED * factor, silhouette_weight=weight))
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from panoless.capture.poses import StatedCameras
 from panoless.capture.views import Views
 from panoless.geometry.free_form.material import Material
-from panoless.geometry.free_form.schedule import Round
+from panoless.geometry.free_form.schedule import SILHOUETTE_GAIN, Round
 from panoless.problem.blocks import Exposures, WhiteBalances
 from panoless.problem.nuisance import NO_NUISANCE, Nuisance
 from panoless.problem.observations import Pixels, background_rays, is_saturated, silhouette_rays, solid_pixels
@@ -92,6 +92,8 @@ def make_task(
     density = COUNTED_RAYS / total * len(silhouettes.size) / max(len(chosen.size), 1)
     dominance = (settings.robust_scale / RADIANCE_SIGMA) ** 2 if settings.silhouette_dominated else 1.0
     of_silhouettes = settings.silhouette_gain * dominance * density / SILHOUETTE_SIGMA_PX**2
+    # Where masks are stated as rough, no gain takes them for right.
+    of_silhouettes /= 1 + SILHOUETTE_GAIN * (views.mask_sigma_px / SILHOUETTE_SIGMA_PX) ** 2
     brightness = max(float(pixels.radiance.mean()), LEAST_BRIGHTNESS)
     background = background_rays(views, settings.rays)
     cameras = StatedCameras.of(views)

@@ -10,8 +10,8 @@ from panoless.capture.ground import Ground
 from panoless.capture.views import load_views
 from shinypartial.core.camera import Similarity
 from shinypartial.core.errors import InputError
-from shinypartial.dataset.read import open_dataset, read_focal_sigma, read_ground
-from shinypartial.dataset.schema import GroundPlane
+from shinypartial.dataset.read import open_dataset, read_ground, read_statement
+from shinypartial.dataset.schema import GroundPlane, Statement
 from shinypartial.io.files import read_json, write_json
 from tests.support.ball_on_tiles import CENTER, GROUND, RADIUS, linear_tiles, write_ball_on_tiles
 
@@ -88,6 +88,7 @@ def test_a_plane_moves_with_its_points() -> None:
         ({"ground": {"normal": [0, 0], "offset": 0}}, "ground"),
         ({"focal_sigma": -1}, "focal_sigma"),
         ({"focal_sigma": "sure"}, "focal_sigma"),
+        ({"mask_sigma_px": -0.5}, "mask_sigma_px"),
     ],
 )
 def test_statements_without_a_meaning_are_refused(tmp_path: Path, stated: dict, found: str) -> None:
@@ -96,10 +97,10 @@ def test_statements_without_a_meaning_are_refused(tmp_path: Path, stated: dict, 
     write_json(path, {**read_json(path, "cameras"), **stated})
     dataset = replace(open_dataset(folder))
     with pytest.raises(InputError, match=found):
-        (read_ground if "ground" in stated else read_focal_sigma)(dataset)
+        (read_ground if "ground" in stated else read_statement)(dataset)
 
 
 def test_what_is_stated_is_read(folder: Path) -> None:
     dataset = open_dataset(folder)
     assert read_ground(dataset) == GROUND
-    assert read_focal_sigma(dataset) == 0.001
+    assert read_statement(dataset) == Statement(0.001)
