@@ -8,6 +8,7 @@ import pytest
 
 from panoless.photographs import masks as masks_module
 from panoless.photographs.hull import carve, nearest_point, overlap, silhouette
+from panoless.photographs.make import contour_sigma_px
 from panoless.photographs.masks import (
     MORE_HINTS,
     Hint,
@@ -200,3 +201,12 @@ def test_masks_beside_photographs_or_a_video_are_found_where_all_are_there(tmp_p
     (masks / "b_mask.png").touch()
     for source in (tmp_path, tmp_path / "frames", tmp_path / "film.mp4"):
         assert masks_beside(source, names) == masks
+
+
+def test_contours_are_off_by_what_overlaps_lack_of_a_disk() -> None:
+    rows, columns = np.indices((200, 200))
+    away = np.hypot(rows - 100, columns - 100)
+    for off_px in (1.0, 2.0, 4.0):
+        mask, hull = (away < 60).astype(float), away < 60 - off_px
+        overlap_of_both = overlap(mask > 0.5, hull)
+        assert contour_sigma_px({"a": mask}, [overlap_of_both]) == pytest.approx(off_px, rel=0.15)

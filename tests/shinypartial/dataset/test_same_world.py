@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from shinypartial.core.camera import Camera, Similarity
 from shinypartial.core.errors import InputError
-from shinypartial.dataset.read import open_dataset, read_view
+from shinypartial.dataset.read import open_dataset, read_ground, read_statement, read_view
 from shinypartial.dataset.same_world import about_ball, align, similarity
-from shinypartial.dataset.schema import MANIFEST, Frame
+from shinypartial.dataset.schema import MANIFEST, Frame, GroundPlane, Statement
 from shinypartial.dataset.write import write_transforms
 from shinypartial.io.files import read_json, write_json
 from shinypartial.io.images import read_png, write_jpeg, write_png
@@ -125,6 +125,19 @@ def test_another_world_is_no_error(truth: Path, tmp_path: Path) -> None:
     before, after = open_dataset(truth), open_dataset(tmp_path / "aligned")
     for old, new in zip((*before.train, *before.test), (*after.train, *after.test), strict=True):
         np.testing.assert_allclose(new.camera.camera_to_world, old.camera.camera_to_world, atol=1e-9)
+
+
+def test_the_ground_and_what_is_sure_come_along(truth: Path, tmp_path: Path) -> None:
+    ground, statement = GroundPlane((0.0, 0.6, 0.8), -1.5), Statement(0.002, 0.7)
+    folder = captured(truth, tmp_path / "captured", WORLD)
+    frames = open_dataset(folder).train
+    write_transforms(folder, "train", frames, ground=ground.moved(WORLD), statement=statement)
+    align(folder, truth, tmp_path / "aligned")
+    aligned = open_dataset(tmp_path / "aligned")
+    found = read_ground(aligned)
+    assert found is not None
+    np.testing.assert_allclose([*found.normal, found.offset], [*ground.normal, ground.offset], atol=1e-9)
+    assert read_statement(aligned) == statement
 
 
 def test_turned_cameras_are_told(truth: Path, tmp_path: Path) -> None:
