@@ -8,16 +8,15 @@ import torch
 from jaxtyping import Float, Int
 
 from panoless.capture.background import Background
+from panoless.capture.masks import BESIDE_PX
 from panoless.capture.object_frame import ObjectFrame
 from panoless.capture.rays import camera_rays
-from shinypartial.core.camera import Camera, Similarity
-from shinypartial.core.sphere import directions_to_cube
+from shinypartial.core.camera import Camera
+from shinypartial.core.sphere import flat_texels
 from shinypartial.dataset.schema import GroundPlane
 
 SAMPLED_PIXELS = 30_000
 """About so many pixels of a view are looked at."""
-BESIDE_PX = 3.0
-"""Masks err by less."""
 LEAST_FALL = 0.05
 """Sine of the angle at which a ray has to come down on the ground."""
 FARTHEST = 8.0
@@ -81,19 +80,15 @@ def ground_of(plane: GroundPlane, frame: ObjectFrame, seen: Sequence[SeenGround]
     A direction from the center has the median color of its pixels, if at least half of these differ little from it:
     what stands on the ground, or lies behind its end, is seen elsewhere by each view.
     """
-    to_frame = Similarity(1 / frame.radius, np.eye(3), -frame.center / frame.radius)
-    known = plane.moved(to_frame)
+    known = plane.moved(frame.from_world)
     if known.offset >= 0:
         return None
-    places = to_frame(np.concatenate([each.points for each in seen]).astype(np.float64))
+    places = frame.from_world(np.concatenate([each.points for each in seen]).astype(np.float64))
     near = np.linalg.norm(places, axis=1) < FARTHEST
     directions = places[near] / np.linalg.norm(places[near], axis=1, keepdims=True)
     radiance = np.concatenate([each.radiance for each in seen])[near]
-    face, st = directions_to_cube(directions)
-    column, row = np.clip((st.T + 1) * RESOLUTION / 2, 0, RESOLUTION - 1).astype(np.int64)
-    _, group, counts = np.unique(
-        (face * RESOLUTION + row) * RESOLUTION + column, return_inverse=True, return_counts=True
-    )
+    texels = flat_texels(directions, RESOLUTION)
+    _, group, counts = np.unique(texels, return_inverse=True, return_counts=True)
     color = _medians(radiance, group, counts)
     spread = _medians(np.abs(radiance - color[group]), group, counts)
     agreed = (counts >= LEAST_SEEN) & (spread < AGREED + AGREED_SHARE * color).all(1)

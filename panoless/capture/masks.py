@@ -19,6 +19,8 @@ from shinypartial.core.errors import InputError
 
 #: A pixel of at least this alpha is on the object.
 MASK_LEVEL = 0.5
+#: Masks err by less: pixels that lie farther beside them show what is past the object.
+BESIDE_PX = 3.0
 #: Pieces of a mask smaller than this share of its largest are specks, and are removed. An object's own pieces, such as
 #: a tip that shows beyond a rim, are larger; a larger stray piece harms nothing but the size of the crop.
 SPECK_SHARE = 0.002

@@ -19,7 +19,7 @@ from panoless.kernels.camera import RasterCamera
 from shinypartial.core.camera import Camera
 from shinypartial.core.conventions import SOLID_ALPHA
 from shinypartial.core.errors import InputError
-from shinypartial.dataset.read import read_ground, read_statement, read_view, read_whole_view
+from shinypartial.dataset.read import read_statement, read_view, read_whole_view
 from shinypartial.dataset.schema import Dataset
 from shinypartial.io.progress import Progress
 
@@ -156,11 +156,15 @@ def load_views(
     Raises InputError for unreadable images and for masks that are all empty.
     """
     progress = Progress("reading views", len(dataset.train))
-    photographs, empty, plane = list[Photograph](), list[str](), read_ground(dataset)
-    seen = list[SeenGround]()
+    photographs, empty, seen = list[Photograph](), list[str](), list[SeenGround]()
+    stated = read_statement(dataset)
+    plane = stated.ground
     downscale = max(1, min(downscale, int(_object_px(dataset) / least_object_px))) if least_object_px else downscale
     for frame in dataset.train:
-        view, color, shown = read_whole_view(frame)
+        if plane is None:
+            view = read_view(frame)
+        else:
+            view, color, shown = read_whole_view(frame)
         alpha = _block_means(np.clip(view.alpha, 0, 1), downscale)
         if (alpha >= MASK_LEVEL).any():
             radiance = encoding.encoded(_block_means(encoding.clipped(frame, view), downscale), alpha)
@@ -181,7 +185,6 @@ def load_views(
             found=f"{len(empty)} of {len(dataset.train)} masks empty: {', '.join(empty[:NAMED_VIEWS])}{more}",
             remedy="Correct these masks, or remove their frames from transforms_train.json.",
         )
-    stated = read_statement(dataset)
     sigma_px = stated.mask_sigma_px / downscale
     views = replace(views_of(photographs, known_radius), focal_sigma=stated.focal_sigma, mask_sigma_px=sigma_px)
     return views if plane is None else replace(views, ground=ground_of(plane, views.object_frame, seen))

@@ -1,13 +1,11 @@
 """The cubemap: its start, look-up and resampling."""
 
-import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from panoless.config import EnvironmentConfig
 from panoless.kernels.cubemap import cubemap_directions, sample_cubemap
-from shinypartial.core.sphere import directions_to_cube
 
 GRAY = 0.5
 """Radiance of the first map."""
@@ -51,14 +49,3 @@ def by_texel(image: Float[Tensor, "6 C L L"]) -> Float[Tensor, "T C"]:
 def by_face(texels: Float[Tensor, "T C"], resolution: int) -> Float[Tensor, "6 C L L"]:
     """The image whose texels these are, the inverse of `by_texel`."""
     return texels.reshape(6, resolution, resolution, -1).movedim(-1, 1)
-
-
-def flat_texels(directions: Float[np.ndarray, "*P 3"], resolution: int) -> Int[np.ndarray, "*P"]:
-    """The flat index of the texel that each direction falls into."""
-    return texels_at(*directions_to_cube(directions), resolution)
-
-
-def texels_at(face: Int[np.ndarray, "*P"], st: Float[np.ndarray, "*P 2"], resolution: int) -> Int[np.ndarray, "*P"]:
-    """The flat index of the texel at each place of a face."""
-    column, row = np.moveaxis(np.clip((st + 1) * resolution / 2, 0, resolution - 1).astype(np.int64), -1, 0)
-    return (face * resolution + row) * resolution + column

@@ -8,7 +8,7 @@ import torch
 from panoless.capture.background import Background
 from panoless.capture.ground import Ground
 from panoless.capture.views import Views
-from panoless.environment.rays import Rays
+from panoless.environment.rays import Rays, joined_rays
 from panoless.environment.resolution import count_rays
 from panoless.environment.solve import solve_environment
 from panoless.environment.surroundings import Floor, Surroundings
@@ -18,14 +18,15 @@ RESOLUTION = 32
 """Texels along a face side of the map by which both kinds of light are compared: 2.8°. Not tuned."""
 
 
-def direct_rays(views: Views, surroundings: Surroundings, rays: Sequence[Rays]) -> list[Rays]:
+def direct_rays(views: Views, surroundings: Surroundings, rays: Sequence[Rays]) -> Rays:
     """What is seen past the object as rays beside those that are mirrored: light past a ball, and the ground that is
-    stated, as far as these surroundings have a floor.
+    stated, as far as these surroundings have a floor; none where there is neither.
     """
     found = [] if views.background is None else [views.background]
     if views.ground is not None and surroundings.floor is not None:
         found.append(ground_light(views.ground, surroundings.floor))
-    return [scaled_to_map(each, rays) for each in found if len(each.weight)]
+    none = Rays(rays[0].directions[:0], rays[0].radiance[:0])
+    return joined_rays([none, *(scaled_to_map(each, rays) for each in found if len(each.weight))])
 
 
 def ground_light(ground: Ground, floor: Floor) -> Background:

@@ -9,8 +9,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from panoless.environment.cubemap import by_face, by_texel, flat_texels, resample
-from shinypartial.core.sphere import cube_to_directions
+from panoless.environment.cubemap import by_face, by_texel, resample
+from shinypartial.core.sphere import cube_to_directions, flat_texels
 
 #: A level of L texels a side is relaxed this often over L: the coarse ones, which carry far and cost little, most.
 RELAXED_TEXELS = 256

@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from panoless.environment.cubemap import flat_texels
 from panoless.environment.rays import Rays, Weighted
 from panoless.kernels.cubemap import apply_gram, lookup_gram, sample_cubemap, scatter_cubemap, weigh_cubemap
 from panoless.numeric.robust import robust_weight
+from shinypartial.core.sphere import flat_texels
 
 BATCH_PIXELS = 500_000
 """Views make a batch until it has so many, which bounds memory. Each batch costs time for every texel of the map: with

@@ -11,12 +11,11 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from panoless.capture.encoding import SATURATED
-from panoless.environment.cubemap import flat_texels
 from panoless.environment.material_field import MaterialField
 from panoless.environment.rays import Rays
 from panoless.numeric.robust import robust_weight
 from shinypartial.core.harmonics import project, real_harmonics
-from shinypartial.core.sphere import cube_directions, cube_solid_angles
+from shinypartial.core.sphere import cube_directions, cube_solid_angles, flat_texels
 
 ROBUST_SCALE = 0.1
 """Residual (linear radiance) beyond which a ray loses its vote; narrower scales lose the rays of a strong color."""

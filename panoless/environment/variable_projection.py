@@ -18,9 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int
 
-from panoless.environment.cubemap import texels_at
 from panoless.numeric.gauss_newton import jacobian_of_rows, normal_equations
-from shinypartial.core.sphere import directions_to_cube
+from shinypartial.core.sphere import directions_to_cube, texels_at
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix

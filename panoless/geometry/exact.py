@@ -121,7 +121,8 @@ class ExactGeometry:
         """
         rays = normalize_confidence(merged(observe_views(views, cast(Geometry, self), config.environment.rays)))
         resolution, encoding = config.environment.solve_resolution, encoding_of(config)
-        rays += direct_rays(views, self.surroundings, rays)
+        direct = direct_rays(views, self.surroundings, rays)
+        rays = [*rays, direct] if len(direct.directions) else rays
         footprints = None if encoding.high_dynamic_range else self.footprints(views, config.environment.rays)
         if footprints is None or not footprints.smooth:
             return solve_environment(rays, resolution or densest_resolution(rays)), rays

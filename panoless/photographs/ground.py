@@ -18,7 +18,7 @@ from scipy import ndimage
 from panoless.capture.masks import MAIN_SHARE, largest_pieces
 from panoless.photographs.hull import cube, nearest_point, pixels_of, silhouette
 from panoless.photographs.lens import opencv
-from panoless.photographs.masks import EDGE_PX, HULL_SPARE, HULL_VOXELS, averaged, enlarged
+from panoless.photographs.masks import EDGE_PX, HULL_SPARE, HULL_VOXELS, averaged, enlarged, signed_distance_px
 from shinypartial.core.camera import Camera
 from shinypartial.core.errors import InputError
 from shinypartial.core.sphere import tangents
@@ -90,7 +90,6 @@ GIVE_MASKS = (
 )
 #: One texel of this many determines how bright a view is.
 SPARSE = 4
-SPECK_PX = 5
 
 
 @dataclass(frozen=True)
@@ -308,7 +307,7 @@ def largest_part(inside: Bool[np.ndarray, "P"], count: int) -> Bool[np.ndarray, 
     """The largest connected part on a grid of count³ points."""
     parts, _ = ndimage.label(inside.reshape(count, count, count))
     sizes = np.bincount(parts.ravel())
-    found: np.ndarray = inside & (parts.ravel() == 1 + np.argmax(sizes[1:], axis=0)) if len(sizes) > 1 else inside
+    found: np.ndarray = inside & (parts.ravel() == 1 + np.argmax(sizes[1:])) if len(sizes) > 1 else inside
     return found
 
 
@@ -389,14 +388,6 @@ def log_odds(view: Evidence, where: Bool[np.ndarray, "H W"]) -> Float[np.ndarray
     of_ground = np.maximum(share((distance < -2) & (distance > -40), USUALLY[0]).clip(0.5, 0.98), of_object + 0.01)
     odds = np.where(matched, np.log(of_object / of_ground), np.log((1 - of_object) / (1 - of_ground)))
     return np.where(view.predicted, odds, 0.0).astype(np.float32)
-
-
-def signed_distance_px(where: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
-    """Distance from the edge of a region, positive inside; the border of the picture is no edge."""
-    cv2 = opencv()
-    inside, outside = (cv2.distanceTransform(each.astype(np.uint8), cv2.DIST_L2, 3) for each in (where, ~where))
-    found: np.ndarray = np.where(where, inside - 0.5, 0.5 - outside)
-    return found
 
 
 def drawn_edge(

@@ -43,7 +43,6 @@ from shinypartial.io.threads import in_threads
 
 #: What the stages found, beside the dataset proper.
 WORK = "capture"
-ALPHA = "alpha channels"
 SHEET_PICTURES = 12
 
 
@@ -115,8 +114,9 @@ def capture(request: Request) -> Captured:
             Frame(f"train/{view.name}", view.camera, train / view.name, pose_covariance=view.pose_covariance)
             for view in poses.views
         ]
-        statement = Statement(poses.focal_error, masks.sigma_px)
-        write_transforms(request.output, "train", listed, ground=poses.ground, statement=statement)
+        write_transforms(
+            request.output, "train", listed, statement=Statement(poses.focal_error, masks.sigma_px, poses.ground)
+        )
     return Captured(frames, poses, masks)
 
 
@@ -264,7 +264,7 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
 
     def work_on() -> Masks:
         shutil.rmtree(train, ignore_errors=True)
-        own, remedy = True, CHECK_MASKS
+        own, remedy, is_found = True, CHECK_MASKS, True
         cameras = {view.name: view.camera for view in poses.views}
         given = bool(given_masks or request.hints)
 
@@ -279,6 +279,7 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
             own = own and alpha
             progress.advance()
         if given_masks:
+            is_found = request.segmenter is not None
             origin = f"the model {request.segmenter.name}" if request.segmenter else "files"
             for view in poses.views:
                 if view.name not in given_masks:
@@ -292,7 +293,7 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
             for name, mask in find_masks(cameras, train, hints).items():
                 write_png(train / f"{name}_alpha.png", mask)
         elif own or poses.ground is None:
-            origin = ALPHA
+            origin, is_found = "alpha channels", False
         else:
             origin, remedy = "what moves against the ground", GIVE_MASKS
             found = ground_masks(cameras, train, poses.ground, work / "ground.png")
@@ -302,8 +303,7 @@ def _masks(request: Request, frames: Frames, poses: Poses, given_masks: dict[str
         judged = {name: (cameras[name], mask) for name, mask in masks.items()}
         overlaps = overlaps_of(judged, remedy)
         _write_mask_sheet(work / "masks.jpg", train, masks, dict(zip(masks, overlaps, strict=True)))
-        sigma = 0.0 if (given_masks and not request.segmenter) or origin == ALPHA else contour_sigma_px(masks, overlaps)
-        return Masks(origin, tuple(masks), overlaps, sigma)
+        return Masks(origin, tuple(masks), overlaps, contour_sigma_px(masks, overlaps) if is_found else 0.0)
 
     return stage(work, "masks", given, Masks, work_on)
 

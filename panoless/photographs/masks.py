@@ -337,13 +337,18 @@ def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
 
 def _band(shape: Bool[np.ndarray, "H W"], share: float, least_px: float = 2.0) -> UInt8[np.ndarray, "H W"]:
     """GrabCut's trimap, which is open within a band about a silhouette."""
-    cv2 = opencv()
     width = max(least_px, share * float(np.sqrt(np.count_nonzero(shape))))
-    inside = cv2.distanceTransform(np.pad(shape, 1, mode="edge").astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
-    outside = cv2.distanceTransform((~shape).astype(np.uint8), cv2.DIST_L2, 3)
-    trimap = np.full(shape.shape, PERHAPS_OBJECT, np.uint8)
-    trimap[inside > width], trimap[outside > width] = OBJECT, AROUND
+    distance, trimap = signed_distance_px(shape), np.full(shape.shape, PERHAPS_OBJECT, np.uint8)
+    trimap[distance > width - 0.5], trimap[distance < 0.5 - width] = OBJECT, AROUND
     return trimap
+
+
+def signed_distance_px(where: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    """Distance from the edge of a region, positive inside; the border of the picture is no edge."""
+    cv2 = opencv()
+    inside, outside = (cv2.distanceTransform(each.astype(np.uint8), cv2.DIST_L2, 3) for each in (where, ~where))
+    found: np.ndarray = np.where(where, inside - 0.5, 0.5 - outside)
+    return found
 
 
 def _cut(

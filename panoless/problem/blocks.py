@@ -69,9 +69,9 @@ class Block:
         return self.scale * float(np.sqrt((self.values[:, self.measured] ** 2).mean()))
 
     @property
-    def prior_score(self) -> float:
-        """1/n Σ xᵀ P x, of the prior."""
-        return float(np.einsum("bi,bij,bj", self.values, self.precision, self.values)) / self.values.size
+    def from_prior(self) -> float:
+        """Σ xᵀ P x."""
+        return float(np.einsum("bi,bij,bj", self.values, self.precision, self.values))
 
     @property
     def size(self) -> int:
@@ -93,9 +93,10 @@ class Block:
         return slice(None)
 
     @classmethod
-    def at_prior(cls: type[AnyBlock], groups: int) -> AnyBlock:
-        """At the mean of the prior."""
-        return cls(np.zeros((groups, cls.count)), np.tile(np.eye(cls.count) / cls.sigma**2, (groups, 1, 1)))
+    def at_prior(cls: type[AnyBlock], groups: int, sigma: float | None = None) -> AnyBlock:
+        """At the mean of the prior, with its standard deviation or another one."""
+        precision = np.eye(cls.count) / (cls.sigma if sigma is None else sigma) ** 2
+        return cls(np.zeros((groups, cls.count)), np.tile(precision, (groups, 1, 1)))
 
     @classmethod
     def of(cls: type[AnyBlock], views: Views, around: Surroundings) -> AnyBlock | None:
@@ -166,8 +167,8 @@ class FocalLength(Lens):
     @classmethod
     def of(cls, views: Views, around: Surroundings) -> "FocalLength":
         """As stated, and as far as that is known."""
-        sigma = cls.sigma if views.focal_sigma is None else math.hypot(views.focal_sigma, cls.model_error)
-        return cls(np.zeros((1, 1)), np.full((1, 1, 1), 1 / sigma**2))
+        stated = views.focal_sigma
+        return cls.at_prior(1, None if stated is None else math.hypot(stated, cls.model_error))
 
     @property
     def lens(self) -> LensChange:

@@ -14,7 +14,7 @@ from panoless.capture.poses import StatedCameras
 from panoless.capture.views import Views
 from panoless.environment.direct import direct_rays
 from panoless.environment.mirrored import MirroredRays, slopes_of
-from panoless.environment.rays import Rays, joined_rays
+from panoless.environment.rays import Rays
 from panoless.environment.solve import solve_environment
 from panoless.environment.surroundings import Surroundings
 from panoless.environment.variable_projection import VariableProjection
@@ -169,7 +169,7 @@ class Photographs:
         mirrored = MirroredRays(rays.directions, hits.normals, hits.points, state.around)
         directions, seen = (torch.from_numpy(each).float() for each in (mirrored.looked_up, radiance))
         rays_seen = [Rays(directions, seen)]
-        past = joined_rays([*direct_rays(data.views, state.around, rays_seen), rays_seen[0].kept(slice(0))])
+        past = direct_rays(data.views, state.around, rays_seen)
         environment = solve_environment([*rays_seen, past], data.settings.resolution)
         light = mirrored.light(environment)
         residual = light - radiance
@@ -181,8 +181,7 @@ class Photographs:
             weights *= min(COUNTED_RAYS / len(chosen), 1.0)
         direct = (sample_cubemap(environment, past.directions) - past.radiance).double().numpy()
         counted = past.initial_weight().double().numpy() * robust_weight(direct, data.settings.robust_scale)
-        if len(direct):
-            weights = np.concatenate([weights, counted * np.median(weights)])
+        weights = np.concatenate([weights, counted * np.median(weights)])
         looked_up = np.concatenate([mirrored.looked_up, past.directions.double().numpy()])
         projection = VariableProjection.of(looked_up, weights, data.settings.resolution)
         return cls(chosen, rays, hits, mirrored, environment, light, residual, sigma, projection, direct)

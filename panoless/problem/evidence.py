@@ -56,7 +56,7 @@ def decided(
 ) -> Decision:
     """Whether a block is needed and its prior allows it; one that is `required` is kept."""
     found = scored(block, variances, covariance)
-    is_possible = block.prior_score <= block.most_deviations**2
+    is_possible = block.from_prior <= block.most_deviations**2 * block.values.size
     return replace(found, kept=required or (is_possible and found.score > found.bound))
 
 

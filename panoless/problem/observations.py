@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from panoless.capture.masks import remembered
+from panoless.capture.masks import BESIDE_PX, remembered
 from panoless.capture.silhouettes import MaskContours, mask_contours
 from panoless.capture.views import Views, concatenated, every_kth_pixel
 from panoless.problem.rays import PixelRays
@@ -14,8 +14,6 @@ from shinypartial.core.conventions import SOLID_ALPHA
 
 SATURATED = 0.97
 """Share of the largest radiance from which a pixel is taken for saturated."""
-BACKGROUND_PX = 3.0
-"""Masks err by less."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +60,11 @@ def solid_pixels(views: Views, count: int) -> Pixels:
 
 
 def background_rays(views: Views, count: int) -> PixelRays:
-    """Rays of pixels more than `BACKGROUND_PX` outside of their masks, as dense as `count` solid ones are."""
+    """Rays of pixels more than `BESIDE_PX` outside of their masks, as dense as `count` solid ones are."""
     stride = max(views.num_solid // count, 1)
     rays = []
     for number, view in enumerate(views.train):
-        outside = np.flatnonzero(outer_distance_px(view.mask) > BACKGROUND_PX)
+        outside = np.flatnonzero(outer_distance_px(view.mask) > BESIDE_PX)
         rays.append(PixelRays.centers(view.camera, outside[number % stride :: stride], number))
     return concatenated(rays)
 

@@ -58,16 +58,17 @@ def proposed_surroundings(
         return FAR
     with torch.no_grad():
         geometry = family.before_steps(views, proposal, config)
+        if views.ground is not None and options.floor == "auto":
+            rays = joined(leaving_rays(views, geometry, rays_taken))
+            level, _ = with_floor(rays, views.ground.up, (views.ground.depth,))
+            return found_surroundings(rays, level.with_degree(options.degree), known_floor=True)
         some = replace(views, train=views.train[:: -(-len(views.train) // CHECKED_VIEWS)])
         few = joined(leaving_rays(some, geometry, CHECKED_RAYS))
         near = Linearized.at(few, FAR.with_degree(0), CHECKED_RESOLUTION).pull() >= LEAST_PULL
         floored = options.floor == "auto" and with_floor(few, _up(views))[1] < LARGEST_FLOOR_COST
-        if options.mode == "auto" and not near and not floored and views.ground is None:
+        if options.mode == "auto" and not near and not floored:
             return FAR
         rays = joined(leaving_rays(views, geometry, rays_taken))
-        if views.ground is not None and options.floor == "auto":
-            level, _ = with_floor(rays, views.ground.up, (views.ground.depth,))
-            return found_surroundings(rays, level.with_degree(options.degree), known_floor=True)
         best = found_surroundings(rays, FAR.with_degree(0))
         if options.degree > 0:
             best = found_surroundings(rays, best.with_degree(options.degree))

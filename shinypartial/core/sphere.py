@@ -169,6 +169,17 @@ def latlong_to_cube(latlong: Float[np.ndarray, "H W C"], resolution: int) -> Flo
     return fine.reshape(6, resolution, 2, resolution, 2, -1).mean((2, 4)).astype(latlong.dtype)
 
 
+def flat_texels(directions: Float[np.ndarray, "*P 3"], resolution: int) -> Int[np.ndarray, "*P"]:
+    """The flat index of the texel that each direction falls into."""
+    return texels_at(*directions_to_cube(directions), resolution)
+
+
+def texels_at(face: Int[np.ndarray, "*P"], st: Float[np.ndarray, "*P 2"], resolution: int) -> Int[np.ndarray, "*P"]:
+    """The flat index of the texel at each place of a face."""
+    column, row = np.moveaxis(np.clip((st + 1) * resolution / 2, 0, resolution - 1).astype(np.int64), -1, 0)
+    return (face * resolution + row) * resolution + column
+
+
 def cube_to_latlong(cube: Float[np.ndarray, "6 L L C"], height: int) -> Float[np.ndarray, "H 2*H C"]:
     """Resample a cubemap onto lat-long texel centers."""
     return sample_cube(cube, latlong_directions(height)).astype(cube.dtype)

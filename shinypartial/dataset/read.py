@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,6 @@ from shinypartial.dataset.schema import (
     BallEvidence,
     Dataset,
     Frame,
-    GroundPlane,
     Statement,
     View,
 )
@@ -46,9 +45,6 @@ from shinypartial.io.images import (
 from shinypartial.io.records import read_record
 
 DEFAULT_FOLDER = Path("datasets")
-STATED = ("focal_sigma", "mask_sigma_px")
-NORMAL_ERROR = 1e-4
-"""By which the length of a stated normal may differ from one."""
 
 
 def newest_dataset(parent: Path = DEFAULT_FOLDER) -> Path:
@@ -303,24 +299,18 @@ def read_ball_evidence(dataset: Dataset) -> BallEvidence | None:
 
 
 def read_statement(dataset: Dataset) -> Statement:
-    """How sure focal length and masks are, as far as the cameras of the train split state it."""
+    """What a capture knows and how sure it is, as far as the cameras of the train split state it; InputError for what
+    has no meaning.
+    """
     path = dataset.root / "transforms_train.json"
     table = read_table(path, "the cameras of the train split")
-    known = {name: table[name] for name in STATED if name in table}
-    return read_record(Statement, known, str(path), remedy="Correct it, or leave it out.")
-
-
-def read_ground(dataset: Dataset) -> GroundPlane | None:
-    """What the object stands on, where the cameras of the train split state it; InputError for what is no plane."""
-    path = dataset.root / "transforms_train.json"
-    stated = read_table(path, "the cameras of the train split").get("ground")
-    if stated is None:
-        return None
-    found = read_record(GroundPlane, stated, f"`ground` of {path}", allow_unknown=True)
-    if not np.isfinite([*found.normal, found.offset]).all() or abs(np.linalg.norm(found.normal) - 1) > NORMAL_ERROR:
+    known = {item.name: table[item.name] for item in fields(Statement) if item.name in table}
+    found = read_record(Statement, known, str(path), allow_unknown=True, remedy="Correct it, or leave it out.")
+    plane = found.ground
+    if plane is not None and not plane.is_plane:
         raise InputError(
             expected=f"`ground` of {path} with a normal of length 1 and a finite offset: points x with n · x = offset",
-            found=f"normal {list(found.normal)}, offset {found.offset}",
+            found=f"normal {list(plane.normal)}, offset {plane.offset}",
             remedy="Correct it, or leave `ground` out.",
         )
     return found

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from shinypartial.core.camera import Camera, Similarity
 from shinypartial.core.conventions import PIXEL_CENTER
 from shinypartial.core.errors import InputError
-from shinypartial.dataset.read import open_dataset, read_ground, read_statement, read_view
+from shinypartial.dataset.read import open_dataset, read_statement, read_view
 from shinypartial.dataset.schema import MANIFEST, SPLITS, Dataset, Frame
 from shinypartial.dataset.subset import files_of
 from shinypartial.dataset.write import write_transforms
@@ -129,9 +129,7 @@ def align(captured: Path, truth: Path, output: Path, gauge: GaugeKind | None = N
         for old, new in copies:
             copy_or_link(old, new, False)
         result = _compare(kind, found.scale, [(new, true) for new, (_, true) in zip(moved, pairs, strict=True)])
-        ground = read_ground(ours)
-        ground = None if ground is None else ground.moved(found)
-        write_transforms(output, SPLITS[0], moved, ground=ground, statement=read_statement(ours))
+        write_transforms(output, SPLITS[0], moved, statement=read_statement(ours).moved(found))
         if theirs.test:
             write_transforms(output, SPLITS[1], theirs.test)
         write_json(output / ALIGNMENT, write_record(result))

@@ -1,7 +1,7 @@
 """Names and types of the dataset folder: the only place where its layout is spelled out."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,6 +33,8 @@ ENVIRONMENT_INVERSE_DISTANCE = Path("environment/inverse_distance.exr")
 INVERSE_DISTANCE_CHANNEL = "Y"
 ENVIRONMENT_CUBE = Path("environment/cube")
 BACKGROUND = "background.exr"
+NORMAL_ERROR = 1e-4
+"""By which the length of a stated normal may differ from one."""
 
 
 @dataclass(frozen=True)
@@ -119,11 +121,16 @@ class Frame:
 
 @dataclass(frozen=True)
 class GroundPlane:
-    """What the object stands on: points x of the world with n · x = offset, as `transforms_train.json` states it."""
+    """What the object stands on: points x of the world with n · x = offset."""
 
     normal: tuple[float, float, float]
     """n, of length 1, toward the cameras."""
     offset: float
+
+    @property
+    def is_plane(self) -> bool:
+        """Whether the normal has length 1 and all is finite."""
+        return math.isfinite(self.offset) and abs(math.hypot(*self.normal) - 1) <= NORMAL_ERROR
 
     def moved(self, by: Similarity) -> "GroundPlane":
         """In another world."""
@@ -133,12 +140,18 @@ class GroundPlane:
 
 @dataclass(frozen=True)
 class Statement:
-    """How sure a capture is, as `transforms_train.json` states it."""
+    """What a capture knows and how sure it is, as `transforms_train.json` states it."""
 
     focal_sigma: NonNegative | None = None
     """Standard deviation of the focal length, as a share of it; None: it is not stated."""
     mask_sigma_px: NonNegative = 0.0
     """That of the contours of masks, in pixels, beyond the error of right ones."""
+    ground: GroundPlane | None = None
+    """What the object stands on; None: it is not stated."""
+
+    def moved(self, by: Similarity) -> "Statement":
+        """In another world."""
+        return self if self.ground is None else replace(self, ground=self.ground.moved(by))
 
 
 @dataclass(frozen=True)

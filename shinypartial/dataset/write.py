@@ -31,7 +31,6 @@ from shinypartial.dataset.schema import (
     SELF_REFLECTION_CHANNEL,
     BallEvidence,
     Frame,
-    GroundPlane,
     Statement,
     View,
 )
@@ -148,7 +147,6 @@ def write_transforms(
     split: str,
     frames: Sequence[Frame],
     ball: BallEvidence | None = None,
-    ground: GroundPlane | None = None,
     statement: Statement | None = None,
 ) -> None:
     """Write `transforms_SPLIT.json` with OpenGL poses, as NeRF-synthetic and nerfstudio readers expect.
@@ -169,11 +167,9 @@ def write_transforms(
         if frame.mask is not None:
             entry["mask_path"] = Path(os.path.relpath(frame.mask, root)).as_posix()
         entries.append(entry if own == shared else {**entry, **own})
-    stated: dict[str, Any] = {
-        name: write_record(each) for name, each in (("ball", ball), ("ground", ground)) if each is not None
-    }
+    stated = {} if ball is None else {"ball": write_record(ball)}
     if statement is not None:
-        stated |= write_record(statement)
+        stated |= {name: value for name, value in write_record(statement).items() if value is not None}
     write_json(root / f"transforms_{split}.json", {**shared, **stated, "frames": entries})
 
 

@@ -60,5 +60,5 @@ def write_ball_on_tiles(folder: Path, lacked_px: int = 0) -> Path:
         write_png(stem.with_name(f"{stem.name}.png"), picture)
         write_png(stem.with_name(f"{stem.name}_alpha.png"), mask.astype(np.uint8) * 255)
         frames.append(Frame(f"train/{stem.name}", camera, stem))
-    write_transforms(folder, "train", frames, ground=GROUND, statement=Statement(0.001))
+    write_transforms(folder, "train", frames, statement=Statement(0.001, 0.0, GROUND))
     return folder

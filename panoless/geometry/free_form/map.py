@@ -9,17 +9,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from panoless.capture.views import Views
-from panoless.environment.cubemap import by_face, by_texel, resample, texels_at
+from panoless.environment.cubemap import by_face, by_texel, resample
 from panoless.environment.direct import direct_rays
 from panoless.environment.fill import fill_unobserved, texel_neighbors
 from panoless.environment.footprints import PixelFootprints, splat
-from panoless.environment.rays import Rays, joined_rays
+from panoless.environment.rays import Rays
 from panoless.environment.surroundings import Surroundings
 from panoless.geometry.free_form.material import LEAST_SHARE, Material
 from panoless.numeric.conjugate_gradients import conjugate_gradients
 from panoless.numeric.robust import robust_weight
 from panoless.problem.observations import is_saturated
-from shinypartial.core.sphere import directions_to_cube
+from shinypartial.core.sphere import flat_texels
 
 SMOOTHNESS = 0.05
 """Weight λ of squared differences of neighboring texels, in rays."""
@@ -125,13 +125,13 @@ class MapData:
         mirrored: Mirrored,
         outgoing: Float[np.ndarray, "P K 3"],
         weights: Float[Tensor, "P"],
-        views: Views | None,
+        views: Views,
         surroundings: Surroundings,
     ) -> "MapData":
         """Of pixels as areas that are mirrored in those directions."""
         areas = PixelFootprints(*(torch.from_numpy(each).float() for each in (outgoing, mirrored.radiance)))
         rays = replace(areas, trust=weights).rays()
-        direct = joined_rays([rays.kept(slice(0)), *(direct_rays(views, surroundings, [rays]) if views else ())])
+        direct = direct_rays(views, surroundings, [rays])
         beside = PixelFootprints(direct.directions[:, None].expand(-1, outgoing.shape[1], 3), direct.radiance)
         weights = torch.cat([weights, direct.initial_weight()])
         return cls(mirrored.beside(direct), PixelFootprints.joined([areas, beside]), weights, direct)
@@ -160,7 +160,7 @@ class MapData:
 
     def known(self, resolution: int) -> Float[np.ndarray, "T"]:
         """Weights of what is seen directly of each texel."""
-        texels = texels_at(*directions_to_cube(self.direct.directions.double().numpy()), resolution)
+        texels = flat_texels(self.direct.directions.double().numpy(), resolution)
         weights = self.direct.initial_weight().double().numpy()
         return np.bincount(texels, weights, 6 * resolution**2).astype(np.float64)
 

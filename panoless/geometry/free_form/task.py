@@ -47,12 +47,12 @@ class Task:
     """Of all views."""
     brightness: float
     """Mean over all pixels and channels (linear radiance)."""
+    views: Views
+    """For what is seen past the object."""
     reference: Float[np.ndarray, "A B C"] | None = None
     """Coefficients the change from which is to be smooth; None: the surface is."""
     prior_factor: float = 1.0
     """Of the precision of nuisance blocks, in whose units pixels count more than they are worth."""
-    views: Views | None = None
-    """For what is seen past the object; None: nothing is."""
     material: Material | None = None
     """What places mirror and scatter; None: they are perfect mirrors."""
 
@@ -98,5 +98,5 @@ def make_task(
     background = background_rays(views, settings.rays)
     cameras = StatedCameras.of(views)
     return Task(
-        pixels, chosen, background, share, of_silhouettes, settings, cameras, brightness, views=views, material=material
+        pixels, chosen, background, share, of_silhouettes, settings, cameras, brightness, views, material=material
     )

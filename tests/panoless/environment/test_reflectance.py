@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from panoless.environment.cubemap import flat_texels
 from panoless.environment.rays import Rays
 from panoless.environment.reflectance import (
     Reflectance,
@@ -17,7 +16,7 @@ from panoless.environment.reflectance import (
     unsaturated,
 )
 from panoless.kernels.cubemap import cubemap_directions
-from shinypartial.core.sphere import cube_solid_angles
+from shinypartial.core.sphere import cube_solid_angles, flat_texels
 
 GOLD = np.array([1.0, 0.77, 0.34])
 PALE = 0.75 * GOLD

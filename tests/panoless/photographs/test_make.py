@@ -19,7 +19,7 @@ from shinypartial.core.camera import opencv_to_opengl
 from shinypartial.core.errors import InputError
 from shinypartial.dataset.bundled import bundled_dataset, resolve_dataset
 from shinypartial.dataset.export_cameras import export_cameras
-from shinypartial.dataset.read import open_dataset, read_ground, read_statement, read_view
+from shinypartial.dataset.read import open_dataset, read_statement, read_view
 from shinypartial.dataset.schema import Statement
 from shinypartial.io.images import write_png
 from tests.panoless.photographs.test_masks import CAMERAS, TRUTH, box_of, write_pictures
@@ -61,7 +61,7 @@ def test_photographs_with_masks_become_a_dataset(photographs: Path, tmp_path: Pa
     assert {path.name for path in (output / "capture").glob("*.*g")} == {"frames.jpg", "poses.png", "masks.jpg"}
     # Masks that are given are right, and no ground was looked for.
     assert read_statement(dataset) == Statement()
-    assert read_ground(dataset) is None
+    assert read_statement(dataset).ground is None
 
 
 def test_stages_that_are_done_are_not_done_again(photographs: Path, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Captured cameras in the world of their truth: a similarity is taken out, an error is not."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from shinypartial.core.camera import Camera, Similarity
 from shinypartial.core.errors import InputError
-from shinypartial.dataset.read import open_dataset, read_ground, read_statement, read_view
+from shinypartial.dataset.read import open_dataset, read_statement, read_view
 from shinypartial.dataset.same_world import about_ball, align, similarity
 from shinypartial.dataset.schema import MANIFEST, Frame, GroundPlane, Statement
 from shinypartial.dataset.write import write_transforms
@@ -128,16 +129,18 @@ def test_another_world_is_no_error(truth: Path, tmp_path: Path) -> None:
 
 
 def test_the_ground_and_what_is_sure_come_along(truth: Path, tmp_path: Path) -> None:
-    ground, statement = GroundPlane((0.0, 0.6, 0.8), -1.5), Statement(0.002, 0.7)
+    ground = GroundPlane((0.0, 0.6, 0.8), -1.5)
+    statement = Statement(0.002, 0.7, ground)
     folder = captured(truth, tmp_path / "captured", WORLD)
     frames = open_dataset(folder).train
-    write_transforms(folder, "train", frames, ground=ground.moved(WORLD), statement=statement)
+    write_transforms(folder, "train", frames, statement=statement.moved(WORLD))
     align(folder, truth, tmp_path / "aligned")
     aligned = open_dataset(tmp_path / "aligned")
-    found = read_ground(aligned)
+    stated = read_statement(aligned)
+    found = stated.ground
     assert found is not None
     np.testing.assert_allclose([*found.normal, found.offset], [*ground.normal, ground.offset], atol=1e-9)
-    assert read_statement(aligned) == statement
+    assert replace(stated, ground=ground) == statement
 
 
 def test_turned_cameras_are_told(truth: Path, tmp_path: Path) -> None:
