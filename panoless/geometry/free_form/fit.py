@@ -35,8 +35,6 @@ from panoless.problem.nuisance import NO_NUISANCE, Nuisance, nuisance_of
 from panoless.problem.observations import silhouette_rays, solid_pixels
 from shinypartial.io.progress import Progress
 
-SHARED_SCALE = 0.2
-"""Robust scale above which what all views share stays: its derivative under a coarse map has the wrong sign."""
 LAST_RAYS = 2.5
 """Factor of the pixels of the last round, which all views take: those before lead to where it starts…"""
 MOST_RAYS = 300_000
@@ -315,7 +313,7 @@ def take_round(
 ) -> FitStage:
     """A stage after the steps of a round; in the `last` one silhouettes count more if photographs agree with them."""
     surface, nuisance = stage.surface, stage.nuisance
-    if settings.robust_scale > SHARED_SCALE:
+    if settings.is_coarse:
         stage = replace(stage, nuisance=nuisance.under_coarse(settings.resolution))
     if stage.settings is None or stage.settings.cells != settings.cells:
         surface = surface.resampled(settings.cells)

@@ -27,6 +27,10 @@ STEPS = 6
 """Conjugate-gradient steps of a robust round."""
 PHOTON_SHARE = 0.75
 """Share of a pixel's variance that grows with its light."""
+FLAT_SHARE, STEEP_SHARE = 0.5, 0.2
+"""Of all pixels: those where the map changes least show their noise, those where it does most how far rays err."""
+LEAST_NOISE = 1e-4
+"""Median length of a residual at least (linear radiance)."""
 
 
 def splatted_map(pixels: PixelFootprints, weights: Float[Tensor, "P"], resolution: int) -> Float[Tensor, "6 3 L L"]:
@@ -66,6 +70,30 @@ def photon_gain(seen: Float[np.ndarray, "P 3"], brightness: float) -> Float[np.n
     """
     light = np.maximum(seen.mean(1), 0.0)
     gain: Float[np.ndarray, "P"] = 1 / np.sqrt(1 - PHOTON_SHARE + PHOTON_SHARE * light / brightness)
+    return gain
+
+
+def direction_gain(
+    residual: Float[np.ndarray, "P 3"],
+    slopes: Float[np.ndarray, "P 3 3"],
+    clear: Bool[np.ndarray, "P"],
+    least_noise: float = LEAST_NOISE,
+) -> Float[np.ndarray, "P"]:
+    """By how much residuals count less because mirrored rays err: 1/√(1 + (θ ‖∇E‖/σ)²).
+
+    A ray that is wrong by θ (rad) shows light that is wrong by θ ‖∇E‖ (effective variance, Orear 1982). σ is the median
+    ‖e‖ of flat pixels, or the `least_noise` if it is larger; θ is the median of √(‖e‖² − σ²)/‖∇E‖ of steep ones.
+    Without it few lamps decide where a surface ends: each keeps the pixels that show it already.
+    """
+    size, steepness = np.linalg.norm(residual, axis=1), np.linalg.norm(slopes, axis=(1, 2))
+    if not clear.any():
+        return np.ones(len(size))
+    of_flat, of_steep = np.quantile(steepness[clear], (FLAT_SHARE, 1 - STEEP_SHARE))
+    flat, steep = clear & (steepness <= of_flat), clear & (steepness >= max(of_steep, 1e-9))
+    noise = max(float(np.median(size[flat])), least_noise)
+    off = np.sqrt(np.maximum(size[steep] ** 2 - noise**2, 0)) / steepness[steep]
+    turned = float(np.median(off)) if len(off) else 0.0
+    gain: Float[np.ndarray, "P"] = 1 / np.sqrt(1 + (turned * steepness / noise) ** 2)
     return gain
 
 

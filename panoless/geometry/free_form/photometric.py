@@ -11,7 +11,8 @@ from torch import Tensor
 
 from panoless.capture.views import concatenated
 from panoless.geometry.free_form.equations import Rows, gauge_rows, joined_rows, silhouette_rows
-from panoless.geometry.free_form.map import MapData, Mirrored, photon_gain
+from panoless.geometry.free_form.map import LEAST_NOISE, MapData, Mirrored, direction_gain
+from panoless.geometry.free_form.material import LEAST_SHARE
 from panoless.geometry.free_form.motions import pixel_motion_rows
 from panoless.geometry.free_form.surface import Hits, LevelSet
 from panoless.geometry.free_form.task import RADIANCE_SIGMA, SILHOUETTE_SIGMA_PX, Task
@@ -146,6 +147,9 @@ class Linearization:
         light, slopes, texels = seen_with_slopes(padded, reflected.outgoing)
         counted = mirrored.gain(light, task.brightness)
         residual, slopes = (light - mirrored.radiance) * counted, slopes * counted[..., None]
+        least_noise = LEAST_NOISE if settings.is_coarse else RADIANCE_SIGMA
+        turned = direction_gain(residual, slopes, free > 0, least_noise)[:, None]
+        counted, residual, slopes = counted * turned, residual * turned, slopes * turned[..., None]
         known = seen.known(settings.resolution)
         found = task, surface, reflected, trust, environment, counted, residual, slopes, texels, free, light, known
         return cls(*found, nuisance)
@@ -355,7 +359,10 @@ class Linearization:
     @cached_property
     def _light(self) -> Float[np.ndarray, "P 3"]:
         """The prediction, times the gain of residuals."""
-        return self.residual + self.radiance * photon_gain(self.light, self.task.brightness)[:, None]
+        if self.task.material is None:
+            return self.light * self.gain
+        share, _ = self.task.material.at(self.points, self.facing)
+        return self.light_shown * self.gain / np.maximum(share, LEAST_SHARE)
 
     def _of_views(self, blocks: Sequence[Block]) -> Linearized:
         count = len(blocks[0].values)

@@ -5,6 +5,8 @@ from typing import Literal
 
 from panoless.geometry.free_form.options import FreeFormOptions
 
+COARSE_SCALE = 0.2
+"""Robust scale above which a round is coarse."""
 SILHOUETTE_GAIN = 9.0
 """Factor of the silhouettes' weight where they count as if they were right to 0.05 px, not 0.15 px."""
 
@@ -41,6 +43,13 @@ class Round:
     """Whether the map stays as trusted pixels determine it, and the surface alone moves."""
     least_gain: float = 3e-3
     """The round ends when a step lowers the cost by less than this share."""
+
+    @property
+    def is_coarse(self) -> bool:
+        """Whether rays may be far off: then all pixels count alike by how far theirs are, and what all views share
+        stays, as its derivative under a coarse map has the wrong sign.
+        """
+        return self.robust_scale > COARSE_SCALE
 
 
 DESCENT = tuple(
