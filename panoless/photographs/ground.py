@@ -307,7 +307,8 @@ def largest_part(inside: Bool[np.ndarray, "P"], count: int) -> Bool[np.ndarray, 
     """The largest connected part on a grid of count³ points."""
     parts, _ = ndimage.label(inside.reshape(count, count, count))
     sizes = np.bincount(parts.ravel())
-    found: np.ndarray = inside & (parts.ravel() == 1 + np.argmax(sizes[1:])) if len(sizes) > 1 else inside
+    sizes[0] = 0  # What is outside.
+    found: np.ndarray = inside & (parts.ravel() == np.argmax(sizes))
     return found
 
 

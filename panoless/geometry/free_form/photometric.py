@@ -167,10 +167,15 @@ class Linearization:
     @property
     def light_shown(self) -> Float[np.ndarray, "P 3"]:
         """What pixels are predicted to show."""
-        if self.task.material is None:
-            return self.light
-        share, scattered = self.task.material.at(self.points, self.facing)
+        share, scattered = self._material
         return share * self.light + scattered
+
+    @cached_property
+    def _material(self) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]]:
+        """Mirrored share and scattered radiance of the pixels."""
+        if self.task.material is None:
+            return np.ones_like(self.light), np.zeros_like(self.light)
+        return self.task.material.at(self.points, self.facing)
 
     @property
     def facing(self) -> Float[np.ndarray, "P"]:
@@ -180,8 +185,7 @@ class Linearization:
     @cached_property
     def weights(self) -> Float[np.ndarray, "P"]:
         """Of the pixels, with trust, but without robust weights; in units of 1/σ²."""
-        trusted = self.trust.at(self.surface.points(self.reflected.hits.places))
-        return self.task.photograph_weight * self.free * trusted
+        return self.task.photograph_weight * self.free * self.trust.at(self.points)
 
     @cached_property
     def points(self) -> Float[np.ndarray, "P 3"]:
@@ -359,9 +363,7 @@ class Linearization:
     @cached_property
     def _light(self) -> Float[np.ndarray, "P 3"]:
         """The prediction, times the gain of residuals."""
-        if self.task.material is None:
-            return self.light * self.gain
-        share, _ = self.task.material.at(self.points, self.facing)
+        share, _ = self._material
         return self.light_shown * self.gain / np.maximum(share, LEAST_SHARE)
 
     def _of_views(self, blocks: Sequence[Block]) -> Linearized:

@@ -165,5 +165,5 @@ def with_material(linearization: Linearization) -> Linearization:
 
 def measured_trust(linearization: Linearization) -> Trust:
     """Trust by the residuals of a linearization."""
-    points, clear = linearization.surface.points(linearization.reflected.hits.places), linearization.free > 0
-    return linearization.trust.measured(points, linearization.residual, linearization.free, clear)
+    clear = linearization.free > 0
+    return linearization.trust.measured(linearization.points, linearization.residual, linearization.free, clear)
